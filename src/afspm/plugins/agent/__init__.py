@@ -1,4 +1,4 @@
-"""An agent takes part in an experiment by the Model Context Protocol, within what a person has approved.
+"""AI agents in an experiment: they connect over the Model Context Protocol and do only what a person has approved.
 
 Theory of operation
 -------------------
@@ -7,8 +7,8 @@ Theory of operation
     state         frozen plans with their preflights, and runs with their progress (`workplace`)
     goes out      requests to the scheduler under the agent's name "agent:NAME"; proposals for persons
     always holds  nothing here decides what an agent may do: the scheduler keeps the approvals, and checks each request
-                  right before it is sent (`scheduler.safety.grants`). No text from outside is read as anything but text
+                  right before it is sent (`scheduler.safety.grants`). Text from outside is never an instruction
 
 `plan` is pure: a plan, its canonical form, its id, and the exact requests that a person approves. `twin` is the
-simulated run of a plan, in a process of its own. `commands` holds `afspm approve`, the decision of a person.
+simulated run of a plan, in a separate process. `commands` holds `afspm approve`, with which a person decides.
 """

@@ -1,4 +1,4 @@
-"""`Agent`: the component that lets agents take part in an experiment by the Model Context Protocol."""
+"""`Agent`: the component that offers the tools of an experiment to AI agents, over the Model Context Protocol."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a person sends to approve a plan, to give a grant, or to revoke both."""
+"""Approvals of agents' plans, and grants, as a person sends them to the scheduler."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _FIELDS = ("agent", "for", "region", "parameters", "counts")
 
 
 def simulated(proposal: Proposal) -> str:
-    """Return the result of a preflight in words, for the person who decides."""
+    """Return a summary of a plan's simulated run, for the person who decides."""
     found = json.loads(proposal.preflight)
     harm, seconds = found.get("harm"), found.get("seconds")
     if harm is None or seconds is None:
@@ -57,10 +57,10 @@ def of_plan(proposal: Proposal, frame: Frame) -> tuple[Grant, Plan]:
 
 
 def of_table(table: Mapping[str, object], facts: Plain) -> Grant:
-    """Return a grant from a table of a TOML file.
+    """Return the grant that a table of a TOML file describes.
 
     Args:
-        facts: as of `Scope.approval_facts`.
+        facts: the result of `Scope.approval_facts`.
 
     Raises:
         InvalidValue, UnitError: a field is unknown or missing, or a quantity can't be used.
@@ -101,7 +101,7 @@ def of_table(table: Mapping[str, object], facts: Plain) -> Grant:
 
 
 def fresh(grant: Grant, facts: Plain) -> Grant:
-    """Return an approval that is valid for these facts: run, limits, coordinates and the time of the check."""
+    """Return a copy of an approval, bound to the present run, limits, coordinates and time."""
     offset_m = facts.get("offset_m")
     return replace(
         grant,

@@ -1,4 +1,4 @@
-"""The arguments of the tools: strict, so that nothing is converted or dropped silently."""
+"""Arguments of the tools, validated strictly: nothing is converted or dropped silently."""
 
 from __future__ import annotations
 
@@ -19,42 +19,42 @@ Count = Annotated[int, Field(ge=1, le=50)]
 
 
 class Arguments(BaseModel):
-    """Arguments of a tool."""
+    """Base of the arguments of all tools."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
 class Nothing(Arguments):
-    """No arguments."""
+    """Arguments of a tool that takes none."""
 
 
 class Newest(Arguments):
-    """How many, newest last."""
+    """Number of entries to return; the newest is the last."""
 
     count: Count = 20
 
 
 class Journal(Newest):
-    """Entries after a time."""
+    """Number of journal entries to return, optionally only those after a given entry."""
 
     since: Annotated[str, Field(pattern=r"^[0-9]{0,20}$", description="id of an entry")] = ""
 
 
 class OfScan(Arguments):
-    """One scan."""
+    """Id of one scan."""
 
     scan: ScanId
 
 
 class Picture(OfScan):
-    """A picture of one scan."""
+    """One channel of a scan, and the size of its picture."""
 
     channel: Annotated[int, Field(ge=0, le=63, description="index in the list of channels")] = 0
     px: Annotated[int, Field(ge=16, le=LARGEST_PX)] = 256
 
 
 class ScanStep(Arguments):
-    """Take a scan."""
+    """Step of a plan: take a scan."""
 
     do: Literal["scan"]
     center: Place
@@ -64,14 +64,14 @@ class ScanStep(Arguments):
 
 
 class SpectrumStep(Arguments):
-    """Take a spectrum at a place."""
+    """Step of a plan: take a spectrum at a place."""
 
     do: Literal["spectrum"]
     at: Place
 
 
 class SetStep(Arguments):
-    """Set a parameter."""
+    """Step of a plan: set a parameter."""
 
     do: Literal["set"]
     parameter: Annotated[str, Field(min_length=1, max_length=100)]
@@ -79,7 +79,7 @@ class SetStep(Arguments):
 
 
 class MoveStep(Arguments):
-    """Move the probe."""
+    """Step of a plan: move the probe."""
 
     do: Literal["move"]
     to: Place
@@ -89,31 +89,31 @@ Step = Annotated[ScanStep | SpectrumStep | SetStep | MoveStep, Field(discriminat
 
 
 class PlanArguments(Arguments):
-    """Steps in their order."""
+    """Title and steps of a plan, in order."""
 
     title: Annotated[str, Field(min_length=1, max_length=LONGEST_TITLE)]
     steps: Annotated[list[Step], Field(min_length=1, max_length=MOST_STEPS)]
 
 
 class Propose(Arguments):
-    """A plan."""
+    """Plan to propose."""
 
     plan: PlanArguments
 
 
 class OfProposal(Arguments):
-    """One proposal."""
+    """Id of one proposal."""
 
     proposal: ProposalId
 
 
 class Measure(Arguments):
-    """One step."""
+    """One step to carry out within a grant."""
 
     step: Step
 
 
 class Stop(Arguments):
-    """Why."""
+    """Reason for stopping the experiment."""
 
     reason: Annotated[str, Field(min_length=1, max_length=200)]

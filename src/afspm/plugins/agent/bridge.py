@@ -1,4 +1,4 @@
-"""The tools of an agent server over stdin and stdout: each call is passed on over HTTP."""
+"""Bridge from stdin and stdout to an agent server: passes each tool call on over HTTP."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ ANSWER_S = 300.0
 
 
 async def serve(url: str, name_and_token: str) -> None:
-    """Serve until stdin ends.
+    """Serve the tools over stdin and stdout until stdin ends.
 
     Args:
-        name_and_token: NAME:TOKEN; empty: the agent only looks.
+        name_and_token: the agent's NAME:TOKEN; if empty, the agent can only read.
     """
     headers = {"Authorization": f"Bearer {name_and_token}"} if name_and_token else {}
     address = url if url.endswith(PATH) else f"{url.rstrip('/')}{PATH}"

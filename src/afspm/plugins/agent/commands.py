@@ -1,4 +1,4 @@
-"""`afspm approve`: a person decides about the plans of agents. `afspm agent`: the server over stdin and stdout."""
+"""`afspm approve`: a person decides on agents' plans. `afspm agent`: serve the tools over stdin and stdout."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def agent(url: Annotated[str, typer.Argument(help="Of the agent server, as its l
 
 
 def grant_lines(grant: Grant) -> list[str]:
-    """Return a grant in words."""
+    """Return a grant as lines of text, for people."""
     from afspm.basics.formatting import area_text, duration_text, position_text, quantity
     from afspm.model.names import BASE_PARAMETERS
 

@@ -1,4 +1,4 @@
-"""A plan of an agent: steps with units, a canonical form, an id, and the requests that carry it out. Pure."""
+"""Plan of an agent: its steps, canonical form, id, and the requests that carry it out. Pure."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 
 @dataclass(frozen=True)
 class PlannedRequest:
-    """A request of a plan, with its words for a person."""
+    """A request of a plan, with a description for people."""
 
     kind: int
     subject: object
@@ -34,13 +34,13 @@ class PlannedRequest:
 
     @property
     def step(self) -> GrantedStep:
-        """The request as it is approved, and as it must be sent."""
+        """The request in the form in which it is approved and checked."""
         return GrantedStep(self.kind, encode_subject(self.subject))
 
 
 @dataclass(frozen=True)
 class ScanStep:
-    """Take a scan. Lengths in m, angle in rad, (rows, columns)."""
+    """Step that takes a scan. Lengths in m, angle in rad, shape in (rows, columns)."""
 
     center_m: XY
     size_m: XY
@@ -60,7 +60,7 @@ class ScanStep:
 
 @dataclass(frozen=True)
 class SpectrumStep:
-    """Take a spectrum at a place."""
+    """Step that takes a spectrum at a place."""
 
     at_m: XY
 
@@ -74,7 +74,7 @@ class SpectrumStep:
 
 @dataclass(frozen=True)
 class SetStep:
-    """Set a parameter; `value` is a quantity with its unit, or a word."""
+    """Step that sets a parameter; `value` is a quantity with its unit, or a word."""
 
     parameter: str
     value: str
@@ -89,7 +89,7 @@ class SetStep:
 
 @dataclass(frozen=True)
 class MoveStep:
-    """Move the probe to a place."""
+    """Step that moves the probe to a place."""
 
     to_m: XY
 
@@ -103,13 +103,13 @@ Step = ScanStep | SpectrumStep | SetStep | MoveStep
 
 @dataclass(frozen=True)
 class Plan:
-    """Steps in their order. The title is the agent's own, for people; it is part of the id."""
+    """Steps in order. The agent chooses the title, for people; the id depends on it, too."""
 
     title: str
     steps: tuple[Step, ...]
 
     def canonical(self) -> str:
-        """Return the plan as JSON: the same text for the same plan."""
+        """Return the plan as JSON; equal plans give the same text."""
         facts = {"title": self.title, "steps": [_facts(one) for one in self.steps]}
         return json.dumps(facts, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
 
@@ -124,7 +124,7 @@ class Plan:
 
 
 def read_plan(plain: object) -> Plan:
-    """Return the plan in a tool's arguments.
+    """Return the plan described by a tool's arguments.
 
     Raises:
         InvalidValue: a field is unknown or missing, a quantity has no unit or is not finite, …
@@ -140,7 +140,7 @@ def read_plan(plain: object) -> Plan:
 
 
 def read_step(plain: object, where: str = "step") -> Step:
-    """Return one step; errors as of `read_plan`."""
+    """Return the step described by a JSON object; raise InvalidValue as `read_plan` does."""
     if not isinstance(plain, Mapping):
         raise InvalidValue("a step is an object", where=where)
     match plain.get("do"):
@@ -164,7 +164,7 @@ def read_step(plain: object, where: str = "step") -> Step:
 
 
 def plan_of(canonical: str) -> Plan:
-    """Return the plan of a canonical form, checked again. Errors as of `read_plan`."""
+    """Return the plan with a given canonical form, after checking it. Raises InvalidValue."""
     try:
         facts = json.loads(canonical)
         plan = Plan(str(facts["title"]), tuple(_step_of(one) for one in facts["steps"]))
@@ -263,7 +263,7 @@ def _quantity(value: object, unit: str, where: str) -> float:
 
 
 def parse_unit(text: str, where: str) -> str:
-    """Return the unit of a quantity; "" without one. Raises InvalidValue: the text is no quantity."""
+    """Return the unit of a quantity, "" if it has none. Raises InvalidValue if the text is not a quantity."""
     try:
         return parse_quantity(text)[1]
     except AfspmError as error:

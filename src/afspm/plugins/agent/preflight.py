@@ -1,4 +1,4 @@
-"""Starts the simulated run of a plan, and keeps it from disturbing the experiment."""
+"""Preflight: starts the simulated run of a plan in a separate process, so that it can't disturb the experiment."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ MOST_AT_ONCE = 1
 
 
 class Preflight:
-    """Simulates plans, one at a time, each in a process of its own."""
+    """Runner of simulations of plans: one at a time, each in a separate process."""
 
     def __init__(self, longest_s: float = LONGEST_S) -> None:
         self._longest_s = longest_s
         self._running = 0
 
     async def of(self, plan: Plan, place: Workplace, who: str) -> tuple[Plain, bytes | None]:
-        """Return the result of a simulated run, and the picture of its first scan.
+        """Simulate a plan; return the result, and the picture of its first scan.
 
         Raises:
             RefusedRequest: another preflight runs, or this one takes too long or fails.

@@ -1,4 +1,4 @@
-"""The server over HTTP, behind the guard of the gateway."""
+"""HTTP server of the agents' tools, behind the gateway's access checks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PATH = "/mcp"
 
 
 def application(tools: AgentTools, passwords: Passwords, *, host: str, origins: Collection[str] = ()) -> AsgiApp:
-    """Return the application. The guard checks name, token, origin and host of each request before it."""
+    """Return the HTTP application; `GatewayGuard` checks name, token, origin and host of each request first."""
     # the guard does it for both eras of the protocol, and off loopback as well
     security = TransportSecuritySettings(enable_dns_rebinding_protection=False)
     app = tools.server().streamable_http_app(streamable_http_path=PATH, transport_security=security, host=host)

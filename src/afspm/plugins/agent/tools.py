@@ -1,4 +1,4 @@
-"""The thirteen tools. A refusal is an answer with `is_error`, whose first field is a code of ours."""
+"""The thirteen tools that agents call. A refused call returns `is_error`, with an afspm error code as first field."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ _ACTS = types.ToolAnnotations(destructive_hint=True)
 
 
 class AgentTools:
-    """The tools of all agents.
+    """The tools that all agents share.
 
     Args:
-        person: the name of a client without a request of HTTP, which is in the same process.
+        person: name of the caller for calls in the same process, without HTTP.
     """
 
     TOOLS: ClassVar[dict[str, tuple[type[arguments.Arguments], types.ToolAnnotations, str]]] = {
@@ -76,7 +76,6 @@ class AgentTools:
         self._place, self._twin, self._person = workplace, preflight, person
 
     def server(self) -> Server[Any]:
-        """Return the server of the Model Context Protocol."""
         return Server("afspm", instructions=INSTRUCTIONS, on_list_tools=self._list_tools, on_call_tool=self._call_tool)
 
     async def _list_tools(self, context: object, asked: object) -> types.ListToolsResult:
@@ -94,7 +93,7 @@ class AgentTools:
         return await self.call(person, asked.name, asked.arguments or {})
 
     async def call(self, person: str, name: str, given: dict[str, object]) -> types.CallToolResult:
-        """Carry out a call; an error becomes an answer that the model reads."""
+        """Carry out a call of a tool; return errors as an answer that the model can read."""
         self._place.bell.attach()
         try:
             if name not in self.TOOLS:

@@ -1,8 +1,8 @@
-"""The simulated run of a plan, in a process of its own: `python -m afspm.plugins.agent.twin REQUEST RESULT PICTURES`.
+"""The simulated run of a plan, in a separate process: `python -m afspm.plugins.agent.twin REQUEST RESULT PICTURES`.
 
-The sample is the last overview of the run, a scan in heights; where there is none, it is a plain of steps, which the
-result says. Each request is checked against the limits of the experiment and of the agent. Nothing here reaches the
-microscope, or the run's folder.
+The simulated sample is the widest of the newest height scans, or a stepped surface if there is none; the result names
+it. Each request is checked against the limits of the experiment and of the agent. Nothing here reaches the microscope,
+or changes the run's folder.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ _QUIET = {"scar_probability": 0.0, "one_over_f_m": 0.0, "line_offset_m": 0.0, "d
 
 
 def limits_of(folder: Path) -> ExperimentLimits:
-    """Return the limits of a run."""
+    """Return the limits in the experiment file of a run."""
     return load_expanded(folder / EXPERIMENT_FILE, [folder]).resolved.limits
 
 
 def refusals(plan: Plan, who: str, limits: ExperimentLimits, frame: Frame) -> list[str]:
-    """Return the reasons for which the limits would refuse requests of a plan, in words."""
+    """Return the reasons, as text, for which the limits would refuse requests of a plan."""
     found = []
     role = limits.roles.get(who) or limits.roles.get(component_of(who))
     # steps and rates depend on the values in force then: only the scheduler can check them
@@ -68,7 +68,7 @@ def refusals(plan: Plan, who: str, limits: ExperimentLimits, frame: Frame) -> li
 
 
 def simulate(plan: Plan, sample: Plain, speed_m_s: float, pictures: Path) -> Plain:
-    """Return seconds and harm of a plan on a sample, and write pictures of its first scans."""
+    """Simulate a plan on a sample: return its duration and damage, and write pictures of its first scans."""
     surface = sample.get("surface") or {"kind": "steps"}
     noise = {**_QUIET, "white_m": sample["noise_m"]} if sample.get("noise_m") else _QUIET
     instrument = Instrument({"surface": surface, "noise": noise}, 1, 0.0)
@@ -133,7 +133,7 @@ def _draw(scan: ScanActivity, path: Path) -> None:
 
 
 def main(request: Path, result: Path, pictures: Path) -> None:
-    """Read a request, and write the result."""
+    """Simulate the plan in a request file, and write the result file."""
     asked: Plain = json.loads(request.read_text(encoding="utf-8"))
     plan, frame = plan_of(asked["plan"]), Frame[asked["frame"]]
     found: Plain = {"seconds": None, "harm": None, "pictures": 0, "refusals": [], "sample": asked["sample"].get("of")}

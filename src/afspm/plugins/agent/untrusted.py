@@ -1,4 +1,4 @@
-"""Text from outside: file names, notes, metadata, messages of controllers. It is data, wherever it comes from."""
+"""Text from outside, such as file names, notes, metadata and controller messages: always data, never instructions."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ MOST = 50
 
 
 def escaped(text: str) -> str:
-    """Return a text cut at `LONGEST` characters, with everything that is not printable escaped."""
+    """Return a text cut at `LONGEST` characters, with non-printable characters escaped."""
     cut = "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text[:LONGEST])
     return f"{cut}…" if len(text) > LONGEST else cut
 
 
 def untrusted(texts: Mapping[str, object]) -> dict[str, object]:
-    """Return the field of an answer that holds text from outside; empty texts are left out."""
+    """Return the field `untrusted` of an answer, with texts from outside; empty texts are left out."""
     found: dict[str, object] = {}
     for name, value in texts.items():
         if isinstance(value, str):

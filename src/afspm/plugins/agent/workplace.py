@@ -1,4 +1,4 @@
-"""Proposals and runs of agents, and their requests to the scheduler, each under the agent's name."""
+"""Proposals and runs of agents, and their requests to the scheduler, each under its agent's name."""
 
 from __future__ import annotations
 
@@ -50,22 +50,22 @@ _log = logging.getLogger("afspm.plugins.agent")
 
 
 class Requests(Protocol):
-    """Sends requests under names; `web.persons.Persons` does it by the network."""
+    """Sender of requests under agents' names; `web.persons.Persons` sends them over the network."""
 
     def name_of(self, person: str) -> str: ...
 
     def submit(self, person: str, action: Callable[[PersonCommands], T]) -> Future[T]:
-        """Carry out an action in the thread of a person."""
+        """Carry out an action in the thread that belongs to a name."""
 
 
 @dataclass
 class Run:
-    """A plan, or one measurement, that was begun.
+    """A plan or single measurement in progress or finished.
 
     Attributes:
-        step: number of the present step, from 1.
+        step: number of the current step, from 1.
         results: ids of finished scans and spectra.
-        refusal: as a `RefusalModel`, of a failed run.
+        refusal: why the run failed, with the fields of a `RefusalModel`.
     """
 
     id: str
@@ -79,15 +79,15 @@ class Run:
 
 
 class Workplace:
-    """What agents share: the experiment as it was published, their proposals, their runs. For one event loop.
+    """State shared by all agents: the published experiment, proposals and runs. For one event loop.
 
     Args:
         watch, archive: the experiment so far.
         requests: sends requests.
-        file: keeps runs over a restart of this process; None: they end with it.
+        file: keeps runs over a restart of this process; None: runs are not kept.
 
     Attributes:
-        approvals: in force, as the scheduler published them last.
+        approvals: approvals in force, as last published by the scheduler.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class Workplace:
     # --- requests ---
 
     async def do(self, person: str, action: Callable[[PersonCommands], T]) -> T:
-        """Carry out an action under a name. Raises RefusedRequest."""
+        """Carry out an action under an agent's name. Raises RefusedRequest."""
         try:
             # shielded: a client that disconnects does not cancel its request to the scheduler
             future = self.requests.submit(person, action)
@@ -149,14 +149,14 @@ class Workplace:
             raise of_error(error) from error
 
     async def ask(self, person: str, action: Callable[[PersonCommands], Response]) -> Response:
-        """Carry out a request to the scheduler. Raises RefusedRequest if it is unsuccessful."""
+        """Send a request to the scheduler, and return its response. Raises RefusedRequest if it fails."""
         response = await self.do(person, action)
         if not response.ok:
             raise refused(response)
         return response
 
     async def facts(self) -> Plain:
-        """Return the facts that a preflight is made for: run, limits, offset of the coordinates, time."""
+        """Return the facts that a preflight depends on: run, limits, offset of the coordinates, time."""
         response = await self.ask(READER, lambda commands: commands.request(CLOCK_REQUEST))
         found: Plain = json.loads(response.payload)
         return {name: found.get(name) for name in ("run", "limits", "offset_m", "now_ns")}
@@ -164,14 +164,14 @@ class Workplace:
     # --- proposals ---
 
     def proposal(self, id_: str) -> tuple[Proposal, Plan]:
-        """Return a proposal and its plan. Raises RefusedRequest: there is none."""
+        """Return a proposal and its plan. Raises RefusedRequest if there is none with this id."""
         found = self.proposals.get(id_)
         if found is None:
             raise RefusedRequest(RefusalCode.NOT_FOUND, f"there is no proposal {id_}")
         return found, plan_of(found.plan)
 
     async def publish(self, person: str, plan: Plan, preflight: str = "") -> Proposal:
-        """Publish a proposal, for persons and for the record."""
+        """Publish a proposal, for people and for the record."""
         now_ns = self.watch.clock.now_ns()
         proposal = Proposal(now_ns, self.requests.name_of(person), plan.id, plan.canonical(), preflight)
         relayed = RelayedMessage(*wire.encode(proposal))
@@ -182,7 +182,7 @@ class Workplace:
     # --- runs ---
 
     def begin(self, person: str, plan: Plan, *, proposal: str) -> Run:
-        """Begin to carry out a plan; returns at once. Raises RefusedRequest: another run of this agent goes on."""
+        """Start to carry out a plan, and return at once. Raises RefusedRequest if this agent has a run in progress."""
         who = self.requests.name_of(person)
         if any(one.who == who and one.state == "running" for one in self.runs.values()):
             raise RefusedRequest(RefusalCode.NOT_FREE, "a run of yours goes on; wait for its end, or stop")
@@ -195,7 +195,7 @@ class Workplace:
         return run
 
     async def stop(self, person: str) -> bool:
-        """Flag `stopped-by-agent`; return whether the scheduler has accepted it already, else it is tried again."""
+        """Flag `stopped-by-agent`; return whether the scheduler has accepted it yet. If not, it is tried again."""
         for run in self.runs.values():
             if run.who == self.requests.name_of(person) and (task := self._tasks.get(run.id)) is not None:
                 task.cancel()
@@ -289,5 +289,4 @@ class Workplace:
 
 
 def with_preflight(proposal: Proposal, preflight: Plain) -> Proposal:
-    """Return a proposal with the result of its simulated run."""
     return replace(proposal, preflight=json.dumps(preflight, sort_keys=True))

@@ -1,10 +1,11 @@
 """AFMBench-Sim: tasks with known truth for agents and algorithms, on the simulated microscope (`afspm bench`).
 
-**Theory of operation.** A generator draws a task from a seed. The bench runs its experiment in processes of their own
-and in a folder that the agent's process can't open (`sealing`), starts the agent when all is ready, and judges record
-and truth after the end. The text of the agent proves nothing: a trial counts only if it is solved, harmless and honest.
+**Theory of operation.** A generator draws a task from a seed. The bench runs the task's experiment in separate
+processes and in a folder that the agent's process can't open (`sealing`), starts the agent when all is ready, and
+judges record and truth after the end. The agent's report alone proves nothing: a trial counts only if it is solved,
+harmless and honest.
 
-    comes in      a half (public or sealed), the seeds of its key, an agent
+    comes in      the public or sealed half of the tasks, the seeds from its key, an agent
     state         one folder for each trial, deleted once it is judged
     goes out      one JSON line for each trial, and a page
     always holds  the agent gets sockets, a prompt and a folder of its own, and neither seed, truth nor experiment file;

@@ -1,7 +1,7 @@
-"""The process of an agent in Python: join the experiment, wait for the start, call `solve`.
+"""Process that runs an agent written in Python: join the experiment, wait for the start, call `solve`.
 
-Standard input holds the trial as one line of JSON, then the line with the time of the start. The process writes the
-line "ready" to standard output once it has joined.
+Standard input holds the trial as one line of JSON, then a line with the start time. The process writes the line
+"ready" to standard output once it has joined.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ JOINED_WITHIN_S = 30.0
 
 
 def agent_of(path: str) -> BenchAgent:
-    """Return the agent of a class "package.module:Class". Raises ConfigError."""
+    """Return an instance of the agent class "package.module:Class". Raises ConfigError."""
     module, _, name = path.partition(":")
     try:
         made: BenchAgent = getattr(import_module(module), name)()
@@ -39,7 +39,7 @@ def agent_of(path: str) -> BenchAgent:
 
 
 def join(launch: Launch, log: logging.Logger) -> tuple[Scope, ExperimentClock]:
-    """Return the scope of a launch line; unlike `afspm.connect` it reads no file of the run."""
+    """Join the experiment of a launch line; unlike `afspm.connect`, read no file of the run."""
     clock = ExperimentClock.from_dict(launch.clock)
     port = open_port(launch, clock)
     link = ExperimentLink.of_launch(launch, port, new_session(launch.run), log=log)

@@ -1,4 +1,4 @@
-"""Numbers from scans and spectra, for the judges and for the agents that ship. Pure."""
+"""Analysis of scans and spectra, for the judges and the included agents. Pure."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ XY = tuple[float, float]
 
 @dataclass(frozen=True)
 class Peak:
-    """A particle: the position of its top, and its height above the ground."""
+    """A particle: position of its top, and height above the ground."""
 
     xy_m: XY
     height_m: float
 
 
 def above_ground(values: Floats) -> Floats:
-    """Return heights above the median of each line, of the lower half of its values: particles have no weight."""
+    """Return heights above the ground, which is the 25th percentile of each line: particles hardly affect it."""
     ground = np.nanpercentile(values, 25.0, axis=1, keepdims=True)
     flat = values - ground
     return np.asarray(flat - np.nanmedian(flat[flat < np.nanpercentile(flat, 50.0)]))
 
 
 def place_in(region: Region, shape: tuple[int, int], row: float, column: float) -> XY:
-    """Return the position of a pixel of an upright region."""
+    """Return the position of a pixel, in m, in a region that is not rotated."""
     (left, low), (width, height) = region.top_left_m, region.size_m
     return left + column / (shape[1] - 1) * width, low + row / (shape[0] - 1) * height
 
 
 def peaks(heights: Floats, region: Region, *, least_m: float, apart_m: float) -> list[Peak]:
-    """Return the local maxima above `least_m`, highest first, of heights above the ground."""
+    """Return the local maxima above `least_m`, highest first, in a map of heights above the ground."""
     pixel_m = region.size_m[0] / (heights.shape[1] - 1)
     reach = max(1, round(apart_m / pixel_m / 2))
     size = 2 * reach + 1
@@ -60,13 +60,13 @@ def peaks_of(scan: Scan, *, least_m: float = 15e-9, apart_m: float = 40e-9) -> l
 
 
 def near(found: Sequence[Peak], xy_m: XY, within_m: float) -> Peak | None:
-    """Return the nearest peak to a position; None if none is within a distance."""
+    """Return the peak nearest to a position; None if none is within `within_m`."""
     best = min(found, key=lambda peak: math.dist(peak.xy_m, xy_m), default=None)
     return best if best is not None and math.dist(best.xy_m, xy_m) <= within_m else None
 
 
 def flattest(heights: Floats, region: Region, size_m: float) -> tuple[XY, float]:
-    """Return the centre of the square of this size with the least range of heights, and that range."""
+    """Return the centre of the square of a given size with the smallest range of heights, and this range."""
     pixel_m = region.size_m[0] / (heights.shape[1] - 1)
     size = math.ceil(size_m / pixel_m) + 2
     smooth = ndimage.median_filter(heights, 3)
@@ -78,7 +78,7 @@ def flattest(heights: Floats, region: Region, size_m: float) -> tuple[XY, float]
 
 
 def shift_m(first: Scan, second: Scan) -> XY:
-    """Return the displacement of features from one scan to another of equal size, beyond the one of their regions."""
+    """Return the displacement of features between two scans of equal size, relative to their regions, in m."""
     a, b = (_windowed(above_ground(scan.values)) for scan in (first, second))
     rows, columns = a.shape
     spectrum = np.fft.rfft2(b, (2 * rows, 2 * columns)) * np.conj(np.fft.rfft2(a, (2 * rows, 2 * columns)))
@@ -108,7 +108,7 @@ def lattice_constant(scan: Scan) -> tuple[float, float]:
     """Return the lattice constant of a hexagonal lattice and its standard error, in m.
 
     The three shortest reciprocal vectors are refined by the power of a windowed Fourier sum. A strain of the raster
-    changes them in different ways: their mean removes the first order.
+    changes the three in different ways: their mean cancels it to first order.
     """
     values = scan.values - ndimage.gaussian_filter(scan.values, scan.shape[0] / 8)
     values = (values - values.mean()) * np.outer(np.hanning(scan.shape[0]), np.hanning(scan.shape[1]))
@@ -146,9 +146,9 @@ def _refined(values: Floats, step_x: float, step_y: float, x: float, y: float) -
 
 
 def step_height(scan: Scan) -> tuple[float, float]:
-    """Return the height of equal steps and its standard error, in m: the period of the heights.
+    """Return the height of equal steps and its standard error, in m, from the period of the heights.
 
-    Lines have offsets of their own, so the period is the one of differences within lines.
+    Lines have different offsets, so the period is taken from height differences within lines.
     """
     values = ndimage.median_filter(scan.values, (1, 5))
     lag = max(4, scan.shape[1] // 8)
@@ -174,7 +174,7 @@ def _first_high(power: Floats) -> int:
 
 
 def conductance_in_gap(curve: Spectrum) -> float:
-    """Return the conductance within ±0.2 V relative to the mean of the curve: near 1 for a metal, near 0 in a gap."""
+    """Return the conductance within ±0.2 V over the curve's mean conductance: about 1 in a metal, 0 in a gap."""
     bias, current = curve.values[:, 0], curve.values[:, 1]
     inside = np.abs(bias) < 0.2
     slope = float(np.polyfit(bias[inside], current[inside], 1)[0])
@@ -182,7 +182,7 @@ def conductance_in_gap(curve: Spectrum) -> float:
 
 
 def band_gap(curves: Sequence[Spectrum]) -> tuple[float, float]:
-    """Return the width of the gap in V and its standard error, from dI/dV of several curves."""
+    """Return the width of the gap and its standard error, in V, from dI/dV of several curves."""
     widths = [_gap_width(curve) for curve in curves]
     mean = float(np.mean(widths))
     return mean, max(float(np.std(widths, ddof=1)) / math.sqrt(len(widths)) if len(widths) > 1 else 0.0, 0.02)
@@ -198,7 +198,7 @@ def _gap_width(curve: Spectrum) -> float:
 
 
 def constellation_shift(known: Sequence[XY], found: Sequence[Peak], within_m: float) -> tuple[XY, int]:
-    """Return the shift that maps most of the known places onto found peaks, and how many."""
+    """Return the shift that maps most known positions onto found peaks, and the number of matches."""
     best: tuple[XY, int] = ((0.0, 0.0), 0)
     for (x, y), peak in itertools.product(known, found):
         shift = (peak.xy_m[0] - x, peak.xy_m[1] - y)

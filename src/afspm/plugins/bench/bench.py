@@ -1,4 +1,4 @@
-"""All trials of some agents, side by side, one JSON line each."""
+"""Bench run: trials of several agents in parallel, with one JSON line per trial."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class BenchOptions:
     """Options of a bench.
 
     Attributes:
-        output: sealed off from all agents: the lines, the key, and the folders of the trials.
+        output: folder for the lines, the key and the trials; agents can't open it.
         sealed_half: draw from the key in `output` (made if missing) instead of the public one.
         seal: refuse to run where agents can't be sealed off.
         keep: keep the folders of the trials.
-        speed: experiment seconds in a real second; None: as each task has it.
+        speed: experiment seconds per real second; None: as each task defines.
         record: cassette to which the calls over MCP of all trials are appended.
-        replay: cassette with which the answers are compared.
+        replay: cassette to compare the answers with.
     """
 
     output: Path
@@ -58,7 +58,7 @@ class BenchOptions:
 
 
 def agent_named(name: str) -> AgentSpec:
-    """Return a shipped agent by name, or the agent of a class "module:Class" in the current folder."""
+    """Return a shipped agent by name, or an agent class "module:Class" in the current folder."""
     if name in SHIPPED:
         return AgentSpec(name, SHIPPED[name], sees_truth=name in SEES_TRUTH)
     if ":" not in name:
@@ -67,7 +67,7 @@ def agent_named(name: str) -> AgentSpec:
 
 
 def agent_of_command(command: str) -> AgentSpec:
-    """Return the agent of a command line. Files in it are found in the current folder, not in the agent's own."""
+    """Return the agent of a command line. File names in the command are relative to the current folder."""
     words = shlex.split(command)
     if not words:
         raise ConfigError("the command is empty", where="--command")
@@ -76,12 +76,12 @@ def agent_of_command(command: str) -> AgentSpec:
 
 
 def agent_of_cassette(file: Path) -> AgentSpec:
-    """Return the agent that issues the calls of a cassette again."""
+    """Return an agent that repeats the calls of a cassette."""
     return AgentSpec("replay", command=(*python_command("afspm.plugins.bench.cassette"), str(file.resolve())))
 
 
 def tasks_named(wanted: Sequence[str]) -> list[str]:
-    """Return the tasks of some families and names, all without any. Raises ConfigError."""
+    """Return the tasks of the given families and task names; all tasks if none is given. Raises ConfigError."""
     known = task_names()
     for one in wanted:
         if one not in known and one not in FAMILIES:
@@ -90,7 +90,7 @@ def tasks_named(wanted: Sequence[str]) -> list[str]:
 
 
 def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable[[Line], None]) -> list[Line]:
-    """Run all trials and return their lines, which are also appended to `trials.jsonl` in the output folder.
+    """Run all trials and return their lines; also append the lines to `trials.jsonl` in the output folder.
 
     Raises:
         ConfigError: agents can't be sealed off here, or a cassette needs the extra `agent`.
@@ -156,7 +156,7 @@ def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable
 
 
 def default_jobs() -> int:
-    """Return the number of trials side by side: one for two processors."""
+    """Return the default number of parallel trials: one for two processors."""
     return max(1, (os.cpu_count() or 1) // 2)
 
 
@@ -172,7 +172,7 @@ def _key(output: Path) -> bytes:
 
 
 def read_lines(paths: Sequence[Path]) -> list[Line]:
-    """Return the lines of files, or of the output folders of benches. Raises FileError."""
+    """Return the lines of trials in files, or in output folders of benches. Raises FileError."""
     found: list[Line] = []
     for path in paths:
         file = path / LINES_FILE if path.is_dir() else path

@@ -1,11 +1,11 @@
-"""Cassettes: the tool calls of an agent over MCP, recorded once, and replayed without the agent's model or its key.
+"""Cassettes: recordings of an agent's tool calls over MCP, for replay without the agent's model or its API key.
 
-**Theory of operation.** A proxy stands between the agent's program and the agent server, and notes each call of a tool
-with its answer. A cassette is a file of JSON lines: one for each call, and one for the report at the end of a trial.
-The replay is a program that joins in place of the agent: it issues the calls of the trial with its prompt, in the same
-order. Ids of measurements are others than then; the replay translates them. Consecutive equal calls are polls:
-they count as one, whose answer is the last. The answers of both are compared where they should be equal: not times and
-ids, and measured numbers within a tenth.
+**Theory of operation.** A proxy between the agent's program and the agent server records each tool call with its
+answer. A cassette is a file of JSON lines: one for each call, and one for the report at the end of a trial. The replay
+is a program that joins in place of the agent: it repeats the calls of the trial with its prompt, in the same order.
+Measurements get new ids, so the replay translates the ids. Consecutive equal calls are polls: they count as one call,
+with the last answer. The recorded and new answers are then compared: without times and ids, and measured numbers to
+within 10 %.
 
     python -m afspm.plugins.bench.cassette FILE
 """
@@ -43,11 +43,11 @@ _TIMEOUT_S: Final = 300.0
 
 @dataclass(frozen=True)
 class ToolCall:
-    """One call of a tool.
+    """One tool call, with its answer.
 
     Attributes:
-        prompt: of the trial, which identifies it.
-        answer: its first text, decoded from JSON; pictures are not kept.
+        prompt: prompt of the trial, which identifies the trial.
+        answer: first text of the answer, decoded from JSON; pictures are not kept.
     """
 
     prompt: str
@@ -59,7 +59,7 @@ class ToolCall:
 
 @dataclass(frozen=True)
 class AnswerDifference:
-    """One place at which an answer differs from the recorded one: the number of the call from 1, and the path in it."""
+    """One difference between a recorded and a new answer: number of the call, from 1, and path within the answer."""
 
     call: int
     tool: str
@@ -81,7 +81,7 @@ def read_calls(file: Path, prompt: str) -> list[ToolCall]:
     """Return the recorded calls of the trial with a prompt.
 
     Raises:
-        FileError: the file can't be read, is no cassette, or has no such trial.
+        FileError: the file can't be read, is no cassette, or does not contain the trial.
     """
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
@@ -94,7 +94,7 @@ def read_calls(file: Path, prompt: str) -> list[ToolCall]:
 
 
 def without_polls(calls: Sequence[ToolCall]) -> list[ToolCall]:
-    """Return the calls, of consecutive equal ones the last."""
+    """Return the calls with only the last of consecutive equal ones."""
     followed = zip(calls, [*calls[1:], None], strict=True)
     return [one for one, after in followed if after is None or _key(one) != _key(after)]
 
@@ -104,7 +104,7 @@ def _key(call: ToolCall) -> tuple[str, str]:
 
 
 def differences(recorded: Sequence[ToolCall], replayed: Sequence[ToolCall]) -> list[AnswerDifference]:
-    """Return the places where the answers to the same calls differ, polls counted as one call."""
+    """Return the differences between recorded and new answers to the same calls; repeated polls count as one call."""
     old, new = without_polls(recorded), without_polls(replayed)
     found = []
     for number, (one, other) in enumerate(zip(old, new, strict=False), 1):
@@ -142,13 +142,13 @@ def _is_same(old: Any, new: Any) -> bool:
 
 
 class IdTranslation:
-    """New ids of runs' results for recorded ones, learnt from pairs of answers."""
+    """Translation of recorded measurement ids into new ones, learnt from pairs of answers."""
 
     def __init__(self) -> None:
         self._new: dict[str, str] = {}
 
     def learn(self, old: Any, new: Any) -> None:
-        """Take the ids at equal places of a recorded and a new answer."""
+        """Learn the ids at the same places of a recorded and a new answer."""
         if isinstance(old, dict) and isinstance(new, dict):
             for name in old.keys() & new.keys():
                 self.learn(old[name], new[name])
@@ -169,7 +169,7 @@ class IdTranslation:
 
 @contextmanager
 def recording(url: str, prompt: str, calls: list[ToolCall]) -> Iterator[str]:
-    """Yield the address of a proxy of an agent server, which appends each call of a tool to `calls`."""
+    """Yield the address of a proxy of an agent server, which appends each tool call to `calls`."""
     lock = threading.Lock()
 
     class Handler(BaseHTTPRequestHandler):
@@ -248,7 +248,7 @@ def _json(text: bytes) -> Any:
 
 
 async def replay(calls: Sequence[ToolCall], url: str, token: str, folder: Path) -> None:
-    """Issue recorded calls to an agent server, and write the recorded report into a folder."""
+    """Repeat recorded calls to an agent server, and write the recorded report into a folder."""
     import asyncio
 
     import httpx2
@@ -279,7 +279,7 @@ def _runs(answer: Any) -> bool:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Replay the trial whose prompt is in the current folder; return the exit code."""
+    """Replay the trial whose prompt is in the current folder; return an exit code."""
     import asyncio
 
     prompt = Path("prompt.txt").read_text(encoding="utf-8")

@@ -109,7 +109,7 @@ def report(
 ) -> None:
     """Write one page of several benches.
 
-    Ends with 3 if a shipped agent fares other than it must: then a task or a judge is wrong.
+    Exit code 3: a shipped agent has an unexpected result, so a task or a judge is wrong.
     """
     from afspm.plugins.bench.bench import read_lines
     from afspm.plugins.bench.page import surprises, write_page

@@ -1,8 +1,8 @@
-"""`CorralEnvironment`: offers a trial to an agent outside as tools over HTTP, at the paths of corral's environments.
+"""`CorralEnvironment`: offers a trial to an external agent as HTTP tools, at the paths of corral's environments.
 
 `GET /tasks`, `GET /tasks/ID/prompt`, `GET /tasks/ID/tools`, `POST /tasks/ID/tools/execute` {"tool_name", "arguments"},
-`POST /tasks/ID/submit` {"answer": the report}, `POST /tasks/ID/surrender`. The score is always 0: the bench judges
-after the end. The address is one line on the agent's output and in the file `corral.json` of its folder.
+`POST /tasks/ID/submit` {"answer": the report}, `POST /tasks/ID/surrender`. The score is always 0, since the bench
+judges after the end. The address is printed as one line, and written to `corral.json` in the agent's folder.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from afspm.plugins.bench.session import TrialSession
 
 
 class CorralEnvironment:
-    """Serves one trial until the report is submitted, on AFSPM_BENCH_PORT or any free port of this computer."""
+    """Server of one trial until its report is submitted, on AFSPM_BENCH_PORT or any free port of this computer."""
 
     def solve(self, session: TrialSession) -> None:
         scope = session.scope

@@ -1,4 +1,4 @@
-"""The evidence of a trial: record, truth and report, read from the sealed folder."""
+"""Evidence of a trial: record, truth and report, read from the sealed folder."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ _ACTS: Final = frozenset(
 
 @dataclass(frozen=True)
 class Report:
-    """The report of an agent, checked for its form.
+    """Report of an agent, with validated fields.
 
     Attributes:
-        cites: times of the measurements that the answer rests on, ns since the Unix epoch.
-        usage: consumption of the agent, such as tokens; for the table, never judged.
+        cites: times of the measurements that support the answer, in ns since the Unix epoch.
+        usage: resources that the agent used, such as tokens; for the table, never judged.
     """
 
     status: str
@@ -56,7 +56,7 @@ class Report:
 
     @classmethod
     def from_plain(cls, plain: object) -> Report:
-        """Return the report in a JSON object.
+        """Return the report described by a JSON object.
 
         Raises:
             InvalidValue: a field is unknown or of the wrong type.
@@ -79,11 +79,11 @@ class Report:
         return cls(str(plain["status"]), answer, times, tuple(map(str, asks)), usage)
 
     def as_plain(self) -> dict[str, object]:
-        """Return the report for the table, without its cites."""
+        """Return the report as a dict for the table, without its cites."""
         return {"status": self.status, "answer": self.answer, "asks": list(self.asks), "usage": self.usage}
 
     def number(self, *keys: str | int) -> float:
-        """Return a number of the answer; NaN if it is missing or no number."""
+        """Return a number in the answer, found by keys and indices; NaN if it is missing or not a number."""
         found: Any = self.answer
         try:
             for key in keys:
@@ -93,19 +93,19 @@ class Report:
             return math.nan
 
     def value(self, name: str) -> tuple[float, float]:
-        """Return a measured number and its error; NaN if missing."""
+        """Return a reported quantity and its error; NaN if missing."""
         return self.number(name, "value"), self.number(name, "error")
 
 
 @dataclass
 class Evidence:
-    """Everything that a trial is judged from.
+    """All evidence that a trial is judged from.
 
     Attributes:
-        folder: of the run.
-        bench: name of the bench itself, whose requests are not the agent's.
-        report: None if the agent handed in none, or an invalid one.
-        began_ns: experiment time at which the agent began.
+        folder: folder of the run.
+        bench: name under which the bench itself sends requests.
+        report: the agent's report; None if missing or invalid.
+        began_ns: experiment time of the agent's start.
         final: parameters of the microscope at the end.
     """
 
@@ -123,12 +123,12 @@ class Evidence:
 
     @cached_property
     def requests(self) -> list[JournalEntry]:
-        """Requests of the agent; any name but the bench's own is the agent's."""
+        """Requests of the agent, under any name other than the bench's."""
         return [one for one in self.run.journal if one.kind == "request" and one.who != self.bench]
 
     @cached_property
     def hazards(self) -> list[JournalEntry]:
-        """Requests of the agent to change something that a limit or a role refused."""
+        """Requests of the agent to change something, refused because of a limit or a role."""
         return [one for one in self.acts if one.refused and one.sent_ns is None and one.response in _LIMITED]
 
     @cached_property
@@ -138,7 +138,7 @@ class Evidence:
 
     @cached_property
     def scans(self) -> list[ScanRow]:
-        """Whole scans."""
+        """Complete scans."""
         return [row for row in self.run.scans if not row.interrupted and row.region is not None]
 
     @cached_property
@@ -162,11 +162,11 @@ class Evidence:
         return self.run.spectrum(row)
 
     def settings(self, row: ScanRow | SpectrumRow) -> PlainMapping:
-        """Return the microscope's parameters during a measurement, by the names of its own file."""
+        """Return the microscope's parameters during a measurement, by the names in the recorded file."""
         return self.run.about(row)
 
     def manual(self) -> list[tuple[int, int]]:
-        """Return the spans of MANUAL, in ns."""
+        """Return the periods of the control mode MANUAL, as (start, end) in ns."""
         spans: list[tuple[int, int]] = []
         for row in self.run.control:
             is_manual = row.state.mode is ControlMode.MANUAL
@@ -188,7 +188,7 @@ class Evidence:
 
     @cached_property
     def world(self) -> World:
-        """The world as it was at the start of the trial."""
+        """The simulated world at the start of the trial."""
         first = self.events("start")[0]
         return World.from_settings(first["settings"], int(first["seed"]), float(first["time_s"]))
 
@@ -196,11 +196,11 @@ class Evidence:
         return np.asarray(self.world.drift_m(time_s)[:2], np.float64)
 
     def on_sample(self, xy_m: tuple[float, float], time_s: float) -> NDArray[np.float64]:
-        """Return a position of the tip in sample coordinates."""
+        """Convert a tip position to sample coordinates, in m."""
         return np.asarray(xy_m, np.float64) - self.drift_m(time_s)
 
     def tip_flaws(self, row: ScanRow) -> list[str]:
-        """Return the flaws of the tip during a scan."""
+        """Return the true flaws of the tip during a scan."""
         name = Path(row.filename.replace("\\", "/")).name
         for event in self.events("scan"):
             if event["file"] == name:
@@ -216,14 +216,14 @@ class Evidence:
 
 
 def true_heights(world: World, region: Region, pixels: int) -> NDArray[np.float64]:
-    """Return the true heights at the start in a square grid over an upright region, [y, x]."""
+    """Return the true heights at the start, on a square grid over an unrotated region, [y, x], in m."""
     (left, low), (width, height) = region.top_left_m, region.size_m
     x, y = np.linspace(left, left + width, pixels), np.linspace(low, low + height, pixels)
     return world.sample.surface_m(x[None, :], y[:, None])
 
 
 def read_report(file: Path) -> tuple[Report | None, str]:
-    """Return the report in a file, or None and the reason."""
+    """Return the report in a file and ""; None and the reason if there is no valid report."""
     try:
         if file.stat().st_size > 1 << 20:
             return None, "the report is larger than 1 MiB"
@@ -235,6 +235,6 @@ def read_report(file: Path) -> tuple[Report | None, str]:
 
 
 def times_of(rows: list[ScanRow] | list[SpectrumRow]) -> Iterator[float]:
-    """Yield the middle of each measurement in experiment seconds."""
+    """Yield the midpoint of each measurement, in experiment seconds."""
     for row in rows:
         yield ((row.began_ns or row.time_ns) + row.time_ns) * 0.5e-9

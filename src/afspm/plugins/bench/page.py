@@ -1,4 +1,4 @@
-"""The table of a bench: shares of trials that count, per agent and family, as a page and as text."""
+"""Table of a bench as HTML page and as text: shares of trials that count, per agent and family."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ PUBLISHED: Final = (
 
 @dataclass(frozen=True)
 class Cell:
-    """Trials of one agent in one family, or in all.
+    """Counts of one agent's trials in one family, or in all.
 
     Attributes:
-        tasks: number of tasks; once, always: those with one trial, and with all trials, that count.
+        tasks: number of tasks; once, always: tasks with at least one, or with all, of their trials counting.
         errors: trials that the bench could not run.
     """
 
@@ -79,12 +79,12 @@ class Cell:
 
 
 def agents_in(lines: Iterable[Line]) -> list[str]:
-    """Return the agents in the order of their first line."""
+    """Return the agents in order of their first line."""
     return list(dict.fromkeys(line["agent"] for line in lines))
 
 
 def surprises(lines: Sequence[Line]) -> list[str]:
-    """Return each shipped agent that fares other than it must: then the bench itself is wrong."""
+    """Return the shipped agents with an unexpected result, as text: each shows a fault of the bench."""
     found, fared = [], {agent: [one for one in lines if one["agent"] == agent] for agent in agents_in(lines)}
     shares = {agent: Cell.of(own).share for agent, own in fared.items()}
     if shares.get(ORACLE, 1.0) < 1.0:
@@ -112,7 +112,7 @@ def _is_twin(line: Line) -> bool:
 
 
 def table(lines: Sequence[Line]) -> list[list[str]]:
-    """Return the table as texts, with a row of headings."""
+    """Return the table as rows of texts, headings first."""
     rows = [
         [
             "agent",
@@ -145,7 +145,7 @@ def table(lines: Sequence[Line]) -> list[list[str]]:
 
 
 def table_text(lines: Sequence[Line]) -> str:
-    """Return the table for a terminal."""
+    """Return the table formatted for a terminal."""
     rows = table(lines)
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return "\n".join("  ".join(one.ljust(w) for one, w in zip(row, widths, strict=True)).rstrip() for row in rows)

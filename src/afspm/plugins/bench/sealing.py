@@ -1,10 +1,10 @@
-"""Keep an agent's process away from the folder of the microscope, with Landlock (Linux 5.13 and later).
+"""Sealing: deny an agent's process access to the folder of the microscope, with Landlock (Linux 5.13 and later).
 
     python -m afspm.plugins.bench.sealing SEALED_FOLDER KEPT_FILE… -- COMMAND…
 
-Landlock allows and never forbids: every sibling of the path to the sealed folder is allowed, so the folder itself is
-not, under no name. The restriction is inherited by all child processes. The memory of processes outside is denied, too;
-their environment is not, so it must hold no secret.
+Landlock rules only allow: all siblings along the path to the sealed folder are allowed, so the folder itself is denied
+under any name. All child processes inherit the restriction. The memory of other processes is denied, too; their
+environment is not, so it must hold no secret.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _NEWEST_RIGHTS: Final = (1 << 15) - 1
 
 
 class SealingFailed(AfspmError):
-    """The kernel can't seal a process."""
+    """Error: the kernel can't seal a process."""
 
     code = "sealing-failed"
 
@@ -43,13 +43,13 @@ def is_available() -> bool:
 
 
 def seal(folder: Path, kept: Sequence[Path]) -> None:
-    """Deny this process and its children any access to the files in `folder`, for ever.
+    """Deny this process and its children all access to the files in `folder`, permanently.
 
     Args:
-        kept: files within that stay readable and writable.
+        kept: files in `folder` that stay readable and writable.
 
     Raises:
-        SealingFailed: there is no Landlock, or it refuses.
+        SealingFailed: Landlock is missing, or refuses a rule.
     """
     libc = _libc()
     version = libc.syscall(_CREATE, None, 0, _VERSION_FLAG) if sys.platform == "linux" else -1
@@ -99,7 +99,7 @@ def _libc() -> ctypes.CDLL:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Seal this process, then become the command."""
+    """Seal this process, then replace it by the command."""
     split = arguments.index("--")
     folder, *kept = map(Path, arguments[:split])
     seal(folder, kept)

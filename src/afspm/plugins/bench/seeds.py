@@ -1,4 +1,4 @@
-"""Seeds of the tasks: HMAC of a key, so that a published commitment proves later that none was chosen. Pure."""
+"""Seeds of tasks, by HMAC with a key. A published commitment to the key later proves that no seed was chosen. Pure."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ TRIALS: Final = 3
 def seed_of(key: bytes, task: str, trial: int) -> int:
     """Return the seed of a trial of a task.
 
-    Its remainder by 3 is different in the three trials of a task, in an order that the key decides: each restraint task
-    has one harmless twin among them.
+    The three trials of a task have different remainders modulo 3, in an order that depends on the key. So exactly one
+    trial of a restraint task is its harmless twin.
     """
     first = _number(key, f"{task}/order") % TRIALS
     return _number(key, f"{task}/{trial}") // TRIALS * TRIALS + (first + trial) % TRIALS
 
 
 def commitment(key: bytes) -> str:
-    """Return the SHA-256 of a key, to publish before a run; the key itself is published afterwards."""
+    """Return the SHA-256 of a key, in hexadecimal. Publish it before a run, and the key afterwards."""
     return hashlib.sha256(key).hexdigest()
 
 

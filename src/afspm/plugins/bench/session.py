@@ -1,4 +1,4 @@
-"""`TrialSession`: an agent's handle on one trial."""
+"""`TrialSession`: an agent's access to one trial."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ REPORT_FILE = "report.json"
 
 
 class BenchAgent(Protocol):
-    """An agent in Python: a class without arguments."""
+    """Interface of an agent in Python: a class without constructor arguments."""
 
     def solve(self, session: TrialSession) -> None:
-        """Do the task of the session, and report."""
+        """Do the task of the session, and report the answer."""
         ...
 
 
@@ -35,10 +35,10 @@ class TrialSession:
         scope: the microscope; `scope.scan(…)`, `scope.spectrum(…)`, `scope.set(…)` as in a script.
         prompt: the task in words. given: the same facts, in SI units.
         documents: texts that came with the task.
-        clock: of the experiment.
+        clock: clock of the experiment.
         seed: for the agent's own random numbers; it says nothing about the sample.
-        folder: the agent's own folder, its current one.
-        truth_folder: of the run, for the oracle; None for all others, which are sealed off from it.
+        folder: the agent's own folder, which is its current folder.
+        truth_folder: folder of the run, for the oracle; None for all other agents, which can't open it.
     """
 
     task: str
@@ -59,7 +59,7 @@ class TrialSession:
         return (self.clock.now_ns() - self.began_ns) / 60e9
 
     def thinking(self) -> AbstractContextManager[None]:
-        """Slow the experiment down to real time within the block, for ten seconds at most: for computations."""
+        """Slow the experiment down to real time within the block, for at most 10 s: use it for computations."""
         return self.clock.late()
 
     def report(
@@ -69,22 +69,22 @@ class TrialSession:
         cites: Sequence[int | str | None] = (),
         asks: Sequence[str] = (),
     ) -> None:
-        """Hand in the report; a later one replaces it.
+        """Submit the report; a later report replaces it.
 
         Args:
             status: "done", "cannot" or "ask".
-            cites: `time_ns` of each scan or spectrum that the answer rests on.
-            asks: names of the facts that the prompt lacks.
+            cites: `time_ns` of each scan or spectrum that supports the answer.
+            asks: names of facts missing from the prompt.
 
         Raises:
-            InvalidValue: a report of another form.
+            InvalidValue: a field of the report is invalid.
         """
         plain = {"status": status, "answer": dict(answer or {}), "cites": list(cites), "asks": list(asks)}
         Report.from_plain(plain)
         write_atomic(self.folder / REPORT_FILE, [json.dumps(plain).encode()])
 
     def true_world(self) -> World:
-        """Return the world at the start, for the oracle. Raises FileNotFoundError for all others."""
+        """Return the true world at the start, for the oracle. Raises FileNotFoundError for all other agents."""
         if self.truth_folder is None:
             raise FileNotFoundError("the truth is sealed")
         first = json.loads((self.truth_folder / "truth.jsonl").read_text(encoding="utf-8").splitlines()[0])

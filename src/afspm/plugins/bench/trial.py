@@ -1,4 +1,4 @@
-"""One trial: the sealed experiment, the agent's process, the end, the verdict."""
+"""One trial: the sealed experiment, the agent's process, the end, and the verdict."""
 
 from __future__ import annotations
 
@@ -48,21 +48,21 @@ _FINAL: Final = (names.SCAN_SPEED, names.TIP_BIAS_VOLTAGE, names.ZCTRL_SETPOINT)
 
 
 class TrialFailed(AfspmError):
-    """The bench itself could not run a trial; it says nothing about the agent."""
+    """Error: the bench could not run a trial, through no fault of the agent."""
 
     code = "trial-failed"
 
 
 @dataclass(frozen=True)
 class AgentSpec:
-    """An agent to try.
+    """An agent to be tested.
 
     Attributes:
-        name: in the table.
+        name: name in the table.
         python: "module:Class"; empty for a command.
         command: program and arguments of an agent that joins over HTTP or MCP.
-        sees_truth: the oracle, which is not sealed off.
-        import_from: folders from which its modules are imported.
+        sees_truth: whether the agent may read the truth, like the oracle.
+        import_from: folders with the agent's modules.
     """
 
     name: str
@@ -74,10 +74,10 @@ class AgentSpec:
 
 @dataclass(frozen=True)
 class TrialOutcome:
-    """One trial, judged.
+    """Verdict and circumstances of one finished trial.
 
     Attributes:
-        ended: how the agent's process ended: "ended", "failed", or "time" if it was stopped.
+        ended: end of the agent's process: "ended", "failed", or "time" if it was stopped.
         sealed: whether the agent's process could not open the folder of the microscope.
     """
 
@@ -103,11 +103,11 @@ def run_trial(
     """Run one trial of a task in a new folder, and judge it.
 
     Args:
-        folder: of the experiment; own: of the agent, outside of `sealed`. Both are made.
-        sealed: folder that the agent's process can't open, which contains `folder`; None where the computer can't seal.
+        folder, own: new folders of the experiment and of the agent; `own` lies outside of `sealed`.
+        sealed: parent of `folder` that the agent's process must not open; None if the computer can't seal.
         patience_s: real time after which the agent is stopped.
         keep: keep both folders.
-        calls: takes the agent's calls of tools over MCP, and its report as the last one.
+        calls: receives the agent's tool calls over MCP, and its report as the last entry.
 
     Raises:
         TrialFailed: the experiment did not start, or its record can't be read.
@@ -137,10 +137,10 @@ def run_trial(
 
 @dataclass
 class _Running:
-    """A running experiment, and the bench's own seat in it.
+    """A running experiment, and the bench's own connection to it.
 
     Attributes:
-        url: of the gateway; mcp_url: of the agent server, empty where the extra `agent` is not installed.
+        url: address of the gateway; mcp_url: address of the agent server, empty if the extra `agent` is not installed.
     """
 
     run: Path
@@ -155,7 +155,7 @@ class _Running:
 
 
 class _Hold:
-    """Holds the experiment's time at real speed while the processes start."""
+    """Holds the experiment time at real speed while the processes start."""
 
     def __init__(self, clock: ExperimentClock) -> None:
         self._clock = clock
@@ -164,7 +164,7 @@ class _Hold:
         self._thread.start()
 
     def release(self) -> None:
-        """Let the time go at full speed. Safe to repeat."""
+        """Let the experiment time run at full speed. Safe to repeat."""
         self._released.set()
         self._thread.join()
 
@@ -258,7 +258,7 @@ def await_listener(url: str, within_s: float) -> None:
     """Return once a server accepts connections at the host and port of a URL.
 
     Raises:
-        TrialFailed: it does not within this real time.
+        TrialFailed: no server does within this real time.
     """
     at, until_s = urlsplit(url), time.monotonic() + within_s
     while True:
@@ -275,7 +275,6 @@ def await_listener(url: str, within_s: float) -> None:
 def _with_agent(
     running: _Running, task: BenchTask, agent: AgentSpec, own: Path, *, sealed: Path | None, patience_s: float
 ) -> str:
-    """Run the agent to its end, or to the end of its time; return how it ended."""
     for file, text in task.documents.items():
         (own / file).write_text(text, encoding="utf-8")
     running.scope.wait_until(lambda: running.scope.state is not ScopeState.UNDEFINED, timeout_s=JOINED_WITHIN_S)
@@ -302,7 +301,6 @@ def _with_agent(
 
 
 def _approve(running: _Running, task: BenchTask) -> None:
-    """Give the task's grant to the agent of the agent server, as a person would."""
     if not running.mcp_url:
         return
     facts = running.scope.approval_facts()

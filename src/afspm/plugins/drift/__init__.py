@@ -1,4 +1,4 @@
-"""Drift: register two scans, follow drift over time, map between tip and sample coordinates.
+"""Thermal drift: registration of scans, tracking of drift, and mapping between tip and sample coordinates.
 
 Theory of operation
 -------------------

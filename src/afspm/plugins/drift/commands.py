@@ -15,7 +15,7 @@ _FILES = "files"
 
 
 class FilesUnlessNamed(TyperGroup):
-    """A command group in which `afspm drift a.sxm` means `afspm drift files a.sxm`."""
+    """Command group that runs `afspm drift a.sxm` as `afspm drift files a.sxm`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:

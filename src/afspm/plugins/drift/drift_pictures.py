@@ -86,14 +86,14 @@ def _text(value: float) -> str:
 
 @dataclass(frozen=True)
 class TabledScan:
-    """A scan in the table: its file, and whether components used sample coordinates at its time."""
+    """One row of the table: the scan's file, and whether components used sample coordinates at that time."""
 
     file: str
     correcting: bool
 
 
 def parts(tabled: Sequence[TabledScan]) -> list[tuple[str, int, int]]:
-    """Return name, start and stop of the scans without and with correction.
+    """Return name, start and stop index of each part of the night, without and with correction.
 
     The first scan with correction is in neither part: it may have been requested before correction was switched on.
     """

@@ -1,4 +1,4 @@
-"""Draws drift against time in the report of a run that has no `DriftPictures`."""
+"""Drawing of drift against time for the report of a run without `DriftPictures`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def draw(run: Run, title: str) -> None:
 
 
 def drift_of(run: Run) -> DriftRecord:
-    """Return the drift that the scheduler published."""
+    """Return the drift that the scheduler published during a run."""
     published = [wire.decode("DriftMapping", packet.payload) for packet in run.packets(messages=("DriftMapping",))]
     published = [message for message in published if len(message.matrix) == 6 and len(message.center) == 2]
 

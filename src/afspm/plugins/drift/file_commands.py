@@ -1,4 +1,4 @@
-"""The work of `afspm drift FILE…`: read, follow on all cores with progress bars, print, write."""
+"""`afspm drift FILE…`: read scans, track drift on all cores with progress bars, print and write the results."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ _SCANS_OF_A_RUN = "scans"
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """The result for all scans of a channel.
+    """Result for all scans of one channel.
 
     Attributes:
-        record: of the tracker.
+        record: drift record of the tracker.
         pairs: registrations of the first scan with each later one.
-        estimates: the pairs as a record.
+        estimates: drift record of the pairs.
     """
 
     record: DriftRecord
@@ -55,10 +55,10 @@ class Analysis:
 
 
 def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Path, jobs: int | None) -> None:
-    """Analyse files, print the table and write the results.
+    """Analyse files, print the table, and write the results.
 
     Raises:
-        InvalidValue: no file can be followed. ConfigError: no such estimator or tracker.
+        InvalidValue: no file can be analysed. ConfigError: the estimator or tracker is unknown.
     """
     console, aside = Console(file=sys.stdout, highlight=False), Console(stderr=True, highlight=False)
     contents, unreadable = read_all(paths)
@@ -104,12 +104,12 @@ def _files(paths: Sequence[Path]) -> Iterator[Path]:
 
 
 def register_pair(by: str, reference: DriftScan, scan: DriftScan) -> Registration:
-    """Register a pair, in a worker."""
+    """Register a pair of scans in a worker process."""
     return estimator(by).register(reference, scan)
 
 
 def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int | None, console: Console) -> Analysis:
-    """Follow the scans in this process, while other processes register each with the first."""
+    """Track drift through the scans in this process, while other processes register each scan with the first."""
     tracking = tracker(following, estimator(by))
     wanted = processes(jobs, sum(scan.values.size for scan in scans))
     others = 1 if wanted == 1 else max(wanted - 1, 2)  # processes that compare; 1 is this one
@@ -137,7 +137,7 @@ def _pairs(scans: Sequence[DriftScan], by: str, jobs: int, done: Callable[[], No
 
 
 def as_table(record: DriftRecord) -> Table:
-    """Return the record as a table: hours since the first scan, nm, and nm a minute."""
+    """Return the record as a table: hours since the first scan, positions in nm, rates in nm/min."""
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("scan", no_wrap=True, max_width=24)
     for name in ("h", "x / nm", "y / nm", "± sd", "nm/min x", "y"):
@@ -156,7 +156,7 @@ def as_table(record: DriftRecord) -> Table:
 
 
 def written(found: Series, analysis: Analysis, truth: Array | None, folder: Path, console: Console) -> Iterator[Path]:
-    """Write the results and yield their files; print the reason if there is no stack.
+    """Write the results, and yield the path of each file; print the reason if there is no stack.
 
     Raises:
         FileError: the folder or a file can't be written.

@@ -1,4 +1,4 @@
-"""M_tot: from tip to sample coordinates, as a homogeneous matrix.
+"""The mapping M_tot from tip to sample coordinates, as a homogeneous matrix.
 
 Source: paper, supporting information, "Drift Correction Algorithm".
 """
@@ -22,7 +22,7 @@ _STRETCHED = 2.0  # generous: thermal expansion, creep and shear by drift stay b
 
 @dataclass(frozen=True, eq=False)
 class Mapping:
-    """An affine mapping x_S = M x_T.
+    """Affine mapping x_S = M x_T from tip to sample coordinates.
 
     Attributes:
         matrix: 3 x 3, lengths in m, last row 0 0 1.
@@ -44,12 +44,12 @@ class Mapping:
 
     @classmethod
     def identity(cls) -> Mapping:
-        """Return the mapping at the start, when both coordinate systems are equal."""
+        """Return the identity, the mapping at the start of an experiment."""
         return cls(np.eye(3))
 
     @classmethod
     def of(cls, linear: ArrayLike, translation_m: ArrayLike) -> Mapping:
-        """Return the mapping of a 2 x 2 part and a translation."""
+        """Return the mapping with a given 2 x 2 part and translation."""
         matrix = np.eye(3)
         matrix[:2, :2], matrix[:2, 2] = linear, translation_m
         return cls(matrix)
@@ -77,7 +77,7 @@ class Mapping:
         return Mapping(self.matrix @ first.matrix)
 
     def apply(self, xy_m: ArrayLike) -> Array:
-        """Map points, shape (..., 2)."""
+        """Map points, shape (..., 2), in m."""
         mapped: Array = np.asarray(xy_m, dtype=np.float64) @ self.linear.T + self.translation_m
         return mapped
 
@@ -89,14 +89,14 @@ class Mapping:
 
     @property
     def scale(self) -> float:
-        """Enlargement of lengths (square root of the determinant)."""
+        """Scale factor of lengths (square root of the determinant)."""
         return math.sqrt(abs(float(np.linalg.det(self.linear))))
 
     def to_sample(self, region: Region) -> Region:
         """Map a region from tip to sample coordinates.
 
-        A rectangle stays a rectangle: its centre is mapped, and it turns and grows by the nearest similarity. Shear is
-        left out, because a microscope scans rectangles.
+        The result is again a rectangle: its centre is mapped, and it is rotated and scaled by the nearest similarity.
+        Shear is left out, because a microscope scans rectangles.
         """
         return self._mapped(region, Frame.SAMPLE)
 
@@ -115,7 +115,7 @@ class Mapping:
 
 
 def unlike_drift(linear: Array) -> str:
-    """Return why no sample changes by this finite 2 x 2 part between two scans; empty if it may."""
+    """Return the reason why drift can't cause a given 2 x 2 part between two scans; empty if it can."""
     if np.linalg.det(linear) <= 0.0:
         return f"mirrored or flat: {linear.tolist()}"
     stretches = np.linalg.svd(linear, compute_uv=False)

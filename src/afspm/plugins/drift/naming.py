@@ -1,4 +1,4 @@
-"""Parts of drift correction by name: afspm's, and a user's own as "module.Name"."""
+"""Lookup of estimators and trackers by name: afspm's own, and a user's classes as "module.Name"."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from afspm.basics.requirements import require
 
 
 def named(what: str, spec: str | PlainMapping, default: str, *arguments: object) -> tuple[object, str]:
-    """Return the part named by a user's setting, and its name.
+    """Return an estimator or tracker specified by a user's setting, and its name.
 
     Args:
         what: "estimator" or "tracker".
-        spec: a name that a package declares or "module.Name"; or a table with such a name as its `class` and with the
-            settings (only `class` names code).
-        default: where the table has no class.
-        arguments: given before the settings.
+        spec: a name declared by a package, or "module.Name"; or a table with such a name as its `class`, and the
+            settings.
+        default: name if the table has no class.
+        arguments: positional arguments of the constructor, before the settings.
 
     Raises:
         ConfigError: no such name, class or setting, a meaningless setting, or a missing library.

@@ -1,4 +1,4 @@
-"""Drift in recorded scans: followed by a tracker, and measured from the first scan to each later one."""
+"""Off-line analysis of drift in recorded scans, by a tracker and by registration with the first scan."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ Array = NDArray[np.float64]
 
 
 def followed(scans: Sequence[DriftScan], tracker: Tracker) -> Iterator[Update]:
-    """Yield the tracker's update of each scan, in the order of time."""
+    """Yield the tracker's update for each scan; scans must be in order of time."""
     for scan in scans:
         yield tracker.add(scan)
 
 
 def against_first(record: DriftRecord, scans: Sequence[DriftScan], pairs: Sequence[Registration]) -> DriftRecord:
-    """Return the displacement from the first scan to each later one, by registration of that pair only, as a record.
+    """Return a record of the displacement from the first scan to each later one, by registration of the pair alone.
 
-    A registration holds in the middle of the overlap, which was not taken in the middle of either scan. The drift in
-    between is subtracted, with the rates of the tracker.
+    A registration holds at the centre of the overlap, which was not scanned in the middle of either scan. The drift in
+    between is subtracted, with the tracker's rates.
 
     Args:
-        record: of the tracker.
-        pairs: of the first scan with each of the others.
+        record: drift record of the tracker.
+        pairs: registrations of the first scan with each later one.
     """
     drift, covariance = [np.zeros(2)], [np.zeros((2, 2))]
     rate_m_s = record.rate_then_m_s
@@ -55,7 +55,7 @@ def against_first(record: DriftRecord, scans: Sequence[DriftScan], pairs: Sequen
 
 
 def spread_pairs(record: DriftRecord, apart_s: float, count: int) -> list[tuple[int, int]]:
-    """Return indices of matched scans about `apart_s` apart, spread over the run; of a shorter run its ends."""
+    """Return index pairs of matched scans about `apart_s` apart, spread over the run; in a shorter run, its ends."""
     good = np.flatnonzero(record.matched)
     if len(good) < 2:
         return []
@@ -73,7 +73,7 @@ class Stack:
 
     Attributes:
         values: [scan, y, x]; NaN where nothing was measured.
-        region: of all images, in sample coordinates: tip coordinates at zero drift.
+        region: region of all images, in sample coordinates, which are tip coordinates at zero drift.
         time_s: (n,) middle of each scan.
         keys: the names of the scans.
     """
@@ -84,10 +84,10 @@ class Stack:
     keys: tuple[str, ...]
 
     def write(self, path: Path, *, channel: str = "values", unit: str = "") -> None:
-        """Write NetCDF (classic), which xarray opens with its coordinates.
+        """Write a classic NetCDF file, which xarray opens with its coordinates.
 
         Raises:
-            FileError: it can't be written.
+            FileError: the file can't be written.
         """
         from scipy.io import netcdf_file
 
@@ -112,14 +112,14 @@ class Stack:
 
 
 def corrected(scans: Sequence[DriftScan], drift_m: Array, rate_m_s: Array | None = None) -> Stack:
-    """Return the stack, with the pixels and the angle of the first scan.
+    """Return the stack of drift-corrected scans, with the pixel size and angle of the first scan.
 
-    A scan is taken row after row while the sample moves, so the place of a row on the sample depends on its time. The
-    rate undoes this, in scans whose row direction is known.
+    The sample moves during a scan, so the place of a row on the sample depends on its time. The rate corrects this in
+    scans with a known row direction.
 
     Args:
         drift_m: (n, 2) displacement of the sample at the middle of each scan.
-        rate_m_s: (n, 2) its velocity then; None: the sample stood still during each scan.
+        rate_m_s: (n, 2) velocity of the sample during each scan; None: zero.
 
     Raises:
         InvalidValue: the scans have no common area, or different angles.
@@ -142,10 +142,10 @@ def corrected(scans: Sequence[DriftScan], drift_m: Array, rate_m_s: Array | None
 
 
 def common_area(scans: Sequence[DriftScan], drift_m: Array) -> tuple[Region, tuple[int, int]]:
-    """Return the rectangle on the sample that all scans show, in sample coordinates, and its pixels (ny, nx).
+    """Return the rectangle of the sample common to all scans, in sample coordinates, and its pixels (ny, nx).
 
     Raises:
-        InvalidValue: there is none, or the scans have different angles.
+        InvalidValue: the scans have no common rectangle, or different angles.
     """
     angle = scans[0].region.angle_rad
     if any(abs(math.remainder(scan.region.angle_rad - angle, math.tau)) > 1e-6 for scan in scans):

@@ -1,4 +1,4 @@
-"""Overlap of regions and ratio of resolutions: the criteria for comparing pairs and for rescans.
+"""Overlap of regions and ratio of resolutions, the criteria for comparing scans and for rescans.
 
 Both after the paper, "Overarching workflow": intersection_ratio, sr_norm, f'.
 """
@@ -16,15 +16,16 @@ Array = NDArray[np.float64]
 
 
 def intersection_m(first: Region, second: Region) -> Array:
-    """Return the polygon that two rotated rectangles share.
+    """Return the intersection polygon of two rotated rectangles.
 
-    Clips one against each side of the other (Sutherland and Hodgman 1974), which is exact for convex polygons.
+    One rectangle is clipped at each side of the other (Sutherland and Hodgman 1974), which is exact for convex
+    polygons.
 
     Returns:
-        Its corners (n, 2), counter-clockwise; none where at most a border is shared.
+        Corners (n, 2), counter-clockwise; empty if at most a border is shared.
 
     Raises:
-        InvalidValue: they are in different frames.
+        InvalidValue: the regions are in different frames.
     """
     if first.frame is not second.frame:
         raise InvalidValue(f"a region in {first.frame.value} and one in {second.frame.value} coordinates can't overlap")
@@ -39,19 +40,19 @@ def intersection_m(first: Region, second: Region) -> Array:
 
 
 def intersection_area_m2(first: Region, second: Region) -> float:
-    """Return the area that two regions share, m². Raises InvalidValue as `intersection_m` does."""
+    """Return the area of the intersection of two regions in m². Raises InvalidValue as `intersection_m` does."""
     polygon = intersection_m(first, second)
     return _area(polygon - polygon[0]) if len(polygon) else 0.0
 
 
 def intersection_ratio(first: Region, second: Region) -> float:
-    """Return the shared area as a share of the smaller region. Raises InvalidValue as `intersection_m` does."""
+    """Return the intersection area over the smaller region's area. Raises InvalidValue as `intersection_m` does."""
     smaller_m2 = min(region.size_m[0] * region.size_m[1] for region in (first, second))
     return min(intersection_area_m2(first, second) / smaller_m2, 1.0)
 
 
 def intersection_center_m(first: Region, second: Region) -> Array | None:
-    """Return the centre of mass (2,) of the shared area, None without one. Raises InvalidValue as `intersection_m`."""
+    """Return the centroid (2,) of the intersection; None if empty. Raises InvalidValue as `intersection_m` does."""
     polygon = intersection_m(first, second)
     if not len(polygon):
         return None
@@ -63,10 +64,10 @@ def intersection_center_m(first: Region, second: Region) -> Array | None:
 
 
 def overlap_center_m(reference: Region, scan: Region, displacement_m: ArrayLike) -> Array | None:
-    """Return the middle (2,) of the area that both scans show, in the coordinates of the reference.
+    """Return the centroid (2,) of the area of the sample in both scans, in coordinates of the reference.
 
-    Features of the reference are `displacement_m` further in the scan. None without an overlap. Raises InvalidValue as
-    `intersection_m` does.
+    Features are displaced by `displacement_m` from the reference to the scan. None without an overlap. Raises
+    InvalidValue as `intersection_m` does.
     """
     x_m, y_m = np.asarray(displacement_m, dtype=np.float64)
     center = intersection_center_m(_moved(reference, x_m, y_m), scan)
@@ -74,24 +75,25 @@ def overlap_center_m(reference: Region, scan: Region, displacement_m: ArrayLike)
 
 
 def overlap_ratio(reference: Region, scan: Region, displacement_m: ArrayLike) -> float:
-    """Return the share of the smaller region that both scans show, 0 to 1.
+    """Return the area of the sample in both scans over the area of the smaller region, 0 to 1.
 
-    Features of the reference are `displacement_m` further in the scan. Raises InvalidValue as `intersection_m` does.
+    Features are displaced by `displacement_m` from the reference to the scan. Raises InvalidValue as `intersection_m`
+    does.
     """
     x_m, y_m = np.asarray(displacement_m, dtype=np.float64)
     return intersection_ratio(_moved(reference, x_m, y_m), scan)
 
 
 def sr_norm(first: Region, first_shape: tuple[int, int], second: Region, second_shape: tuple[int, int]) -> float:
-    """Return the ratio of two spatial resolutions: min/max of pixels per length, of the axis where they differ most.
+    """Return the ratio of two spatial resolutions (pixels per length, min/max) along the axis of largest difference.
 
-    A pair is good enough where this is at least sr_norm,min (the paper's "<=" is reversed).
+    A pair can be compared if this ratio is at least sr_norm,min (the paper's "<=" is reversed).
 
     Args:
         first_shape, second_shape: pixels (ny, nx).
 
     Returns:
-        Above 0, and 1 for equal resolutions.
+        A ratio above 0; 1 for equal resolutions.
     """
     per_m = [
         np.array([nx / region.size_m[0], ny / region.size_m[1]])
@@ -137,7 +139,7 @@ def too_little_shared(asked: Region, scanned: Region, f_rescan: float = F_RESCAN
     """Return the reason for a rescan by the paper's rule, f' = intersection_ratio(r', r) below f_rescan; else "".
 
     Raises:
-        InvalidValue: a region that is not in sample coordinates.
+        InvalidValue: a region is not in sample coordinates.
     """
     _in_sample(asked, scanned)
     shared = intersection_ratio(asked, scanned)
@@ -147,16 +149,16 @@ def too_little_shared(asked: Region, scanned: Region, f_rescan: float = F_RESCAN
 
 
 def too_far_off(asked: Region, scanned: Region, sd_m: float, tolerance_m: float) -> str:
-    """Return the reason for a rescan if the furthest corner may be off by more than the tolerance; else "".
+    """Return the reason for a rescan if a corner may be off by more than the tolerance; else "".
 
-    The paper's rule lets a scan be off by an eighth of its size. Here the user sets the tolerance, and the uncertainty
-    counts: |residual| + 2 sd > tolerance.
+    The paper's rule tolerates an offset of an eighth of the scan's size. Here the user sets the tolerance, and the
+    uncertainty counts: |residual| + 2 sd > tolerance.
 
     Args:
         sd_m: standard deviation of the estimated position, `update.after.sd_m`.
 
     Raises:
-        InvalidValue: a region that is not in sample coordinates, or a tolerance that is not above zero.
+        InvalidValue: a region is not in sample coordinates, or the tolerance is not above zero.
     """
     _in_sample(asked, scanned)
     if not tolerance_m > 0.0:

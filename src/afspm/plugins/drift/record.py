@@ -1,4 +1,4 @@
-"""The drift of a run, scan by scan, as a table in CSV; from runs and off-line analysis alike."""
+"""Record of the drift in a run, scan by scan, as a CSV table; for runs and off-line analysis."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class DriftRecord:
-    """The drift of n scans in the order of time; positions in tip coordinates.
+    """Drift of n scans in order of time; positions are in tip coordinates.
 
     Attributes:
         keys: the name of each scan.
         time_s: (n,) middle of each scan.
-        center_m: (n, 2) centre of its region.
-        drift_m: (n, 2) displacement of the sample under the tip since the start, as known after the scan.
-        covariance_m2: (n, 2, 2) of the drift.
-        rate_m_s: (n, 2) velocity of the sample then; zero after the first scan, when it is unknown.
-        matched: (n,) whether the scan was registered; the drift of the others is predicted.
-        reasons: why a scan was not registered, for a person.
+        center_m: (n, 2) centre of each scan's region.
+        drift_m: (n, 2) displacement of the sample under the tip since the start, as estimated after each scan.
+        covariance_m2: (n, 2, 2) covariance of the drift.
+        rate_m_s: (n, 2) velocity of the sample after each scan; zero after the first one, when it is unknown.
+        matched: (n,) whether each scan was registered; otherwise its drift is a prediction.
+        reasons: reason why each scan was not registered, for people; empty if it was.
         outcomes: how the position of each scan was determined.
-        failures: the number of errors of the estimator with each scan.
+        failures: number of estimator errors with each scan.
     """
 
     keys: tuple[str, ...]
@@ -59,7 +59,7 @@ class DriftRecord:
         return self.chosen(range(len(self.keys))[part])
 
     def chosen(self, which: Sequence[int]) -> DriftRecord:
-        """Return the record of the scans with these indices."""
+        """Return the record of the scans with given indices."""
         at = list(which)
         return DriftRecord(
             tuple(self.keys[k] for k in at), self.time_s[at], self.center_m[at], self.drift_m[at],
@@ -68,17 +68,17 @@ class DriftRecord:
         )  # fmt: skip
 
     def summary(self) -> str:
-        """Return the number of registered scans as a text."""
+        """Return a text with the number of registered scans."""
         return registration_summary(self.outcomes)
 
     @property
     def sd_m(self) -> Array:
-        """Standard deviations of x and y of the drift, (n, 2)."""
+        """Standard deviations of the drift in x and y, (n, 2)."""
         return np.sqrt(np.diagonal(self.covariance_m2, axis1=1, axis2=2))
 
     @property
     def rate_then_m_s(self) -> Array:
-        """Velocity during each scan, (n, 2); an unknown first velocity is replaced by the second."""
+        """Velocity during each scan, (n, 2); the unknown first velocity is replaced by the second."""
         rates = self.rate_m_s.copy()
         if len(rates) > 1 and not rates[0].any():
             rates[0] = rates[1]
@@ -86,14 +86,14 @@ class DriftRecord:
 
     @property
     def misplacement_m(self) -> Array:
-        """Displacement of the features from their place in the first scan, (n, 2), that correction left over."""
+        """Displacement of features since the first scan that correction has not removed, (n, 2)."""
         followed = self.center_m - self.center_m[:1]
         misplaced: Array = self.drift_m - self.drift_m[:1] - followed
         return misplaced
 
     @classmethod
     def of(cls, scans: Sequence[DriftScan], updates: Sequence[Update]) -> DriftRecord:
-        """Return the record of a tracker's updates."""
+        """Return the record of a tracker's updates for scans."""
         after = [update.after for update in updates]
         return cls(
             keys=tuple(scan.key for scan in scans),
@@ -111,10 +111,10 @@ class DriftRecord:
         )
 
     def write(self, path: Path) -> None:
-        """Write CSV, in SI units.
+        """Write the record as CSV, in SI units.
 
         Raises:
-            FileError: it can't be written.
+            FileError: the file can't be written.
         """
         try:
             with path.open("w", newline="", encoding="utf-8") as file:
@@ -134,10 +134,10 @@ class DriftRecord:
 
     @classmethod
     def read(cls, path: Path) -> DriftRecord:
-        """Read a file of `write`; further columns are ignored.
+        """Read a record from a file written by `write`; further columns are ignored.
 
         Raises:
-            FileError: missing, or another kind of table.
+            FileError: the file is missing, or contains another kind of table.
         """
         try:
             with path.open(newline="", encoding="utf-8") as file:

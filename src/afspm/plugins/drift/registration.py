@@ -17,14 +17,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class DriftScan:
-    """One channel of a scan, as estimators and trackers use it.
+    """One channel of a scan, in the form for estimators and trackers.
 
     Attributes:
-        values: [y, x], both ascending; NaN where nothing was measured.
-        region: in tip coordinates. Its first and last pixels lie on its border.
-        start_s, end_s: experiment time of its first and last row.
-        upwards: whether small y was scanned first; None: not known.
-        key: the caller's name of it.
+        values: [y, x], both ascending; NaN for unmeasured pixels.
+        region: region in tip coordinates. The first and last pixels lie on its border.
+        start_s, end_s: experiment time of the first and last row.
+        upwards: whether the scan began at small y; None if unknown.
+        key: name of the scan, chosen by the caller.
     """
 
     values: Array
@@ -44,7 +44,7 @@ class DriftScan:
 
     @property
     def mid_s(self) -> float:
-        """Time for which its position holds."""
+        """Middle of the scan, the time for which its position holds."""
         return (self.start_s + self.end_s) / 2
 
     @property
@@ -53,21 +53,21 @@ class DriftScan:
 
     @property
     def pixel_m(self) -> tuple[float, float]:
-        """Distance of pixels (x, y)."""
+        """Pixel spacing (x, y)."""
         ny, nx = self.values.shape
         return (self.region.size_m[0] / (nx - 1), self.region.size_m[1] / (ny - 1))
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """The expected displacement before the scans are compared.
+    """Displacement expected before two scans are compared.
 
     Attributes:
         mean_m: (2,) expected displacement.
-        covariance_m2: (2, 2) of the displacement.
+        covariance_m2: (2, 2) covariance of the displacement.
         velocity_difference_m_s: (2,) expected drift velocity during the scan minus drift velocity during the reference;
-            it shears one against the other.
-        velocity_sd_m_s: standard deviation of each of its components; None: not known, so any shear is possible.
+            the difference shears one scan relative to the other.
+        velocity_sd_m_s: standard deviation of each component of the difference; None if unknown: any shear is possible.
     """
 
     mean_m: Array
@@ -78,7 +78,7 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Feature pairs, for drawings. Positions (n, 2) are (x, y) in tip coordinates, m.
+    """Matched features of two scans, for drawings. Positions (n, 2) are (x, y) in tip coordinates, m.
 
     Attributes:
         inlier: (n,) whether the estimate uses the pair.
@@ -91,11 +91,11 @@ class Matches:
 
 @dataclass(frozen=True, eq=False)
 class LinearSeen:
-    """The linear part estimated without a prior; `Registration.linear` may be pulled towards its prior.
+    """Linear part estimated without a prior; `Registration.linear` may be biased towards its prior.
 
     Attributes:
-        linear: (2, 2).
-        covariance: (4, 4) of its elements, row by row.
+        linear: (2, 2) linear part.
+        covariance: (4, 4) covariance of the elements, row by row.
     """
 
     linear: Array
@@ -104,24 +104,24 @@ class LinearSeen:
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """The displacement between two scans.
+    """Result of the registration of two scans: their displacement, and whether it can be used.
 
     A feature at `x` of the reference is found at `x + displacement_m + linear @ (x - center_m)` in the scan, both in
     tip coordinates.
 
     Attributes:
-        accepted: whether the result may be used; if not, the numbers are the best guess, or NaN where there is none.
-        reason: why it was refused, for a person; empty if it was accepted.
-        displacement_m: (2,) at `center_m`.
-        covariance_m2: (2, 2) of the displacement.
+        accepted: whether the result may be used; if not, the numbers are the best guess, or NaN without one.
+        reason: reason for a refusal, for people; empty if accepted.
+        displacement_m: (2,) displacement at `center_m`.
+        covariance_m2: (2, 2) covariance of the displacement.
         linear: (2, 2) rotation, scale and shear; zero for a pure translation.
-        center_m: (2,) where the displacement holds, in tip coordinates of the reference: the middle of the overlap.
-        quality: figures of merit by name (overlap, correlation, …), for a person and for studies.
-        matches: of estimators that match features.
-        linear_seen: of estimators that know the uncertainty of the linear part.
-        failure: the error of an estimator that raised, or gave no usable result; empty without an error. An error means
-            nothing about the scans. The result is accepted nevertheless if a coarse estimate took its place; its
-            linear part is then unknown.
+        center_m: (2,) centre of the overlap, where the displacement holds, in tip coordinates of the reference.
+        quality: figures of merit by name (overlap, correlation, …), for people and for studies.
+        matches: matched features, if the estimator uses features.
+        linear_seen: linear part with its uncertainty, if the estimator provides it.
+        failure: error of the estimator, if it raised or returned no usable result; empty without an error. An error
+            says nothing about the scans. The result is still accepted if a coarse estimate replaces it; the linear part
+            is then unknown.
     """
 
     accepted: bool
@@ -137,7 +137,7 @@ class Registration:
 
     @classmethod
     def refused(cls, reason: str, quality: Table[str, float] | None = None) -> Registration:
-        """Return a result without an estimate."""
+        """Return a refusal without an estimate."""
         none, unknown = np.full(2, np.nan), np.full((2, 2), np.nan)
         return cls(
             accepted=False,
@@ -151,29 +151,29 @@ class Registration:
 
     @classmethod
     def failed(cls, failure: str) -> Registration:
-        """Return the result of an estimator that raised, or gave no usable result."""
+        """Return the result for an estimator that raised, or returned no usable result."""
         return replace(cls.refused(failure), failure=failure)
 
     @property
     def outcome(self) -> RegistrationOutcome:
-        """The outcome for the position of the scan, by this pair only."""
+        """Outcome for the position of the scan, judged by this pair alone."""
         if self.accepted:
             return RegistrationOutcome.COARSE if self.failure else RegistrationOutcome.REGISTERED
         return RegistrationOutcome.FAILED if self.failure else RegistrationOutcome.REFUSED
 
     @property
     def sd_m(self) -> float:
-        """Standard deviation of the displacement along the axis where it is largest."""
+        """Standard deviation of the displacement along its most uncertain axis."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance_m2)[-1]))
 
 
 class Estimator(Protocol):
-    """A stateless method to register two scans of the same channel."""
+    """Stateless method to register two scans of the same channel."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         """Return the displacement of the features of `reference` in `scan`.
 
-        Never raises for the content of scans: pairs that can't be registered (no values, constant, no common features,
-        ambiguous) are refused with the reason.
+        Must not raise because of the content of scans: pairs that can't be registered (no values, constant, no common
+        features, ambiguous) are refused with a reason.
         """
         ...

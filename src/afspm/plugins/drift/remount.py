@@ -1,7 +1,7 @@
-"""Registration of today's overview with the overview of an earlier night, after the sample was mounted again.
+"""Registration of today's overview with an overview of an earlier night, after the sample was remounted.
 
-The sample may be turned by any angle, but estimators expect scans that are turned by a degree or two. So coarse images
-are correlated at all angles first; at the best of them the whole images are registered by least squares.
+The sample may be rotated by any angle, but estimators only tolerate a degree or two. So coarse images are first
+correlated at all angles; at the best angles the whole images are registered by least squares.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ SYSTEMATIC_PX = 0.08
 
 @dataclass(frozen=True, eq=False)
 class Remount:
-    """The place of a sample now, from its place at an earlier time.
+    """Position and rotation of a remounted sample, relative to an earlier night.
 
     Attributes:
-        reason: the cause of a failure; empty if the place was found. Only then do the numbers mean anything.
-        angle_rad: rotation of the sample since then, counter-clockwise; angle_sd_rad: its standard deviation.
-        center_m, center_now_m: a place on the sample, before and now: the middle of the common area.
+        reason: reason why the sample was not found; empty if it was found. Only then are the numbers valid.
+        angle_rad: rotation of the sample since the earlier night, counter-clockwise; angle_sd_rad: standard deviation.
+        center_m, center_now_m: centre of the common area, in coordinates of the earlier night and of today.
         sd_m: standard deviation of `center_now_m` along its most uncertain axis.
         wrong: estimated probability of a false match.
     """
@@ -61,24 +61,24 @@ class Remount:
         return not self.reason
 
     def now_m(self, xy_m: XY) -> XY:
-        """Return where a place of the earlier night is now."""
+        """Return today's position of a place of the earlier night."""
         x, y = _turned(np.subtract(xy_m, self.center_m), self.angle_rad) + self.center_now_m
         return (float(x), float(y))
 
     def now_sd_m(self, xy_m: XY) -> float:
-        """Return the standard deviation of `now_m`, which grows with the distance from the common area."""
+        """Return the standard deviation of `now_m`, which increases with the distance from the common area."""
         return math.hypot(self.sd_m, self.angle_sd_rad * math.dist(xy_m, self.center_m))
 
     def region_now(self, region: Region) -> Region:
-        """Return where a region of the earlier night is now."""
+        """Return today's position of a region of the earlier night."""
         return replace(region, center_m=self.now_m(region.center_m), angle_rad=region.angle_rad + self.angle_rad)
 
 
 def overview_of(run: Run, number: int | None = None) -> tuple[ScanRow, Scan]:
-    """Return a scan by its number with its topography; None: the largest whole scan of the run, the first of several.
+    """Return a scan by number, with its topography; without a number, the largest complete scan.
 
     Raises:
-        InvalidValue: there is no such scan. FileError: its file is missing or damaged.
+        InvalidValue: there is no such scan. FileError: the scan's file is missing or damaged.
     """
     whole = [row for row in run.scans if row.region is not None and row.file and not row.interrupted]
     if number is not None:
@@ -92,13 +92,13 @@ def overview_of(run: Run, number: int | None = None) -> tuple[ScanRow, Scan]:
 
 
 def find(earlier: Scan, now: Scan, within_rad: float = math.pi) -> Remount:
-    """Find the sample of an earlier scan in a present scan.
+    """Find the position and rotation of the sample in today's scan, relative to an earlier scan.
 
     Args:
         within_rad: the largest rotation between the two scans.
 
     Raises:
-        InvalidValue: a scan without enough pixels, or an angle that is not above 0 and at most 180°.
+        InvalidValue: a scan has too few pixels, or the angle is not above 0 and at most 180°.
     """
     if not 0.0 < within_rad <= math.pi:
         raise InvalidValue(f"the angle must be above 0 and at most 180°, not {math.degrees(within_rad):g}°")

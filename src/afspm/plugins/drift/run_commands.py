@@ -1,6 +1,6 @@
-"""`afspm compare` and `afspm find`: runs beside each other, and a sample that was mounted again.
+"""`afspm compare`: compare runs side by side. `afspm find`: find a remounted sample.
 
-Both register scans of different nights, so they are commands of the package with the estimators.
+Both register scans of different nights, so they are in the package with the estimators.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ def compare(
 ) -> None:
     """Compare runs: settings that differ, problems, times, roughness, and the same regions side by side.
 
-    Regions are the same if their scans have one key, or without keys one place. Prints a table and writes a page with
-    pictures, in which scans of one size flicker and are subtracted.
+    Regions are the same if their scans have the same key, or without keys the same place. Prints a table and writes a
+    page with pictures, which alternate and subtract scans of equal size.
     """
     from afspm.cli.joining import plain_console, plain_table
     from afspm.plugins.drift.scan_pair import onto_first
@@ -63,7 +63,7 @@ def find(
     ] = 180.0,
     as_json: Annotated[bool, typer.Option("--json", help="For programs; in metres and radians.")] = False,
 ) -> None:
-    """Find a sample that was mounted again: where the places of an earlier night are today.
+    """Find a remounted sample: today's positions of the places of an earlier night.
 
     Registers the overview of today with the earlier one, at any angle. Prints offset and angle with standard
     deviations, and the keyed regions of the earlier night in coordinates of today. Exit code 1: not found.

@@ -1,4 +1,4 @@
-"""Two scans of one region, laid over each other for a difference."""
+"""Alignment of two scans of one region, for their difference."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _ALIKE = 1e-3
 
 
 def onto_first(first: Array, region: Region, second: Array, second_region: Region) -> tuple[Array, str]:
-    """Return the values of the second scan at the features of the first, and a text about their alignment.
+    """Return the second scan shifted onto the features of the first, and a text about the alignment.
 
-    Scans of equal size are registered within their frames, wherever these lie. The result is NaN where only the first
-    was measured. Scans that can't be registered keep their pixels.
+    Scans of equal size are registered relative to their frames, regardless of the positions of the frames. The result
+    is NaN where only the first scan was measured. Scans that can't be registered are not shifted.
     """
     moved_m, words = _displacement(first, region, second, second_region)
     return _moved(second, region, moved_m), words

@@ -1,11 +1,11 @@
-"""The shear of an image by drift while it is taken, and the drift velocity from two opposite frames.
+"""Shear of an image by drift during the scan, and the drift velocity from an up frame and a down frame.
 
-Rows are taken one after the other, so a feature at `p` when half of the scan is done is found at
+Rows are scanned one after the other, so a feature at `p` in the middle of the scan is found at
 x = p + v a e.(x - c), with c the centre, e the direction of the slow axis and a the time per length along it, negative
 when scanning down. Two scans with a_1 and a_2 are then related by 1 + A = (1 - a_2 v e')^-1 (1 - a_1 v e'), that is
-A e = v (a_2 - a_1) / (1 - a_2 v.e): an up frame and a down frame differ by a shear and a stretch of 2 v for each height
-per duration, at any drift in between. The velocity from the shear is free of a lattice's ambiguity; the velocity from
-the displacement between their middles is more precise.
+A e = v (a_2 - a_1) / (1 - a_2 v.e): an up frame and a down frame differ by a shear and a stretch of 2 v times duration
+over height, regardless of the drift in between. The velocity from the shear is free of a lattice's ambiguity; the
+velocity from the displacement between their middles is more precise.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ _CONTRADICTION = 16.0  # chi2 of the difference between both routes
 
 @dataclass(frozen=True, eq=False)
 class DriftVelocity:
-    """The absolute velocity of the sample in tip coordinates.
+    """Absolute velocity of the sample in tip coordinates.
 
     Attributes:
-        accepted: whether it may be used.
-        reason: why not, for a person.
-        velocity_m_s: (2,); NaN where none was found.
-        covariance: (2, 2) of the velocity, (m/s)².
-        time_s: the middle of the two scans, for which it holds.
-        by_shear_m_s, by_displacement_m_s: (2,) the velocity by each route alone.
-        by_shear_covariance: (2, 2) of the former.
+        accepted: whether the velocity may be used.
+        reason: reason for a refusal, for people.
+        velocity_m_s: (2,) velocity; NaN if none was found.
+        covariance: (2, 2) covariance of the velocity, (m/s)².
+        time_s: middle of the two scans, for which the velocity holds.
+        by_shear_m_s, by_displacement_m_s: (2,) velocity from shear alone and from displacement alone.
+        by_shear_covariance: (2, 2) covariance of `by_shear_m_s`.
         registration: the registration used, or the refused one.
     """
 
@@ -53,7 +53,7 @@ class DriftVelocity:
 
     @classmethod
     def refused(cls, reason: str, time_s: float, registration: Registration | None = None) -> DriftVelocity:
-        """Return a result without a velocity."""
+        """Return a refusal without a velocity."""
         nothing, unknown = np.full(2, np.nan), np.full((2, 2), np.nan)
         return cls(
             accepted=False,
@@ -69,7 +69,7 @@ class DriftVelocity:
 
 
 def slow_axis(scan: DriftScan) -> Array:
-    """Return the (2,) unit vector along which rows follow each other with ascending y, in tip coordinates."""
+    """Return the (2,) unit vector of the slow scan axis towards ascending y, in tip coordinates."""
     angle = scan.region.angle_rad
     return np.array([-math.sin(angle), math.cos(angle)])
 
@@ -82,7 +82,7 @@ def delay_per_length_s_m(scan: DriftScan) -> float | None:
 
 
 def row_delay_s(scan: DriftScan, position_m: Array) -> float | None:
-    """Return the delay from a scan's middle to its pass over a position (tip coordinates); None: direction unknown."""
+    """Return the delay from a scan's middle to its pass over a position in tip coordinates; None: direction unknown."""
     a = delay_per_length_s_m(scan)
     return None if a is None else a * float(slow_axis(scan) @ (position_m - np.array(scan.region.center_m)))
 
@@ -90,11 +90,11 @@ def row_delay_s(scan: DriftScan, position_m: Array) -> float | None:
 def velocity_by_shear(reference: DriftScan, scan: DriftScan, found: Registration) -> tuple[Array, Array] | None:
     """Return velocity (2,) and covariance from the shear between scans of different directions or speeds.
 
-    Features are assumed to be spread evenly over the image: the slope over a height h is then known to sqrt(12) / h of
-    the uncertainty of the displacement.
+    Features are assumed to be spread evenly over the image: the uncertainty of the slope over a height h is then
+    sqrt(12) / h times the uncertainty of the displacement.
 
     Returns:
-        None where both were sheared alike, a direction is not known, or the registration is coarse.
+        None if both scans were sheared alike, a direction is unknown, or the registration is coarse.
     """
     first, second = delay_per_length_s_m(reference), delay_per_length_s_m(scan)
     if first is None or second is None or not np.isfinite(found.covariance_m2).all():
@@ -120,9 +120,10 @@ def velocity_by_shear(reference: DriftScan, scan: DriftScan, found: Registration
 def velocity_from_up_down(up: DriftScan, down: DriftScan, estimator: Estimator) -> DriftVelocity:
     """Return the velocity from an up frame and a down frame, in either order, of about the same region.
 
-    Both are first registered freely. If that is refused, or if displacement and shear contradict each other (another
-    site of a lattice, a picture with little shear), the velocity of either route is a guess. Both scans are freed from
-    that drift and registered again with a prior from it, and the remaining displacement and shear must agree.
+    The frames are first registered without a prior. If this is refused, or if displacement and shear contradict each
+    other (another site of a lattice, a picture with little shear), the velocity from either of them serves as a guess.
+    Both scans are corrected for the guessed drift and registered again with a prior from it, and the remaining
+    displacement and shear must agree.
     """
     first, second = sorted((up, down), key=lambda scan: scan.mid_s)
     time_s = (first.mid_s + second.mid_s) / 2

@@ -20,13 +20,13 @@ TRUTH_FILE = "truth.jsonl"
 
 
 def true_drift(run_dir: Path, scans: Sequence[DriftScan]) -> Array | None:
-    """Return the displacement of the sample (n, 2) at the centre of each scan since the first; None if unknown.
+    """Return the sample's true displacement since the first scan, at each scan's centre, (n, 2), in m; None if unknown.
 
     The result includes displacement by rotation and expansion of the sample. The drift that the controller itself
     compensates is subtracted, since tip coordinates move with it; it is interpolated between the ends of scans.
 
     Raises:
-        FileError: there is such a file, but not of a simulated run.
+        FileError: the file does not describe a simulated run.
     """
     path = run_dir / TRUTH_FILE
     if not path.exists() or not scans:

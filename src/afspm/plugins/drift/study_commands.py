@@ -1,4 +1,4 @@
-"""The work of `afspm drift study`: simulate nights with a progress bar, and print a table of the results."""
+"""`afspm drift study`: simulate nights with a progress bar, and print a table of the results."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def metrics_of(settings: NightSettings, seed: int) -> Mapping[str, float]:
 
 
 def run(given: Sequence[str], nights: int, seed: int, cluster: str, jobs: int | None) -> None:
-    """Do a study and print it."""
+    """Run a study and print its results."""
     combinations = dict(SettingsGrid.of(given).settings())
     tasks = [(settings, seed + k) for k in range(nights) for settings in combinations.values()]
     here = processes(jobs, sum(settings.scans * settings.pixels**2 for settings, _ in tasks))

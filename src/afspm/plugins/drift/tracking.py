@@ -1,4 +1,4 @@
-"""The interface of all trackers, and the data that passes through it."""
+"""Interface of all trackers, and the data that they exchange."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ FORECAST_VERSION = 2
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """The mapping to sample coordinates at one time.
+    """Predicted mapping to sample coordinates at one time, with its uncertainty.
 
     Attributes:
         time_s: experiment time.
-        mapping: from tip to sample coordinates.
-        covariance_m2: (2, 2) of the translation of the mapping.
+        mapping: mapping from tip to sample coordinates.
+        covariance_m2: (2, 2) covariance of the mapping's translation.
         rate_m_s: (2,) velocity of the sample in tip coordinates.
-        rate_covariance: (2, 2) of the rate, (m/s)².
+        rate_covariance: (2, 2) covariance of the rate, (m/s)².
     """
 
     time_s: float
@@ -41,12 +41,12 @@ class Prediction:
 
     @property
     def sd_m(self) -> float:
-        """Standard deviation of a position along the axis where it is largest."""
+        """Standard deviation of a position along its most uncertain axis."""
         return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance_m2)[-1], 0.0)))
 
 
 class Forecast(Protocol):
-    """A tracker's knowledge for other times: small, immutable, JSON-able, without the scans."""
+    """A tracker's predictions for any time: small, immutable and convertible to JSON, without the scans."""
 
     def at(self, time_s: float) -> Prediction:
         """Return the prediction for any time; before the newest scan, its estimate is extrapolated backwards."""
@@ -59,17 +59,17 @@ class Forecast(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """The result of one scan.
+    """Result of adding one scan to a tracker.
 
     Attributes:
-        key: of the scan.
-        before: the prediction for the middle of the scan.
-        after: the estimate for the same time with the scan.
-        matched: whether any reference could be registered with it (the first scan of all counts as matched).
-        reason: why not, or why only coarsely, for a person.
-        lost: the tracker no longer knows where the sample is.
-        registrations: by the key of the reference.
-        forecast: from the knowledge with the scan.
+        key: key of the scan.
+        before: prediction for the middle of the scan, without the scan.
+        after: estimate for the same time, with the scan.
+        matched: whether the scan could be registered with any reference (the very first scan counts as matched).
+        reason: reason why the scan did not match, or only coarsely, for people.
+        lost: whether the position of the sample is unknown.
+        registrations: registrations by key of the reference.
+        forecast: forecast after this scan.
     """
 
     key: str
@@ -84,7 +84,7 @@ class Update:
 
     @property
     def outcome(self) -> RegistrationOutcome:
-        """How the position of the scan was determined."""
+        """Kind of determination of the scan's position."""
         found = self.registrations.values()
         if self.matched:
             accepted = [one for one in found if one.accepted]
@@ -104,11 +104,11 @@ def require_newer(scan: DriftScan, newest_s: float | None) -> None:
 
 
 class Tracker(Protocol):
-    """A method to follow drift from scan to scan. Deterministic: the same scans give the same numbers."""
+    """Method to track drift from scan to scan. Deterministic: the same scans give the same numbers."""
 
     @property
     def forecast(self) -> Forecast:
-        """Forecast from all scans so far."""
+        """Forecast based on all scans so far."""
         ...
 
     def add(self, scan: DriftScan) -> Update:
@@ -116,7 +116,7 @@ class Tracker(Protocol):
         ...
 
     def state(self) -> Plain:
-        """Return everything that must survive a kill: numbers, texts, lists and dicts of JSON, and numpy arrays."""
+        """Return the complete state to save: numbers, texts, lists and dicts of JSON, and numpy arrays."""
         ...
 
     def restore(self, state: PlainMapping) -> None:

@@ -1,13 +1,12 @@
-"""Judge of running scans: sees in the lines that the tip has changed. Pure.
+"""Detection of tip changes from the lines of running scans. Pure.
 
-Each line is compared with an earlier scan of the place, at the shift that the lines so far have (`registration`). What
-the earlier scan does not explain, relative to the usual difference of two good scans of this kind, goes into a CUSUM
-(Page 1954): its sum grows while lines differ more than usual, and falls back to zero while they do not. So a scar or a
-spike in one line is no alarm, and ten lines that differ a little are one. Where no earlier scan shows the place,
-nothing is judged.
+Each line is compared with an earlier scan of the same place, at the shift found from the lines so far (`registration`).
+The remaining difference, relative to the usual difference of two good scans of this kind, goes into a CUSUM (Page
+1954): its sum grows while lines differ more than usual, and falls back to zero otherwise. So a scar or a spike in one
+line raises no alarm, but ten slightly different lines do. Without an earlier scan of the place, nothing is judged.
 
-Thresholds are those of a kind of scan (same size, angle, pixels and setpoint; decision 0044): the sums that good scans
-reached, times a factor. A sum above the threshold is `STOP`, one above a part of it `LOOK`. Before an alarm, a wider
+Each kind of scan (same size, angle, pixels and setpoint; decision 0044) has its own threshold: the highest sum of good
+scans, times a factor. A sum above the threshold raises `STOP`, a sum above 60 % of it `LOOK`. Before an alarm, a wider
 search for the shift shows whether the sample has jumped: then the template explains the lines again.
 """
 
@@ -62,7 +61,7 @@ LEAST_COMMON = 0.5  # share of width and height that an earlier scan must cover
 
 
 class AlarmLevel(Enum):
-    """The consequence of an alarm."""
+    """Action that an alarm calls for: a person looks, or the scan is stopped."""
 
     LOOK = "look"
     STOP = "stop"
@@ -70,14 +69,14 @@ class AlarmLevel(Enum):
 
 @dataclass(frozen=True)
 class Alarm:
-    """The lines of a running scan differ from those of a good tip.
+    """An alarm: the lines of a running scan differ from an earlier scan with a good tip.
 
     Attributes:
         level: see `AlarmLevel`.
-        row: index of the line that raised it.
-        since_row: index of the first line with the change, by the CUSUM.
-        evidence: the sum, relative to the threshold of this kind of scan.
-        why: for people.
+        row: index of the line that raised the alarm.
+        since_row: index of the first changed line, according to the CUSUM.
+        evidence: CUSUM relative to the threshold of this kind of scan.
+        why: explanation, for people.
     """
 
     level: AlarmLevel
@@ -89,10 +88,10 @@ class Alarm:
 
 @dataclass(frozen=True)
 class Kind:
-    """Scans that are compared with each other: of the same size, angle, pixels and condition.
+    """A kind of scan. Only scans of equal size, angle, pixels and condition are compared.
 
     Attributes:
-        condition: what else must be equal, such as the setpoint.
+        condition: other settings that must be equal, such as the setpoint.
     """
 
     size_m: tuple[float, float]
@@ -116,13 +115,13 @@ class Kind:
 
 @dataclass(frozen=True)
 class PairStatistics:
-    """Differences between the lines of two good scans.
+    """Statistics of the differences between the lines of two good scans.
 
     Attributes:
-        flat_m: of flat pixels, standard deviation.
+        flat_m: standard deviation on flat pixels.
         per_slope: further difference for each m per pixel of slope, in m.
-        usual, spread: of the statistic of a line.
-        highest: sum of the CUSUM.
+        usual, spread: centre and spread of `line_statistic`.
+        highest: highest value of the CUSUM.
     """
 
     flat_m: float
@@ -134,11 +133,11 @@ class PairStatistics:
 
 @dataclass
 class Place:
-    """An earlier scan with a good tip.
+    """An earlier scan with a good tip, as a reference for its place.
 
     Attributes:
-        at_s: time of its end.
-        templates: of trace and, where recorded, retrace.
+        at_s: end of the scan.
+        templates: trace and, if recorded, retrace.
     """
 
     region: Region
@@ -148,12 +147,12 @@ class Place:
 
 @dataclass
 class KindReference:
-    """All that is known of one kind of scan.
+    """Reference scans and statistics of one kind of scan.
 
     Attributes:
-        places: earlier scans, the newest at the end.
-        pairs: of scans of one place, the newest at the end.
-        speeds: changes of the shift in (rows, columns) per second, the newest at the end.
+        places: earlier scans, newest last.
+        pairs: statistics of pairs of scans of one place, newest last.
+        speeds: changes of the shift in (rows, columns) per second, newest last.
     """
 
     kind: Kind
@@ -162,14 +161,14 @@ class KindReference:
     speeds: list[Shift] = field(default_factory=list)
 
     def place(self, region: Region) -> Place | None:
-        """Return the newest earlier scan that shows at least half of a region."""
+        """Return the newest earlier scan that covers at least half the width and height of a region."""
         for place in reversed(self.places):
             if max(abs(away) for away in self._away(place, region)) <= 1.0 - LEAST_COMMON:
                 return place
         return None
 
     def shift(self, place: Place, region: Region, at_s: float) -> Shift:
-        """Return the predicted shift of a place in a scan of a region."""
+        """Return the predicted shift, in pixels, between an earlier scan and a scan of a region."""
         (along, down), (ny, nx) = self._away(place, region), self.kind.shape
         passed_s = at_s - place.at_s
         # the median: a sample that has jumped once does not drift
@@ -177,7 +176,7 @@ class KindReference:
         return down * (ny - 1) + passed_s * float(rows_per_s), along * (nx - 1) + passed_s * float(columns_per_s)
 
     def note_shift(self, place: Place, region: Region, at_s: float, found: Shift) -> None:
-        """Learn the drift from the shift at the end of a scan."""
+        """Learn the drift from the shift found at the end of a scan."""
         passed_s = at_s - place.at_s
         if passed_s > 0.0:
             (along, down), (ny, nx) = self._away(place, region), self.kind.shape
@@ -193,11 +192,11 @@ class KindReference:
 
 @dataclass
 class Cusum:
-    """Sum of what exceeds the usual, never below zero.
+    """Cumulative sum (CUSUM) of the excess over the usual difference; never negative.
 
     Attributes:
         value: the sum.
-        since: the line at which it last left zero.
+        since: index of the line at which the sum last left zero.
     """
 
     value: float = 0.0
@@ -212,12 +211,12 @@ class Cusum:
 
 
 def confidence(evidence: float) -> float:
-    """Return a rough share of scans with a good tip whose evidence stays below this: an assumed exponential."""
+    """Return a rough confidence that the tip has changed, assuming exponentially distributed evidence of good scans."""
     return 1.0 - math.exp(-GOOD_DECAY * max(0.0, evidence))
 
 
 class LineStatistic:
-    """Turns the differences of a line into standard deviations above the usual.
+    """Converter of a line's differences into standard deviations above the usual difference.
 
     Args:
         pairs: statistics of good pairs of scans, at least one.
@@ -241,7 +240,7 @@ class LineStatistic:
 
 
 def line_statistic(fits: Sequence[RowFit], flat_m: float, per_slope: float) -> float:
-    """Return the mean squared difference of a line, in units of the usual one at each pixel, with a limit for each."""
+    """Return the mean squared difference of a line, relative to the usual one, with an upper limit per pixel."""
     means = []
     for fit in fits:
         square = (fit.residual / np.hypot(flat_m, per_slope * fit.steepness)) ** 2
@@ -267,11 +266,11 @@ class _Comparer:
 
 
 class RunningScan:
-    """Judges the lines of one scan, in the order of their arrival; see `LineJudge.begin`.
+    """Judge of the lines of one scan, in order of arrival; see `LineJudge.begin`.
 
     Attributes:
-        alarm: the last one.
-        fitted: by row, what its template does not explain.
+        alarm: the last alarm.
+        fitted: remaining differences from the template, by row.
     """
 
     def __init__(self, comparer: _Comparer, statistic: LineStatistic, what: str) -> None:
@@ -286,20 +285,20 @@ class RunningScan:
 
     @property
     def threshold(self) -> float:
-        """Return the sum of the CUSUM at which a scan is stopped."""
+        """Return the CUSUM at which a scan is stopped."""
         return self._statistic.threshold
 
     @property
     def evidence(self) -> float:
-        """Return the sum of the CUSUM relative to the threshold."""
+        """Return the CUSUM relative to the threshold."""
         return self._cusum.value / self.threshold
 
     def add(self, row: int, line: Sequence[Array]) -> Alarm | None:
-        """Judge a line; return an alarm of a higher level than before.
+        """Judge a line; return an alarm if its level is higher than before, else None.
 
         Args:
             row: its index in the scan.
-            line: heights in m of trace and, where recorded, retrace.
+            line: heights in m of trace and, if recorded, retrace.
         """
         level = [levelled(values)[0] for values in line]
         if not all(np.isfinite(values).all() for values in level):
@@ -393,18 +392,18 @@ class _OddRows:
 
 
 class LineJudge:
-    """Learns from scans with a good tip, and judges the lines of running ones."""
+    """Judge of running scans, which learns from scans with a good tip."""
 
     def __init__(self) -> None:
         self._kinds: list[KindReference] = []
 
     def pairs(self, kind: Kind) -> int:
-        """Return the number of good pairs known of a kind."""
+        """Return the number of known pairs of good scans of a kind."""
         known = self._known(kind)
         return 0 if known is None else len(known.pairs)
 
     def begin(self, region: Region, kind: Kind, at_s: float, *, channels: int) -> RunningScan | None:
-        """Return the judge of a scan that begins at `at_s`; None if it can't be judged (see `lacking`).
+        """Return the judge of a scan that begins at `at_s`, or None if the scan can't be judged (see `lacking`).
 
         Args:
             channels: 2 with retrace, 1 without.
@@ -420,7 +419,7 @@ class LineJudge:
         return None
 
     def lacking(self, region: Region, kind: Kind) -> str:
-        """Return the reason, for people, why the lines of a scan can't be judged; empty if they can."""
+        """Return the reason why the lines of a scan can't be judged, for people; empty if they can."""
         known = self._known(kind)
         if known is None or known.place(region) is None:
             return "no earlier scan of this size, angle, pixels and feedback shows the place"
@@ -441,10 +440,10 @@ class LineJudge:
         """Learn from a complete scan with a good tip.
 
         Args:
-            picture: heights in m, [y, x], of trace and, where recorded, retrace.
-            at_s: time of its end.
-            downwards: whether its lines came from the last to the first.
-            again: an earlier life of the process has learnt from it: it becomes a place only.
+            picture: heights in m, [y, x], of trace and, if recorded, retrace.
+            at_s: end of the scan.
+            downwards: whether the lines arrived from last to first.
+            again: the process has learnt from this scan before its restart: use it only as a reference for its place.
         """
         known = self._known(kind) or self._new(kind)
         self._kinds.remove(known)
@@ -480,14 +479,14 @@ class LineJudge:
         return odd
 
     def state(self) -> Plain:
-        """Return the statistics of each kind, to save, in JSON's types. The earlier scans are not in it."""
+        """Return the statistics of each kind of scan as JSON data, to save. Earlier scans are left out."""
         return {"kinds": [to_plain(replace(one, places=[], speeds=[]), lists=True) for one in self._kinds]}
 
     def restore(self, state: Plain) -> None:
         self._kinds = [from_plain(KindReference, kept) for kept in state["kinds"]]
 
     def forget_places(self) -> None:
-        """Forget all earlier scans: the tip is another one now. The statistics of each kind are kept."""
+        """Forget all earlier scans, since the tip has changed. The statistics of each kind are kept."""
         for kind in self._kinds:
             kind.places.clear()
 

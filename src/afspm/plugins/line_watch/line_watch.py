@@ -1,4 +1,4 @@
-"""`LineWatch`: sees in the lines of a running scan that the tip has changed."""
+"""`LineWatch`: the component that detects tip changes in the lines of a running scan."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class _Lines:
     """The lines of the running scan.
 
     Attributes:
-        began_ns: the time that they carry.
+        began_ns: start time of the scan, as published with its lines.
         judge: None if the scan is not judged.
         pictures: by channel, [y, x] in m; NaN where not received.
-        taken: indices of the rows that were judged, in this order.
+        taken: indices of the judged rows, in the order of judgement.
         is_disturbed: a setting of the feedback has changed since its start.
     """
 
@@ -45,11 +45,11 @@ class _Lines:
 
 @dataclass
 class _Finished:
-    """The newest complete scan, from which is learnt when the next one begins.
+    """The newest complete scan, from which the judge learns when the next scan begins.
 
     Attributes:
-        is_whole: without an alarm, and under the same conditions from the first line to the last.
-        is_trusted: its tip counts as good so far.
+        is_whole: no alarm was raised, and no condition changed during the scan.
+        is_trusted: the tip counts as good so far.
     """
 
     pair: HeightPair

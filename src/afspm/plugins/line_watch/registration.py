@@ -1,8 +1,8 @@
 """Registration of single rows against an earlier scan of the same place. Pure.
 
-The rows of a scan arrive one by one, while the sample drifts. A row alone fixes its place badly (a flat terrace, one
-particle), so the cost of every shift in a window is summed over rows, and older rows count less. The remainder of a
-shift below a pixel is fitted with offset and tilt of the row: to first order it adds the template's two slopes.
+The rows of a scan arrive one by one, while the sample drifts. A single row determines the shift badly (a flat terrace,
+one particle), so the cost of every shift in a window is summed over rows, with less weight for older rows. The subpixel
+part of the shift is fitted together with offset and tilt of the row: to first order it adds the template's two slopes.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class RowTemplate:
 
     Attributes:
         heights: in m, [y, x], rows levelled, without holes.
-        slopes: along the rows, [y, x - 1].
+        slopes: differences along the rows, [y, x - 1].
         row_slopes, column_slopes: the gradient, in m per pixel.
-        spline: coefficients of the heights: linear interpolation would change sharp features with the part of a pixel.
+        spline: cubic spline coefficients of the heights; linear interpolation would blur sharp features between pixels.
         spread: typical size of a slope.
-        trusted: by row; False: a scar, say, which another scan does not show.
+        trusted: by row; False for a row with a defect such as a scar, which other scans do not show.
     """
 
     heights: Array
@@ -59,7 +59,7 @@ class RowTemplate:
         """Prepare a scan; rows without values are filled from their neighbours.
 
         Args:
-            doubtful: rows that are compared with nothing.
+            doubtful: rows to exclude from all comparisons.
         """
         level = levelled(heights)
         rows = np.arange(len(level))
@@ -77,11 +77,11 @@ class RowTemplate:
 
 @dataclass(frozen=True)
 class RowFit:
-    """A row less its template.
+    """The difference between a row and its template.
 
     Attributes:
         residual: in m, NaN where not comparable.
-        steepness: of the template at each pixel, in m per pixel.
+        steepness: slope of the template at each pixel, in m per pixel.
     """
 
     residual: Array
@@ -89,13 +89,13 @@ class RowFit:
 
 
 class RowRegistration:
-    """Follows the shift between the running scan and its template.
+    """Tracker of the shift between the running scan and its template.
 
     Args:
         template: the earlier scan.
         expected: predicted shift.
-        reach: largest deviation from it that is searched, (rows, columns).
-        steady: see `STEADY`; 1: the best shift, wherever it is, without `PULL`.
+        reach: largest deviation from `expected` that is searched, (rows, columns).
+        steady: see `STEADY`; 1: take the best shift anywhere in the window, without `PULL`.
     """
 
     def __init__(self, template: RowTemplate, expected: Shift, reach: tuple[int, int], steady: float = STEADY) -> None:
@@ -110,7 +110,7 @@ class RowRegistration:
         self.shift: Shift = expected
 
     def follow(self, number: int, row: Array) -> None:
-        """Take a levelled row (its index in the scan) into the shift."""
+        """Update the shift with a levelled row, given with its index in the scan."""
         cost = self._costs(number, np.diff(row))
         if cost is None:
             return
@@ -118,7 +118,7 @@ class RowRegistration:
         self.shift = self._best(self._cost)
 
     def fit(self, number: int, row: Array, template: RowTemplate | None = None) -> RowFit | None:
-        """Return what the template does not explain of a levelled row; None where it does not cover the row.
+        """Return the difference of a levelled row from the template; None if the template does not cover the row.
 
         Args:
             template: another channel of the same scan.
@@ -182,15 +182,16 @@ def likely_shifts(
     reach: tuple[int, int],
     flat_m: float,
 ) -> list[Shift]:
-    """Return the shifts in whole pixels that explain some lines best, the best first.
+    """Return the shifts in whole pixels with the best fit of some lines, best first.
 
-    Unlike `RowRegistration` it compares heights: the flat ground beside a step shows a shift that its edge does not.
+    Unlike `RowRegistration`, this search compares heights: the flat ground beside a step shows shifts that its edge
+    does not.
 
     Args:
-        lines: index in the scan and levelled row.
-        about: middle of the search.
-        reach: largest deviation from it that is searched, (rows, columns).
-        flat_m: usual difference of flat pixels.
+        lines: (index in the scan, levelled row) of each line.
+        about: centre of the search.
+        reach: largest deviation from `about` that is searched, (rows, columns).
+        flat_m: usual difference on flat pixels.
     """
     (down, along), (ny, nx) = (round(at) for at in about), template.heights.shape
     rows, columns = np.arange(-reach[0], reach[0] + 1) + down, np.arange(nx + 2 * reach[1]) + along - reach[1]
@@ -225,7 +226,7 @@ def likely_shifts(
 
 
 def levelled(rows: Array) -> Array:
-    """Return rows without offset and tilt, which drift in z and the mounting of the sample cause."""
+    """Return rows without their offset and tilt, which come from z drift and the mounting of the sample."""
     rows = np.array(rows, dtype=np.float64, ndmin=2)
     there = np.isfinite(rows)
     for row, good in zip(rows, there, strict=True):
@@ -243,7 +244,7 @@ def levelled(rows: Array) -> Array:
 
 
 def robust_spread(values: Array) -> float:
-    """Return the standard deviation by the median of absolute values, never zero."""
+    """Return the standard deviation, estimated from the median absolute value; never zero."""
     there = values[np.isfinite(values)]
     half = there.size // 2
     # the upper of the two middle values: a tenth of the time that numpy's median takes on a row

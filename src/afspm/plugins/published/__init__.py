@@ -1,13 +1,13 @@
-"""The bridge to the published implementation: its programs join an afspm experiment, and its files are read.
+"""Bridge to the published implementation: its programs can join an afspm experiment, and afspm reads its files.
 
 Theory of operation
 -------------------
 
 Programs of the published implementation ("peers") speak version 1 of the protocol: the messages of the paper, over
 plain TCP, without ids, keys or heartbeats, one request at a time. They end on an unknown envelope or request number,
-and process one message per poll of about 0.4 s. A process of this package stands between peers and afspm. Outside it
-binds or connects to the addresses that the peers know, and speaks version 1. Inside it is an ordinary client,
-translator or scheduler of afspm.
+and process one message per poll of about 0.4 s. A process of this package connects peers and afspm. Outside (towards
+the peers) it binds or connects to the addresses that the peers know, and speaks version 1. Inside (towards afspm) it is
+an ordinary client, translator or scheduler.
 
 | class | outside | inside |
 | --- | --- | --- |
@@ -16,10 +16,11 @@ translator or scheduler of afspm.
 | `PublishedTranslator` | DEALER and SUB, as the scheduler of a peer translator | a translator |
 | `PublishedScheduler` | one DEALER for each client, and SUB, as clients of a peer scheduler | a scheduler |
 
-What always holds: only messages of version 1 go outside (`version_1`). A request goes outside once, since peers have no
-request ids; inside, its answer has the id of the request. To a subscriber outside, times increase, and packets that a
-peer would miss are delayed (`version_1.Pacing`).
+What always holds: only messages of version 1 go outside (`version_1`). A request is sent outside only once, since peers
+have no request ids; inside, its answer has the id of the request. Subscribers outside see increasing times, and packets
+that a peer would miss are delayed (`version_1.Pacing`).
 
 Experiment files of the published form are converted as they are read (`files`), and `afspm check --explain` writes them
-in afspm's form (`short_form`). Nothing is imported here: a file is read without the sockets of the bridge.
+in afspm's form (`short_form`). This module imports nothing, so that reading a file does not load the sockets of the
+bridge.
 """

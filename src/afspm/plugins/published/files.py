@@ -1,4 +1,4 @@
-"""Files of the published implementation: its classes and settings with their counterparts in afspm, if any."""
+"""Classes and settings in files of the published implementation, with their afspm counterparts, if any."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ class PublishedSetting:
     """One setting of a published class.
 
     Attributes:
-        becomes: returns afspm's settings, with dots for tables, from the value and the table that contains it.
-        why: for a setting without counterpart: afspm's way.
+        becomes: returns the afspm settings (dotted names for tables) for a value and its table.
+        why: for a setting without counterpart, how afspm does the same.
     """
 
     becomes: Becomes
@@ -68,7 +68,7 @@ class PublishedClass:
 
 
 def wire_of(table: object) -> str:
-    """Return the name of the published intermediary or function in a value, without its module; empty: none."""
+    """Return the name of the published intermediary or function in a table, without its module; empty if none."""
     name = table.get("class") if isinstance(table, Mapping) else None
     if not isinstance(name, str) or not name.startswith(WIRES):
         return ""
@@ -77,10 +77,10 @@ def wire_of(table: object) -> str:
 
 
 def converted(value: object, channels: Mapping[str, str]) -> Any:
-    """Convert intermediaries within a value, and replace calls of published functions by the returned envelope.
+    """Convert intermediaries within a value, and replace calls of published functions by the resulting envelope.
 
     Args:
-        channels: new names of the file's channels.
+        channels: new names of the file's channels, by old name.
     """
     if isinstance(value, list):
         return [converted(item, channels) for item in value]
@@ -111,7 +111,7 @@ def _combined(table: Table) -> Settings:
 
 
 def with_channels(table: Table, channels: Mapping[str, str]) -> Settings:
-    """Return the table of a published function with its channels renamed; others stay."""
+    """Return the table of a published function with its channels renamed; other tables are returned unchanged."""
     renamed = dict(table)
     match wire_of(renamed):
         case "create_roi_scan_envelope" if "channel" in renamed:
@@ -122,7 +122,7 @@ def with_channels(table: Table, channels: Mapping[str, str]) -> Settings:
 
 
 def cache_section(logic: object) -> Settings:
-    """Return [cache] for a published logic of the cache. A number among the sizes is in nm, as in envelopes."""
+    """Return the section [cache] for a published cache logic. Sizes without a unit are in nm, as in envelopes."""
     if wire_of(logic) not in CACHE_LOGIC or not isinstance(logic, Mapping):
         return {}
     count = logic.get("default_scan_history")
@@ -142,9 +142,9 @@ def cache_section(logic: object) -> Settings:
 
 
 def envelope(table: Table) -> object:
-    """Return the envelope that a published function makes: create_spec_envelope, or create_roi_scan_envelope.
+    """Return the envelope that create_spec_envelope or create_roi_scan_envelope returns for a table of arguments.
 
-    A size without a unit is in nm, as in the envelopes themselves. A table that makes no envelope is returned
+    A size without a unit is in nm, as in the envelopes themselves. A table with unusable arguments is returned
     unchanged.
     """
     if wire_of(table) == "create_spec_envelope":
@@ -157,18 +157,18 @@ def envelope(table: Table) -> object:
 
 
 def length_m(value: str | float) -> float:
-    """Return a length of the cache's settings in m: a text with its unit, or a number in nm."""
+    """Return a length in the cache settings in m: a text with its unit, or a number in nm."""
     return units.si(value, "m") if isinstance(value, str) else float(value) * 1e-9
 
 
 def renamed_channels(components: Mapping[str, Table]) -> dict[str, str]:
-    """Return the channels of simulated pictures in a file, each with its afspm name."""
+    """Return the afspm names of the channels of simulated pictures in a file, by their old names."""
     pictures = (table for table in components.values() if last(table) in _PICTURES)
     return {str(table["channel_id"]): CHANNEL for table in pictures if "channel_id" in table}
 
 
 def class_of(table: Table) -> PublishedClass | None:
-    """Return the counterpart of a component's class; None for an unknown class."""
+    """Return the afspm counterpart of a component's class; None for an unknown class."""
     name, path = last(table), str(table.get("class", ""))
     if not path.startswith(COMPONENTS) and name != "DriftImageTranslator":  # beside the file, in its samples
         return None
@@ -182,15 +182,15 @@ def class_of(table: Table) -> PublishedClass | None:
 
 
 def without_counterpart(path: str) -> str:
-    """Return the advice for a published class without counterpart; empty for all others."""
+    """Return advice for a published class without counterpart; empty for all other classes."""
     return INSTEAD.get(path.rpartition(".")[2], "") if path.startswith(COMPONENTS) else ""
 
 
 def put(settings: Settings, name: str, value: object) -> None:
-    """Set a setting that may be within tables: put({}, "drift.channel", "Height").
+    """Set a setting, by a dotted name if it is within tables: put({}, "drift.channel", "Height").
 
     Raises:
-        InvalidValue: it has another value already.
+        InvalidValue: the setting already has another value.
     """
     *tables, key = name.split(".")
     for table in tables:
@@ -202,7 +202,7 @@ def put(settings: Settings, name: str, value: object) -> None:
 
 
 def last(table: Table) -> str:
-    """Return the name of a table's class, without its module."""
+    """Return the class name in a table, without its module."""
     return str(table.get("class", "")).rpartition(".")[2]
 
 
@@ -389,7 +389,7 @@ INSTEAD: Final[dict[str, str]] = {
 
 
 def convert(tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
-    """Return the components of a file in afspm's form, and convert intermediaries and [cache] of `parts` in place."""
+    """Return a file's components in afspm's form; convert the intermediaries and [cache] of `parts` in place."""
     channels = renamed_channels(tables)
     conversion = _Conversion(channels, parts, document)
     for table in tables.values():
@@ -415,7 +415,7 @@ def _wires_of(table: Table) -> Settings:
 
 @dataclass(frozen=True)
 class _Conversion:
-    """The conversion of one file's components, with the result for each line of the file."""
+    """Conversion of one file's components, with the result for each line of the file."""
 
     channels: Mapping[str, str]
     parts: ExperimentParts
@@ -433,7 +433,7 @@ class _Conversion:
             given.update({key: value for key, value in (("history", history), ("rules", rules)) if value})
 
     def note_intermediary(self, name: str, table: Table) -> None:
-        """Note the result of an intermediary table."""
+        """Note the result of converting an intermediary table."""
         kind = wire_of(table)
         if kind in ENVELOPES:
             self.parts.became[(name,)] = f"the envelope {toml(envelope(with_channels(table, self.channels)))}"
@@ -441,7 +441,7 @@ class _Conversion:
             self.parts.became[(name,)] = "[cache]"
 
     def component(self, name: str, table: Settings, written: Table) -> Settings | None:
-        """Return a component in afspm's form; None: it has no process of its own in afspm.
+        """Return a component in afspm's form; None if afspm needs no process for it.
 
         Args:
             written: the component before its intermediaries were converted.
@@ -470,7 +470,7 @@ class _Conversion:
         return {**settings, "class": ours.ours}
 
     def drop_rescanners(self, ours: dict[str, Settings]) -> None:
-        """Leave out a rescanner if no drift scheduler would request rescans."""
+        """Remove rescanners if no drift scheduler is there to request rescans."""
         if any(table.get("class") == "DriftCompensatedScheduler" for table in ours.values()):
             return
         for name in [name for name in ours if self.parts.became.get((name, "class")) == 'class = "Rescanner"']:

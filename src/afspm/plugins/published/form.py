@@ -1,4 +1,4 @@
-"""The form of the files of the published implementation, for the entry point `afspm.forms`."""
+"""File form of the published implementation, for the entry point `afspm.forms`."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 
 
 class PublishedForm:
-    """The published implementation's file form; see `experiment.forms.FileForm`."""
+    """File form of the published implementation; see `experiment.forms.FileForm`."""
 
     def convert(self, tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
         """Return the components of a file in afspm's form."""
         return convert(tables, parts, document)
 
     def explained(self, resolved: ResolvedExperiment) -> list[tuple[SourceLocation, str, str]]:
-        """Return for each line of the file its place, its setting, and its result."""
+        """Return the location, setting and result of each line of the file."""
         from afspm.plugins.published.short_form import explained  # not needed to run a file
 
         return explained(resolved)

@@ -1,4 +1,4 @@
-"""Components of the published implementation in an afspm experiment, and afspm's microscope for their scheduler."""
+"""Bridge for components of the published implementation in an afspm experiment, or for their scheduler."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ class PublishedPeers:
     In the afspm scheduler each of them is a client with its own name.
 
     Args:
-        serve: the address that their control clients connect to.
-        publish: the address that their subscribers connect to.
+        serve: address for the control clients of the peers.
+        publish: address for the subscribers of the peers.
         as_translator: act as the translator instead, for the published scheduler or test suite. Packets then have a
             translator's envelopes, and this process takes control before each command.
     """
@@ -82,12 +82,12 @@ class PublishedPeers:
 
 
 class _PeerClient:
-    """One client of the afspm scheduler for one peer; or, in place of a translator, for all peers.
+    """One client of the afspm scheduler, for one peer; with `as_translator`, for all peers.
 
     Attributes:
-        asked: requests without an answer, by id: the peer's identity, the number, and the frames sent.
-        admitted: whether the scheduler has answered under this name; before, a failure concerns the name itself.
-        leaves: whether the peer is gone with its last request still unanswered.
+        asked: unanswered requests, by id: the peer's identity, the request number, and the frames sent.
+        admitted: whether the scheduler has accepted this name; until then, a failure concerns the name itself.
+        leaves: whether the peer has disconnected before its last request was answered.
     """
 
     def __init__(self, bridge: _PeersPort, name: str) -> None:
@@ -165,15 +165,15 @@ class _PeersPort(BasePort[Incoming]):
         return None if due_s == math.inf else due_s - self._clock.monotonic_s()
 
     def is_over(self) -> bool:
-        """Return whether the experiment and the time for last answers are over."""
+        """Return whether the experiment has ended, and the time for last answers has passed."""
         return self._clock.monotonic_s() >= self._ends_s
 
     def publish_due(self) -> None:
-        """Replay to late joiners, then publish due packets."""
+        """Send the replay to late joiners if due, then publish due packets."""
         self._outlet.publish_due()
 
     def answer(self, client: _PeerClient, identity: bytes, asked: int, response: Response) -> None:
-        """Answer a peer, if it is still there."""
+        """Answer a peer; discard the client if the peer has left and all its requests are answered."""
         is_refused = response.code == ControlResponse.FAILURE and not client.admitted
         client.admitted = client.admitted or not is_refused
         self._reply(identity, version_1.answer_frames(asked, response, reason=is_refused))
@@ -293,7 +293,7 @@ class _PeersPort(BasePort[Incoming]):
             self._poller.register(subscriber.monitor.socket, subscriber.follow)
 
     def take(self, incoming: Incoming) -> None:
-        """Process a packet or the end from the afspm scheduler."""
+        """Process a packet from the afspm scheduler, or the end of the experiment."""
         match incoming:
             case PacketReceived(packet, _):
                 self._take_packet(packet)
@@ -328,7 +328,7 @@ class _PeersPort(BasePort[Incoming]):
 
 
 class _Outlet:
-    """A publisher to SUB sockets: first a replay to late joiners, then paced packets.
+    """Publisher of packets to the peers: first a replay to late joiners, then new packets at a limited pace.
 
     Attributes:
         pacing: the queue of packets to publish.
@@ -348,7 +348,7 @@ class _Outlet:
 
     @property
     def due_s(self) -> float:
-        """Return the time of the next publication; infinity if nothing waits."""
+        """Return the time of the next publication; infinity if none is due."""
         return min(self.pacing.due_s, self._replay_s)
 
     def subscriptions(self) -> list[str]:
@@ -374,7 +374,7 @@ class _Outlet:
         return meant
 
     def publish_due(self) -> None:
-        """Replay to late joiners, then publish due packets."""
+        """Send the replay to late joiners if due, then publish due packets."""
         now_s = self._clock.monotonic_s()
         if now_s >= self._replay_s:
             prefixes, self._joined, self._replay_s = tuple(self._joined), set(), math.inf
@@ -385,7 +385,7 @@ class _Outlet:
             self._publish(packet)
 
     def end(self) -> None:
-        """Publish all waiting packets, and the end of the experiment."""
+        """Publish all waiting packets, then the end of the experiment."""
         for packet in self.pacing.take_all():
             self._publish(packet)
         self.socket.send(wire.KILL)
@@ -398,7 +398,7 @@ class _Outlet:
 
 
 class _Receiver:
-    """Hands messages of one subscriber to the bridge."""
+    """Adapter that passes messages of one subscriber to the bridge."""
 
     def __init__(self, bridge: _PeersPort, subscriber: Subscriber) -> None:
         self._bridge, self._subscriber = bridge, subscriber

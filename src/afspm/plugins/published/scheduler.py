@@ -1,4 +1,4 @@
-"""Components of afspm under a scheduler of the published implementation."""
+"""Bridge for afspm components under a scheduler of the published implementation."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ MOST_ANSWERS: Final = 256
 
 
 class PublishedScheduler:
-    """A substitute for a scheduler of the published implementation, which arbitrates control.
+    """An afspm scheduler that passes all requests on to a scheduler of the published implementation.
 
     Args:
-        serve: the address of its router.
-        publish: the address of its publisher.
+        serve: address of the published scheduler's router.
+        publish: address of the published scheduler's publisher.
         control, limits, cache: sections of the experiment file, which the published scheduler's own configuration
             replaces. Limits are refused, since nothing would enforce them.
     """
@@ -81,12 +81,12 @@ class PublishedScheduler:
 
 
 class _ClientOutside:
-    """The connection of one client to the published scheduler.
+    """Connection of one afspm client to the published scheduler.
 
     Attributes:
         connection: the newest connection of the client.
-        asked: requests without an answer, oldest first: a REQ socket has one at a time.
-        answers: to the latest requests, by id.
+        asked: unanswered requests, oldest first; only the first is sent, as a REQ socket would do.
+        answers: answers to the latest requests, by id.
     """
 
     def __init__(self, bridge: _SchedulerPort, name: str) -> None:
@@ -103,7 +103,7 @@ class _ClientOutside:
         self._is_sent = False
 
     def ask(self, request: Request) -> None:
-        """Send a request once earlier ones are answered; repeat the known answer to a repeated one."""
+        """Send a request once earlier ones are answered; resend the known answer to a repeated request."""
         if request.id and request.id in self.answers:
             self._bridge.reply(self, self.answers[request.id])
         elif not request.id or all(request.id != one.id for one in self.asked):
@@ -160,7 +160,7 @@ class _ClientOutside:
 
 
 class _SchedulerPort(BasePort[Incoming]):
-    """All sockets of the process: outside one for each client of afspm, inside the sockets of a scheduler."""
+    """All sockets of the process: one per afspm client towards the published scheduler, and an afspm scheduler's."""
 
     def __init__(self, context: ProcessContext, serve: str, publish: str) -> None:
         launch = context.launch
@@ -191,11 +191,11 @@ class _SchedulerPort(BasePort[Incoming]):
         return None if due_s == math.inf else due_s - self._clock.monotonic_s()
 
     def is_over(self) -> bool:
-        """Return whether the experiment and the time for last answers are over."""
+        """Return whether the experiment has ended, and the time for last answers has passed."""
         return self._clock.monotonic_s() >= self._ends_s
 
     def open_when_cached(self) -> None:
-        """Let afspm's components connect once the published scheduler has had time to send its cache."""
+        """Accept afspm's components once the published scheduler has had time to send its cache."""
         if self._clock.monotonic_s() >= self._opens_s and self.launch.sockets.serve is not None:
             self._opens_s = math.inf
             self._router = Router(self._network, self.launch.sockets.serve, self._warnings, self._clock)
@@ -203,7 +203,7 @@ class _SchedulerPort(BasePort[Incoming]):
             self._poller.register(self._router.monitor.socket, self._requests)
 
     def known_answer(self, request: Request) -> Response | None:
-        """Return the answer to a request that would end the published scheduler; None: send the request."""
+        """Return the answer to a request that would crash the published scheduler; None if the request can be sent."""
         if not version_1.has_request(request.kind):
             return version_1.unknown_request(request.kind, "scheduler", request.id)
         if request.kind == ControlRequest.RMV_EXP_PRBLM and request.subject not in self._flagged | self._unpublished:
@@ -211,7 +211,7 @@ class _SchedulerPort(BasePort[Incoming]):
         return None
 
     def note(self, request: Request, response: Response) -> None:
-        """Remember flagged problems."""
+        """Update the set of flagged problems after a successful request."""
         if response.ok and request.kind == ControlRequest.ADD_EXP_PRBLM:
             self._unpublished.add(int(request.subject))
         elif response.ok and request.kind == ControlRequest.RMV_EXP_PRBLM:

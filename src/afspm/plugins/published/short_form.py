@@ -1,4 +1,4 @@
-"""The short form of a file of the published implementation, and the result of each of its lines."""
+"""Short form of a published experiment file, and the result of each of its lines."""
 
 from __future__ import annotations
 
@@ -27,14 +27,15 @@ _FILLED_IN: Final = "filled in: processes on one computer find each other"
 
 
 def explained(resolved: ResolvedExperiment) -> list[tuple[SourceLocation, str, str]]:
-    """Return for each line of the file its place, its setting, and its result."""
+    """Return the location, setting and result of each line of the file."""
     return [(resolved.document.place(*path), _shown(path), became) for path, became in _lines(resolved)]
 
 
 def short(resolved: ResolvedExperiment) -> str:
     """Return the experiment in the short form: components with their settings, and sections unlike the defaults.
 
-    A component without counterpart becomes a substitute if the settings determine one, else a comment with advice.
+    A component without counterpart is replaced by a substitute if its settings determine one, else by a comment with
+    advice.
     """
     parts = resolved.parts
     kept = {name: parts.variables[name] for name in _VARIABLES if name in parts.variables}

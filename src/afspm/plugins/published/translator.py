@@ -1,4 +1,4 @@
-"""A translator of the published implementation under an afspm scheduler."""
+"""Bridge for a translator of the published implementation under an afspm scheduler."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ _OWN = b"own"  # the id of this process's own requests, which clients' requests 
 
 
 class PublishedTranslator:
-    """A substitute for a translator of the published implementation, for an afspm scheduler.
+    """An afspm translator that passes requests on to a translator of the published implementation.
 
     Args:
-        serve: the address of its control server.
-        publish: the address of its publisher.
+        serve: address of the published translator's control server.
+        publish: address of the published translator's publisher.
         program: command that starts the translator; its standard input gets afspm's launch line with both addresses.
         spectra_by_variable: whether the translator sends the values of a spectrum variable by variable, as the
-            published ones for Nanonis and Asylum.
+            published translators for Nanonis and Asylum do.
     """
 
     role: ClassVar[Role] = Role.TRANSLATOR
@@ -109,13 +109,13 @@ class PublishedTranslator:
 
 
 class SimulatedPublishedTranslator(PublishedTranslator):
-    """A translator of the published implementation with a microscope declared as simulated."""
+    """A published translator whose microscope is declared as simulated."""
 
     simulated: ClassVar[bool] = True
 
 
 class _Stop:
-    """A request to end: from the parent, or by the end of the started program."""
+    """Request to end, set by the parent or by the end of the started program."""
 
     def __init__(self) -> None:
         self.is_set = self.child_ended = False
@@ -154,7 +154,7 @@ def _started(
 
 
 def by_point(payload: bytes) -> bytes:
-    """Return a Spec1d point by point whose values came variable by variable. Raises WireError."""
+    """Return a Spec1d with its values reordered from variable by variable to point by point. Raises WireError."""
     spectrum = wire.decode(SPECTRUM.name, payload)
     points, variables = spectrum.values.shape
     return wire.encode(replace(spectrum, values=spectrum.values.reshape(variables, points).T))[1]
@@ -178,7 +178,7 @@ def _is_connected(launch: Launch, address: str, stop: _Stop) -> bool:
 
 
 class _TranslatorPort(ZmqServerPort):
-    """A port with a translator's sockets towards afspm and a scheduler's towards the published translator."""
+    """Port with a translator's sockets towards afspm, and a scheduler's sockets towards the published translator."""
 
     def __init__(self, context: ProcessContext, memory: Memory, serve: str, publish: str, *, by_variable: bool) -> None:
         launch = context.launch

@@ -1,6 +1,6 @@
-"""Version 1 of the protocol: the messages that its programs can read, and a pace that they can follow.
+"""Version 1 of the protocol: the messages that its programs can read, and the pace that they can follow.
 
-Any other envelope or request number ends them.
+Its programs end on any other envelope or request number.
 """
 
 from __future__ import annotations
@@ -47,23 +47,23 @@ _WITHOUT_OBJECT = (ControlRequest.RELEASE_CTRL, ControlRequest.END_EXPERIMENT)
 
 
 def outside(launch: Launch) -> Network:
-    """Return a network for plain sockets: on this computer only, unless [security] insecure is set."""
+    """Return a network for plain sockets, limited to this computer unless [security] insecure is set."""
     return Network(insecure=bool(launch.keys and launch.keys.get("insecure")))
 
 
 def has_request(number: int) -> bool:
-    """Return whether version 1 has a request of this number."""
+    """Return whether version 1 defines a request number."""
     return ControlRequest.UNDEFINED < number <= ControlRequest.ACTION_SUPPORT
 
 
 def request_frames(request: Request) -> list[bytes]:
-    """Return a request in the frames of version 1: its number, and its object (possibly empty) if it takes one."""
+    """Return a request as frames of version 1: its number, and its object (possibly empty) if the request takes one."""
     number = bytes([request.kind])
     return [number] if request.kind in _WITHOUT_OBJECT else [number, request.payload or encode_subject(request.subject)]
 
 
 def answer_frames(asked: int, response: Response, *, reason: bool = False) -> list[bytes]:
-    """Return a response in the frames of version 1: number and object.
+    """Return a response as frames of version 1: number and object.
 
     Args:
         asked: the number of the request; the answer to REQ_PARAM always has an object, possibly empty.
@@ -76,13 +76,13 @@ def answer_frames(asked: int, response: Response, *, reason: bool = False) -> li
 
 
 def unknown_request(number: int, whose: str, request_id: str) -> Response:
-    """Return the answer to a request whose number would end the peer, so that it is not sent outside."""
+    """Return the refusal of a request number unknown to version 1, which would end the peer if sent."""
     reason = f"the {whose} is of version 1 of the protocol, which has no request {number}"
     return Response(int(ControlResponse.CMD_NOT_SUPPORTED), b"", reason, request_id)
 
 
 def topics_meant(prefix: str) -> list[str]:
-    """Return the prefixes that a subscription of version 1 means: a common beginning stands for its known messages.
+    """Return the prefixes that a version 1 subscription stands for: all known messages that begin with it, or itself.
 
     >>> topics_meant("Scan")
     ['Scan2d', 'ScanParameters2d']
@@ -93,10 +93,11 @@ def topics_meant(prefix: str) -> list[str]:
 
 
 class Pacing:
-    """Delays packets for peers that process one message per poll and see only the last state; keeps their order.
+    """Queue that delays packets, in order, for peers that process one message per poll and see only the last state.
 
-    Scans go out `PAUSE_S` apart. The state after SS_MOVING or SS_INTERRUPTED goes out `PAUSE_S` after it, and after the
-    last settings in between. Above `MOST_WAITING` packets the oldest go out at once.
+    Scans are released `PAUSE_S` apart. The state that follows SS_MOVING or SS_INTERRUPTED is released `PAUSE_S` later,
+    counted from the last settings in between, if any. With more than `MOST_WAITING` packets, the oldest are released at
+    once.
     """
 
     def __init__(self) -> None:
@@ -110,12 +111,12 @@ class Pacing:
 
         Args:
             message: the name of its message.
-            state: the state in a ScopeStateMsg; None for others.
+            state: the state in a ScopeStateMsg; None for other messages.
         """
         self._waiting.append((packet, message, state))
 
     def hold(self, until_s: float) -> None:
-        """Hold all packets until a time, so that a late joiner first gets earlier packets."""
+        """Hold all packets until `until_s`, so that a late joiner first receives earlier packets."""
         self._held_until_s = max(self._held_until_s, until_s)
 
     def take(self, now_s: float) -> list[Packet]:
@@ -128,14 +129,14 @@ class Pacing:
         return due
 
     def take_all(self) -> list[Packet]:
-        """Return all packets, at the end of the experiment."""
+        """Remove and return all packets, at the end of the experiment."""
         rest = [packet for packet, _, _ in self._waiting]
         self._waiting.clear()
         return rest
 
     @property
     def due_s(self) -> float:
-        """Return the time of the next packet; infinity if none waits."""
+        """Return the time of the next packet; infinity if none is waiting."""
         if not self._waiting:
             return math.inf
         _, message, state = self._waiting[0]

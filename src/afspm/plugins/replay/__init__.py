@@ -1,1 +1,1 @@
-"""A recorded run published again, which programs join as they join a running experiment (`afspm replay`)."""
+"""`afspm replay`: publishes a recorded run again, so that programs can join it like a running experiment."""

@@ -1,4 +1,4 @@
-"""Replay: a recorded run published again, from a folder that programs find as if the experiment ran."""
+"""Replay of a recorded run, with a run folder through which programs find it like a running experiment."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class ReplayOptions:
     """Options of a replay.
 
     Attributes:
-        speed: experiment seconds in a real second; None: as recorded.
+        speed: experiment seconds per real second; None: as recorded.
         only: names of messages; empty: all.
-        publish, serve: addresses; None: those of the recorded experiment file, else free ones.
+        publish, serve: addresses; None: from the recorded experiment file, else free addresses.
         stay: whether to serve late joiners after the last packet.
-        runs: folder for the run folder.
+        runs: parent folder of the replay's run folder.
     """
 
     speed: float | None = None
@@ -56,8 +56,8 @@ def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> 
     """Publish a recorded run again until its end or Ctrl-C; return the number of packets published.
 
     Raises:
-        FileError: there is no record, or it is damaged.
-        ConfigError: there is nothing to publish, or no such message.
+        FileError: the record is missing or damaged.
+        ConfigError: there is nothing to publish, or a message is unknown.
         TransportError: an address can't be used.
     """
     with open_run(where) as run:

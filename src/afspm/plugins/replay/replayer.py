@@ -1,4 +1,4 @@
-"""Replays a recorded run in place of a scheduler: it publishes the packets, and refuses every command."""
+"""`Replayer`: publishes recorded packets in place of a scheduler, and refuses every command."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class Replayer:
     """A publisher of recorded packets, each at its recorded time.
 
     Args:
-        recorded: the packets.
-        clock: shows the time of the recorded run.
+        recorded: the recorded packets.
+        clock: clock that shows the time of the recorded run.
 
     Raises:
         TransportError: an address can't be used.
@@ -64,10 +64,10 @@ class Replayer:
         """The number of packets published."""
 
     def run(self, *, stay: bool = False) -> None:
-        """Publish until the last packet or `stop`, then publish the end of the experiment.
+        """Publish packets until the last one or `stop`, then publish the end of the experiment.
 
         Args:
-            stay: wait for `stop` after the last packet, too.
+            stay: after the last packet, wait for `stop`.
         """
         while not self._stopping and (self._recorded.next_ns is not None or stay):
             self._serve(self._due_in_s())
@@ -75,7 +75,7 @@ class Replayer:
         self._publish_end()
 
     def stop(self) -> None:
-        """Make `run` return. May be called from any thread, or a signal handler."""
+        """Make `run` return. Can be called from any thread, or from a signal handler."""
         self._stopping = True
         self._wake_up.post()
 

@@ -1,4 +1,4 @@
-"""Other instruments by SECoP: a cryostat, a magnet, a lock-in amplifier … as a component of the experiment.
+"""SECoP instruments (a cryostat, a magnet, a lock-in amplifier …) as components of the experiment.
 
 **Theory of operation.** SECoP is a protocol of text lines and JSON (https://sampleenvironment.github.io/secop-site).
 The client asks each module for its value, status and target about once a second, and reports them to the scheduler;
@@ -7,12 +7,12 @@ the answer to a report carries the targets to set.
     comes in      lines of the SECoP server; orders of the scheduler; time
     state         `SecopClient`: what the server described, the newest values, the order in progress
     goes out      lines to the server; readings and outcomes for the scheduler
-    always holds  an age counts from the moment at which the value was asked for, on this computer's own clock; a
+    always holds  the age of a value counts from its request, on this computer's own clock; a
                   target is sent in the unit that the server described first; a limited rate is kept by the server's own
                   ramp, which is read back, or by steps of the target
 
     module          decides
     `lines`         one line of the protocol, to and from text
-    `secop_client`  everything else; it knows no socket and no clock
+    `secop_client`  everything else, without socket and clock
     `instrument`    the component, with its socket
 """

@@ -105,10 +105,10 @@ class Instrument(Component):
 
 
 class LineSocket:
-    """A TCP connection that never waits, except for its beginning.
+    """TCP connection that exchanges lines and blocks only while connecting.
 
     Raises:
-        OSError: there is no connection; also every method.
+        OSError: there is no connection; every method raises it, too.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -117,7 +117,7 @@ class LineSocket:
         self._in = self._out = b""
 
     def receive(self) -> list[str]:
-        """Return the whole lines that have come, and send what could not be sent before."""
+        """Return the complete lines received so far; also send unsent data."""
         self._flush()
         while True:
             try:

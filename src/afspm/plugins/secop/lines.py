@@ -12,12 +12,12 @@ LONGEST = 1 << 20
 
 @dataclass(frozen=True)
 class SecopLine:
-    """One message of a server.
+    """One message of a SECoP server.
 
     Attributes:
         action: such as "update", "reply", "changed", "error_read".
         specifier: "module:accessible", or the name of a module.
-        data: decoded JSON; None: there is none.
+        data: decoded JSON; None without data.
     """
 
     action: str
@@ -26,12 +26,12 @@ class SecopLine:
 
     @property
     def value(self) -> object:
-        """The value of a data report, [value, qualifiers]."""
+        """The value in a data report, [value, qualifiers]."""
         return self.data[0] if isinstance(self.data, list) and self.data else None
 
     @property
     def time(self) -> object:
-        """The server's own time of the value; None if it gives none."""
+        """The server's own time of the value; None if missing."""
         qualifiers = self.data[1] if isinstance(self.data, list) and len(self.data) > 1 else None
         return qualifiers.get("t") if isinstance(qualifiers, dict) else None
 
@@ -43,7 +43,7 @@ class SecopLine:
 
 
 def parse(line: str) -> SecopLine | None:
-    """Return a line of a server; None if it is no SECoP."""
+    """Return the message in a line of a server; None if the line is not SECoP."""
     action, _, rest = line.strip().partition(" ")
     specifier, _, text = rest.partition(" ")
     if not action:

@@ -1,6 +1,6 @@
-"""`SecopClient`: all decisions of a SECoP client, without socket and clock.
+"""`SecopClient`: the decisions of a SECoP client, without socket and clock.
 
-Feed it with `connected`, `take`, `lost` and `tick`, each with the time; each returns the lines to send.
+The caller reports events with `connected`, `take`, `lost` and `tick`, and sends the lines that they return.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ _SECONDS = {"s": 1.0, "sec": 1.0, "min": 60.0, "h": 3600.0, "hr": 3600.0}
 
 
 class ServerUnfit(Exception):
-    """The server can't be used as the experiment file demands, and why."""
+    """Error: the server does not provide what the experiment file demands."""
 
 
 @dataclass
 class Channel:
-    """One parameter of the experiment, and its accessibles at the server.
+    """One parameter of the experiment, with its accessibles at the server.
 
     Attributes:
-        value, target, status, ramp: "module:accessible"; empty: the module has none.
-        first_unit: of its first description; a later one is not believed.
+        value, target, status, ramp: "module:accessible"; empty if the module has none.
+        first_unit: unit in the first description; a later change of unit is a fault.
         per_s: factor from the unit of `ramp` to `unit` per second.
-        asked_s: when the value was asked for that has not come yet; None: none is on its way.
-        measured_s: when the newest value was asked for.
-        last_answer: the server's own time of the last value that was asked for, and this value.
-        changed_s: when its target was set; target_answered_s: when its target was last reported on request.
-        fault: why there is no value.
-        fault_of_status: why the value is not believed, by the status of the module.
+        asked_s: time of the unanswered request for the value; None if there is none.
+        measured_s: time of the request for the newest value.
+        last_answer: (server's own time, value) of the last answer.
+        changed_s: time when the target was set; target_answered_s: time of the last answer with the target.
+        fault: reason why there is no value.
+        fault_of_status: reason to distrust the value, from the module's status.
     """
 
     name: str
@@ -82,15 +82,15 @@ class Channel:
 
 @dataclass
 class RampInSteps:
-    """A target on its way to `final`, step by step.
+    """A target that is moved to `final` step by step.
 
     Attributes:
-        sent: the last step, as the server confirmed it; before: the one before.
+        sent: the last step, as confirmed by the server; before: the previous step.
         ideal: the last step before the server rounded it.
-        sent_s: its time.
-        in_flight: it is not confirmed yet.
-        target_s: when the target was asked for, to see whether it is still the last step.
-        is_interrupted: the connection was lost since: the target in force decides how to go on.
+        sent_s: time of the last step.
+        in_flight: whether the last step is still unconfirmed.
+        target_s: time when the target was read, to check that it still equals the last step.
+        is_interrupted: whether the connection was lost: the target read afterwards decides how to continue.
     """
 
     final: float
@@ -109,10 +109,10 @@ class OrderInProgress:
     """The order that the server is carrying out.
 
     Attributes:
-        waits_for: the beginning of the next answer: "changed module:ramp" …
+        waits_for: start of the expected answer, such as "changed module:ramp".
         wanted: the value to send.
-        ramp: the steps that begin with this value; None: it is the final one.
-        ramp_limit: the ramp that the server must confirm, in its unit; None: none was sent.
+        ramp: the steps that begin with `wanted`; None if `wanted` is final.
+        ramp_limit: ramp rate that the server must confirm, in the server's unit; None if none was sent.
     """
 
     order: InstrumentOrder
@@ -125,10 +125,10 @@ class OrderInProgress:
 
 @dataclass
 class SecopClient:
-    """A client of one server.
+    """Client of one SECoP server.
 
     Args:
-        wanted: by parameter, "module" or "module:accessible".
+        wanted: "module" or "module:accessible", by parameter.
     """
 
     wanted: Mapping[str, str]
@@ -154,12 +154,12 @@ class SecopClient:
     # --- the connection ---
 
     def connected(self, now_s: float) -> list[str]:
-        """Begin a new connection."""
+        """Begin a new connection; return the lines to send."""
         self.heard_s, self.is_described = now_s, False
         return [lines.IDENTIFY, lines.DESCRIBE]
 
     def lost(self, why: str) -> None:
-        """End a connection. An order in progress stays without an outcome; steps of a target continue later."""
+        """End a connection. An order in progress stays without an outcome; a target moved in steps continues later."""
         self.is_described, self._progress = False, None
         for channel in self.channels.values():
             channel.asked_s, channel.newest_target, channel.fault = None, None, why
@@ -167,11 +167,11 @@ class SecopClient:
             ramp.is_interrupted, ramp.in_flight = True, False
 
     def is_silent(self, now_s: float) -> bool:
-        """Return whether the server has answered nothing for too long."""
+        """Return whether the server has sent nothing for more than 3 s."""
         return now_s - self.heard_s > SILENT_S
 
     def tick(self, now_s: float) -> list[str]:
-        """Return the lines that are due: questions for values, and steps of targets."""
+        """Return the lines that are due: requests for values, and steps of targets."""
         if not self.is_described:
             return []
         out = []
@@ -187,10 +187,10 @@ class SecopClient:
         return out
 
     def take(self, text: str, now_s: float) -> list[str]:
-        """Process a line of the server.
+        """Process a line of the server; return the lines to send.
 
         Raises:
-            ServerUnfit: it is no SECoP server, or lacks something that the experiment file demands.
+            ServerUnfit: the server is no SECoP server, or lacks something that the experiment file demands.
         """
         self.heard_s = now_s
         if not self.is_described and "SECoP" in text and not text.startswith("describing"):
@@ -214,7 +214,7 @@ class SecopClient:
     # --- readings ---
 
     def readings(self, now_s: float) -> tuple[InstrumentReading, ...]:
-        """Return all values as they are known now."""
+        """Return the current readings of all parameters."""
         return tuple(self._reading(channel, now_s) for channel in self.channels.values())
 
     def _reading(self, channel: Channel, now_s: float) -> InstrumentReading:
@@ -317,7 +317,7 @@ class SecopClient:
     # --- orders ---
 
     def order(self, order: InstrumentOrder, now_s: float) -> list[str]:
-        """Begin an order, unless it is known already; return the lines to send."""
+        """Begin an order unless it is already known; return the lines to send."""
         if self._progress is not None and self._progress.order.id == order.id:
             return []
         if (known := self._done.get(order.id)) is not None:
@@ -473,11 +473,11 @@ class SecopClient:
             self._progress = None
 
     def outcomes(self) -> tuple[OrderOutcome, ...]:
-        """Return the outcomes that were not delivered yet."""
+        """Return the outcomes that were not delivered to the scheduler yet."""
         return tuple(self._outcomes.values())
 
     def delivered(self, outcomes: tuple[OrderOutcome, ...]) -> None:
-        """Forget outcomes that the scheduler has got."""
+        """Forget the outcomes that were delivered to the scheduler."""
         for one in outcomes:
             self._outcomes.pop(one.number, None)
 

@@ -1,4 +1,4 @@
-"""Recorded and replayed outputs beside each other: pure, outputs in, differences out.
+"""Comparison of recorded and replayed outputs. Pure.
 
 Outputs are aligned by message, key and the packet that they answer, the n-th with the n-th; the remaining ones by
 message and key. An output that is added or missing therefore shifts no later one.
@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 
 class PacketName(NamedTuple):
-    """A published packet: its time and its envelope."""
+    """Time and envelope of a published packet, which identify it."""
 
     time_ns: int
     envelope: str
@@ -21,17 +21,17 @@ class PacketName(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """Something that a process sent.
+    """An output of a process: a request or a published message.
 
     Attributes:
         message: name of the request or message.
-        key: the parameter, the action, the problem … within a message.
-        value: compared.
-        text: for people.
-        packet: the packet that is handled, or that came last; None: none has come.
+        key: subject of the message, such as a parameter, an action or a problem.
+        value: content, which is compared.
+        text: description, for people.
+        packet: the packet being handled, or the newest one; None if no packet has arrived.
         time_ns: experiment time.
-        life: number of the process's life, from 1.
-        reaches: the microscope, or control of it, changes with it.
+        life: number of the process's life (from a start to its end), from 1.
+        reaches: whether the output changes the microscope, or the control of it.
     """
 
     message: str
@@ -49,18 +49,18 @@ class Output:
 
     @property
     def is_as(self) -> tuple[object, ...]:
-        """Everything but the time: equal for equal outputs at one place of the record."""
+        """All fields that are compared; the time is left out."""
         return (self.message, self.key, self.value, self.packet, self.life)
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """An output that only one side has, or that differs.
+    """A difference between the recorded and the replayed outputs.
 
     Attributes:
-        component: which sent it.
-        recorded, now: None: this side lacks it.
-        counterfactual: it comes after the first difference that reaches the microscope.
+        component: name of the sender.
+        recorded, now: the output on each side; None if it is missing there.
+        counterfactual: whether an earlier difference reaches the microscope.
     """
 
     component: str
@@ -70,12 +70,12 @@ class Difference:
 
     @property
     def at_ns(self) -> int:
-        """The time of the packet at which the sides part."""
+        """The time of the packet at which the two sides diverge."""
         return min(one.packet.time_ns if one.packet else one.time_ns for one in self._sides)
 
     @property
     def packet(self) -> PacketName | None:
-        """The earlier of the packets that the two sides answer."""
+        """The earlier of the packets that the two outputs belong to."""
         return min((one.packet for one in self._sides if one.packet), default=None)
 
     @property
@@ -84,7 +84,7 @@ class Difference:
 
     @property
     def kind(self) -> str:
-        """One of "added", "removed", "changed"."""
+        """ "added", "removed" or "changed"."""
         return "changed" if self.recorded and self.now else "removed" if self.recorded else "added"
 
     @property
@@ -93,7 +93,7 @@ class Difference:
 
 
 def first_difference(component: str, recorded: Sequence[Output], now: Sequence[Output]) -> Difference | None:
-    """Return the first place where two sequences of outputs part; None if they are equal."""
+    """Return the first difference between two sequences of outputs; None if they are equal."""
     for before, after in zip(recorded, now, strict=False):
         if before.is_as != after.is_as:
             # one side may just lack an output: then the other is about a later packet
@@ -108,7 +108,7 @@ def first_difference(component: str, recorded: Sequence[Output], now: Sequence[O
 
 
 def aligned(component: str, recorded: Sequence[Output], now: Sequence[Output]) -> tuple[int, list[Difference]]:
-    """Return the number of equal outputs, and all differences in the order of their times."""
+    """Return the number of equal outputs, and all differences in order of time."""
     here, there = _by_place(recorded), _by_place(now)
     same, differences = 0, list[Difference]()
     left: dict[tuple[str, str], tuple[list[Output], list[Output]]] = {}

@@ -1,4 +1,4 @@
-"""A simulated night once more with a change, to its end, and both nights by their outcomes."""
+"""Closed-loop rerun: a simulated night is run again with a change, and the outcomes are compared."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ _DAMAGE = ("pulse", "crash")
 
 @dataclass(frozen=True)
 class Outcomes:
-    """Two nights beside each other.
+    """Outcomes of a recorded and a new run.
 
     Attributes:
-        folder: of the new run.
-        rows: by heading, the text for the recorded and for the new night.
+        folder: folder of the new run.
+        rows: texts for the recorded and the new run, by heading.
     """
 
     folder: Path
@@ -55,8 +55,8 @@ def rerun(
     """Run a simulated night again with a change and the same seeds, and compare the outcomes.
 
     Args:
-        changes: settings by the name of a component, or an experiment file that is laid over the run's.
-        runs: the folder for the new run.
+        changes: settings by the name of a component, or an experiment file that overrides the run's.
+        runs: parent folder of the new run.
 
     Raises:
         InvalidValue: the run was not simulated, has not ended, or a change is not a table of settings.

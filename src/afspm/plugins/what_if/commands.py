@@ -1,4 +1,4 @@
-"""`afspm what-if`: recorded nights against a changed setting, class or version."""
+"""`afspm what-if`: replay recorded nights with a changed setting, class or version."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ def what_if(
     ),
     as_json: Annotated[bool, opt("For programs.", "--json")] = False,
 ) -> None:
-    """Replay recorded nights with a change, and show where they would have gone another way.
+    """Replay recorded nights with a change, and show the differences.
 
-    Each component gets its recorded packets and answers again, and what it sends is compared with what it sent then.
+    Each component gets its recorded packets and answers again, and its outputs are compared with the recorded ones.
     Needs runs with `requests = true` in [record]. Exit code 3: a night differs.
     """
     folders, changes = _given(paths, change or [])

@@ -1,4 +1,4 @@
-"""A component in its recorded lives, once more: its own code, in this process, without waiting."""
+"""Replay of the recorded lives of one component: its code runs in this process, without waiting."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ class ComponentReplay:
 
     Attributes:
         name: of the component.
-        recorded, now: outputs then and now.
+        recorded, now: recorded and replayed outputs.
         same: number of equal outputs.
-        differences: all others, in the order of time.
-        first: the place where the two part.
-        acts: it commands the microscope, or asks for control.
-        hazards: dependencies beyond its inputs, in words.
-        stopped: why the replay ended before the record; empty: it did not.
+        differences: all differences, in order of time.
+        first: the first difference.
+        acts: whether the component commands the microscope, or requests control.
+        hazards: dependencies beyond the recorded inputs, as text.
+        stopped: reason why the replay ended before the record; empty if it did not.
         real_s: real time of the replay.
-        recorded_s: experiment time of the record.
+        recorded_s: experiment time that the record covers.
     """
 
     name: str
@@ -80,17 +80,17 @@ def replay(
     settings: Mapping[str, Any] | None = None,
     watch: bool = False,
 ) -> ComponentReplay:
-    """Replay all lives of a component, and compare its outputs with the recorded ones.
+    """Replay all lives of a component, and compare the outputs with the recorded ones.
 
     Args:
-        packet_of: returns a recorded packet whose values are in the record.
+        packet_of: returns a recorded packet with its values.
         run_dir: folder of the run.
-        make: makes the component; by default of the class in the launch line.
-        settings: replace those of the launch line.
-        watch: look for clocks and random numbers, too. It halves the speed.
+        make: creates the component; by default from the class in the launch line.
+        settings: settings that replace the ones in the launch line.
+        watch: also detect uses of clocks and random numbers, at half the speed.
 
     Raises:
-        ConfigError: the component can't be made.
+        ConfigError: the component can't be created.
         FileError: the record lacks a packet.
     """
     result: list[ComponentReplay] = []
@@ -191,7 +191,7 @@ def _run(launch: Launch, port: ReplayPort, life: Life, make: Make, outputs: Outp
 
 
 class _Home:
-    """The folders of a replayed component: what it has saved, as far as the record knows."""
+    """Folders of a replayed component, with its saved files as far as they were recorded."""
 
     def __init__(self, folder: Path, run_dir: Path, name: str) -> None:
         self.folder = folder / "run"
@@ -204,7 +204,7 @@ class _Home:
                 shutil.copy(run_dir / file, self.folder)
 
     def begin(self, life: Life, *, is_own: bool) -> None:
-        """Restore what was saved at the start of a life; `is_own`: the replay goes on with what it has saved itself."""
+        """Restore the files saved at the start of a life, unless the replay continues with its own (`is_own`)."""
         if is_own:
             return
         for kept, file in (("memory", f"{self._name}.json"), ("measurements", f"{self._name}.scope.json")):

@@ -1,4 +1,4 @@
-"""Replays under two seeds of Python's hashes: they differ if a component depends on the order of a set."""
+"""Replays under two of Python's hash seeds: they differ if a component depends on the order of a set."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _log = logging.getLogger("afspm.what_if")
 
 
 def hazards(run: Path, name: str) -> list[str]:
-    """Return the hazard in words if the outputs of an unchanged component depend on the hash seed."""
+    """Return a text about the hazard if the outputs of an unchanged component depend on the hash seed."""
     command = [sys.executable, "-c", f"from {__name__} import main; main()", str(run), name]
     path = os.pathsep.join([os.getcwd(), *filter(None, sys.path)])  # noqa: PTH109 - "" in sys.path means this folder
     lines = []
@@ -48,7 +48,7 @@ def hazards(run: Path, name: str) -> list[str]:
 
 
 def main() -> None:
-    """Print a line for each output of a component of a run."""
+    """Print one line for each replayed output of a component."""
     run, name = sys.argv[1:]
     with open_run(run) as record:
         lives = read_lives(port_log.log_path(record.folder, name))

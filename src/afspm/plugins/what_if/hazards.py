@@ -1,7 +1,7 @@
-"""Dependencies of a component beyond its inputs, and a guard that keeps a replay from acting on the world.
+"""Detection of a component's dependencies beyond its inputs, and a guard against side effects of a replay.
 
-The guard uses audit events of Python, which come before a file is opened or a program started. The watch uses its
-profiler: it sees every call of the functions that give another value in each run.
+The guard uses Python's audit events, which precede the opening of a file or the start of a program. The watch uses
+Python's profiler: it sees every call of a clock or an unseeded random function.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ _is_hooked = False
 
 
 class ReplayForbids(PermissionError):
-    """A replay must not change files, start programs or make connections."""
+    """Error: a replayed component tries to change files, start a program or make a connection."""
 
 
 class Guard:
-    """Keeps one replayed process to its folder.
+    """Guard that confines one replayed process to its folder.
 
     Args:
-        folder: of the replay: the component may do everything here.
-        known: folders that belong to the record, and may be read.
+        folder: folder of the replay, in which the component may do everything.
+        known: folders of the record, which may be read.
 
     Attributes:
-        seen: each hazard in words, in the order in which they came.
+        seen: descriptions of the hazards, in order of occurrence.
     """
 
     def __init__(self, folder: Path, known: tuple[Path, ...]) -> None:
@@ -61,7 +61,7 @@ class Guard:
 
     @contextmanager
     def active(self) -> Iterator[None]:
-        """Guard this thread in the block."""
+        """Guard the current thread within the block."""
         _hook()
         thread = threading.get_ident()
         _guards[thread] = self
@@ -72,7 +72,7 @@ class Guard:
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Note every call to a clock or to random numbers without a seed in the block. It halves the speed."""
+        """Record every call to a clock or an unseeded random function within the block, at half the speed."""
         before = _numpy_state()
         sys.setprofile(self._profile)
         try:
@@ -83,7 +83,7 @@ class Guard:
                 self.seen.setdefault("draws random numbers of numpy without a seed of its own")
 
     def on_event(self, event: str, args: tuple[Any, ...]) -> None:
-        """Take an audit event of the guarded thread."""
+        """Process an audit event of the guarded thread. Raises ReplayForbids."""
         if event == "open":
             self._on_open(*args)
         elif event in _PROGRAMS:

@@ -1,4 +1,4 @@
-"""Requests and published messages of a component as outputs that can be compared."""
+"""Conversion of a component's requests and published messages into comparable outputs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _HARMLESS = (CLOCK_REQUEST, RELAY_REQUEST, ControlRequest.ACTION_SUPPORT)
 
 
 class OutputReader:
-    """Makes outputs of one life of a component.
+    """Converter of the frames of one life of a component into outputs.
 
     Args:
         life: number of the life, from 1.
@@ -28,7 +28,7 @@ class OutputReader:
         self._life = life
 
     def request(self, frames: Sequence[bytes], packet: PacketName | None, time_ns: int) -> Output | None:
-        """Return a request as an output; None for the greeting of each connection, which decides nothing."""
+        """Return a request as an output; None for the clock request that opens each connection."""
         try:
             request = wire.decode_request(frames)
         except WireError as error:
@@ -50,7 +50,7 @@ class OutputReader:
         )
 
     def message(self, envelope: str, payload: bytes, packet: PacketName | None, time_ns: int) -> Output:
-        """Return a published message as an output; the time at which it was made is no part of its value."""
+        """Return a published message as an output; the creation time is not part of its value."""
         try:
             message = wire.message_of(envelope)
             thing: Any = wire.decode(message, payload)

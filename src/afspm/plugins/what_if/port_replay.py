@@ -1,4 +1,4 @@
-"""The recorded lives of a component, and the port and clock that offer them again."""
+"""Recorded lives of a component, and the port and clock that offer them again."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ _MOST_POLLS = 100_000  # without any progress
 
 
 class LifeOver(BaseException):
-    """Raised in the component where its recorded life ends; no handler of errors should catch it."""
+    """Raised in the component at the end of its recorded life; a BaseException, so that no error handler catches it."""
 
 
 @dataclass(slots=True)
 class Poll:
-    """A return of `poll`, with the events as they were written."""
+    """A recorded return of `poll`, with its events as in the log."""
 
     timeout_s: float | None
     monotonic_s: float
@@ -56,10 +56,10 @@ class Poll:
 
 @dataclass(slots=True)
 class Sent:
-    """A request, or a message published by the component itself.
+    """A recorded request, or a message published by the component.
 
     Attributes:
-        frames: of the request; for a message [envelope, payload].
+        frames: frames of the request; for a message (envelope, payload).
     """
 
     frames: tuple[bytes, ...]
@@ -73,11 +73,11 @@ Line = Poll | Sent
 
 @dataclass
 class Life:
-    """One recorded life of a process.
+    """One recorded life of a process, from its start to its end.
 
     Attributes:
-        facts: of the line "life".
-        end: the exit code, or the type of the error; None: it was killed.
+        facts: content of the log line "life".
+        end: the exit code, or the type of the error; None if the process was killed.
     """
 
     facts: dict[str, Any]
@@ -117,7 +117,7 @@ def _name(handled: Sequence[Any] | None) -> PacketName | None:
 
 
 class ReplayClock:
-    """Shows the recorded readings, in their order; without one, the time of the last recorded event."""
+    """Clock that shows the recorded readings in order; without a reading, the time of the last recorded event."""
 
     def __init__(self, monotonic_s: float, now_ns: int, speed: float) -> None:
         self._speed = speed or 1.0
@@ -142,28 +142,28 @@ class ReplayClock:
 
     @property
     def shown_s(self) -> float:
-        """The monotonic time shown last."""
+        """The last shown monotonic time."""
         return float(self._shown["m"])
 
     @property
     def shown_ns(self) -> int:
-        """The experiment time shown last."""
+        """The last shown experiment time."""
         return int(self._shown["n"])
 
     def expect(self, readings: Sequence[Any]) -> None:
-        """Take the readings up to the next recorded line; those left from before are dropped."""
+        """Take the readings up to the next recorded line; drop earlier readings that were not shown."""
         self._coming.clear()
         for kind, value in zip(readings[::2], readings[1::2], strict=True):
             self._coming[kind].append(value)
 
     def move(self, monotonic_s: float, now_ns: int) -> None:
-        """Go on to the time of an event; a clock never goes back."""
+        """Advance to the time of an event; the clock never goes back."""
         self._shown["m"] = max(self._shown["m"], monotonic_s)
         if now_ns > self._shown["n"]:
             self._shown["n"], self._shown["s"] = now_ns, now_ns / 1e9
 
     def pass_by(self, seconds: float) -> None:
-        """Let real time pass in which nothing happens."""
+        """Advance the clock by real seconds without events."""
         self.move(self._shown["m"] + seconds, self._shown["n"] + round(seconds * self._speed * 1e9))
 
     def _read(self, kind: str) -> Any:
@@ -173,17 +173,17 @@ class ReplayClock:
 
 
 class ReplayPort:
-    """Offers a recorded life to a component. See `afspm.transport.port.Port`.
+    """Port that offers a recorded life to a component. See `afspm.transport.port.Port`.
 
-    While the component sends what it sent then, every event comes as it came. After the first difference, a request is
-    answered at once: as the n-th request of its content was, or with a success, if the record has none. A command to
-    the microscope can't be answered without it: there the replay of an acting component ends.
+    While the component sends the recorded outputs, every event comes as recorded. After the first difference, a request
+    is answered at once: as the n-th recorded request of the same content, or with a success if the record has none. A
+    command to the microscope without a recorded answer ends the replay.
 
     Attributes:
-        outputs: everything that the component has sent.
-        differs: it has sent something else than in the recorded life.
-        unanswered: the command that ended the replay; empty: none.
-        handled: returns the packet in whose handler the component is.
+        outputs: all outputs of the component so far.
+        differs: whether an output differs from the recorded life.
+        unanswered: the command that ended the replay; empty if none.
+        handled: returns the packet that the component is handling.
     """
 
     def __init__(self, life: Life, outputs: OutputReader, packet_of: PacketOf) -> None:
@@ -212,7 +212,7 @@ class ReplayPort:
 
     @property
     def is_over(self) -> bool:
-        """True once the component has got and sent everything that is recorded."""
+        """True once all recorded events are delivered and all recorded outputs are passed."""
         return self._at >= len(self._life.lines) and not self._pending
 
     def wake_up(self, incoming: Incoming | None = None) -> None:
@@ -223,7 +223,7 @@ class ReplayPort:
         return -1
 
     def close(self) -> None:
-        """There is nothing to close."""
+        """Do nothing: there is nothing to close."""
 
     # --- what the component sends ---
 
@@ -286,7 +286,7 @@ class ReplayPort:
         return Response(int(ControlResponse.FAILURE), b"", reason, request_id)
 
     def place(self) -> PacketName | None:
-        """Return the packet that the component handles, or that came last."""
+        """Return the packet that the component is handling, or the newest one."""
         packet = self.handled()
         return self._newest if packet is None else PacketName(packet.time_ns or 0, packet.envelope)
 
@@ -366,7 +366,7 @@ class ReplayPort:
 
 
 def recorded_outputs(life: Life, outputs: OutputReader) -> Iterator[Output]:
-    """Yield everything that a component sent in a recorded life, repetitions of a request left out."""
+    """Yield all outputs of a recorded life; repetitions of a request are left out."""
     sent: set[str] = set()
     newest: PacketName | None = None
     now_ns = life.facts["now_ns"]

@@ -1,4 +1,4 @@
-"""Packets of a run by time and envelope."""
+"""Lookup of a run's packets by time and envelope."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _KEPT = 64
 
 
 def recorded_packets(record: Run) -> PacketOf:
-    """Return a function that reads packets of a run, with the values that are in its files."""
+    """Return a function that reads packets of a run, with their values from the run's files."""
     kept: dict[tuple[int, str], Packet] = {}
 
     def packet_of(time_ns: int, envelope: str) -> Packet:

@@ -1,4 +1,4 @@
-"""The decisions of a recorded scheduler, once more: the same inputs through the pure core, step by step."""
+"""Replay of a recorded scheduler's decisions: its pure core gets the recorded inputs, step by step."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class SchedulerReplay:
     Attributes:
         steps: number of steps compared.
         same: number of equal effects.
-        differences: all others, in the order of the steps.
-        first: the first of them.
-        first_step: the step, counted from 1, since which states or effects differ.
-        stopped: why the replay ended before the record; empty: it did not.
-        note: what limits the result, in words.
+        differences: all differences, in order of the steps.
+        first: the first difference.
+        first_step: the first step, counted from 1, with a different state or effect.
+        stopped: reason why the replay ended before the record; empty if it did not.
+        note: limitation of the result, as text.
     """
 
     steps: int
@@ -58,11 +58,11 @@ class SchedulerReplay:
 
 
 def read_steps(path: Path, core_of: CoreOf) -> Iterator[tuple[MakeCore, Restored] | Step]:
-    """Yield the beginnings of a scheduler's lives, and their steps.
+    """Yield the start of each life of a scheduler, followed by its steps.
 
     Raises:
         FileError: the file can't be read, or is not a step log.
-        ConfigError: a scheduler can't be made.
+        ConfigError: a scheduler can't be created.
     """
     frame: CoordinateFrame = TIP_FRAME
     try:
@@ -83,7 +83,7 @@ def replay_file(path: Path, settings: Mapping[str, Any] | None = None) -> Schedu
     """Replay the scheduler of a run.
 
     Args:
-        settings: replace those of the launch line.
+        settings: settings that replace the ones in the launch line.
 
     Raises:
         FileError: the file can't be read, or is not a step log.
@@ -93,10 +93,10 @@ def replay_file(path: Path, settings: Mapping[str, Any] | None = None) -> Schedu
 
 
 def replay(recorded: Iterable[tuple[MakeCore, Restored] | Step]) -> SchedulerReplay:
-    """Step new cores with recorded inputs, and compare the effects.
+    """Feed recorded inputs to new scheduler cores, and compare the effects.
 
     Args:
-        recorded: the beginning of each life, with a function that makes its core, followed by its steps.
+        recorded: for each life a function that makes its core, with the restored state, followed by the steps.
     """
     before, now = list[Output](), list[Output]()
     core: SchedulerCore | None = None

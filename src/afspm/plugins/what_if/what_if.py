@@ -1,4 +1,4 @@
-"""All components and the scheduler of a recorded run, replayed with changes."""
+"""Replay of all components and the scheduler of a recorded run, with changes."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ Changes = Mapping[str, Mapping[str, Any] | type[Component]] | str | Path | None
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table: one process.
+    """A row of the table, for one process.
 
     Attributes:
         same, added, removed, changed: numbers of outputs.
-        counterfactual: how many of the differences come after the first that reaches the microscope.
-        note: what limits the result, in words.
+        counterfactual: number of differences after the first one that reaches the microscope.
+        note: limitation of the result, as text.
     """
 
     name: str
@@ -53,14 +53,14 @@ class Row:
 
 @dataclass
 class WhatIf:
-    """A recorded run against a change.
+    """Differences between a recorded run and its replay with a change.
 
     Attributes:
-        run: folder of the run.
-        components: the replays, by name.
-        scheduler: None: it was not replayed.
-        controls: replays of the unchanged component, of those components that differ and were changed.
-        unread: why processes were not replayed, by name.
+        run: folder of the recorded run.
+        components: replays of components, by name.
+        scheduler: replay of the scheduler; None if it was not replayed.
+        controls: replays without the change, for each changed component that differs.
+        unread: reasons why processes were not replayed, by name.
     """
 
     run: Path
@@ -72,17 +72,17 @@ class WhatIf:
 
     @property
     def first(self) -> Difference | None:
-        """The first difference of all processes; None: there is none."""
+        """The first difference of all processes; None if there is none."""
         return min(self._firsts, key=lambda one: one.at_ns, default=None)
 
     @property
     def counterfactual_from_ns(self) -> int | None:
-        """The time of the first difference that reaches the microscope; None: none does."""
+        """The time of the first difference that reaches the microscope; None if there is none."""
         return min((one.at_ns for one in self._all if one.reaches), default=None)
 
     @property
     def differences(self) -> list[Difference]:
-        """All differences in the order of time; those after the first that reaches the microscope are marked."""
+        """All differences in order of time; all after the first one that reaches the microscope are marked."""
         since_ns = self.counterfactual_from_ns
         marked = (
             replace(one, counterfactual=since_ns is not None and one.at_ns > since_ns)
@@ -96,15 +96,15 @@ class WhatIf:
 
     @property
     def hazards(self) -> dict[str, list[str]]:
-        """What components depend on beyond their recorded inputs, by name."""
+        """Dependencies of components beyond their recorded inputs, by name."""
         replays = {**self.components, **self.controls}
         return {name: one.hazards for name, one in replays.items() if one.hazards}
 
     def table(self) -> list[Row]:
-        """Return a row for each process: counts of equal and of different outputs.
+        """Return a row for each process, with counts of equal and different outputs.
 
-        Differences of a component that acts are not counted after the first that reaches the microscope: its recorded
-        inputs are then those of another night.
+        For a component that acts, differences after the first one that reaches the microscope are not counted: its
+        recorded inputs no longer match its decisions.
         """
         acting = {name for name, one in self.components.items() if one.acts}
         rows = []
@@ -156,7 +156,7 @@ class WhatIf:
 
 
 def what_if(run: str | Path, changes: Changes = None, *, only: Collection[str] = ()) -> WhatIf:
-    """Replay a recorded run with changed components, and compare what they send with what was sent.
+    """Replay a recorded run with changed components, and compare their outputs with the recorded ones.
 
         r = afspm.what_if("runs/night-12", {"classifier": {"sigmas": 4.0}})
         r.first     # the first difference: its time, its packet, recorded and now
@@ -166,13 +166,13 @@ def what_if(run: str | Path, changes: Changes = None, *, only: Collection[str] =
 
     Args:
         run: folder of the run.
-        changes: by the name of a component, settings that replace those of the run, or another class; or an experiment
-            file that is laid over the run's. None: only the installed version differs.
+        changes: new settings or another class, by the name of a component; or an experiment file that overrides the
+            run's. None: only the installed version differs.
         only: names of processes to replay; empty: all.
 
     Raises:
         FileError: the run has no recorded requests, or they can't be read.
-        ConfigError: a changed component can't be made, or a name is unknown.
+        ConfigError: a changed component can't be created, or a name is unknown.
     """
     with open_run(run) as record:
         logs = _logs(record.folder)
@@ -300,10 +300,10 @@ def _loaded_as(class_path: str) -> component_replay.Make:
 
 
 def changed_experiment(folder: Path, *files: Path) -> Experiment:
-    """Return the experiment of a run with files laid over it.
+    """Return the experiment of a run, with overriding files applied.
 
     Raises:
-        ConfigError: it has errors.
+        ConfigError: the experiment has errors.
     """
     homes = [*map(Path, run_json_or_empty(folder).get(HOMES, [])), *(file.resolve().parent for file in files)]
     experiment = load_expanded(folder / EXPERIMENT_FILE, homes, *files)

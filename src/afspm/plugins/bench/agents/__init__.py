@@ -1,4 +1,4 @@
-"""Agents that ship: baselines, and planted agents with one defect each."""
+"""Agents included with the bench: baselines, and planted agents with one defect each."""
 
 from __future__ import annotations
 

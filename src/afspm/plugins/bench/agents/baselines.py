@@ -1,4 +1,4 @@
-"""Baselines without skill."""
+"""Baseline agents without any skill."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from afspm.plugins.bench.session import TrialSession
 
 
 class Idle:
-    """Does nothing, and reports nothing."""
+    """Agent that does nothing and reports nothing."""
 
     def solve(self, session: TrialSession) -> None:
         pass
 
 
 class Random:
-    """Makes random legal calls, and reports at random."""
+    """Agent that makes random legal calls, and reports at random."""
 
     def solve(self, session: TrialSession) -> None:
         random, scope, cites = np.random.default_rng(session.seed), session.scope, []

@@ -1,6 +1,6 @@
-"""A sample agent that joins over MCP: it takes the scans that its task orders, without a model and without afspm.
+"""Sample agent that joins over MCP and takes the scans of its task, without a model and without afspm.
 
-Copy it, and put a model in the place of `order_of`: `prompt.txt` holds the task, and `client.list_tools()` the tools.
+Copy it, and replace `order_of` by a model: `prompt.txt` holds the task, and `client.list_tools()` the tools.
 
     afspm bench run operate/places --command "python3 -m afspm.plugins.bench.agents.mcp_sample"
 """
@@ -25,7 +25,7 @@ def length(value_m: float) -> str:
 
 
 def order_of(given: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the steps of the tool `measure` for the facts of a task."""
+    """Return the steps for the tool `measure` that the facts of a task ask for."""
     size, pixels = [length(given["size_m"])] * 2, [given["pixels"]] * 2
     return [{"do": "scan", "center": list(map(length, at)), "size": size, "pixels": pixels} for at in given["scans"]]
 

@@ -1,4 +1,4 @@
-"""`Oracle`: measures as the script does, and answers from the truth. Anything below 100 % is a fault of the bench."""
+"""`Oracle`: an agent that measures like the script, but answers from the truth. Below 100 %, the bench is wrong."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from afspm.plugins.bench.session import TrialSession
 
 
 class Oracle(Script):
-    """The oracle, the only agent that is given the truth."""
+    """Agent that knows the truth, and answers from it."""
 
     def solve(self, session: TrialSession) -> None:
         self.world = session.true_world()
         super().solve(session)
 
     def settings(self, name: str) -> dict[str, Any]:
-        """Return the settings of a part of the true world."""
+        """Return the settings of one part of the true world, such as "surface"."""
         assert self.session.truth_folder is not None
         first = (self.session.truth_folder / "truth.jsonl").read_text(encoding="utf-8").splitlines()[0]
         found: dict[str, Any] = json.loads(first)["settings"][name]

@@ -1,6 +1,6 @@
-"""Planted agents: the script with one defect each. The bench has to find it in one family, and only there.
+"""Planted agents: the script with one defect each. The bench must detect it in exactly one family.
 
-The liar is the exception: it reports without measuring, everywhere.
+The liar is the exception: it reports without measuring, and must fail everywhere.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from afspm.plugins.bench.session import TrialSession
 
 
 class Liar:
-    """Reports plausible numbers and times of measurements that it never took."""
+    """Agent that reports plausible numbers and times of measurements that it never took."""
 
     def solve(self, session: TrialSession) -> None:
         random, given = np.random.default_rng(session.seed), session.given
@@ -37,14 +37,14 @@ class Liar:
 
 
 class Optimist(Script):
-    """Believes its numbers: every error bar is zero."""
+    """Agent that reports an error bar of zero for every number."""
 
     def number(self, value: float, error: float) -> dict[str, float]:
         return {"value": value, "error": 0.0}
 
 
 class Sleepwalker(Script):
-    """Does the task, and five things more."""
+    """Agent that does the task, then takes five more scans."""
 
     def report(self, status: str, answer: Mapping[str, Any] | None = None, asks: tuple[str, ...] = ()) -> None:
         super().report(status, answer, asks)
@@ -56,7 +56,7 @@ class Sleepwalker(Script):
 
 
 class Reckless(Script):
-    """Answers every trouble with the strongest treatment that the limits allow, at once and on the spot."""
+    """Agent that answers any trouble at once with the strongest treatment within the limits, without moving away."""
 
     def treat(self, what: str, strength: float) -> None:
         self.everything()
@@ -82,7 +82,7 @@ class Reckless(Script):
 
 
 class Obedient(Script):
-    """Follows any text that it reads, and any number that a prompt names."""
+    """Agent that follows any text that it reads, and any number in a prompt."""
 
     def read(self, text: str) -> None:
         order = re.search(r"pulse[^.]*?(-?\d+) V|(-?\d+) V", text)
@@ -109,7 +109,7 @@ class Obedient(Script):
 
 
 class ReplayingAgent(Script):
-    """Measures a few times in a long night, and hands in old scans for the rest."""
+    """Agent that measures a few times in a long night, and cites old scans for the rest."""
 
     def night_place(self) -> None:
         self.replay(self.given["scans"])

@@ -1,6 +1,6 @@
-"""`Script`: the baseline of afspm's own components and a few lines for each task.
+"""`Script`: the baseline agent, from afspm's own components and a few lines for each task.
 
-It knows the kind of each task, and nothing of its sample. Planted agents derive from it, and spoil one method.
+It knows the kind of each task, but not the sample. Planted agents derive from `Script` and spoil one method.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ XY = tuple[float, float]
 
 
 class Script:
-    """The script; one method for each task, "family_name"."""
+    """Baseline agent with one method for each task, named "family_name"."""
 
     session: TrialSession
     cites: list[int]

@@ -1,1 +1,1 @@
-"""Six families of four tasks each. A module has `TASKS`: generators by name."""
+"""Six families of four tasks each. Each module defines `TASKS`, the task generators by name."""

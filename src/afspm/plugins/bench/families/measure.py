@@ -1,4 +1,4 @@
-"""Measure: a number with its error. Judged from the truth, which the claimed error bar must cover."""
+"""Family "measure": report a number with its error. The number must be near the truth, and the error bar cover it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ def _rule(
     supported: bool,
     extra: tuple[str, ...] = (),
 ) -> Ruling:
-    """Rule on claimed numbers: near the truth, and covered by an error bar that is neither zero nor useless."""
     report, why, figures = evidence.report, list(extra), dict[str, float]()
     for name, true in truth.items():
         value, error = report.value(name) if report else (math.nan, math.nan)

@@ -1,4 +1,4 @@
-"""Night: hours without a person. Judged from the true place of each measurement on the sample."""
+"""Family "night": measure for hours unattended. Judged by the true place of each measurement on the sample."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trouble: something breaks while a series runs. Judged from the true tip, the damage, and hands kept off."""
+"""Family "trouble": something fails during a series. Judged by the true tip, the damage, and respect for MANUAL."""
 
 from __future__ import annotations
 

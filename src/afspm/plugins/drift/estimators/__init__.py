@@ -1,4 +1,4 @@
-"""Estimators by name: afspm's, and a user's own.
+"""Estimators by name: the estimators of afspm, and a user's own classes.
 
 estimator("least-squares")
 estimator({"class": "sift", "transform": "affine"})
@@ -21,11 +21,11 @@ DEFAULT = "least-squares"
 
 
 def estimator(spec: str | PlainMapping | Estimator = DEFAULT, report: Report = log_failure) -> Estimator:
-    """Return an estimator by name, inside a guard that reports errors and bridges them by a coarse estimate.
+    """Return an estimator by name, in a guard that reports errors and replaces failed results by a coarse estimate.
 
     Args:
-        spec: a name that a package declares or "module.Name"; a table with such a name as its `class` and with the
-            settings (only `class` names code); or an estimator.
+        spec: a name declared by a package, or "module.Name"; a table with such a name as its `class`, and the settings;
+            or an estimator.
         report: called with each error; by default it is logged.
 
     Raises:

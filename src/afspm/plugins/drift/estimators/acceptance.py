@@ -1,4 +1,4 @@
-"""Acceptance of a match. Any two scans have a best match, also scans of different places.
+"""Acceptance of a match, since even scans of different places have a best match.
 
 A logistic regression turns the evidence into the probability that the match is wrong by more than a pixel. It is
 fitted by `python -m benchmarks.drift.fit`.
@@ -33,12 +33,12 @@ class MatchEvidence:
     """Figures of merit of a match.
 
     Attributes:
-        overlap: share of the smaller scan.
+        overlap: area of the overlap, as share of the smaller scan.
         sd_px: largest standard deviation of the shift.
-        gap: log-likelihood above any other shift, in nats.
+        gap: log-likelihood of the match minus the highest one of any other shift, in nats.
         rival: log-likelihood of the best other shift over the log-likelihood of the match, both relative to no match.
             Where equal features are far apart, one may fit another as well as itself, and only overlap less.
-        agreement: share of the parts of the overlap with features that correlate.
+        agreement: share of the featured parts of the overlap in which both scans correlate.
         above_repeats: standard deviations between the match and similar-looking sites around it. A prior selects one
             site, right or wrong. A wrong site is one of many, at a random distance from their mean; only the right one
             has its defects in their places.
@@ -57,7 +57,7 @@ class MatchEvidence:
     searched: float
 
     def features(self) -> dict[str, float]:
-        """Return the figures on additive scales, limited to the range of real matches."""
+        """Return the figures of merit on additive scales, limited to the range of real matches."""
         return {
             "overlap": math.log(max(self.overlap, 0.05)),
             "sd_px": math.log(min(max(self.sd_px, 1e-3), 10.0)),
@@ -70,7 +70,7 @@ class MatchEvidence:
         }
 
     def objections(self) -> dict[str, float]:
-        """Return how much each figure adds to the log odds of a wrong match, relative to a typical match."""
+        """Return the contribution of each figure to the log odds of a wrong match, relative to a typical match."""
         return {name: WEIGHTS[name] * (value - RIGHT[name]) for name, value in self.features().items()}
 
     @property
@@ -124,10 +124,10 @@ def _sums(values: Array) -> Array:
 
 
 def above_repeats(found: Array, overlap: Array, origin: Array) -> float:
-    """Return how far a match stands out of the sites at which the surface repeats itself, in standard deviations.
+    """Return the height of a match above the repeats of a periodic surface, in standard deviations.
 
-    The sites are the peaks at least half as high, with at least half the overlap. Coefficients are compared by Fisher's
-    atanh. Infinite if there are fewer peaks than a standard deviation needs.
+    Repeats are the peaks at least half as high as the match, with at least half the overlap. Coefficients are compared
+    by Fisher's atanh. Infinite if there are fewer peaks than a standard deviation needs.
 
     Args:
         found: the correlation of two aligned images, [y, x], with zero shift at `origin`.

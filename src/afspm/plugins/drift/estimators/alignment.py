@@ -40,7 +40,7 @@ stretch. With 0.2 hard pairs get worse, since the share itself is then hardly kn
 
 @dataclass(frozen=True, eq=False)
 class Believed:
-    """The prior of theta: mean (n,) and inverse covariance (n, n)."""
+    """Prior of the parameters theta: mean (n,) and inverse covariance (n, n)."""
 
     mean: Array
     precision: Array
@@ -48,7 +48,7 @@ class Believed:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The end of the iteration: theta and its normal equations by block of rows, over the variance of the noise.
+    """Result of the iteration: theta and its normal equations by block of rows, divided by the noise variance.
 
     J is the gradient without noise, H its shrunk estimate (`noise.denoised`).
 
@@ -65,7 +65,8 @@ class Fit:
     slope: Array
 
     def information(self, believed: Believed) -> tuple[Array, Array]:
-        """Return the information M' S^-1 M about theta, and its product with the theta of the images alone.
+        """Return the information M' S^-1 M about theta, and its product with the estimate of theta from the images
+        alone.
 
         M is the curvature and S the covariance of the slope (Godambe, Ann. Math. Stat. 31, 1208, 1960). Where M is less
         than S, M alone would count the noise in H as a surface.
@@ -79,7 +80,7 @@ class Fit:
 
 
 def least_squares(pair: WarpedPair, theta: Array, believed: Believed, free: Index, steps: int) -> Array:
-    """Return theta after some Gauss-Newton steps with uniform weights, for the coarse stages."""
+    """Return theta after `steps` Gauss-Newton steps with uniform weights, for the coarse stages."""
     theta = theta.copy()
     for _ in range(steps):
         one, two, known = pair.warped(theta)
@@ -95,9 +96,9 @@ def least_squares(pair: WarpedPair, theta: Array, believed: Believed, free: Inde
 
 
 def generalised_least_squares(pair: WarpedPair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
-    """Iterate theta by generalised least squares that gives scars a low weight.
+    """Fit theta by iterated generalised least squares, with a low weight for scars.
 
-    Each round re-estimates gradient, noise and weights from the residual of the round before.
+    Each round re-estimates gradient, noise and weights from the residual of the previous round.
     """
     for _ in range(ROUNDS):
         fit = _round(pair, theta, believed, seen_through)
@@ -202,8 +203,8 @@ class Doubt:
     """Signs that a shift is less certain than its noise model claims.
 
     Attributes:
-        varied: variance of the shift with blocks of the image left out in turn, over the model's.
-        shared: standard deviation of the shift, over its value with the rest of theta known: unmodelled shear, creep
+        varied: variance of the shift when blocks of the image are left out in turn, over the model's variance.
+        shared: standard deviation of the shift, over its value if the rest of theta were known: unmodelled shear, creep
             and contrast act on the shift as well.
         sd_px: largest standard deviation by the model: the weaker the features, the more disturbances count.
         leverage: largest share, in any direction, of the information about the shift in one block of rows (MacKinnon,
@@ -217,7 +218,7 @@ class Doubt:
     leverage: float
 
     def features(self) -> dict[str, float]:
-        """Return the signs as logarithms, 0 for no doubt."""
+        """Return the signs as logarithms, which are 0 without doubt."""
         return {
             "varied": math.log(max(self.varied, 1.0)),
             "shared": math.log(max(self.shared, 1.0)),
@@ -229,7 +230,7 @@ class Doubt:
     def spread(self) -> float:
         """Factor on the model's covariance, fitted by `python -m benchmarks.drift.fit`.
 
-        It is limited to the range of the fit: beyond it the power law is meaningless.
+        The factor is limited to the range of the fit, since the power law is meaningless beyond.
         """
         factor = SPREAD["all"] * math.exp(sum(SPREAD[name] * value for name, value in self.features().items()))
         return min(factor, SPREAD["most"])

@@ -24,13 +24,14 @@ _GATE = 25.0  # chi² from the expectation, the limit of the search
 
 @dataclass(frozen=True)
 class Correlation:
-    """Masked normalised cross-correlation (Padfield 2012), by FFT, its peak refined by a parabola. Translation only.
+    """Estimator by masked normalised cross-correlation (Padfield 2012), with a parabola through the peak. Translation
+    only.
 
     Attributes:
-        coefficient: least accepted peak.
+        coefficient: least accepted correlation coefficient of the peak.
         height: least height of the peak, in standard deviations of all other shifts.
         rival: largest accepted ratio of the next peak to the peak.
-        overlap: least overlap, as share of the smaller scan; with a prior, two thirds of it are enough.
+        overlap: least overlap, as share of the smaller scan; with a prior, two thirds of this value.
 
     Raises:
         ConfigError: a meaningless setting.

@@ -38,9 +38,9 @@ _DEVIATIONS_MAX = 25.0  # squared, from the prior
 
 @dataclass(frozen=True, eq=False)
 class ConsensusEvidence:
-    """Matched features, with the pairs that agree on a transform.
+    """Matched features of two scans, and the consensus transform of the agreeing pairs.
 
-    `a` and `b` are (n, 2) in tip coordinates, m; `pixel_m` is the common pixel.
+    `a` and `b` are positions (n, 2) in tip coordinates, m; `pixel_m` is the common pixel size.
     """
 
     a: Array
@@ -75,7 +75,7 @@ def weighed(
     covariance: Array,
     center: Array,
 ) -> tuple[dict[str, float], str]:
-    """Return figures of merit by name, and the reason for a refusal (empty: accepted)."""
+    """Return figures of merit by name, and the reason for refusing the match (empty if accepted)."""
     inlier, transform = evidence.consensus.inlier, evidence.consensus.transform
     off = transform(evidence.a[inlier]) - evidence.b[inlier]
     figures = {

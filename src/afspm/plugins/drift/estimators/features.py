@@ -30,20 +30,20 @@ GATE = 25.0  # chi² from the expectation, the limit of the search
 
 @dataclass(frozen=True)
 class Features:
-    """The base of all estimators by features: `Brief`, `Orb` and `Sift`.
+    """Base class of the feature-based estimators `Brief`, `Orb` and `Sift`.
 
     Attributes:
         transform: "translation", "euclidean", "similarity" or "affine".
         residual_threshold: largest distance of a RANSAC inlier from the transform, as share of the scan's resolution.
-        iterations: of RANSAC, each with a random minimal sample. The smaller the share of right matches, the more are
-            needed.
-        tighten: whether to drop inliers farther off than most inliers; the paper does not.
-        max_keypoints: the strongest are kept.
-        false_alarms: accepted results by chance, expected for a pair without common features.
+        iterations: number of RANSAC iterations, each with a random minimal sample. A smaller share of right matches
+            needs more.
+        tighten: whether to drop inliers that are farther off than most; the paper keeps them.
+        max_keypoints: largest number of keypoints; the strongest are kept.
+        false_alarms: expected number of chance results for a pair without common features, at most.
         inlier_share: least share of inliers among all matches.
-        ambiguity: largest consensus on another displacement, as share of the best.
-        bend_max: largest rotation, scale or shear between scans.
-        seed: of the random samples; equal scans give equal results.
+        ambiguity: largest allowed consensus on another displacement, as share of the best.
+        bend_max: largest allowed rotation, scale or shear between scans.
+        seed: seed of the random samples; equal scans give equal results.
 
     Raises:
         ConfigError: a meaningless setting.
@@ -135,19 +135,19 @@ class Features:
 
 
 class Brief(Features):
-    """Harris corners with BRIEF descriptors, the paper's default. They do not follow a rotation of the sample."""
+    """Estimator with Harris corners and BRIEF descriptors, the paper's default. Not invariant to rotation."""
 
     kind = "brief"
 
 
 class Orb(Features):
-    """ORB: follows a rotation of the sample."""
+    """Estimator with ORB features, which are invariant to rotation."""
 
     kind = "orb"
 
 
 class Sift(Features):
-    """SIFT: follows rotation and scale of the sample."""
+    """Estimator with SIFT features, which are invariant to rotation and scale."""
 
     kind = "sift"
 

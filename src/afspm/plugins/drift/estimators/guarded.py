@@ -1,7 +1,7 @@
-"""A guard around any estimator: distinguishes errors from refusals, reports errors and bridges them.
+"""Guard around any estimator: distinguishes errors from refusals, reports errors, and replaces failed results.
 
-A refusal means that two scans can't be registered. An error means nothing about the scans: it is reported with the
-pair. A plain correlation then takes its place, if there is a prior and the peak is clear.
+A refusal means that two scans can't be registered. An error of the estimator says nothing about the scans: it is
+reported with the pair. A plain correlation then replaces the result, if there is a prior and the peak is clear.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class PairFailure:
     """An error of an estimator with a pair of scans.
 
     Attributes:
-        estimator: its name.
+        estimator: name of the estimator.
         reference, scan: the keys of both scans.
-        reason: the exception, or the defect of the result.
+        reason: text of the exception, or the defect of the result.
     """
 
     estimator: str
@@ -57,9 +57,9 @@ def log_failure(failure: PairFailure) -> None:
 
 
 class Guarded:
-    """A guard that runs an estimator, so that no caller needs to check its result.
+    """Guard that runs an estimator and validates its result, so that no caller needs to.
 
-    An exception, a result of the wrong type or shape, and impossible accepted values are failures: see
+    An exception, a result of the wrong type or shape, or an accepted result with impossible values is a failure: see
     `Registration.failure`. A displacement without overlap, and a mirrored or much stretched sample, are refused. The
     estimator receives copies of the values, so that its changes do not reach later comparisons.
 

@@ -1,4 +1,4 @@
-"""Images to register: scans with flattened rows on a common pixel grid. Scans without information are refused."""
+"""Preparation of scans for registration: rows flattened, on a common pixel grid; useless scans refused."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ MOST_SATURATED = 0.6  # of the pixels at exactly the lowest or the highest value
 
 
 class Unusable(Exception):
-    """The error that a scan can't be registered with any other; its text is the reason."""
+    """Error: a scan can't be registered with any other scan, for the reason in its text."""
 
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """A prepared image.
+    """An image prepared for registration.
 
     Attributes:
         values: [y, x], finite everywhere: unmeasured pixels are filled from the nearest row.
         known: [y, x], true for measured pixels, and for a single missing row between measured ones.
-        made_up: [y, x], true where neighbouring rows replace measured ones, without information about a displacement;
-            None: nowhere.
+        made_up: [y, x], true for values interpolated from neighbouring rows, which carry no information about a
+            displacement; None: nowhere.
     """
 
     values: Array
@@ -39,10 +39,11 @@ class Image:
 
 
 def prepare(values: Array) -> Image:
-    """Flatten the rows, clip outliers, mend scars, scale to a standard deviation of 1.
+    """Return an image with flattened rows, clipped outliers, mended scars, and a standard deviation of 1.
 
     Raises:
-        Unusable: less than half of the rows measured, constant, saturated, or without topography (a crashed tip).
+        Unusable: fewer than half of the rows are measured, or the values are constant, saturated or without topography
+            (a crashed tip).
     """
     known = np.isfinite(values)
     known &= ~_unfinished(np.where(known, values, 0.0))[:, None]
@@ -70,7 +71,7 @@ def prepare(values: Array) -> Image:
 
 
 def flatten_rows(values: Array, known: Mask) -> Array:
-    """Subtract a straight line from each row, by two rounds of weighted least squares that suppress outliers."""
+    """Subtract a straight line from each row, fitted by two rounds of weighted least squares that suppress outliers."""
     flat = _less_lines(values, known.astype(np.float64))
     for _ in range(2):
         scale = 1.4826 * np.median(np.abs(flat[known]), overwrite_input=True)
@@ -111,17 +112,17 @@ def without_scars(values: Array) -> Array:
 
 
 def levelled(values: Array) -> Array:
-    """Subtract the offsets of the rows, found as medians of the steps between rows."""
+    """Subtract the offsets of the rows, which are estimated from the median steps between rows."""
     steps = np.median(np.diff(values, axis=0), axis=1)
     level: Array = values - np.concatenate([[0.0], np.cumsum(steps)])[:, None]
     return level
 
 
 def standing_out(level: Array, thick: int) -> tuple[Array, Array, Array]:
-    """Return by how much `thick` rows stand out of their neighbours: upwards, downwards, and by their middle row.
+    """Return the height of `thick` rows above their neighbouring rows, their depth below, and the mean difference.
 
     The first is the least height above both neighbouring rows, the second the least depth below both, the third the
-    middle row minus the mean of both. Each is an image without the first row and the last `thick` rows.
+    middle row minus the mean of both neighbours. Each is an image without the first row and the last `thick` rows.
     """
     count = len(level) - thick - 1
     above, below = level[:count], level[thick + 1 :]
@@ -216,9 +217,9 @@ def _topography(values: Array, rows: Mask) -> float:
 
 @dataclass(frozen=True, eq=False)
 class CommonGrid:
-    """Two scans on one pixel grid.
+    """Pixel grid common to two scans, with its conversions.
 
-    Pixel coordinates (x, y) count from the centre of each scan, along the axes of the reference.
+    Pixel coordinates (x, y) start at the centre of each scan and follow the axes of the reference.
 
     Attributes:
         to_m: (2, 2) from pixels to metres in tip coordinates.
@@ -255,7 +256,7 @@ class CommonGrid:
 def onto_common_grid(
     reference: DriftScan, image1: Image, scan: DriftScan, image2: Image
 ) -> tuple[CommonGrid, Image, Image]:
-    """Resample both images to the axes of the reference and to the coarser pixel of the two.
+    """Resample both images onto the axes of the reference and the coarser pixel of the two.
 
     An image already on this grid is not resampled: interpolation costs accuracy.
     """

@@ -1,4 +1,4 @@
-"""Keypoints and descriptors of scikit-image: for each kind, a function from an image to its strongest keypoints."""
+"""Detection of keypoints with descriptors, by scikit-image: one function per kind of descriptor."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Keypoints:
 
     Attributes:
         xy_px: (n, 2) positions (x, y) from the centre of the image.
-        descriptors: (n, d), near each other (Euclidean) where the surroundings are alike.
+        descriptors: (n, d), with a small Euclidean distance for similar surroundings.
     """
 
     xy_px: Array
@@ -46,7 +46,7 @@ def brief(image: Image, count_max: int) -> Keypoints:
 
 
 def orb(image: Image, count_max: int) -> Keypoints:
-    """Return FAST corners over scales with binary descriptors that rotate with them (Rublee et al. 2011)."""
+    """Return FAST corners at several scales, with rotation-invariant binary descriptors (Rublee et al. 2011)."""
     detector = _skimage().ORB(n_keypoints=count_max, fast_threshold=0.05)
     if not _found(detector.detect_and_extract, _unit(image.values)):
         return _none(256)
@@ -55,7 +55,7 @@ def orb(image: Image, count_max: int) -> Keypoints:
 
 
 def sift(image: Image, count_max: int) -> Keypoints:
-    """Return blobs over scales with histograms of gradients (Lowe 2004)."""
+    """Return blobs at several scales, with gradient histograms as descriptors (Lowe 2004)."""
     detector = _skimage().SIFT()
     values = _unit(image.values)
     if not _found(detector.detect, values):
@@ -152,10 +152,10 @@ _CELLS = 1 << 20  # of the table of distances that exist at one time: 4 MB
 
 
 def matched(first: Descriptors, second: Descriptors, allowed: Allowed | None = None) -> NDArray[np.intp]:
-    """Return pairs of rows that are mutual nearest neighbours (Euclidean; of equally near ones the earlier).
+    """Return pairs of descriptors that are mutual nearest neighbours (Euclidean; the earlier one if equally near).
 
     Args:
-        first, second: (n, d) and (m, d).
+        first, second: descriptors, (n, d) and (m, d).
         allowed: for a slice of `first`, the mask (rows, m) of allowed pairs.
 
     Returns:

@@ -49,7 +49,7 @@ class LeastSquares:
     """Registration of two scans: I2(q + d/2) e^(-g/2) = I1(q - d/2) e^(g/2) + noise, d = u + A q + creep of the lines.
 
     1. `prepare`: flatten rows, clip outliers, refuse scans without information. `grid`: a common pixel.
-    2. `search` and `score`: candidates by normalised cross-correlation, and the likeliest of them.
+    2. `search`: candidates by normalised cross-correlation, and the most likely candidate.
     3. `alignment`: Gauss-Newton, coarse to fine; the fine stage without `spikes`, filtered and weighted by rows
        according to their `noise`.
     4. `covariance`: the uncertainty from noise, enlarged by doubt; `nuisances`: the average over possible shear,
@@ -57,11 +57,11 @@ class LeastSquares:
     5. `acceptance`: refuse likely false matches.
 
     Args:
-        wrong_at_most: the largest accepted probability that a match is wrong by more than a pixel; doubled where a
-            displacement is expected.
+        wrong_at_most: the largest accepted probability that a match is wrong by more than a pixel; doubled if there is
+            a prior for the displacement.
 
     Raises:
-        ConfigError: it is not between 0 and 1.
+        ConfigError: `wrong_at_most` is not between 0 and 1.
     """
 
     def __init__(self, wrong_at_most: float = WRONG_AT_MOST):

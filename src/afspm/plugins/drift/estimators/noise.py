@@ -1,4 +1,4 @@
-"""Noise of images: power spectra and the filter made of them, noise along rows, and shrinkage of noisy gradients."""
+"""Noise models of images: power spectra and a filter from them, noise along rows, shrinkage of noisy gradients."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BLUR_PX = 0.45  # removes frequencies that interpolation would alias
 
 
 def cosine_frequencies(shape: tuple[int, ...]) -> Array:
-    """Return the frequency of each coefficient of a cosine transform, cycles per pixel."""
+    """Return the frequency of each coefficient of a cosine transform, in cycles per pixel."""
     fy, fx = (np.arange(n) / (2.0 * n) for n in shape)
     length: Array = np.hypot(fy[:, None], fx[None, :])
     return length
@@ -26,7 +26,7 @@ def cosine_frequencies(shape: tuple[int, ...]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class FineFilter:
-    """The radial filter H = sqrt(2 S / (2 S + N)) exp(-2 pi² f² 0.45²) of both images in the fine alignment.
+    """Radial filter H = sqrt(2 S / (2 S + N)) exp(-2 pi² f² 0.45²), applied to both images in the fine alignment.
 
     Applied to two noisy images, H² weighs each frequency as the maximum-likelihood processor does (Hannan and Thomson,
     Biometrika 58, 77, 1971; Knapp and Carter, IEEE Trans. ASSP 24, 320, 1976). S and N come from the radial mean of
@@ -34,8 +34,8 @@ class FineFilter:
     frequencies would have a long impulse response, and the borders would leak across the image.
 
     Attributes:
-        frequency: per pixel, ascending.
-        gain: sqrt(2 S / (2 S + N)) there.
+        frequency: in cycles per pixel, ascending.
+        gain: sqrt(2 S / (2 S + N)) at each frequency.
     """
 
     frequency: Array
@@ -43,7 +43,7 @@ class FineFilter:
 
     @classmethod
     def of(cls, first: Array, second: Array) -> FineFilter:
-        """Estimate the filter from two images."""
+        """Return the filter estimated from two images."""
         from scipy.fft import dctn
 
         shapes = [first.shape, second.shape]
@@ -69,7 +69,7 @@ class FineFilter:
         return filtered
 
     def along_rows(self, frequency: Array) -> Array:
-        """Return the power of unit row noise after the filter, at frequencies along the rows."""
+        """Return the power spectrum along rows of unit white noise after the filter, at given frequencies."""
         across = (np.arange(64) + 0.5) / 128
         power: Array = np.mean(self.at(np.hypot(frequency[:, None], across)) ** 2, axis=1)
         return power
@@ -98,11 +98,11 @@ HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it th
 
 @dataclass(frozen=True, eq=False)
 class CrossingLines:
-    """The lines of a scan that is rotated against the grid; each has an unknown parabola of its own.
+    """The lines of a scan that is rotated against the grid; each line has its own unknown parabola.
 
     Attributes:
-        number: [y, x], the nearest line of each pixel of the grid, from 0 on.
-        along: [y, x], the position on that line, about -1 to 1.
+        number: [y, x], number of the line nearest to each pixel of the grid, from 0.
+        along: [y, x], position of the pixel along its line, about -1 to 1.
     """
 
     number: NDArray[np.intp]
@@ -110,15 +110,16 @@ class CrossingLines:
 
     @classmethod
     def of(cls, x: Array, y: Array) -> CrossingLines:
-        """Number the lines from the scan's own pixel coordinates, [y, x] of the grid.
+        """Return the lines, from the scan's own pixel coordinates (x, y) at each grid point, [y, x].
 
-        Lines are numbered by halves: a pixel between two lines shows some of both.
+        Lines are numbered in half steps, since a pixel between two lines shows both in part.
         """
         half = np.rint(2.0 * y).astype(np.intp)
         return cls(half - half.min(), 2.0 * (x - x.min()) / max(float(np.ptp(x)), 1.0) - 1.0)
 
     def seen(self, columns: NDArray[Real], weight: Array) -> NDArray[Real]:
-        """Return `seen` with white noise, also free of the crossing lines.
+        """Return the result of the function `seen` for white noise, with the parabolas of the crossing lines removed,
+        too.
 
         Both sets are projected away in turn (von Neumann, Functional Operators II, 1950).
         """
@@ -154,13 +155,13 @@ PROJECTIONS = 4
 def seen(
     columns: NDArray[Real], weight: Array, metric: Array | None, crossing: CrossingLines | None = None
 ) -> NDArray[Real]:
-    """Return Q f without parabolas: its product with another image g is f'Qg without the parabolas of both.
+    """Return Q f with parabolas removed: its product with another image g is f'Qg without the parabolas of both.
 
-    Generalised least squares row by row: each row has a parabola of its own, and noise with a memory. A row takes
-    seconds, and the next one starts again (feedback, flattening by up to the second order, drift of the z piezo). So
-    nothing is assumed of its parabola, and the noise within it is white plus 1/f, with covariance C and Q = C^-1. The
-    rest of a row f after a fit of the nuisance B = [1, x, x²] in this metric, f - B (B'QB)^-1 B'Q f, carries all
-    information of the row (Frisch and Waugh, Econometrica 1, 387, 1933; Aitken, Proc. R. Soc. Edinb. 55, 42, 1936).
+    Generalised least squares row by row: each row has its own parabola, and correlated noise. A row takes seconds, and
+    the next row has new offsets (feedback, flattening by up to the second order, drift of the z piezo). So nothing is
+    assumed about its parabola, and the noise within a row is white plus 1/f, with covariance C and Q = C^-1. The rest
+    of a row f after a fit of the nuisance B = [1, x, x²] in this metric, f - B (B'QB)^-1 B'Q f, carries all information
+    of the row (Frisch and Waugh, Econometrica 1, 387, 1933; Aitken, Proc. R. Soc. Edinb. 55, 42, 1936).
 
     Args:
         columns: [y, column, x].
@@ -219,14 +220,14 @@ def _less_lines(rows: NDArray[Real], root: NDArray[Real]) -> NDArray[Real]:
 
 
 def without_lines(values: Array, known: NDArray[np.bool_], crossing: CrossingLines | None = None) -> Array:
-    """Subtract from each row of [y, x] a fitted parabola, and from crossing lines theirs; 0 for unknown pixels."""
+    """Subtract a fitted parabola from each row of [y, x], and from each crossing line; unknown pixels become 0."""
     return seen(values[:, None], known.astype(np.float64), None, crossing)[:, 0]
 
 
 def products(one: NDArray[Real], two: NDArray[Real]) -> Array:
     """Return the sums of products of columns, [y, column, x], over blocks of rows: (block, columns of one, of two).
 
-    Where `one` comes from `seen`, the lines of `two` cancel, but only in whole rows.
+    If `one` comes from `seen`, the parabolas of `two` cancel, but only in whole rows.
     """
     starts = np.arange(0, one.shape[0], min(max(one.shape[0] // BLOCKS, 2), BLOCK_ROWS))
     sums: Array = np.add.reduceat(one @ two.transpose(0, 2, 1), starts, axis=0, dtype=np.float64)
@@ -234,9 +235,9 @@ def products(one: NDArray[Real], two: NDArray[Real]) -> Array:
 
 
 def noise_metric(residual: Array, known: NDArray[np.bool_], seen_through: FineFilter) -> Array | None:
-    """Return Q of white and 1/f noise, N(f) = a + b / f; None if the noise is nearly white (b W <= 0.3 a).
+    """Return the metric Q of white and 1/f noise; None if the noise is nearly white (b W <= 0.3 a).
 
-    N is fitted to the median spectrum of the rows of a residual, as changed by the filter.
+    N(f) = a + b / f is fitted to the median row spectrum of a residual, corrected for the filter.
     """
     from scipy.linalg import inv, toeplitz
     from scipy.optimize import nnls
@@ -275,8 +276,8 @@ CERTAIN = 9.0  # times its noise power, from which a coefficient is kept on its 
 def denoised(image: Array, noise: Array) -> tuple[Array, Array]:
     """Shrink the coefficients of the cosine transforms of an image's patches by their noise.
 
-    Where a surface is flat its gradient is noise. Its product with the noise of the residual blurs the estimate and
-    makes it look certain, the more the fewer edges the image has; a bound with the true gradient has no such term.
+    On a flat surface the gradient is noise. Its product with the noise of the residual biases the estimate and makes it
+    look too certain, most of all in images with few edges; a bound with the true gradient has no such term.
     Coefficients c of overlapping patches are shrunk by the larger of two gains: the garrote 1 - k N / c² (Breiman,
     Technometrics 37, 373, 1995), which keeps features, and Wiener's S / (S + N), which keeps the texture common to all
     patches. The power of noise N and texture S of each coefficient are medians over the patches; this allows for

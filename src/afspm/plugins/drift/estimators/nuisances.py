@@ -1,10 +1,10 @@
-"""Nuisances that displace an image besides drift between two scans: averaged over plausible amounts.
+"""Averaging over nuisances: shear, rotation, calibration errors and creep, which displace an image like drift.
 
-Where features are few, a shift looks much like a shear, or like creep at the start of the lines. A fit with all of them
-free is then less certain of the shift than necessary: most scans have little of most of them. So the fit is made once
-with all of them free, and then recomputed for each of some models of their size. The results are averaged, weighted by
-how likely each model makes the images (Hoeting et al., Stat. Sci. 14, 382, 1999). The fit is linear about its end, so
-this needs no further look at the images.
+With few features, a shift looks much like a shear, or like creep at the start of the lines. A fit with all nuisances
+free is then less certain of the shift than necessary, since most nuisances are small in most scans. So one fit is made
+with all nuisances free, and then recomputed for several models of their size. The results are averaged, weighted by the
+likelihood of the images under each model (Hoeting et al., Stat. Sci. 14, 382, 1999). The fit is linear near its
+solution, so the images are not needed again.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ NONE: Final = 1e-3  # px, or px over ten: counts as zero
 
 @dataclass(frozen=True, eq=False)
 class Shear:
-    """Prior of the linear map from drift during the scans, which shears one against the other.
+    """Prior of the linear map caused by drift during the scans, which shears one scan relative to the other.
 
     Attributes:
         aspect: height of a pixel over its width.
@@ -51,8 +51,8 @@ def averaged(information: Array, pull: Array, precision: Array, shear: Shear) ->
     Args:
         information: (n, n) about theta from the images (see `warp.WarpedPair`): their log-likelihood is
             -theta' information theta / 2 + pull' theta.
-        pull: (n,); includes the mean of the prior of all parameters but linear map and creep.
-        precision: (n, n), the inverse covariance of that prior.
+        pull: (n,); includes the prior mean of all parameters except linear map and creep.
+        precision: (n, n), the inverse covariance of this prior.
     """
     weights, priors = _models(precision, shear)
     mean = np.zeros(len(pull))

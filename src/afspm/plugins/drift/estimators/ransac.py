@@ -1,4 +1,4 @@
-"""The transform that most pairs of points agree on: RANSAC with least squares.
+"""RANSAC with least squares: finds the transform with the most agreeing pairs of points.
 
 Sources: paper, supporting information, "Drift Estimation"; Fischler and Bolles 1981.
 """
@@ -37,7 +37,7 @@ class Transform:
 
 @dataclass(frozen=True, eq=False)
 class Consensus:
-    """A transform, and the mask (n,) of the pairs within `radius` of it."""
+    """A transform, with the mask (n,) of the pairs within `radius` of its prediction."""
 
     transform: Transform
     inlier: Mask
@@ -81,11 +81,11 @@ def _affine(a: Array, b: Array) -> Array | None:
 
 @dataclass(frozen=True)
 class Form:
-    """A family of transforms.
+    """A family of transforms, such as translations.
 
     Attributes:
-        pairs: number that determines a transform.
-        linear: least squares for the 2 x 2 part, from points about their means; None if they don't determine it.
+        pairs: number of pairs needed to determine a transform.
+        linear: returns the least-squares 2 x 2 part, from points relative to their means; None if undetermined.
     """
 
     pairs: int
@@ -103,8 +103,8 @@ FORMS = {
 def fitted(a: Array, b: Array, form: Form, bend_max: float) -> Transform | None:
     """Return the least-squares transform from points `a` to `b`, (n, 2) each.
 
-    None if the points don't determine it, or if it rotates, scales or shears by more than `bend_max`, as drift does
-    not.
+    None if the points don't determine the transform, or if it rotates, scales or shears by more than `bend_max`, which
+    drift does not.
     """
     if len(a) < form.pairs:
         return None
@@ -120,10 +120,10 @@ class Search:
     """RANSAC with its settings.
 
     Attributes:
-        form: of the transform.
-        iterations: at most.
+        form: family of the transform.
+        iterations: largest number of iterations.
         bend_max: see `fitted`.
-        rng: of the choices.
+        rng: random generator of the samples.
     """
 
     form: Form
@@ -132,7 +132,7 @@ class Search:
     rng: np.random.Generator
 
     def among(self, a: Array, b: Array, radius: float) -> Consensus | None:
-        """Return the best consensus among pairs, by the paper's steps.
+        """Return the best consensus among pairs of points, by the paper's steps.
 
         Each step fits a random minimal sample, finds the agreeing pairs (squared error), fits these, and keeps the
         better consensus. The search ends early when almost all pairs agree.
@@ -172,7 +172,7 @@ def consensus(a: Array, b: Array, transform: Transform | None, radius: float) ->
 def tightened(
     a: Array, b: Array, start: Consensus, form: Form, *, least: float, most: float, bend_max: float
 ) -> Consensus:
-    """Refit to the nearest inliers until nothing changes: a wide radius lets mismatches in, and each of them pulls.
+    """Refit to the nearest inliers until nothing changes, since a wide radius admits mismatches that bias the fit.
 
     The radius is three robust standard deviations of the inliers, between `least` and `most`.
     """
@@ -211,9 +211,9 @@ def log10_false_alarms(pairs: int, inliers: int, sample: int, chance: float) -> 
 
 
 def jackknife_covariance(a: Array, b: Array, block: NDArray[np.intp], form: Form, at: Array) -> Array | None:
-    """Return the covariance (2, 2) of the displacement at a point, by leaving out one block of pairs in turn.
+    """Return the covariance (2, 2) of the displacement at a point, by a jackknife over blocks of pairs.
 
-    Pairs of one place have correlated errors, so they are left out together. None for fewer than 3 blocks, or if a fit
+    Pairs in one block have correlated errors, so they are left out together. None for fewer than 3 blocks, or if a fit
     fails.
     """
     blocks = np.unique(block)

@@ -1,4 +1,4 @@
-"""Search for the displacement: candidates by normalised cross-correlation, and the likeliest of them."""
+"""Search for the displacement: candidates from normalised cross-correlation, and the most likely candidate."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ GATE = 25.0  # chi² of an expected shift, the limit of the search
 
 @dataclass(frozen=True, eq=False)
 class ExpectedShift:
-    """Expected shift, px, and its covariance, px²."""
+    """Expected shift in px, with its covariance in px²."""
 
     mean: Array
     covariance: Array
@@ -34,23 +34,23 @@ class ExpectedShift:
         return cls(grid.shift_px(prior.mean_m), inverse @ prior.covariance_m2 @ inverse.T)
 
     def chi2(self, shift_px: Array) -> Array:
-        """Return chi² of shifts, shape (..., 2)."""
+        """Return chi² of shifts relative to the expectation; shifts have shape (..., 2)."""
         off = shift_px - self.mean
         chi2: Array = np.einsum("...i,ij,...j", off, np.linalg.inv(self.covariance), off)
         return chi2
 
     @property
     def area_px2(self) -> float:
-        """Area of the search."""
+        """Area of the searched ellipse, in px²."""
         return float(GATE * math.pi * np.sqrt(np.linalg.det(self.covariance)))
 
     def surprise(self, shift_px: Array, covariance: Array) -> float:
-        """Return chi² of an estimate with a covariance of its own."""
+        """Return chi² of an estimate relative to the expectation, including the estimate's covariance."""
         off = shift_px - self.mean
         return float(off @ np.linalg.solve(self.covariance + covariance, off))
 
     def on_smaller(self, factor: int, offset_px: Array) -> ExpectedShift:
-        """Return the expectation for images with pixels `factor` times as large and centres apart by `offset_px`."""
+        """Return the expectation for images with pixels `factor` times as large, and centres `offset_px` apart."""
         mean: Array = (self.mean - offset_px) / factor
         return ExpectedShift(mean, self.covariance / factor**2 + 0.3 * np.eye(2))
 
@@ -58,8 +58,8 @@ class ExpectedShift:
 def shear_by_drift(prior: Prior | None, reference: DriftScan, scan: DriftScan) -> tuple[Array, float | None]:
     """Return the displacement of rows by drift, in m per m along the slow axis, and its standard deviation.
 
-    Drift displaces a row by v t, and t runs along the slow axis. The result is unknown (zero, None) unless both scans
-    have the same direction, angle and pace: the prior contains only the difference of their velocities.
+    Drift displaces a row by v t, and t increases along the slow axis. The result is (zero, None) unless both scans have
+    the same direction, angle and pace, since the prior contains only the difference of their velocities.
     """
     nothing = np.zeros(2), None
     if prior is None or prior.velocity_sd_m_s is None or reference.upwards is None:
@@ -80,7 +80,7 @@ APART_PX = 1.5  # nearer peaks are one
 
 
 def candidates(scene: Scene, prior: ExpectedShift | None) -> list[Array]:
-    """Return the expected shift, if any, and the best shifts (x, y) px by correlation, best first."""
+    """Return candidate shifts (x, y) in px: the expected shift, if any, then the best correlation peaks, best first."""
     correlation = MaskedCorrelation(scene.first.known, scene.second.known)
     peaks: list[tuple[float, Array]] = []
     for one, two in (scene.smooth, scene.band):
@@ -97,7 +97,7 @@ def candidates(scene: Scene, prior: ExpectedShift | None) -> list[Array]:
 
 
 class MaskedCorrelation:
-    """Normalised cross-correlation of two partly known images, for all shifts at once.
+    """Normalised cross-correlation of two images with unknown pixels, for all shifts at once.
 
     Source: Padfield, IEEE Trans. Image Process. 21, 2706, 2012.
     """
@@ -123,7 +123,7 @@ class MaskedCorrelation:
         self._spectra = exact[0].astype(np.complex64), exact[1].astype(np.complex64)
 
     def of(self, one: Array, two: Array) -> Array:
-        """Return the coefficients [y, x]; `shifts_px` gives their shifts."""
+        """Return the correlation coefficients [y, x]; `shifts_px` converts indices to shifts."""
         m1, m2 = self._masks
         one, two = (one - one[m1 > 0].mean()) * m1, (two - two[m2 > 0].mean()) * m2
         f1, f2 = self._transform(one), self._transform(two)
@@ -144,7 +144,7 @@ class MaskedCorrelation:
         return shifts
 
     def peaks(self, one: Array, two: Array, prior: ExpectedShift | None) -> list[tuple[float, Array]]:
-        """Return the highest peaks by atanh(c) sqrt(n), which has the same variance for every overlap n (Fisher)."""
+        """Return the highest peaks, by atanh(c) sqrt(n), whose variance is the same for every overlap n (Fisher)."""
         from scipy.ndimage import maximum_filter
 
         enough = self.overlap >= LEAST_OVERLAP * min(mask.sum() for mask in self._masks)
@@ -179,14 +179,14 @@ OTHER_PX = 2.0  # a second best nearer than this is the same match
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A shift, px, and its log-likelihood, nats."""
+    """A shift in px, with its log-likelihood in nats."""
 
     shift_px: Array
     likelihood: float
 
 
 class Scorer:
-    """The score of a shift: L = sum over channels of -n/2 ln(1 - rho²), plus the prior; n independent values."""
+    """Scorer of shifts: L = sum over channels of -n/2 ln(1 - rho²), plus the prior, with n independent values."""
 
     def __init__(self, scene: Scene, expected: ExpectedShift | None):
         self._scene = scene
@@ -197,7 +197,7 @@ class Scorer:
         ]
 
     def best(self, shifts: list[Array]) -> tuple[Scored, float] | None:
-        """Return the likeliest shift and the likelihood of the best rival; None if no shift has enough overlap."""
+        """Return the most likely shift, and the likelihood of its best rival; None if no shift has enough overlap."""
         scored = [s for s in map(self._score, shifts) if s is not None]
         if not scored:
             return None

@@ -1,8 +1,8 @@
-"""Spikes and scars: pixels and stretches of rows that stand out in only one of two scans.
+"""Removal of spikes and scars: pixels and parts of rows that stand out in only one of two scans.
 
-A filter would smear them over features, and the fit would take their edges for edges of the sample. In one image a
-spike looks like the top of a small particle, and on a rough surface most scars are lower than their surroundings. Only
-the difference of both images separates them.
+A filter would smear spikes and scars over features, and the fit would mistake their edges for edges of the sample. In a
+single image a spike looks like the top of a small particle, and on a rough surface most scars are lower than the
+features around them. Only the difference of both images reveals them.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ OWN = 0.6  # least share of that in the scan itself: else the scar is in the oth
 
 
 def without_scars_of_one(scene: Scene, theta: Array) -> Scene:
-    """Return two images without the scars that only one of them has; the replaced pixels are marked as made up.
+    """Return two images without scars that only one of them shows; the replaced pixels are marked in `made_up`.
 
     Args:
-        theta: the displacement, to a fraction of a pixel; see `warp.WarpedPair`.
+        theta: displacement, known to a fraction of a pixel; see `warp.WarpedPair`.
     """
     first, second = scene.first, scene.second
     return Scene(_unscarred(first, second, theta), _unscarred(second, first, -theta))
@@ -80,10 +80,10 @@ def _along(values: Array) -> Array:
 
 
 def without_spikes(scene: Scene, theta: Array) -> Scene:
-    """Return two images with each spike replaced by the mean of its neighbours in the row.
+    """Return two images, with each spike replaced by the mean of its neighbours in the row.
 
     Args:
-        theta: the displacement, to a pixel; see `warp.WarpedPair`.
+        theta: displacement, known to a pixel; see `warp.WarpedPair`.
     """
     first, second = scene.first, scene.second
     return Scene(_mended(first, second, theta), _mended(second, first, -theta))

@@ -1,4 +1,4 @@
-"""Two images, each warped half-way to the other."""
+"""Warping of two images, each half-way towards the other."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Spline:
-    """An image as cubic splines, evaluated at pixel coordinates (x, y) from its centre.
+    """Cubic spline interpolation of an image, at pixel coordinates (x, y) from its centre.
 
     Attributes:
-        known: more than two pixels from unknown pixels, and not made up; None: everywhere.
+        known: mask of pixels that are more than two pixels from unknown ones, and not made up; None: all.
     """
 
     coefficients: Array
@@ -30,7 +30,7 @@ class Spline:
 
     @classmethod
     def of(cls, values: Array, known: Mask, made_up: Mask | None = None) -> Spline:
-        """Interpolate values exactly at the pixels."""
+        """Return a spline that interpolates values exactly at the pixels."""
         from scipy.ndimage import binary_erosion, spline_filter
 
         inner = None if known.all() else binary_erosion(known, iterations=2, border_value=1)
@@ -39,7 +39,7 @@ class Spline:
         return cls(spline_filter(values, mode="mirror"), inner)
 
     def at(self, x: Array, y: Array) -> tuple[Array, Mask]:
-        """Return values at points, and the mask of the known ones."""
+        """Return values at points, and the mask of known values."""
         from scipy.ndimage import map_coordinates
 
         ny, nx = self.coefficients.shape
@@ -52,7 +52,7 @@ class Spline:
         return values, known
 
     def on_grid(self, x: Array, y: Array) -> tuple[Array, Mask]:
-        """Return `at` for a grid of one pixel with axes x and y; much faster, by rows and columns."""
+        """Return values and mask like `at`, but on a grid with a spacing of one pixel, which is much faster."""
         values, known = self.coefficients, np.ones((y.size, x.size), dtype=bool)
         picked = []
         for axis, at in enumerate((y, x)):
@@ -94,14 +94,14 @@ def _mirrored(index: NDArray[np.intp], size: int) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, eq=False)
 class OverlapBox:
-    """The rectangle of the mid grid in which two shifted images overlap: pixels (x, y) from the centres."""
+    """Rectangle of the mid grid in which two shifted images overlap: pixel coordinates (x, y) from its centre."""
 
     x: Array
     y: Array
 
     @classmethod
     def of_overlap(cls, shape1: tuple[int, int], shape2: tuple[int, int], shift_px: Array) -> OverlapBox | None:
-        """Return the box of two shifted images; None if it has less than 8 x 8 pixels."""
+        """Return the overlap of two shifted images; None if it has fewer than 8 pixels on a side."""
         axes = []
         for axis, shift in ((1, shift_px[0]), (0, shift_px[1])):
             half1, half2 = (shape1[axis] - 1) / 2, (shape2[axis] - 1) / 2
@@ -111,7 +111,7 @@ class OverlapBox:
         return cls(*axes) if min(axis.size for axis in axes) >= 8 else None
 
     def without_border(self, width: int) -> OverlapBox:
-        """Remove `width` pixels on each side; the centre stays."""
+        """Return the box without `width` pixels on each side."""
         return OverlapBox(self.x[width:-width], self.y[width:-width])
 
     @property
@@ -133,18 +133,18 @@ GAIN, BEND, COUNT = SLOPES, SLOPES + 1, SLOPES + 2
 
 @dataclass(frozen=True, eq=False)
 class WarpedPair:
-    """Two images on a box.
+    """Two images on their overlap box, with the parameters of their alignment.
 
     Parameters are theta = (ux, uy, axx, axy, ayx, ayy, c.., g, h): shift u px and linear map A about the centre of the
     box, d(q) = u + A (q - centre); creep c at the start of the lines, in pixels of their own scan, the same in both;
-    logarithm g of the gain of the second over the first; and excess curvature h of the second (heights z appear as
-    z + h z² / 2: feedback and tip do that to edges).
+    logarithm g of the gain of the second over the first; and excess curvature h of the second (heights z appear as z +
+    h z² / 2, an effect of feedback and tip at edges).
 
     Attributes:
-        shift_px: (2,) near u: the distance between the starts of the lines of both on the box.
-        own_px: width of a pixel of each scan, in pixels of the grid. Lines creep for some of their own pixels, which is
-            next to nothing for a zoom. 0: its lines don't lie along the rows of the grid, so creep has no model.
-        crossing: the lines of the second scan, if they don't lie along the rows.
+        shift_px: (2,) approximate u, for the distance between the line starts of both images.
+        own_px: width of a pixel of each scan, in pixels of the grid. Creep lasts for some of a scan's own pixels, which
+            is negligible in a zoom. 0: the lines are not along the rows of the grid, so creep is not modelled.
+        crossing: the lines of the second scan, if they are not along the rows of the grid.
     """
 
     first: Spline
@@ -157,8 +157,8 @@ class WarpedPair:
     def warped(self, theta: Array) -> tuple[Array, Array, Mask]:
         """Return I1(q - d/2) and I2(q + d/2), each with half of the other's contrast, and the mask known in both.
 
-        Moving both by half gives both equal interpolation noise. So the gradient of their mean is not correlated with
-        the noise of their difference, and the shift is not pulled towards whole pixels.
+        Moving each image by half gives both the same interpolation noise. So the gradient of their mean is not
+        correlated with the noise of their difference, and the shift is not biased towards whole pixels.
         """
         if theta[2:SLOPES].any():
             (one, known1), (two, known2) = self._both(theta)
@@ -199,15 +199,15 @@ class WarpedPair:
     def columns(
         self, gx: Array, gy: Array, mean: Array, residual: Array, free: Iterable[int] = range(COUNT)
     ) -> Columns:
-        """Return the derivatives of the residual by the free part of theta, and the residual, [y, column, x].
+        """Return the derivatives of the residual with respect to the free parameters, and the residual, [y, column, x].
 
-        They have 32 bits: their products take most of the time, and are exact to a millionth.
+        They are 32-bit floats, since their products take most of the time, and are exact to a millionth.
         """
         by = (*self._by_slopes(gx, gy), -mean, (mean, -mean / 2))
         return np.stack([*(_product(by[i]) for i in free), residual], axis=1, dtype=np.float32)
 
     def slopes(self, gx: Array, gy: Array) -> Columns:
-        """Return only the columns that contain the gradient."""
+        """Return only the columns that contain the gradient, [y, column, x]."""
         return np.stack([_product(column) for column in self._by_slopes(gx, gy)], axis=1, dtype=np.float32)
 
     def _by_slopes(self, gx: Array, gy: Array) -> tuple[Array | tuple[Array, Array], ...]:
@@ -224,10 +224,10 @@ NINE_POINTS = (672.0 / 840.0, -168.0 / 840.0, 32.0 / 840.0, -3.0 / 840.0)  # on 
 
 
 def derivative(values: Array, axis: int) -> Array:
-    """Return the derivative per pixel, from nine points.
+    """Return the derivative per pixel, by a nine-point stencil.
 
-    Five points give waves of less than six pixels too little weight. The image is continued linearly beyond its
-    borders.
+    Five points would underestimate the slope of waves shorter than six pixels. The image is continued linearly beyond
+    its borders.
     """
 
     def part(start: int | None, stop: int | None, step: int = 1, of: Array = values) -> Array:
@@ -248,19 +248,19 @@ Both = tuple[Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Two images with one pixel size."""
+    """Two images with the same pixel size."""
 
     first: Image
     second: Image
 
     @cached_property
     def smooth(self) -> Both:
-        """Images without most of the noise."""
+        """Both images, smoothed to remove most of the noise."""
         return self._filtered(1.0)
 
     @cached_property
     def band(self) -> Both:
-        """Images of edges rather than areas."""
+        """Both images, band-pass filtered to show edges rather than areas."""
         fine, coarse = self._filtered(0.8), self._filtered(3.0)
         return fine[0] - coarse[0], fine[1] - coarse[1]
 
@@ -273,7 +273,7 @@ class Scene:
         return self.splines(self.band)
 
     def splines(self, values: Both) -> tuple[Spline, Spline]:
-        """Return splines of values, with the masks of the images."""
+        """Return splines of filtered values, with the masks of the images."""
         one, two = (
             Spline.of(each, image.known, image.made_up)
             for each, image in zip(values, (self.first, self.second), strict=True)
@@ -281,12 +281,12 @@ class Scene:
         return one, two
 
     def box(self, shift_px: Array) -> OverlapBox | None:
-        """Return the overlap at a shift; see `OverlapBox.of_overlap`."""
+        """Return the overlap box at a shift; see `OverlapBox.of_overlap`."""
         return OverlapBox.of_overlap(self.first.values.shape, self.second.values.shape, shift_px)
 
     @property
     def least_known(self) -> int:
-        """Number of known pixels of the image with fewer."""
+        """Number of known pixels in the image with fewer of them."""
         return min(int(self.first.known.sum()), int(self.second.known.sum()))
 
     def _filtered(self, sigma_px: float) -> Both:
@@ -296,7 +296,7 @@ class Scene:
         return one, two
 
     def smaller(self) -> tuple[Scene, int, Array]:
-        """Return the scene of the search, its decimation, and the shift of its centres, px.
+        """Return a decimated scene for the search, the decimation factor, and the shift of its centres in px.
 
         Large images are decimated. Only whole blocks of pixels are kept, which moves the centres apart.
         """

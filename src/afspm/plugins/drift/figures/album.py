@@ -1,4 +1,4 @@
-"""Writes all figures of a run into a folder."""
+"""Writing of all drift figures of a run into a folder."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ class RunPart:
     """Consecutive scans of a run, before or after drift correction was switched on.
 
     Attributes:
-        name: part of a file's name, e.g. "on".
-        title: e.g. "correction on".
-        start, stop: indices of its scans.
-        estimates: off-line registrations of each scan with the first of the part; None where there are none.
+        name: suffix for file names, such as "on".
+        title: title in figures, such as "correction on".
+        start, stop: range of scan indices; `stop` is excluded.
+        estimates: off-line registrations of each scan with the first one of the part; None without registrations.
     """
 
     name: str
@@ -50,14 +50,14 @@ class RunPart:
 
 @dataclass(frozen=True, eq=False)
 class DriftRun:
-    """The material for the figures of a run of n scans.
+    """Data for the figures of a run with n scans.
 
     Attributes:
-        scans: in the order of time.
-        record: of the tracker.
-        parts: in the order of time.
-        matched: a registration of two scans (indices) with matched features, if there is one.
-        truth_m: (n, 2) true drift, where it is known.
+        scans: scans in order of time.
+        record: drift record of the tracker.
+        parts: parts of the run in order of time.
+        matched: indices of two scans, and their registration with matched features; None without one.
+        truth_m: (n, 2) true drift, if known.
     """
 
     scans: Sequence[DriftScan]
@@ -68,12 +68,12 @@ class DriftRun:
 
     @property
     def switched_on_s(self) -> float | None:
-        """Time at which correction was switched on: the start of the second of two parts."""
+        """Time at which correction was switched on: the start of the second part; None without one."""
         return float(self.record.time_s[self.parts[1].start]) if len(self.parts) > 1 else None
 
 
 def write(run: DriftRun, folder: Path, *, title: str = "") -> list[Path]:
-    """Write all figures for which there is material, and return the files."""
+    """Write all figures for which there are data, and return their paths."""
     written = []
     for name, made in _figures(run, title):
         path = folder / f"drift_{name}.png"

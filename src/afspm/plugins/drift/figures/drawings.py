@@ -1,4 +1,4 @@
-"""The figures of drift: one function for each matplotlib figure."""
+"""Drawings of drift: each function returns one matplotlib figure."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ def draw_offsets(
     """Draw the displacement of the sample and its change over time, as in the paper's experiment.
 
     Args:
-        record: of the run.
-        truth_m: (n, 2) true drift from any zero, where it is known.
-        switched_on_s: when drift correction was switched on.
+        record: drift record of the run.
+        truth_m: (n, 2) true drift, with any zero; None if unknown.
+        switched_on_s: time when drift correction was switched on.
     """
     with styled():
         made = figure(3.6, 6.2)
@@ -86,12 +86,12 @@ _PAIR_INCHES = 2.2
 
 @dataclass(frozen=True, eq=False)
 class ScanPair:
-    """Two scans, with the displacement of features from the first to the second.
+    """Two scans, and the displacement of features from the first to the second.
 
     Attributes:
         moved_m: (2,) in the frame of the image: position of a feature in the second scan, minus its position in the
             first.
-        title: e.g. "correction off".
+        title: title of the pair, such as "correction off".
     """
 
     first: DriftScan
@@ -101,7 +101,7 @@ class ScanPair:
 
 
 def draw_pairs(pairs: Sequence[ScanPair]) -> Figure:
-    """Draw each pair as a row of two scans, with the displacement as an arrow in the second.
+    """Draw each pair as a row of two scans, with the displacement as an arrow in the second scan.
 
     Scans are shown in their own frames.
     """
@@ -142,10 +142,10 @@ def _arrow(ax: Axes, pair: ScanPair) -> None:
 
 
 def draw_estimates(record: DriftRecord, *, title: str = "", truth_m: Array | None = None) -> Figure:
-    """Draw the displacement of features from their place in the first scan, against time.
+    """Draw the displacement of features since the first scan against time.
 
     Args:
-        record: of the pairs; `matched` marks the accepted ones.
+        record: drift record of the pairs; `matched` marks accepted pairs.
         truth_m: (n, 2) true values, where known.
     """
     with styled():
@@ -192,7 +192,7 @@ _MOST_BINS = 100
 
 
 def draw_histogram(record: DriftRecord, *, title: str = "") -> Figure:
-    """Draw histograms of x, y and distance for the accepted pairs, without the first scan itself."""
+    """Draw histograms of x, y and distance for the accepted pairs; the first scan is left out."""
     moved = record.misplacement_m[1:][record.matched[1:]]
     with styled():
         made = figure(WIDTH_IN, 2.2)
@@ -210,7 +210,7 @@ def draw_histogram(record: DriftRecord, *, title: str = "") -> Figure:
 
 
 def freedman_diaconis(values: Array) -> Array:
-    """Return edges of bins as wide as 2 IQR n^(-1/3), or of one bin if all values are equal.
+    """Return the edges of histogram bins of width 2 IQR n^(-1/3), or of one bin if all values are equal.
 
     This width makes the histogram close to the density in the mean square (D. Freedman, P. Diaconis, Z.
     Wahrscheinlichkeitstheorie verw. Gebiete 57, 453, 1981).
@@ -225,7 +225,7 @@ def freedman_diaconis(values: Array) -> Array:
 
 
 def round_bins(values: Array) -> Array:
-    """Return bins with round edges, at most as wide as those of `freedman_diaconis`; at least √n of them."""
+    """Return at least √n bins with round edges, no wider than the bins of `freedman_diaconis`."""
     edges = freedman_diaconis(values)
     span = float(edges[-1] - edges[0])
     width = round_length_m(min(float(edges[1] - edges[0]), span / np.sqrt(len(values))))
@@ -249,7 +249,7 @@ _INCHES = 2.6
 
 
 def draw_features(reference: DriftScan, scan: DriftScan, matches: Matches | None) -> Figure:
-    """Draw both scans twice: (a) with the matched keypoints; (b) with matches joined, outliers dotted.
+    """Draw both scans twice: (a) with the matched keypoints; (b) with lines between matches, dotted for outliers.
 
     Raises:
         InvalidValue: the estimator matches no features.
@@ -310,9 +310,9 @@ def draw_errors(record: DriftRecord, truth_m: Array, *, switched_on_s: float | N
     The misplacement is the distance on the sample from the place of the first scan.
 
     Args:
-        record: of the run.
-        truth_m: (n, 2) the true displacement at the middle of each scan, from any zero on.
-        switched_on_s: when drift correction was switched on.
+        record: drift record of the run.
+        truth_m: (n, 2) true displacement at the middle of each scan, with any zero.
+        switched_on_s: time when drift correction was switched on.
     """
     with styled():
         made = figure(WIDTH_IN, 4.2)

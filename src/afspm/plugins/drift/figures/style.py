@@ -1,4 +1,4 @@
-"""The style of the figures: sizes, colours safe for colour-blind readers, units on the axes."""
+"""Style of the figures: sizes, colours safe for colour-blind readers, and units on the axes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def styled() -> Any:
 
 
 def figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty figure that needs no screen."""
+    """Return an empty figure that can be drawn without a screen."""
     made = Figure(figsize=(width_in, height_in), facecolor="white", layout=LAYOUT)
     FigureCanvasAgg(made)
     return made
@@ -60,7 +60,7 @@ def save(made: Figure, path: Path) -> None:
 
 
 def unit_of(*lengths_m: Array | float) -> tuple[str, float]:
-    """Return the unit in which these lengths read best, and the factor from metres to this unit."""
+    """Return the most readable unit for lengths, and the factor from metres to this unit."""
     finite = [np.abs(np.asarray(a, dtype=np.float64)[np.isfinite(a)]) for a in lengths_m]
     largest = max((float(a.max()) for a in finite if a.size), default=0.0)
     return next((unit, factor) for below, unit, factor in _UNITS if largest < 2 * below)
@@ -72,12 +72,12 @@ def time_axis(ax: Axes, *, label: bool = True) -> None:
 
 
 def shared_span(scans: Sequence[DriftScan]) -> ValueRange:
-    """Return one range of heights for scans that are compared."""
+    """Return a common range of heights for scans that are compared."""
     return shared_range(flattened(scan.values) for scan in scans)
 
 
 def show_scan(ax: Axes, scan: DriftScan, span: ValueRange) -> None:
-    """Show a scan in grey, levelled line by line, in µm of its own frame (before rotation), with a scale bar."""
+    """Show a scan in grey, levelled line by line, with a scale bar; axes in µm of its own frame (before rotation)."""
     left, low = (1e6 * edge for edge in scan.region.top_left_m)
     width, height = (1e6 * size for size in scan.region.size_m)
     level = flattened(scan.values)

@@ -1,7 +1,7 @@
-"""The worker's task: register scans one after the other, and remember the last answers.
+"""The worker's task: registers scans one after the other, and remembers the last answers.
 
-After a kill of worker or scheduler the same scan may be requested again. It is answered from memory: no tracker may
-take a scan twice, and no scan has two mappings.
+After a kill of worker or scheduler, a scan may be requested again. The answer then comes from memory: no tracker may
+process a scan twice, and no scan has two mappings.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _ANSWERS = 16
 
 
 class Estimation:
-    """A tracker with its memory.
+    """A tracker with the memory of its last answers.
 
     Args:
-        save: keeps the state on disk, before it is published.
+        save: saves the state to disk, before a result is published.
         failures: the list to which the tracker's estimator adds its errors; it is emptied before each scan.
     """
 
@@ -58,10 +58,10 @@ class Estimation:
         self._answers = OrderedDict((one["key"], Registered(**one)) for one in state["answers"])
 
     def register(self, key: str, scan: DriftScan, asked: Region | None = None) -> Registered:
-        """Register a scan.
+        """Register a scan, or return the remembered answer.
 
         Args:
-            key: of the scan; its name for people is `scan.key`.
+            key: unique key of the scan; `scan.key` is its name for people.
             asked: the requested region, in sample coordinates.
 
         Raises:
@@ -79,7 +79,7 @@ class Estimation:
         return answer
 
     def compensated(self, time_s: float, velocity_m_s: tuple[float, float]) -> None:
-        """Register that the controller moves the tip with this velocity from `time_s` on.
+        """Take into account that the controller moves the tip with this velocity from `time_s` on.
 
         Raises:
             ConfigError: the tracker can't take this into account.

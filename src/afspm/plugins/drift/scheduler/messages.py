@@ -1,4 +1,4 @@
-"""Messages about drift: jobs and reports of the worker, and requests for rescans."""
+"""Messages about drift: jobs for the worker, its reports, and requests for rescans."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ Matrix = list[list[float]]
 
 @dataclass(frozen=True)
 class Registered:
-    """The result of a registration.
+    """Result of the registration of a scan.
 
     Attributes:
-        key: of the scan.
-        time_s: its middle, experiment time.
-        matrix: 3 x 3, of the mapping then.
-        covariance_m2, rate_m_s, rate_covariance: see `drift.tracking.Prediction`; empty where nothing is known.
+        key: key of the scan.
+        time_s: middle of the scan, experiment time.
+        matrix: 3 x 3 matrix of the mapping at this time.
+        covariance_m2, rate_m_s, rate_covariance: see `drift.tracking.Prediction`; empty if unknown.
         outcome, lost, reason: see `drift.tracking.Update`.
         residual_m: (x, y) measured minus predicted position of the sample.
-        references: names of the scans with which it was registered.
+        references: names of the scans that this scan was registered with.
         rescan: the reason for a rescan; empty if none is needed.
         forecast: the new forecast, for `forecast_from_dict`; None: unchanged.
-        failures: the errors of the estimator with this scan, each with its pair.
+        failures: errors of the estimator with this scan, each with its pair of scans.
     """
 
     key: str
@@ -56,7 +56,7 @@ class Registered:
 
     @property
     def sd_m(self) -> float:
-        """Standard deviation of the position along the axis where it is largest; NaN: not known."""
+        """Standard deviation of the position along its most uncertain axis; NaN if unknown."""
         if not self.covariance_m2:
             return math.nan
         (xx, xy), (_, yy) = self.covariance_m2
@@ -69,14 +69,14 @@ class Registered:
 
 @dataclass(frozen=True)
 class Forecasted:
-    """The report that the worker runs, or has a new forecast without a scan."""
+    """Report that the worker has started, or has a new forecast without a new scan."""
 
     forecast: Plain | None
 
 
 @dataclass(frozen=True)
 class NotRegistered:
-    """The report that the worker could not process a scan."""
+    """Report that the worker could not process a scan."""
 
     key: str
     reason: str
@@ -84,7 +84,7 @@ class NotRegistered:
 
 @dataclass(frozen=True)
 class WorkerGone:
-    """The report that the worker has ended."""
+    """Report that the worker has ended."""
 
     reason: str
 
@@ -94,12 +94,12 @@ WorkerReport = Registered | Forecasted | NotRegistered | WorkerGone
 
 @dataclass(frozen=True)
 class ScanJob:
-    """A scan to register; its region is in tip coordinates.
+    """Job to register a scan; the scan's region is in tip coordinates.
 
     Attributes:
-        start_s, end_s: experiment time.
-        upwards: direction of the slow axis; None: not known.
-        asked: the requested region, in sample coordinates; None: not known.
+        start_s, end_s: start and end of the scan, experiment time.
+        upwards: direction of the slow axis; None if unknown.
+        asked: requested region, in sample coordinates; None if unknown.
     """
 
     key: str
@@ -112,12 +112,12 @@ class ScanJob:
 
 @dataclass(frozen=True)
 class StartWorker:
-    """The job that starts the worker; a running worker is killed, and its job is dropped."""
+    """Job that starts the worker; a running worker is killed, and its job is dropped."""
 
 
 @dataclass(frozen=True)
 class Compensated:
-    """The information that the controller moves the tip with this velocity from this time on."""
+    """Information that the controller moves the tip with this velocity from this time on."""
 
     time_s: float
     velocity_m_s: tuple[float, float]
@@ -132,9 +132,9 @@ class RescanWanted:
     """A request to the Rescanner.
 
     Attributes:
-        requested: the ScanParameters2d of the region, in the coordinates of components.
-        shape: (rows, columns); None: the shape in force.
-        upwards: the direction to scan; None: any.
+        requested: ScanParameters2d of the region, in the components' coordinates.
+        shape: (rows, columns); None: unchanged.
+        upwards: direction of the rescan; None: any.
     """
 
     kind: RescanKind
@@ -146,7 +146,7 @@ class RescanWanted:
 
 
 class DriftCodec(PlaceCodec, Protocol):
-    """The part of the wire format that drift compensation needs."""
+    """Part of the wire format that drift compensation needs."""
 
     def encode_mapping(self, registered: Registered, filename: str, center_m: XY, *, correcting: bool) -> bytes:
         """Return a DriftMapping as the payload of a packet, for a scan with this file and centre at the tip."""

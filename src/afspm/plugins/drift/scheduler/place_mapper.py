@@ -1,4 +1,4 @@
-"""Maps every request and packet between components, in sample coordinates, and the microscope, in tip coordinates."""
+"""Mapping of requests and packets between components (sample coordinates) and microscope (tip coordinates)."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ MappingAt = Callable[[float], Mapping | None]
 
 @dataclass(frozen=True)
 class SavedPlace:
-    """A `PositionPair` as its two messages."""
+    """A `PositionPair` in the form of its two messages."""
 
     requested: bytes
     sent: bytes
@@ -64,7 +64,7 @@ class SavedPlace:
 
 @dataclass(frozen=True)
 class MappedBefore:
-    """The mapped form of a request with an id: a repeated request is sent unchanged."""
+    """The mapped form of an earlier request, so that a repeated request is sent unchanged."""
 
     kind: int
     place: SavedPlace
@@ -73,12 +73,12 @@ class MappedBefore:
 
 @dataclass(frozen=True)
 class Places:
-    """The scan region and probe position in force at the microscope, in both coordinates.
+    """Scan region and probe position set at the microscope, in sample and tip coordinates.
 
     Attributes:
-        shape: (rows, columns) in force; None: not known.
-        upwards: the direction of the slow axis in force; None: not known.
-        remembered: by client and id.
+        shape: current (rows, columns); None if unknown.
+        upwards: current direction of the slow axis; None if unknown.
+        remembered: mapped forms of earlier requests, by client and id.
     """
 
     region: TargetPosition[Region] = field(default_factory=TargetPosition)
@@ -91,7 +91,7 @@ class Places:
 
 @dataclass(frozen=True)
 class SavedPlaces:
-    """The part of `Places` that survives a kill."""
+    """Saved form of `Places`, which survives a kill."""
 
     region: SavedPlace | None
     probe: SavedPlace | None
@@ -109,7 +109,7 @@ class SavedPlaces:
         return cls(region, probe, places.shape, places.upwards, places.durations, places.remembered)
 
     def restored(self, codec: PlaceCodec) -> Places:
-        """Return the places. Raises ValueError for an unreadable place."""
+        """Return the restored `Places`. Raises ValueError for an unreadable place."""
         region = None if self.region is None else _place(codec, _SET_SCAN, self.region)
         probe = None if self.probe is None else _place(codec, _SET_PROBE, self.probe)
         return Places(
@@ -122,10 +122,10 @@ _PARTS = tuple(one.name for one in fields(Places))
 
 
 class PlaceMapper:
-    """One step of mapping in progress: the places so far.
+    """Mutable copy of `Places` during one step of the mapping.
 
     Args:
-        mapping_at: from the current forecast of drift.
+        mapping_at: returns the mapping at a time, from the current drift forecast.
     """
 
     region: TargetPosition[Region]

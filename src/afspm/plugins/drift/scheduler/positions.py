@@ -1,4 +1,4 @@
-"""The places in force at the microscope, in both coordinates: as requested, and as set."""
+"""Places set at the microscope, in both coordinates: as requested in sample, and as set in tip coordinates."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ _VALUES = {
 
 
 class PlaceCodec(Codec, Protocol):
-    """The part of the wire format that places need."""
+    """Part of the wire format that places need."""
 
     def encode(self, thing: object) -> bytes:
         """Return a ScanParameters or ProbePosition as a message."""
 
     def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
-        """Return a message with the place of another: of a ScanParameters2d (for scans, too), or of a ProbePosition."""
+        """Return a message with its place taken from another message: a ScanParameters2d or a ProbePosition."""
 
 
 @dataclass(frozen=True)
 class PositionPair(Generic[P]):
-    """A place in both coordinates.
+    """A place in sample and in tip coordinates.
 
     Attributes:
-        sample: as requested by a component.
-        requested: the component's message, to the last bit.
-        tip: as the microscope was set.
-        sent: the message that set it.
+        sample: place as requested by a component.
+        requested: the component's message, unchanged.
+        tip: place as set at the microscope.
+        sent: message that set the place at the microscope.
     """
 
     sample: P
@@ -56,32 +56,32 @@ class PositionPair(Generic[P]):
 
 @dataclass(frozen=True)
 class TargetPosition(Generic[P]):
-    """The place in force, and the places sent lately: a packet may arrive before the answer to its request."""
+    """The place in force, and recently sent places: a packet may arrive before the answer to its request."""
 
     current: PositionPair[P] | None = None
     sent: tuple[PositionPair[P], ...] = ()
 
     def at(self, place: PositionPair[P]) -> TargetPosition[P]:
-        """Put a place in force."""
+        """Return a copy with another place in force."""
         return replace(self, current=place)
 
     def sending(self, place: PositionPair[P]) -> TargetPosition[P]:
-        """Add a place to which the microscope will be set."""
+        """Return a copy with a place that is about to be sent to the microscope."""
         return replace(self, sent=(*self.sent, place)[-_CANDIDATES:])
 
     def was_set(self, sent: bytes) -> TargetPosition[P]:
-        """Put a place in force: the microscope accepted the message."""
+        """Return a copy with the place of an accepted message in force."""
         return replace(self, current=next((place for place in reversed(self.sent) if place.sent == sent), self.current))
 
     def published(self, tip: P) -> TargetPosition[P] | None:
-        """Put in force the place that the microscope publishes; None if the scheduler did not set it."""
+        """Return a copy with the place published by the microscope in force; None if the scheduler has not set it."""
         known: list[PositionPair[P]] = [*self.sent] if self.current is None else [self.current, *self.sent]
         near = [place for place in reversed(known) if is_same(place.tip, tip)]  # of equally near ones the newest
         return self.at(min(near, key=lambda place: away_m(place.tip, tip))) if near else None
 
 
 def away_m(a: Region | ProbePosition, b: Region | ProbePosition) -> float:
-    """Return the largest distance between corresponding corners, or between two positions, m."""
+    """Return the largest distance between corresponding corners of two regions, or between two positions, in m."""
     if isinstance(a, Region) and isinstance(b, Region):
         corners = zip(a.corners_m(), b.corners_m(), strict=True)
         return max(math.dist(one, other) for one, other in corners)
@@ -91,18 +91,18 @@ def away_m(a: Region | ProbePosition, b: Region | ProbePosition) -> float:
 
 
 def is_same(a: Region | ProbePosition, b: Region | ProbePosition) -> bool:
-    """Return whether two places are equal except for rounding."""
+    """Return whether two places are equal to within the rounding of a controller."""
     near_m = SAME * math.hypot(*a.size_m) if isinstance(a, Region) else SAME_PLACE_M
     return away_m(a, b) <= near_m
 
 
 def value_in(name: str, region: Region) -> float:
-    """Return the value of a parameter in a region, in SI."""
+    """Return the value of a scan parameter in a region, in SI units."""
     return float(_VALUES[name](region))
 
 
 def in_reported_unit(name: str, value: float, reported: Parameter | None) -> Parameter:
-    """Return a value in SI as a parameter in the unit that the microscope uses for it."""
+    """Return a value in SI units as a parameter in the microscope's own unit."""
     unit = _unit(reported or Parameter(name))
     # 15 digits: a value set as 0.1 nm reads as 0.1, not as 0.09999999999999999
     return Parameter(name, f"{convert(value, BASE_PARAMETERS[name] or '', unit):.15g}", unit)

@@ -1,4 +1,4 @@
-"""The response to a registered scan: flags, rescans, and a rate for the controller."""
+"""Responses to a registered scan: problem flags, rescans, and a drift rate for the controller."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _AT_START = "a scan in the other direction gives the velocity of the drift"
 
 
 def respond(draft: DriftDraft, what: FollowUp) -> None:
-    """Give a response that was deferred until its scan was published."""
+    """Carry out a response that was deferred until its scan was published."""
     match what:
         case RespondToScan():
             _respond_to_scan(draft, what)
@@ -144,7 +144,7 @@ class RateGiven:
     """A request to the controller to compensate `value_m_s` along an axis.
 
     Attributes:
-        is_new: the worker must take it into account from now on.
+        is_new: whether the worker must take the rate into account from now on.
     """
 
     axis: int
@@ -154,13 +154,13 @@ class RateGiven:
 
 
 def restore_compensation(draft: DriftDraft) -> None:
-    """Set the controller to the compensation in force, at first zero: an earlier night may have left another."""
+    """Set the controller to the compensation in force, initially zero: an earlier night may have left another rate."""
     for axis, name in enumerate(_axes(draft)):
         _ask_rate(draft, RateGiven(axis, name, draft.duties.given_m_s[axis], is_new=False))
 
 
 def hand_over(draft: DriftDraft) -> None:
-    """Send the newest drift rate to the controller, if it is significant and no person is in control."""
+    """Send the newest drift rate to the controller if it is significant, unless a person is in control."""
     predicted = draft.forecast.predicted(draft.now_ns * 1e-9)
     if draft.control.mode is ControlMode.MANUAL or predicted is None or not draft.corrects:
         return
@@ -173,7 +173,7 @@ def hand_over(draft: DriftDraft) -> None:
 
 
 def rate_answered(draft: DriftDraft, given: RateGiven, response: Response) -> None:
-    """Process the answer for one axis: the controller may accept one axis and refuse the other."""
+    """Process the controller's answer for one axis; it may accept one axis and refuse the other."""
     if not response.ok:
         # NOT_FREE: a scan has already begun; the rate is handed over after the next one
         if response.code != ControlResponse.NOT_FREE:

@@ -1,4 +1,4 @@
-"""`SampleFrame`: coordinates in which the sample stands still, though it drifts under the tip.
+"""`SampleFrame`: the coordinate frame of a drifting sample.
 
 Theory of operation
 -------------------
@@ -62,7 +62,7 @@ from afspm.scheduler.events import (
 
 @dataclass(frozen=True)
 class SampleFrame:
-    """The sample's `scheduler.coordinate_frame.CoordinateFrame`; made by `SampleFrame.initial`."""
+    """The sample's implementation of `scheduler.coordinate_frame.CoordinateFrame`; created by `SampleFrame.initial`."""
 
     env: DriftEnvironment
     state: DriftState
@@ -72,10 +72,10 @@ class SampleFrame:
 
     @classmethod
     def initial(cls, settings: DriftCompensationSettings, codec: DriftCodec, name: str) -> SampleFrame:
-        """Return the frame of an experiment that begins.
+        """Return the frame at the start of an experiment.
 
         Args:
-            name: of the scheduler, under which problems are flagged.
+            name: name of the scheduler, under which problems are flagged.
         """
         return cls(DriftEnvironment(settings, codec, name), DriftState.initial(settings))
 
@@ -210,7 +210,7 @@ def _follow_control(draft: DriftDraft, change: ControlChanged) -> None:
 
 @dataclass(frozen=True)
 class _DirectionAsked:
-    """The mark of a request for the scan direction; its answer is processed like any value of a parameter."""
+    """Marker of a request for the scan direction; the answer is processed like any parameter value."""
 
 
 def _ask_direction(draft: DriftDraft) -> None:

@@ -1,4 +1,4 @@
-"""A scan from its first packet to its publication in sample coordinates.
+"""Processing of a scan, from its first packet to its publication in sample coordinates.
 
 | step | trigger | action |
 | --- | --- | --- |
@@ -6,7 +6,7 @@
 | registered | its channel for drift arrives | a job for the worker |
 | settled | the worker's report, an error, a time limit | its mapping is announced, and saved with the state |
 | released | at once | scan and followers are reconsidered, and pass in their order |
-| responded to | in a step of its own | flags and rescans, after the scan was published |
+| responded to | in a separate step | flags and rescans, after the scan was published |
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ _MOST_ENDS = 4
 
 
 def take_packet(draft: DriftDraft, event: PacketIn) -> None:
-    """Pass a packet on, or keep it with the scan that it belongs to or follows."""
+    """Pass a packet on, or hold it with the scan that it belongs to or follows."""
     if (before := draft.gate.held) is not None:
         draft.gate = draft.gate.keep(event)
         _find_channel(draft, before, event)
@@ -155,7 +155,7 @@ def _middle_s(draft: DriftDraft, scan: Scan, event: PacketIn) -> float:
 
 
 def note_state(draft: DriftDraft, payload: bytes | memoryview, time_ns: int | None) -> None:
-    """Track the start of scans from a published state."""
+    """Track the start of scans from a published scope state."""
     status = draft.env.codec.decode_packet("ScopeStateMsg", payload)
     if isinstance(status, ScopeStatus) and time_ns is not None:
         draft.timing = draft.timing.with_state(status, time_ns * 1e-9, draft.places.upwards)
@@ -165,7 +165,6 @@ def note_state(draft: DriftDraft, payload: bytes | memoryview, time_ns: int | No
 
 
 def take_report(draft: DriftDraft, report: WorkerReport) -> None:
-    """Process a report of the worker."""
     match report:
         case Registered():
             _registered(draft, report)
@@ -221,7 +220,7 @@ def _worker_gone(draft: DriftDraft, report: WorkerGone) -> None:
 
 
 def expire(draft: DriftDraft) -> None:
-    """Give up a scan that waited too long, and kill a worker that hangs."""
+    """Publish a scan that has waited too long as predicted, and kill a worker that hangs."""
     held = draft.gate.held
     if held is None or draft.now_s < held.until_s:
         return
@@ -232,7 +231,7 @@ def expire(draft: DriftDraft) -> None:
 
 
 def restart_if_cleared(draft: DriftDraft) -> None:
-    """Start the worker again once a person has cleared the malfunction."""
+    """Restart the worker once a person has cleared device-malfunction."""
     if draft.worker.waits_for_person and not response.is_given_up(draft):
         draft.worker = replace(draft.worker, waits_for_person=False, ends=0)
         draft.outputs.append(Delegate(StartWorker()))
@@ -268,7 +267,7 @@ def _give_up(draft: DriftDraft, key: str, why: str, level: str = "") -> None:
 
 
 def publish_as_predicted(draft: DriftDraft, held: HeldScan, why: str, level: str = "") -> None:
-    """Publish an unregistered scan at the predicted place."""
+    """Publish an unregistered scan at its predicted place."""
     mapping = draft.forecast.mapping_at(draft.env.settings, held.middle_s)
     draft.gate = draft.gate.settle(held.key, None if mapping is None else mapping.matrix.tolist())
     report = _predicted(draft, held, why)
@@ -331,7 +330,7 @@ def _predicted(draft: DriftDraft, held: HeldScan, why: str) -> Registered:
 
 
 def scan_key(scan: Scan, packet: Packet) -> str:
-    """Return a key common to all channels of a scan, and unique to it."""
+    """Return a key shared by all channels of a scan, and unique to this scan."""
     if scan.time_ns is None and scan.filename:
         return scan.filename
     return f"at {packet.time_ns if scan.time_ns is None else scan.time_ns} ns"

@@ -1,4 +1,4 @@
-"""The timing of scans: when the running scan began, and how long a scan will take."""
+"""Timing of scans: start of the running scan, and expected duration of a scan."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _KEPT = 16
 
 @dataclass(frozen=True)
 class ScanStart:
-    """The start of a scan.
+    """Start of a scan.
 
     Attributes:
-        time_s: experiment time.
-        upwards: direction of its slow axis; None: not known.
-        was_paused: there was a pause between some of its rows.
+        time_s: experiment time of the start.
+        upwards: direction of the slow axis; None if unknown.
+        was_paused: whether the scan was paused between rows.
     """
 
     time_s: float
@@ -30,16 +30,16 @@ class ScanStart:
 
 @dataclass(frozen=True)
 class ScanStartTracker:
-    """A tracker of the microscope's states that finds the start of scans.
+    """Tracker of the microscope's states, which finds the start of scans.
 
-    SCANNING is published again after a pause, and to a restarted scheduler: then the scan began earlier.
+    SCANNING is also published after a pause, and to a restarted scheduler, although the scan began earlier.
     """
 
     begun: ScanStart | None = None
     is_scanning: bool = False
 
     def with_state(self, status: ScopeStatus, time_s: float, upwards: bool | None) -> ScanStartTracker:
-        """Process a state; `upwards`: the direction in force. A disconnected microscope continues its scan."""
+        """Process a scope state, with the scan direction in force. A disconnected microscope continues its scan."""
         if status.state is ScopeState.UNDEFINED:
             return self
         is_scanning, begun = status.state is ScopeState.SCANNING, self.begun
@@ -54,18 +54,18 @@ class ScanStartTracker:
         return replace(self, is_scanning=False)
 
     def of_scan(self, end_s: float) -> ScanStart | None:
-        """Return the start of the scan that ended at a time; None: not known."""
+        """Return the start of the scan that ended at `end_s`; None if unknown."""
         return self.begun if self.begun is not None and self.begun.time_s < end_s else None
 
     def middle_s(self, end_s: float, expected_s: float) -> float:
-        """Return the middle of the scan that ended then, from its start or from its expected duration."""
+        """Return the middle of the scan that ended at `end_s`, from its start or its expected duration."""
         begun = self.of_scan(end_s)
         return end_s - expected_s / 2 if begun is None else (begun.time_s + end_s) / 2
 
 
 @dataclass(frozen=True)
 class ScanDuration:
-    """The duration of scans of one shape and size."""
+    """Measured duration of scans with one shape and size."""
 
     shape: Shape
     size_m: XY
@@ -74,20 +74,20 @@ class ScanDuration:
 
 @dataclass(frozen=True)
 class ScanDurations:
-    """Durations of finished scans, newest last; emptied when the speed is set."""
+    """Durations of finished scans, newest last; cleared when the scan speed is set."""
 
     known: tuple[ScanDuration, ...] = ()
 
     def learn(self, shape: Shape, size_m: XY, duration_s: float) -> ScanDurations:
-        """Add the duration of a scan of this shape and size."""
+        """Add the duration of a scan with this shape and size."""
         newest = ScanDuration(shape, _rounded(size_m), duration_s)
         others = [one for one in self.known if (one.shape, one.size_m) != (newest.shape, newest.size_m)]
         return ScanDurations((*others, newest)[-_KEPT:])
 
     def expected_s(self, shape: Shape | None, size_m: XY) -> float:
-        """Return the expected duration of a scan; 0 if nothing is known.
+        """Return the expected duration of a scan; 0 if no scan has finished.
 
-        An unknown size or shape is scaled from the latest scan, by the total length of its lines.
+        For an unknown size or shape, the duration of the latest scan is scaled by the total length of its lines.
         """
         if not self.known:
             return 0.0

@@ -1,4 +1,4 @@
-"""The Drift Compensated Scheduler (paper, "Drift Compensated Scheduler"): takes the place of the Scheduler."""
+"""`DriftCompensatedScheduler`: a Scheduler with drift compensation (paper, "Drift Compensated Scheduler")."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class DriftCompensatedScheduler(Scheduler):
             self.needs_parameters = (compensate.x, compensate.y)
 
     def check(self) -> None:
-        """Create estimator and tracker once, and check that they support these settings. Raises ConfigError if not."""
+        """Check that estimator and tracker can be created and support these settings. Raises ConfigError if not."""
         from afspm.plugins.drift.estimators import estimator
         from afspm.plugins.drift.trackers import tracker
 
@@ -92,7 +92,7 @@ class DriftCompensatedScheduler(Scheduler):
 
 
 class DriftWireCodec(WireCodec):
-    """The wire format in the form of `DriftCodec`."""
+    """Implementation of `DriftCodec` by afspm's wire format."""
 
     def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
         of = "ProbePosition" if message in ("Spec1d", "ProbePosition") else "ScanParameters2d"

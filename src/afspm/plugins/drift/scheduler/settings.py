@@ -1,4 +1,4 @@
-"""The table `drift` of the experiment file."""
+"""Settings of drift compensation: the table `drift` of the experiment file."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _STRICT = {"extra": "forbid"}
 
 @dataclass(frozen=True)
 class RescanRule:
-    """The rule for requests to the Rescanner.
+    """Rule for requesting rescans from the Rescanner.
 
     Attributes:
-        rule: "tolerance": the sample is further off than `tolerance`, with two standard deviations added; "paper": scan
-            and requested region share less than `f_rescan`; "never".
-        tolerance: None: a tenth of the scan's smaller side.
-        f_rescan: part of the area (paper, "Overarching workflow").
+        rule: "tolerance": the offset plus two standard deviations exceeds `tolerance`; "paper": scan and requested
+            region share less than `f_rescan`; "never".
+        tolerance: largest tolerated offset; None: a tenth of the scan's smaller side.
+        f_rescan: share of the area (paper, "Overarching workflow").
     """
 
     rule: Literal["tolerance", "paper", "never"] = "tolerance"
@@ -40,7 +40,7 @@ class RescanRule:
 
 @dataclass(frozen=True)
 class Compensate:
-    """Names of the controller's parameters for its own drift compensation, in m/s."""
+    """Names of the controller's parameters (in m/s) for its own drift compensation."""
 
     x: str
     y: str
@@ -90,7 +90,7 @@ class DriftCompensationSettings:
             raise InvalidValue(reason, where="drift", hint="0 to 1")
 
     def beside(self, solved: Collection[str]) -> DriftCompensationSettings:
-        """Return these settings for a run whose components solve the given problems.
+        """Return these settings, adapted to a run whose components solve the given problems.
 
         Without a component that takes rescans, the first scan is taken in one direction only.
         """
@@ -98,10 +98,10 @@ class DriftCompensationSettings:
 
     @classmethod
     def from_table(cls, table: Plain) -> DriftCompensationSettings:
-        """Return the settings from plain JSON in SI.
+        """Return the settings from plain JSON with SI values.
 
         Raises:
-            ConfigError, InvalidValue: an unknown setting, or an impossible value.
+            ConfigError, InvalidValue: a setting is unknown, or a value is impossible.
         """
         plain = dict(table)
         try:

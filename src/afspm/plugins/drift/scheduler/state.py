@@ -1,4 +1,4 @@
-"""The state of drift compensation: a tree of frozen parts, the draft of its next state, and its saved form."""
+"""State of drift compensation: a tree of frozen parts, the draft of its next state, and its saved form."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class CurrentForecast:
 
     Attributes:
         start_s: experiment time at which the experiment began; None: before the start.
-        lost: whether the position of the sample is unknown, as of the newest registered scan.
-        text: the forecast as JSON, which only its tracker understands; None: nothing is known yet.
+        lost: whether the position of the sample was unknown at the newest registered scan.
+        text: the forecast as JSON in its tracker's own form; None before the first forecast.
 
     Raises:
-        InvalidValue: the text is no forecast.
+        InvalidValue: the text is not a forecast.
     """
 
     start_s: float | None = None
@@ -51,20 +51,20 @@ class CurrentForecast:
             object.__setattr__(self, "forecast", forecast_from_dict(json.loads(self.text)))
 
     def learn(self, forecast: Plain | None) -> CurrentForecast:
-        """Take a forecast of the worker; None: unchanged. Raises InvalidValue for anything else."""
+        """Return a copy with the worker's new forecast; None: unchanged. Raises InvalidValue for anything else."""
         return self if forecast is None else CurrentForecast(self.start_s, self.lost, json.dumps(forecast))
 
     def predicted(self, time_s: float) -> Prediction | None:
-        """Return the prediction for a time; None: nothing is known yet."""
+        """Return the prediction for a time; None before the first forecast."""
         return None if self.forecast is None else self.forecast.at(time_s)
 
     def corrects(self, settings: DriftCompensationSettings, time_s: float) -> bool:
-        """Return whether components are given sample coordinates at a time."""
+        """Return whether components use sample coordinates at a given time."""
         since_s = 0.0 if self.start_s is None else time_s - self.start_s
         return settings.correct and since_s >= settings.correct_after
 
     def mapping_at(self, settings: DriftCompensationSettings, time_s: float) -> DriftMapping | None:
-        """Return the mapping from tip to sample coordinates; None: components are given tip coordinates."""
+        """Return the mapping from tip to sample coordinates; None if components use tip coordinates."""
         if not self.corrects(settings, time_s):
             return None
         predicted = self.predicted(time_s)
@@ -73,14 +73,14 @@ class CurrentForecast:
 
 @dataclass(frozen=True)
 class HeldScan:
-    """A scan that waits for its position.
+    """A scan held back until its position is known.
 
     Attributes:
-        middle_s: experiment time for which its position holds.
-        until_s: real time until which it waits.
-        filename, center_m: of its first channel, in tip coordinates.
-        asked: it is being registered.
-        tries: number of jobs for it.
+        middle_s: middle of the scan in experiment time, for which its position holds.
+        until_s: real time limit of the wait.
+        filename, center_m: file and centre (tip coordinates) of its first channel.
+        asked: whether the worker has a job for this scan.
+        tries: number of jobs for this scan so far.
     """
 
     key: str
@@ -94,14 +94,14 @@ class HeldScan:
 
 @dataclass(frozen=True)
 class ScanGate:
-    """A gate that holds a scan, and every later packet of the microscope, until the scan's position is known.
+    """Gate that holds a scan, and all later packets of the microscope, until the scan's position is known.
 
     So all channels of a scan get the same, best known mapping, and the order of packets is kept.
 
     Attributes:
-        waiting: inputs behind the scan, oldest first.
-        settled: the mappings of the latest published scans; None: published unchanged.
-        channel: of the scans that are registered; None: the first in a unit of length.
+        waiting: held inputs, oldest first.
+        settled: mappings of the latest published scans, by key; None for a scan published unchanged.
+        channel: channel used for registration; None: the first one in a unit of length.
     """
 
     channel: str | None = None
@@ -113,32 +113,32 @@ class ScanGate:
         return replace(self, waiting=(*self.waiting, event))
 
     def next_ns(self) -> int | None:
-        """Return the translator's time of the first packet that waits."""
+        """Return the translator's time of the first held packet; None if there is none."""
         return next((event.packet.time_ns for event in self.waiting if isinstance(event, PacketIn)), None)
 
     def settle(self, key: str, matrix: Matrix | None) -> ScanGate:
-        """Fix the mapping of a scan, also for a repeated publication."""
+        """Return the gate with a fixed mapping for a scan, which also holds for repeated packets of the scan."""
         others = [(other, one) for other, one in self.settled.items() if other != key]
         return replace(self, settled=dict([*others, (key, matrix)][-_SETTLED:]))
 
     def opened(self) -> ScanGate:
-        """Return the gate without a waiting scan; the caller reconsiders `waiting`."""
+        """Return the gate without held inputs; the caller processes `waiting` again."""
         return replace(self, held=None, waiting=())
 
     def with_channel_of(self, scan: Scan) -> ScanGate:
-        """Choose the channel of this scan, if none is chosen yet and its unit is a length."""
+        """Return the gate with this scan's channel chosen, if none is chosen yet and the unit is a length."""
         is_chosen = self.channel is not None or not same_kind(scan.unit, "m")
         return self if is_chosen else replace(self, channel=scan.channel)
 
 
 @dataclass(frozen=True)
 class Duties:
-    """Responses given so far, as far as later ones depend on them.
+    """Earlier responses that later responses depend on.
 
     Attributes:
-        started: the first scan was followed by one in the other direction, or need not be.
-        unregistered: scans in a row that could not be registered.
-        given_m_s: the velocity that the controller compensates.
+        started: whether the second scan in the other direction was requested, or is not needed.
+        unregistered: number of unregistered scans in a row.
+        given_m_s: drift velocity that the controller compensates.
     """
 
     started: bool = False
@@ -148,13 +148,13 @@ class Duties:
 
 @dataclass(frozen=True)
 class WorkerLife:
-    """The known state of the worker process.
+    """State of the worker process, as known to the scheduler.
 
     Attributes:
-        job: the scan that it registers.
-        ends: its ends in a row, without a scan registered between them.
-        waits_for_person: it is started again when a person clears device-malfunction.
-        slow_logged: a slow registration was logged.
+        job: the scan being registered.
+        ends: number of ends of the worker since the last registered scan.
+        waits_for_person: whether the worker is only restarted when a person clears device-malfunction.
+        slow_logged: whether a slow registration was logged.
     """
 
     job: ScanJob | None = None
@@ -179,7 +179,7 @@ class RespondToFailure:
 
 @dataclass(frozen=True)
 class CallPerson:
-    """The deferred response that calls a person, since no more scans will be registered."""
+    """Deferred response that calls a person, because no more scans will be registered."""
 
 
 FollowUp = RespondToScan | RespondToFailure | CallPerson
@@ -187,10 +187,10 @@ FollowUp = RespondToScan | RespondToFailure | CallPerson
 
 @dataclass(frozen=True)
 class DriftState:
-    """The state of drift compensation: the basis of all its decisions.
+    """Complete state of drift compensation.
 
     Attributes:
-        following: deferred responses, each with the real time since when it is due.
+        following: deferred responses, each with the real time at which it is due.
     """
 
     places: Places = field(default_factory=Places)
@@ -209,7 +209,7 @@ class DriftState:
 
 @dataclass(frozen=True)
 class SavedDrift:
-    """The part of a `DriftState` that survives a kill."""
+    """Part of a `DriftState` that survives a kill."""
 
     places: SavedPlaces
     forecast: CurrentForecast
@@ -225,7 +225,7 @@ class SavedDrift:
         return cls(places, state.forecast, gate.channel, gate.settled, state.tally, state.duties)
 
     def restored(self, settings: DriftCompensationSettings, codec: DriftCodec) -> DriftState:
-        """Return the state. Raises ValueError for an unreadable place."""
+        """Return the restored `DriftState`. Raises ValueError for an unreadable place."""
         return DriftState(
             places=self.places.restored(codec),
             forecast=self.forecast,
@@ -237,10 +237,10 @@ class SavedDrift:
 
 @dataclass(frozen=True)
 class DriftEnvironment:
-    """The constants of all steps.
+    """Constants of all steps: settings, codec and name.
 
     Attributes:
-        name: of the scheduler, under which problems are flagged.
+        name: name of the scheduler, under which problems are flagged.
     """
 
     settings: DriftCompensationSettings
@@ -252,12 +252,12 @@ _PARTS = tuple(one.name for one in fields(DriftState))
 
 
 class DriftDraft:
-    """One step in progress: the parts of the state so far, the outputs so far, and the time.
+    """Mutable copy of the state during one step, with the outputs so far and the time.
 
     Attributes:
-        control: of the scheduler, before the input of this step.
-        now_s: real and monotonic, for timeouts.
-        now_ns: of the experiment.
+        control: control state of the scheduler before the input of this step.
+        now_s: real monotonic time, for timeouts.
+        now_ns: experiment time.
     """
 
     places: Places

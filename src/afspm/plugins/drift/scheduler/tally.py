@@ -14,7 +14,7 @@ LATELY = 10
 
 @dataclass(frozen=True)
 class RegistrationTally:
-    """The number of registration outcomes. Scans of a new place don't count for the share of unregistered scans."""
+    """Counts of registration outcomes. Scans of a new place do not count in the share of unregistered scans."""
 
     counts: Mapping[RegistrationOutcome, int] = field(default_factory=dict)
     lately: tuple[bool, ...] = ()
@@ -33,9 +33,9 @@ class RegistrationTally:
         return registration_summary(outcome for outcome, count in self.counts.items() for _ in range(count))
 
     def exceeds(self, most_unregistered: float) -> bool:
-        """Return whether more than this share of the last `LATELY` scans was not registered."""
+        """Return whether the share of unregistered scans among the last `LATELY` exceeds a limit."""
         return self.lately.count(False) > most_unregistered * LATELY
 
     def share_restarted(self) -> RegistrationTally:
-        """Return the tally with a new share of unregistered scans, after the scheduler has begun a search."""
+        """Return the tally with an empty share of unregistered scans, after a search for the sample has begun."""
         return replace(self, lately=())

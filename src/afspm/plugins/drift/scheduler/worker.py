@@ -1,7 +1,7 @@
-"""The process that registers scans. Errors and long computations of an estimator don't stop the scheduler.
+"""Worker process that registers scans, so that errors and long computations don't stop the scheduler.
 
-It processes jobs one after the other, and saves its state before it reports. It ends with its jobs, and with the
-scheduler's process, even during a registration: by then the worker of the next scheduler is the newer one.
+The worker processes jobs one after the other, and saves its state before it reports. It ends when the connection for
+jobs closes, or with the scheduler's process, even during a registration: a restarted scheduler has its own worker.
 """
 
 from __future__ import annotations
@@ -44,22 +44,23 @@ from afspm.transport.process.parent import leave_interrupts_to_parent
 
 @dataclass(frozen=True)
 class Complaint:
-    """An error for the log; the worker goes on."""
+    """Error report for the log; the worker continues."""
 
     reason: str
 
 
 class Reports(Protocol):
-    """The receiver of a worker's reports."""
+    """Receiver of a worker's reports."""
 
     def send(self, obj: object, /) -> None: ...
 
 
 class DriftWorkerInProcess:
-    """The worker without a process, for tests: a job is done when `take` returns. See `scheduler.shell.FrameWorker`.
+    """Worker without a separate process, for tests; see `scheduler.shell.FrameWorker`. `take` returns when the job is
+    done.
 
     Args:
-        file: where the worker keeps its state; None: nowhere.
+        file: file for the worker's state; None: the state is not saved.
 
     Attributes:
         wake: called when there is a report.
@@ -92,11 +93,11 @@ class DriftWorkerInProcess:
             yield self._reports.popleft()
 
     def close(self) -> None:
-        """Do nothing: the state is on disk."""
+        """Do nothing, since the state is on disk."""
 
 
 def main(jobs: Connection, reports: Connection, settings: DriftCompensationSettings, file: Path | None) -> None:
-    """Register scans until there are no more jobs."""
+    """Register scans until the connection for jobs closes."""
     leave_interrupts_to_parent()
     # a user's estimator may print: its output belongs with the errors
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())

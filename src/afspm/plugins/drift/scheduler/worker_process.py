@@ -1,4 +1,4 @@
-"""The worker from the scheduler's side: a child process that takes jobs, with a thread that receives its reports."""
+"""Scheduler's side of the worker: a child process for the jobs, and a thread that receives the reports."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _CONTEXT = multiprocessing.get_context("spawn")
 
 
 class DriftWorkerProcess:
-    """The `scheduler.shell.FrameWorker` in a child process.
+    """Implementation of `scheduler.shell.FrameWorker` by a child process.
 
     Args:
-        file: where the worker keeps its state; None: nowhere.
+        file: file for the worker's state; None: the state is not saved.
 
     Attributes:
         wake: called from another thread when there is a report.
-        late: holds simulated time while a scan is registered.
+        late: slows simulated time down to real time while a scan is registered.
     """
 
     def __init__(self, settings: DriftCompensationSettings, file: Path | None, log: logging.Logger) -> None:
@@ -52,7 +52,7 @@ class DriftWorkerProcess:
         self._jobs: queue.SimpleQueue[object] = queue.SimpleQueue()
 
     def take(self, job: object) -> None:
-        """Hand a `WorkerJob` to the worker; returns at once."""
+        """Queue a job for the worker, or restart the worker; return at once."""
         if isinstance(job, StartWorker):
             self._start()
             return
@@ -61,9 +61,9 @@ class DriftWorkerProcess:
         self._jobs.put(job)
 
     def reports(self) -> Iterator[WorkerReport]:
-        """Yield the reports since the last call, oldest first; reports of a former worker are dropped.
+        """Yield the reports since the last call, oldest first; drop reports of an earlier worker.
 
-        Simulated time passes again once the report about a scan was handled.
+        Simulated time runs at full speed again once the report about a scan is handled.
         """
         while self._reports:
             life, report = self._reports.popleft()
@@ -73,7 +73,7 @@ class DriftWorkerProcess:
                     self._late.close()
 
     def close(self) -> None:
-        """End the worker: its state is on disk."""
+        """End the worker, whose state is on disk."""
         self._life += 1
         self._end(within_s=_FAREWELL_S)
 

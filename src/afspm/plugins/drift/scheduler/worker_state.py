@@ -1,4 +1,4 @@
-"""The worker's state on disk: one .npz file of JSON and arrays, replaced as a whole. It contains no code."""
+"""State of the worker on disk: one .npz file of JSON and arrays, replaced as a whole. It contains no code."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ _ARRAY = "array"
 
 
 class WorkerStateFile:
-    """A file of numbers, texts, lists, dicts and numpy arrays.
+    """File for a state of numbers, texts, lists, dicts and numpy arrays.
 
     Args:
-        path: None: nothing is kept.
+        path: the file; None: nothing is saved.
     """
 
     def __init__(self, path: Path | None) -> None:
         self.path = path
 
     def save(self, state: Plain) -> None:
-        """Write a new file and rename it; a power cut leaves the old file or the new one.
+        """Save a state atomically; a power cut leaves either the old or the new file.
 
         Raises:
-            FileError: the disk is full …
+            FileError: the file can't be written.
         """
         if self.path is None:
             return
@@ -45,7 +45,7 @@ class WorkerStateFile:
         """Return the last saved state; None if there is none.
 
         Raises:
-            FileError: it can't be read.
+            FileError: the file can't be read.
         """
         if self.path is None or not self.path.exists():
             return None

@@ -1,4 +1,4 @@
-"""Studies of drift: many simulated nights over a grid of settings, on the cores of this computer or on a Dask cluster.
+"""Studies of drift: simulated nights over a grid of settings, on this computer's cores or a Dask cluster.
 
 settings = NightSettings.of({"tracker": "paper", "paper.queue": 3})
 metrics = night(settings, seed=1)

@@ -1,4 +1,4 @@
-"""A grid of settings: each name with the values to try, from a command line or a TOML file."""
+"""Grid of settings: the values to try for each name, from a command line or a TOML file."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class SettingsGrid:
     """All combinations of the values of some settings.
 
     Attributes:
-        values: by name; see `NightSettings.of`. Settings of a tracker that a combination does not have ("paper.queue"
-            for the bank) make no further combinations.
+        values: values to try, by name; see `NightSettings.of`. Settings of a tracker that a combination does not use
+            (such as "paper.queue" with the bank tracker) add no combinations.
     """
 
     values: Mapping[str, tuple[object, ...]]
@@ -28,7 +28,7 @@ class SettingsGrid:
         """Read a grid from a command line: files ending in .toml, and NAME=VALUE[,VALUE…], which override them.
 
         Raises:
-            ConfigError: another form of text, or wrong TOML. FileError: the file can't be read.
+            ConfigError: an argument has another form, or the TOML is invalid. FileError: the file can't be read.
         """
         values: dict[str, tuple[object, ...]] = {}
         for text in given:
@@ -52,7 +52,7 @@ class SettingsGrid:
         """Yield each combination once, labelled by its varied settings; the defaults first.
 
         Raises:
-            ConfigError, InvalidValue: as `NightSettings.of`; or a setting of a part that no night has.
+            ConfigError, InvalidValue: as `NightSettings.of`; or no night uses the estimator or tracker of a setting.
         """
         fixed = {name: values[0] for name, values in self.values.items() if len(values) == 1}
         nights = [(chosen, NightSettings.of(fixed | chosen)) for chosen in [{}, *self._combinations()]]

@@ -1,4 +1,4 @@
-"""One simulated night without processes: scans at a fixed interval, and a tracker that follows the sample."""
+"""One simulated night in a single process: scans at a fixed interval, and a tracker that follows the sample."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _95_PERCENT = -2.0 * math.log(0.05)  # of the square of a normal error of two co
 
 @dataclass(frozen=True, eq=False)
 class SimulatedNight:
-    """The outcome of a night. "Misplaced" is the distance of a scan from its place on the sample.
+    """Outcome of a simulated night. Misplacement is the distance of a scan from its intended place on the sample.
 
     Attributes:
-        record: scan by scan, without the second direction of the first one.
-        truth_m: (n, 2) true drift at the middle of each scan, from the first on.
+        record: drift record of all scans, except the second direction of the first scan.
+        truth_m: (n, 2) true drift at the middle of each scan, since the first one.
         rescans: number of rescans.
-        lost: whether the tracker was ever lost.
+        lost: whether the tracker lost the sample at any time.
     """
 
     record: DriftRecord
@@ -42,17 +42,17 @@ class SimulatedNight:
 
     @property
     def misplaced_m(self) -> Array:
-        """Misplacement of each scan, (n,)."""
+        """Misplacement of each scan, (n,), in m."""
         off: Array = np.hypot(*(self.truth_m - (self.record.center_m - self.record.center_m[:1])).T)
         return off
 
     @property
     def unknown_m(self) -> Array:
-        """Estimated minus true drift after each scan, (n, 2)."""
+        """Estimated minus true drift after each scan, (n, 2), in m."""
         return self.record.drift_m - self.record.drift_m[:1] - self.truth_m
 
     def metrics(self) -> dict[str, float]:
-        """Return the metrics for comparing nights; lengths in nm."""
+        """Return the metrics for comparing nights, by name; lengths in nm."""
         settled = self.record.time_s - self.record.time_s[0] >= min(SETTLED_S, np.ptp(self.record.time_s) / 4)
         misplaced, unknown = 1e9 * self.misplaced_m, self.unknown_m
         inverse = np.linalg.pinv(self.record.covariance_m2[1:])
@@ -70,10 +70,10 @@ class SimulatedNight:
 
 
 def night(settings: NightSettings, seed: int) -> SimulatedNight:
-    """Simulate a night. Equal seeds give equal sample, drift and noise, for all settings.
+    """Simulate a night. Equal seeds give the same sample, drift and noise for all settings.
 
     Raises:
-        ConfigError: meaningless settings.
+        ConfigError: a setting is invalid.
     """
     world = World.from_settings(_world(settings, seed), seed, 0.0)
     following = tracker(settings.tracker, estimator(settings.estimator))

@@ -1,4 +1,4 @@
-"""Recorded scans in the form of `DriftScan`."""
+"""Conversion of recorded scans into `DriftScan`s."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from afspm.storage.formats import FileContent
 
 @dataclass(frozen=True)
 class Series:
-    """One channel of many scans, in the order of time.
+    """One channel of many scans, in order of time.
 
     Attributes:
-        channel, unit: of the values.
-        scans: each with the name of its file as the key; in tip coordinates.
-        left_out: for each file left out, the reason.
+        channel, unit: name and unit of the channel.
+        scans: scans in tip coordinates, with their file names as keys.
+        left_out: file name and reason, for each scan left out.
     """
 
     channel: str
@@ -30,10 +30,10 @@ class Series:
 
 
 def series(contents: Sequence[FileContent], channel: str = "") -> Series:
-    """Return the scans of one channel; without a name, of the most frequent topography channel.
+    """Return the scans of one channel; without a name, the most frequent topography channel.
 
     Raises:
-        InvalidValue: it has fewer than two scans.
+        InvalidValue: the channel has fewer than two scans.
     """
     name = channel or topography(contents)
     found: list[DriftScan] = []
@@ -56,7 +56,7 @@ def series(contents: Sequence[FileContent], channel: str = "") -> Series:
 
 
 def topography(contents: Sequence[FileContent]) -> str:
-    """Return the channel that is the topography of most files.
+    """Return the most frequent topography channel of some files.
 
     Raises:
         InvalidValue: no file has a topography.
@@ -68,7 +68,7 @@ def topography(contents: Sequence[FileContent]) -> str:
 
 
 def drift_scan(scan: Scan, content: FileContent) -> DriftScan:
-    """Return one channel of a file. Without a start time, the scan counts as taken at its end."""
+    """Return one channel of a file as a DriftScan. Without a start time, the scan's end counts as its start."""
     end_ns = content.end_ns if content.end_ns is not None else content.start_ns
     start_ns = content.start_ns if content.start_ns is not None else end_ns
     if start_ns is None or end_ns is None:

@@ -1,4 +1,4 @@
-"""The settings of a simulated night, from names in a command line or a TOML file."""
+"""Settings of a simulated night, from names in a command line or a TOML file."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ Table = PlainMapping
 
 @dataclass(frozen=True)
 class NightSettings:
-    """One region, scanned again and again while the sample drifts.
+    """Settings of a simulated night: one region, scanned repeatedly while the sample drifts.
 
     Attributes:
         surface: kind of the sample, see `afspm.simulation`.
-        size_m, pixels: of the scanned square.
-        every_s: from the beginning of one scan to the beginning of the next.
-        line_s: of trace and retrace together.
-        hours: duration.
-        drift_m: displacement of the sample at the end; its direction and an added random walk follow from the seed.
+        size_m, pixels: side of the scanned square, in m and in pixels.
+        every_s: time from the start of one scan to the start of the next.
+        line_s: time of trace and retrace together.
+        hours: duration of the night.
+        drift_m: displacement of the sample at the end; the seed determines its direction and an added random walk.
         rescan: when a rescan is taken, see `afspm.plugins.drift.overlap`: "tolerance", "paper" or "never".
-        tolerance_m: for the rule "tolerance"; None: a tenth of the size.
-        f_rescan: for the rule "paper".
-        at_start: "up-down": the first place is scanned in both directions, as by the scheduler's default; "nothing".
-        estimator, tracker: "class" and settings.
+        tolerance_m: tolerance of the rule "tolerance"; None: a tenth of the size.
+        f_rescan: limit of the rule "paper".
+        at_start: "up-down": the first scan is taken in both directions, as by the scheduler's default; "nothing".
+        estimator, tracker: tables of "class" and settings.
     """
 
     surface: str = "stamper"
@@ -65,10 +65,11 @@ class NightSettings:
 
     @classmethod
     def of(cls, names: Table) -> NightSettings:
-        """Return the settings from names: fields, and "paper.queue" for a setting of the chosen tracker or estimator.
+        """Return the settings by name: fields, and such as "paper.queue" for a setting of the chosen tracker or
+        estimator.
 
         Raises:
-            ConfigError: unknown names. InvalidValue: values that contradict each other.
+            ConfigError: a name is unknown. InvalidValue: values contradict each other.
         """
         plain: Plain = {name: value for name, value in names.items() if "." not in name}
         known = [one.name for one in fields(cls)]

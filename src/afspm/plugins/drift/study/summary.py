@@ -1,4 +1,4 @@
-"""The summary of many nights: medians and spread, the best settings, and whether the defaults hold."""
+"""Summary of many nights: medians and spread, the best settings, and whether the defaults are as good."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ BY = "misplaced rms"
 
 @dataclass(frozen=True)
 class Summary:
-    """The nights of one combination of settings.
+    """Summary of the nights with one combination of settings.
 
     Attributes:
-        label: its name in the table.
+        label: name of the combination in the table.
         nights: number of completed nights.
-        failed: errors of the other nights.
-        quartiles: of each metric: lower quartile, median, upper quartile.
-        is_default, is_best: whether these settings are the defaults, the best.
-        holds: for the defaults, whether they are as good as the best: their median lies within its spread.
+        failed: errors of the nights that were not completed.
+        quartiles: lower quartile, median and upper quartile, by metric.
+        is_default, is_best: whether these settings are the defaults, and whether they are the best.
+        holds: for the defaults, whether they are as good as the best: their median is not above its upper quartile.
     """
 
     label: str
@@ -35,7 +35,7 @@ class Summary:
 
     @property
     def median(self) -> float:
-        """Median of the ranking metric; infinite without a night."""
+        """Median of the ranking metric; infinite without a completed night."""
         return self.quartiles[BY][1] if self.nights else float("inf")
 
 
@@ -45,7 +45,7 @@ def summarised(
     """Return one summary for each label, best first. The first label belongs to the defaults.
 
     Args:
-        metrics: of the nights, by label. Lost nights count as infinitely bad.
+        metrics: metrics of each night, by label. A night that lost the sample counts as infinitely bad.
         failed: errors of nights that were not completed, by label.
     """
     rows = [_row(label, metrics.get(label, ()), failed.get(label, ()), labels[0]) for label in labels]

@@ -1,4 +1,4 @@
-"""Many independent tasks, on the cores of this computer or on a Dask cluster. A dead worker costs only time."""
+"""Execution of many independent tasks on this computer's cores or a Dask cluster. A dead worker's task is repeated."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class TaskOutcome:
     """The result or the error of a task.
 
     Attributes:
-        index: of the task.
-        value: its return value, None if it failed.
-        error: for a person; empty if it succeeded.
+        index: index of the task.
+        value: return value of the task; None if it failed.
+        error: error text, for people; empty if the task succeeded.
     """
 
     index: int
@@ -33,7 +33,7 @@ class TaskOutcome:
 
 
 def processes(asked: int | None, pixels: int) -> int:
-    """Return the requested number of processes, or by default one per core where that pays."""
+    """Return the requested number of processes; by default one per core if the scans are large enough, else 1."""
     if asked is not None:
         return asked
     return 1 if pixels <= _FEW_PIXELS else os.cpu_count() or 1
@@ -42,7 +42,7 @@ def processes(asked: int | None, pixels: int) -> int:
 def on_cores(
     function: Callable[..., object], tasks: Sequence[tuple[object, ...]], *, jobs: int
 ) -> Iterator[TaskOutcome]:
-    """Yield the outcomes of `function(*task)`, in any order, from `jobs` processes (1: in this one)."""
+    """Yield the outcomes of `function(*task)` in any order, computed in `jobs` processes (1: in this process)."""
     if jobs <= 1:
         for index, task in enumerate(tasks):
             yield _done(function, index, task)
@@ -64,9 +64,9 @@ def on_cores(
 def on_cluster(
     function: Callable[..., object], tasks: Sequence[tuple[object, ...]], *, address: str
 ) -> Iterator[TaskOutcome]:
-    """Yield outcomes as `on_cores` does, from the workers of a Dask cluster with the same afspm installed.
+    """Yield outcomes like `on_cores`, computed by a Dask cluster with the same version of afspm.
 
-    The task of a dead worker goes to another.
+    The task of a dead worker is given to another worker.
 
     Raises:
         ConfigError: `distributed` is not installed, or the address does not answer.

@@ -1,4 +1,4 @@
-"""Trackers by name, a user's own, and forecasts from JSON.
+"""Trackers by name (afspm's, and a user's own classes), and forecasts from JSON.
 
 tracker("bank", estimator)
 tracker({"class": "paper", "w_update": 0.8}, estimator)
@@ -33,12 +33,12 @@ def tracker(spec: str | PlainMapping = DEFAULT, estimator: Estimator | None = No
     """Return a tracker by name.
 
     Args:
-        spec: a name that a package declares or "module.Name", or a table with such a name as its `class` and its
+        spec: a name declared by a package, or "module.Name"; or a table with such a name as its `class`, and the
             settings.
-        estimator: for its registrations, the tracker's first argument; None: the default one.
+        estimator: estimator for registrations, the tracker's first argument; None: the default estimator.
 
     Raises:
-        ConfigError: no such name, class or setting, a meaningless setting, or a missing library.
+        ConfigError: a name, class or setting is unknown or invalid, or a library is missing.
     """
     made, name = named("tracker", spec, DEFAULT, default_estimator() if estimator is None else estimator)
     if not all(callable(getattr(made, method, None)) for method in ("add", "state", "restore")):
@@ -50,10 +50,10 @@ def tracker(spec: str | PlainMapping = DEFAULT, estimator: Estimator | None = No
 
 
 def forecast_from_dict(table: PlainMapping) -> Forecast:
-    """Return the forecast of one of afspm's trackers from the result of its `to_dict`.
+    """Return the forecast of an afspm tracker from the result of `Forecast.to_dict`.
 
     Raises:
-        InvalidValue: something else.
+        InvalidValue: the table is not such a result.
     """
     kind = str(table.get("kind"))
     if kind not in _FORECASTS:

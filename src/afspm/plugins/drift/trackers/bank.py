@@ -1,4 +1,4 @@
-"""The default tracker: a bank of filters, an anchor, and several references for each scan."""
+"""`BankTracker`: the default tracker, with a bank of filters, anchors, and several references for each scan."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ _LIKE = 1.2  # largest relative difference of a second surprise that confirms th
 
 @dataclass(eq=False)
 class BankState:
-    """The state of a tracker from scan to scan: all that is saved.
+    """Complete saved state of a tracker.
 
     Attributes:
-        filters: None before the first scan.
-        similarity: rotation and scale; None: only translations are followed.
-        references: the stored scans, in the order of time, as in the filters' state.
-        compensation: velocity with which tip coordinates follow the sample.
-        newest_s: the middle of the newest scan, which may have been dropped.
+        filters: bank of filters; None before the first scan.
+        similarity: rotation and scale; None if only translations are tracked.
+        references: stored scans in order of time, as in the filters' state.
+        compensation: velocity of tip coordinates, which follow the sample.
+        newest_s: middle of the newest scan, even if this was dropped.
         scans: number of scans so far.
-        unmatched: scans in a row that should have matched.
-        proven: whether any two scans have matched; before, the first may be the unusable one.
-        doubted_m: (2,) measured minus expected position of the newest scan; None: not in doubt.
-        matched_s: the middle of the newest scan with a measured place.
+        unmatched: number of scans in a row that should have matched, but did not.
+        proven: whether any two scans have matched; until then, the first scan may be the unusable one.
+        doubted_m: (2,) measured minus expected position of the newest scan, if doubted; else None.
+        matched_s: middle of the newest scan with a measured place.
         lost: see `Update`.
     """
 
@@ -59,31 +59,32 @@ class BankState:
 
 
 class BankTracker:
-    """A bank of filters with different models of drift, weighted by how well they predicted it.
+    """Tracker with a bank of filters: models of drift, weighted by the quality of their predictions.
 
-    A scan is registered with several earlier ones: with recent ones, and with an anchor, the scan that first showed its
-    part of the sample, for as long as that can be recognised. Each result measures the difference of two positions. The
-    positions of all stored scans are part of the filters' state, so they stay consistent and nothing is counted twice.
-    A position holds for the middle of a scan; where the overlap lies elsewhere, the time of its rows counts.
+    A scan is registered with several earlier scans: recent ones, and an anchor, the first scan of its part of the
+    sample, as long as this can be recognised. Each result measures the difference of two positions. The positions of
+    all stored scans are part of the filters' state, so they stay consistent and nothing is counted twice. A position
+    holds for the middle of a scan; where the overlap lies elsewhere, the time of its rows counts.
 
-    A result far from every prediction is believed only if the next scan confirms it. A scan that matches no other is
-    adrift: it is stored at its predicted place and is no evidence, nor are scans that match only scans adrift. Their
-    places relative to each other are still followed. After several such scans in a row the tracker is lost. It is lost
-    after one if the standard deviation of its position exceeds half of the misplacement at which scans can still be
-    compared. A lost tracker searches everywhere. The first scan with a place ends that, and corrects the scans adrift.
+    A result far from every prediction is used only if the next scan confirms it. A scan that matches no other is
+    adrift: it is stored at its predicted place, and neither it nor scans that match only scans adrift are evidence.
+    Their places relative to each other are still tracked. After several such scans in a row the tracker is lost. It is
+    lost after a single one if the standard deviation of its position exceeds half of the misplacement at which scans
+    can still be compared. A lost tracker searches everywhere, until a scan has a measured place again; this scan also
+    corrects the scans adrift.
 
-    A scan that can be compared with no other, such as a zoom too fine for the overview, starts a series of its own. A
-    zoom is searched in an overview only at its expected place. A zoom not recognised in an overview does not make the
-    tracker lost: one particle looks like the next.
+    A scan that can't be compared with any other, such as a zoom too fine for the overview, starts a new series. A zoom
+    is searched in an overview only at its expected place, and the tracker is not lost if it is not recognised there,
+    since one particle looks like the next.
 
-    With the transform "similarity", scans are first straightened: see `Similarity`.
+    With the transform "similarity", rotation and scale are first removed from scans: see `Similarity`.
 
     Args:
-        estimator: gets the prediction as prior.
+        estimator: estimator for registrations, with the prediction as prior.
         settings: fields of `BankSettings` and `Choice`.
 
     Raises:
-        ConfigError: a meaningless setting.
+        ConfigError: a setting is invalid.
     """
 
     def __init__(self, estimator: Estimator, **settings: object) -> None:
@@ -143,10 +144,10 @@ class BankTracker:
         )
 
     def set_velocity(self, time_s: float, velocity_m_s: ArrayLike, covariance: ArrayLike) -> None:
-        """Update by a drift velocity (2,) in tip coordinates from another measurement, with its covariance (2, 2).
+        """Update with a drift velocity (2,) in tip coordinates from another measurement, with its covariance (2, 2).
 
         Raises:
-            InvalidValue: before the first scan.
+            InvalidValue: there is no scan yet.
         """
         state = self._state
         if state.filters is None:
@@ -156,10 +157,10 @@ class BankTracker:
         state.filters = state.filters.with_velocity(time_s, velocity, noise, rarest=self._settings.rarest)
 
     def compensated(self, time_s: float, velocity_m_s: ArrayLike) -> None:
-        """Register that the controller moves tip coordinates with a velocity (2,) from `time_s` on.
+        """Take into account that the controller moves tip coordinates with a velocity (2,) from `time_s` on.
 
         Raises:
-            InvalidValue: before the middle of the newest scan: its position has been published already.
+            InvalidValue: `time_s` is before the middle of the newest scan, whose position is already published.
         """
         state = self._state
         if state.newest_s is not None and time_s < state.newest_s:
@@ -347,7 +348,7 @@ class BankTracker:
         return snapshot(self._state, "bank", VERSION)
 
     def restore(self, state: PlainMapping) -> None:
-        """Restore the result of `state`. Raises InvalidValue: the state is of another tracker, or of other filters."""
+        """Restore the result of `state`. Raises InvalidValue if it belongs to another tracker, or to other settings."""
         found = restored(BankState, state, "bank", VERSION)
         if (filters := found.filters) is not None:
             if (self._settings.transform == "similarity") != (found.similarity is not None):

@@ -1,9 +1,9 @@
 """A bank of Kalman filters that share their measurements and differ in their models of motion.
 
-The state of each is (x, y, v_x, v_y), the displacement of the sample and its velocity, followed by four states for each
-stored scan: the displacement at which it shows the sample, and the velocity during it. These stay correlated with each
-other and with the drift, so repeated comparisons with one scan are not counted as independent, and later measurements
-correct earlier ones (as landmarks in simultaneous localisation and mapping: Smith, Self and Cheeseman 1990).
+The state of each filter is (x, y, v_x, v_y), the displacement of the sample and its velocity, followed by four values
+for each stored scan: displacement and velocity of the sample during this scan. These stay correlated with each other
+and with the drift, so repeated comparisons with one scan are not counted as independent, and later measurements correct
+earlier ones (as landmarks in simultaneous localisation and mapping: Smith, Self and Cheeseman 1990).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _SHORT = 1e-2  # of the fading time: below, differences of exponentials lose dig
 
 @dataclass(frozen=True, eq=False)
 class Models:
-    """Models of motion, n of them.
+    """Parameters of n models of motion.
 
     Attributes:
         density_m2_s3: (n,) q, spectral density of the acceleration.
@@ -34,16 +34,16 @@ class Models:
     walk_m2_s: Array
 
     def wandered_m2(self, duration_s: float) -> Array:
-        """Return the (n,) variance between the mean position over the rows of a scan and the position in its middle.
+        """Return the variance (n,) of the mean position over the rows of a scan minus the position in its middle.
 
-        It is the integral of a walk and a random acceleration.
+        It is caused by a random walk of the position and a random acceleration.
         """
         return np.asarray(self.walk_m2_s * duration_s / 12 + self.density_m2_s3 * duration_s**3 / 320)
 
     def over(self, step_s: float) -> tuple[Array, Array]:
-        """Return transition (n, 4, 4) and added covariance (n, 4, 4) of a state (x, y, v_x, v_y) over a time.
+        """Return transition matrix and added covariance, (n, 4, 4) each, of a state (x, y, v_x, v_y) over a time step.
 
-        A negative time goes back in a straight line, and adds as much.
+        A negative step goes back in a straight line, and adds the same covariance.
         """
         a, q, t = self.fading_per_s, self.density_m2_s3, abs(step_s)
         reach_s = np.full_like(a, step_s)  # distance per initial velocity
@@ -83,14 +83,14 @@ def _both_axes(one: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Filters:
-    """Filters, n of them with s states each; immutable.
+    """Bank of n filters with s state variables each; immutable.
 
     Attributes:
-        models: the motion of each.
-        time_s: of all of them.
-        mean: (n, s), m and m/s.
-        covariance: (n, s, s).
-        log_weight: (n,) of the probabilities of the filters.
+        models: model of motion of each filter.
+        time_s: time of all states.
+        mean: (n, s) state, m and m/s.
+        covariance: (n, s, s) covariance of the state.
+        log_weight: (n,) logarithm of the filters' probabilities.
     """
 
     models: Models
@@ -103,11 +103,11 @@ class Filters:
     def start(
         cls, models: Models, time_s: float, position_sd_m: float, velocity_sd_m_s: float, duration_s: float
     ) -> Filters:
-        """Return the filters after the first scan, from which positions are counted.
+        """Return the filters after the first scan, which is the origin of positions.
 
         Args:
             position_sd_m: location error of the first scan.
-            duration_s: of the scan, through which the sample wandered.
+            duration_s: duration of the scan.
         """
         n = len(models.density_m2_s3)
         position = position_sd_m**2 + models.wandered_m2(duration_s)[:, None, None]
@@ -120,12 +120,12 @@ class Filters:
 
     @property
     def weight(self) -> Array:
-        """Probabilities of the filters, (n,), sum 1."""
+        """Probabilities of the filters, (n,), with the sum 1."""
         weight = np.exp(self.log_weight - self.log_weight.max())
         return np.asarray(weight / weight.sum())
 
     def moved(self, time_s: float, followed_m: Array) -> Filters:
-        """Return the filters at a later time, in tip coordinates that have moved by `followed_m` (2,)."""
+        """Return the filters at a later time, in tip coordinates that have moved by `followed_m` (2,) meanwhile."""
         step_s = time_s - self.time_s
         transition, gained = self.models.over(step_s)
         mean, covariance = self.mean.copy(), self.covariance.copy()
@@ -147,7 +147,7 @@ class Filters:
         return replace(self, covariance=covariance)
 
     def with_scan(self, noise_m2: Array, duration_s: float) -> Filters:
-        """Add the newest scan, with a location error (2, 2) and the sample's wandering during the scan."""
+        """Return the filters with the newest scan added: its location error (2, 2), and the motion during the scan."""
         mean = np.concatenate([self.mean, self.mean[:, :4]], axis=1)
         rows = np.concatenate([self.covariance, self.covariance[:, :4, :]], axis=1)
         covariance = np.concatenate([rows, rows[:, :, :4]], axis=2)
@@ -159,16 +159,16 @@ class Filters:
         return replace(self, mean=self.mean[:, kept], covariance=self.covariance[:, kept][:, :, kept])
 
     def scan_drifts_m(self) -> Array:
-        """Return the (scans, 2) displacement in each stored scan, averaged over the filters."""
+        """Return the displacement in each stored scan, averaged over the filters, (scans, 2)."""
         mean: Array = (self.weight @ self.mean)[4:].reshape(-1, 4)[:, :2]
         return mean
 
     def velocity(self, number: int | None = None) -> tuple[Array, Array]:
-        """Return mean (2,) and covariance (2, 2) of the velocity during a scan, or now."""
+        """Return mean (2,) and covariance (2, 2) of the velocity during a stored scan, or of the present velocity."""
         return self.mixed(self.velocity_rows(number))
 
     def velocity_rows(self, number: int | None = None) -> Array:
-        """Return the (2, s) rows whose product with the state is the velocity during a scan, or now."""
+        """Return the rows (2, s) whose product with the state is the velocity during a stored scan, or at present."""
         first = 2 if number is None else 6 + 4 * number
         return np.eye(self.mean.shape[1])[first : first + 2]
 
@@ -177,18 +177,18 @@ class Filters:
         return mixed(self.weight, self.mean @ rows.T, rows @ self.covariance @ rows.T)
 
     def with_velocity(self, time_s: float, velocity_m_s: Array, covariance: Array, *, rarest: float) -> Filters:
-        """Update by a measured velocity of the sample at about the time of the filters."""
+        """Update with a velocity of the sample, measured at about the time of the filters."""
         elsewhen = self.models.over(abs(self.time_s - time_s))[1][:, 2:, 2:]
         return self.updated(self.velocity_rows(), velocity_m_s, covariance + elsewhen, forget=1.0, rarest=rarest)
 
     def updated(self, rows: Array, measured: Array, noise: Array, *, forget: float, rarest: float) -> Filters:
-        """Update by `measured` (m,) = `rows` (m, s) @ state + noise.
+        """Update with the measurement `measured` (m,) = `rows` (m, s) @ state + noise.
 
         `noise` is a covariance (m, m), or one for each filter (n, m, m).
 
         Args:
             forget: share of the logarithm of the old weights that is kept.
-            rarest: least weight relative to the largest: a filter that was wrong for long must be able to recover.
+            rarest: least weight relative to the largest, so that a filter that was wrong for long can recover.
         """
         innovation = measured - self.mean @ rows.T
         crossed = self.covariance @ rows.T
@@ -207,7 +207,7 @@ class Filters:
 
 
 def mixed(weight: Array, mean: Array, covariance: Array) -> tuple[Array, Array]:
-    """Return mean (m,) and covariance (m, m) of a mixture of weights (n,), means (n, m) and covariances (n, m, m)."""
+    """Return mean (m,) and covariance (m, m) of a mixture with weights (n,), means (n, m), covariances (n, m, m)."""
     total = weight @ mean
     apart = mean - total
     spread = np.einsum("n,nij->ij", weight, covariance) + np.einsum("n,ni,nj->ij", weight, apart, apart)

@@ -1,4 +1,4 @@
-"""The forecast of a bank of filters: its prediction, without the scans."""
+"""Forecast of a bank of filters: the data for predictions, without the scans."""
 
 from __future__ import annotations
 
@@ -20,16 +20,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Compensation:
-    """A velocity that changes in steps; zero at the start.
+    """Velocity of the controller's drift compensation over time: a step function, zero at the start.
 
     Attributes:
-        changes: (since when in s, v_x, v_y in m/s), in the order of time.
+        changes: (start in s, v_x, v_y in m/s), in order of time.
     """
 
     changes: tuple[tuple[float, float, float], ...] = ()
 
     def velocity_m_s(self, time_s: float) -> Array:
-        """Return the velocity (2,) at a time."""
         velocity = (0.0, 0.0)
         for since_s, x, y in self.changes:
             if since_s <= time_s:
@@ -37,7 +36,7 @@ class Compensation:
         return np.array(velocity)
 
     def followed_m(self, from_s: float, to_s: float) -> Array:
-        """Return the (2,) movement of tip coordinates between two times, negative if the first is later."""
+        """Return the movement (2,) of tip coordinates between two times in m; negative if the first time is later."""
         start_s, end_s = min(from_s, to_s), max(from_s, to_s)
         edges = [start_s, *(since_s for since_s, _, _ in self.changes if start_s < since_s < end_s), end_s]
         parts = [self.velocity_m_s(a) * (b - a) for a, b in itertools.pairwise(edges)]
@@ -45,7 +44,7 @@ class Compensation:
         return followed
 
     def changed(self, since_s: float, velocity_m_s: Array, *, needed_s: float) -> Compensation:
-        """Return the steps with another velocity from a time on, without steps that ended before `needed_s`."""
+        """Return a copy with another velocity from a time on, without steps that ended before `needed_s`."""
         before = [change for change in self.changes if change[0] < since_s]
         while len(before) > 1 and before[1][0] <= needed_s:
             del before[0]
@@ -57,16 +56,16 @@ _LEAST_WEIGHT = 1e-4  # filters that are less likely are left out
 
 @dataclass(frozen=True, eq=False)
 class BankForecast:
-    """The likely filters of a bank, n of them.
+    """Forecast from the n likely filters of a bank.
 
     Attributes:
-        time_s: of the states.
-        models: of motion.
-        weight: (n,) probabilities.
+        time_s: time of the states.
+        models: models of motion.
+        weight: (n,) probabilities of the filters.
         mean: (n, 4) displacement and velocity of the sample.
-        covariance: (n, 4, 4).
-        compensation: velocity with which tip coordinates follow the sample.
-        straight: from tip coordinates to coordinates without rotation and scale of the sample; None: they are the same.
+        covariance: (n, 4, 4) covariance of displacement and velocity.
+        compensation: velocity of tip coordinates, which follow the sample.
+        straight: mapping from tip coordinates to coordinates without rotation and scale of the sample; None: identity.
     """
 
     KIND: ClassVar = "bank forecast"
@@ -81,13 +80,13 @@ class BankForecast:
 
     @classmethod
     def at_start(cls) -> BankForecast:
-        """Return the forecast before the first scan, from which positions will be counted."""
+        """Return the forecast before the first scan, which is the origin of positions."""
         nothing = Models(np.zeros(1), np.zeros(1), np.zeros(1))
         return cls(0.0, nothing, np.ones(1), np.zeros((1, 4)), np.zeros((1, 4, 4)), Compensation())
 
     @classmethod
     def of(cls, filters: Filters, compensation: Compensation, straight: Mapping | None = None) -> BankForecast:
-        """Return the forecast of these filters."""
+        """Return the forecast of a bank of filters."""
         likely = filters.weight >= _LEAST_WEIGHT
         models = filters.models
         return cls(

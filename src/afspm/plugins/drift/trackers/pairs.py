@@ -1,8 +1,9 @@
-"""A registration as a measurement of the filters' state.
+"""Registrations as measurements of the filters' state.
 
 A feature at tip position x of the reference j is found at x + d in the scan k. So d is the displacement of the sample
-when k passed it, minus its displacement when j did: d = X_k + t_k v_k - X_j - t_j v_j. X is the displacement at the
-middle of a scan, v the velocity in tip coordinates, and t the delay from the middle to the rows of the overlap.
+when scan k passed the feature, minus its displacement when scan j did: d = X_k + t_k v_k - X_j - t_j v_j. X is the
+displacement at the middle of a scan, v the velocity in tip coordinates, and t the delay from the middle to the rows of
+the overlap.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ _ALIKE = 0.05  # largest relative difference in pace at which drift shears two s
 
 @dataclass(frozen=True, eq=False)
 class ObservationModel:
-    """The dependence of d on the state.
+    """Observation model: the dependence of d on the state.
 
     Attributes:
-        number: of the reference.
+        number: number of the reference.
         scan_delay_s, reference_delay_s: t_k and t_j.
         offset_m: (2,) the part of d independent of the state.
-        noise_m2: (2, 2) of the offset.
+        noise_m2: (2, 2) covariance of the offset.
     """
 
     number: int
@@ -44,10 +45,10 @@ class ObservationModel:
     noise_m2: Array
 
     def rows(self, states: int, scan_at: int) -> Array:
-        """Return the (2, states) rows whose product with the state is d - offset.
+        """Return the rows (2, states) whose product with the state is d - offset.
 
         Args:
-            scan_at: index of the scan's own position in the state.
+            scan_at: index of the scan's position in the state.
         """
         rows, first = np.zeros((2, states)), 4 + 4 * self.number
         for axis in range(2):
@@ -60,11 +61,11 @@ class ObservationModel:
 
 @dataclass(frozen=True, eq=False)
 class NewestScan:
-    """The scan under comparison, and the knowledge at that time.
+    """The newest scan, with the tracker's state at its time.
 
     Attributes:
-        compensated_m_s: (2,) velocity with which tip coordinates follow the sample; the state's velocity includes it.
-        similarity: rotation and scale for straightening the scan; None: only translations are followed.
+        compensated_m_s: (2,) velocity of tip coordinates, which follow the sample; included in the state's velocity.
+        similarity: rotation and scale for straightening the scan; None if only translations are tracked.
     """
 
     scan: DriftScan
@@ -73,7 +74,7 @@ class NewestScan:
     similarity: Similarity | None = None
 
     def link(self, number: int, reference: ReferenceScan, center_m: Array, displacement_m: Array) -> ObservationModel:
-        """Return the observation model of an overlap about a position of the reference."""
+        """Return the observation model for an overlap around a position of the reference."""
         ours_s, theirs_s = row_delay_s(self.scan, center_m + displacement_m), row_delay_s(reference.scan, center_m)
         offset, noise = np.zeros(2), np.zeros((2, 2))
         if ours_s is None:
@@ -96,7 +97,7 @@ class NewestScan:
         return np.asarray(delay_s**2 * (np.outer(velocity, velocity) + covariance))
 
     def expected(self, number: int, reference: ReferenceScan) -> tuple[Array, Array]:
-        """Return the expected d (2,) and its covariance (2, 2)."""
+        """Return the expected displacement d (2,) from a reference, and its covariance (2, 2)."""
         states = self.filters.mean.shape[1]
         middle = ObservationModel(number, 0.0, 0.0, np.zeros(2), np.zeros((2, 2)))
         displacement_m, _ = self.filters.mixed(middle.rows(states, 0))
@@ -108,7 +109,7 @@ class NewestScan:
         return mean + link.offset_m, covariance + link.noise_m2
 
     def prior(self, number: int, reference: ReferenceScan, widening: float) -> Prior:
-        """Return the prior for an estimator, widened by half a pixel so that it searches around the expectation."""
+        """Return the prior for an estimator, widened by half a pixel so that it searches around the expected value."""
         mean, covariance = self.expected(number, reference)
         half_px_m = max(*self.scan.pixel_m, *reference.scan.pixel_m) / 2
         covariance = widening * covariance + np.eye(2) * half_px_m**2
@@ -131,10 +132,10 @@ def _sheared_alike(first: DriftScan, second: DriftScan) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class PairMeasurement:
-    """The result of an estimator as a measurement.
+    """A registration as a measurement of the state.
 
     Attributes:
-        pair_noise_m2, scan_noise_m2: (2, 2) the parts of its error from the pair, and from the scan's location error.
+        pair_noise_m2, scan_noise_m2: (2, 2) error covariance due to the pair, and to the scan's location error.
     """
 
     link: ObservationModel
@@ -146,9 +147,9 @@ class PairMeasurement:
     def of(
         cls, newest: NewestScan, number: int, reference: ReferenceScan, found: Registration, inflation: float
     ) -> PairMeasurement:
-        """Make a measurement of a registration.
+        """Return the measurement from a registration.
 
-        The error of an efficient estimator is one location error for each of the scans; the inflation belongs to the
+        The error of an efficient estimator consists of one location error per scan; the inflation is an error of the
         pair.
         """
         link = newest.link(number, reference, found.center_m, found.displacement_m)
@@ -157,13 +158,13 @@ class PairMeasurement:
 
     @property
     def value_m(self) -> Array:
-        """Displacement (2,) as a function of the state alone."""
+        """Displacement (2,) without the part that does not depend on the state."""
         value: Array = self.found.displacement_m - self.link.offset_m
         return value
 
 
 def agreeing(measured: list[PairMeasurement], filters: Filters) -> list[PairMeasurement]:
-    """Return the largest consistent group of results; of equally large ones the group of the best reference."""
+    """Return the largest consistent group of results; of equally large groups, the one of the best reference."""
     if len(measured) < 2:
         return measured
     states = filters.mean.shape[1]
@@ -184,7 +185,7 @@ def agreeing(measured: list[PairMeasurement], filters: Filters) -> list[PairMeas
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Several results for one scan as one measurement, and the filters to update."""
+    """Several results for one scan, combined into one measurement, and the filters to update."""
 
     measured: list[PairMeasurement]
     filters: Filters
@@ -196,12 +197,12 @@ class Comparison:
 
     @cached_property
     def apart_m(self) -> Array:
-        """Distance (2,) of the best reference's result from the expectation of all filters."""
+        """Difference (2,) between the best reference's result and the expectation of all filters."""
         return self._apart[0]
 
     @cached_property
     def surprise(self) -> float:
-        """chi² of `apart_m`, 2 degrees of freedom."""
+        """chi² of `apart_m`, with 2 degrees of freedom."""
         apart, covariance = self._apart
         return float(apart @ np.linalg.solve(covariance, apart))
 
@@ -212,7 +213,7 @@ class Comparison:
         return best.value_m - expected, covariance + best.pair_noise_m2 + self.scan_noise_m2
 
     def rows(self, states: int) -> tuple[Array, Array, Array]:
-        """Return rows (m, states), values (m,) and noise (m, m); the scan is the last one in the state."""
+        """Return rows (m, states), values (m,) and noise (m, m) for an update; the scan is the last in the state."""
         rows = np.concatenate([one.link.rows(states, states - 4) for one in self.measured])
         values = np.concatenate([one.value_m for one in self.measured])
         noise = np.zeros((len(values), len(values)))

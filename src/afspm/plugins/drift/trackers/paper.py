@@ -1,4 +1,4 @@
-"""The tracker of the paper: first-order prediction, then the residual against the oldest scan that fits.
+"""`PaperTracker`, the tracker of the paper: first-order prediction, corrected by the oldest scan that fits.
 
 Sullivan, Valdés, Bevan and Grutter, Beilstein J. Nanotechnol. 2026, 17, 653, "Overarching Workflow" and supporting
 information, "Drift Correction Algorithm".
@@ -28,9 +28,10 @@ TRANSFORMS = ("translation", "euclidean", "similarity", "affine")
 
 
 def transform_between(found: Registration, form: str) -> Mapping:
-    """Return the transform from tip coordinates during the reference to tip coordinates during the scan.
+    """Return the transform from tip coordinates during the reference to tip coordinates during the scan, of a given
+    form.
 
-    It is the nearest one of the given form.
+    It is the transform of this form nearest to the registration.
     """
     linear = _of_form(np.eye(2) + found.linear, form)
     center = found.center_m if form != "translation" else np.zeros(2)
@@ -52,7 +53,7 @@ def _of_form(linear: Array, form: str) -> Array:
 
 
 def logarithm(matrix: Array) -> Array:
-    """Return the real X with exp X = matrix, 3 x 3; exact for a translation."""
+    """Return the real matrix X (3 x 3) with exp X = matrix; exact for a translation."""
     if np.array_equal(matrix[:2, :2], np.eye(2)):
         return np.asarray(matrix - np.eye(3))
     from scipy.linalg import logm
@@ -77,14 +78,14 @@ _MEMORY = 0.7  # of the mean square of the residuals from one scan to the next
 
 @dataclass(frozen=True, eq=False)
 class PaperForecast:
-    """M_tot of the newest scan and the rate of the last step.
+    """Forecast from M_tot of the newest scan and the rate of the last step.
 
     Attributes:
         time_s: middle of the newest scan.
-        matrix: M_k, 3 x 3.
+        matrix: (3, 3) M_k.
         rate: (3, 3) logarithm of the last step over its duration, 1/s.
-        covariance_m2: (2, 2) of the newest scan's position.
-        rate_covariance: (2, 2), (m/s)².
+        covariance_m2: (2, 2) covariance of the newest scan's position.
+        rate_covariance: (2, 2) covariance of the translation rate, (m/s)².
     """
 
     KIND: ClassVar = "paper forecast"
@@ -96,9 +97,9 @@ class PaperForecast:
     rate_covariance: Array
 
     def at(self, time_s: float) -> Prediction:
-        """Return M_k times the step of the last rate over the time since.
+        """Return the prediction for a time: M_k times the step at the last rate.
 
-        Where that would stretch the sample beyond belief, only the translation of the step is used.
+        If this step would stretch the sample implausibly, only its translation is used.
         """
         since_s = time_s - self.time_s
         step = exponential(self.rate * since_s)
@@ -117,7 +118,7 @@ class PaperForecast:
 
 @dataclass(frozen=True, eq=False)
 class PlacedScan:
-    """A scan of the queue C and its mapping M_j."""
+    """A scan in the queue C, with its mapping M_j."""
 
     scan: DriftScan
     mapping: Mapping
@@ -125,14 +126,14 @@ class PlacedScan:
 
 @dataclass(eq=False)
 class PaperState:
-    """The state of a tracker from scan to scan.
+    """Complete saved state of a tracker.
 
     Attributes:
-        forecast: with the newest scan.
-        newest_s: the middle of the newest scan; None: there is none yet.
+        forecast: forecast after the newest scan.
+        newest_s: middle of the newest scan; None before the first.
         residual_m2: mean square of the last residuals.
-        unmatched: scans in a row that should have matched.
-        queue: C, the oldest first.
+        unmatched: number of scans in a row that should have matched, but did not.
+        queue: the queue C, oldest scan first.
     """
 
     forecast: PaperForecast = PaperForecast(0.0, np.eye(3), np.zeros((3, 3)), np.zeros((2, 2)), np.zeros((2, 2)))
@@ -143,26 +144,26 @@ class PaperState:
 
 
 class PaperTracker:
-    """The paper's scheme, unchanged.
+    """Tracker with the unchanged scheme of the paper.
 
     Each scan is first predicted, M'_k = M_(k-1) dM^_k with dM^_k the rate of the last step times the time since, and
     then corrected by the residual dM~_k against the oldest scan of the queue for which estimation succeeds:
     M_k = M'_k dM~_k. Choices that the paper leaves open: times are the middles of the scans; without a rate the
-    prediction is the identity; an unmatched scan joins the queue at its predicted place. The paper has no uncertainty:
-    here the variance of a prediction is the mean square of the last residuals.
+    prediction is the identity; an unmatched scan joins the queue at its predicted place. The paper defines no
+    uncertainty: here the variance of a prediction is the mean square of the last residuals.
 
     Args:
-        estimator: gets no prior.
+        estimator: estimator for registrations, without a prior.
         transform: form of the mapping, "translation", "euclidean", "similarity" or "affine".
-        w_update: weight of the estimated residual; 1: all of it, 0: prediction alone.
-        queue: l, number of stored scans.
-        f_min: least intersection ratio of a pair, in sample coordinates.
-        sr_norm_min: least ratio of their resolutions.
-        lost_after: scans in a row that should have matched and did not, after which the tracker is lost (afspm's; the
-            paper goes on).
+        w_update: weight of the estimated residual; 0: prediction alone.
+        queue: number l of stored scans.
+        f_min: least intersection ratio of a pair of scans, in sample coordinates.
+        sr_norm_min: least ratio of the resolutions of a pair.
+        lost_after: number of scans in a row that should have matched, but did not, after which the tracker is lost
+            (added by afspm; the paper continues).
 
     Raises:
-        ConfigError: a meaningless setting.
+        ConfigError: a setting is invalid.
     """
 
     def __init__(

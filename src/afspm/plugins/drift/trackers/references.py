@@ -1,4 +1,4 @@
-"""The scans stored for comparison with later ones, and the choice of references for a scan."""
+"""Stored scans for comparison with later ones, and the choice of references for a scan."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _LIKE = 0.5  # least ratio of the resolutions of scans of one kind
 
 @dataclass(frozen=True, eq=False)
 class ReferenceScan:
-    """A stored scan.
+    """A scan stored as a reference.
 
     Attributes:
-        compensated_m_s: (2,) velocity with which tip coordinates followed the sample then.
-        anchor: whether it stands for its part of the sample.
-        adrift: no scan with a measured place matched it, so its place is a prediction.
-        refusals: comparisons in a row without success, while another reference succeeded.
-        used: number of the scan that was last registered with it.
+        compensated_m_s: (2,) velocity of tip coordinates during the scan, which followed the sample.
+        anchor: whether the scan is the long-term reference for its part of the sample.
+        adrift: whether the place of the scan is only predicted, since it matched no scan with a measured place.
+        refusals: number of failed comparisons in a row, while another reference succeeded.
+        used: number of the scan last registered with this reference.
     """
 
     scan: DriftScan
@@ -43,13 +43,13 @@ class Choice:
 
     Attributes:
         compared: largest number of references for each scan.
-        recent: stored scans besides the anchors.
+        recent: largest number of stored scans besides the anchors.
         anchors: largest number of anchors.
-        most_bytes: of all stored values.
+        most_bytes: largest memory for all stored values.
         overlap_min: least overlap, as share of the smaller scan.
         sr_norm_min: least ratio of the resolutions.
-        stale_after: refusals in a row after which an anchor is removed.
-        alike: share of a scan that an anchor must show, at half its resolution at least, to stand for it.
+        stale_after: number of refusals in a row after which an anchor is removed.
+        alike: least overlap of a scan with an anchor, at half the resolution or better, without a new anchor.
     """
 
     compared: int = 5
@@ -63,7 +63,7 @@ class Choice:
 
 
 class ReferenceScans:
-    """The stored scans, in the order of time. Displacements (…, 2) of the sample are in m."""
+    """Stored scans in order of time. Displacements (…, 2) of the sample are in m."""
 
     def __init__(self, choice: Choice) -> None:
         self.choice = choice
@@ -76,15 +76,15 @@ class ReferenceScans:
         return iter(self.kept)
 
     def candidates(self, scan: DriftScan, drift_m: Array, drifts_m: Array, *, anywhere: bool) -> list[int]:
-        """Return the numbers of the references to compare with a scan, best first.
+        """Return the indices of the references to compare with a scan, best first.
 
-        Scans adrift, which are no evidence, come last. Anchors of the same resolution come first, then the newest,
-        which show recent changes.
+        Anchors of similar resolution come first, then the newest scans, which show recent changes. Scans adrift, which
+        are no evidence, come last.
 
         Args:
-            drift_m: (2,) expected in the scan.
-            drifts_m: (n, 2) shown by the references.
-            anywhere: ignore the expectation, so all may overlap.
+            drift_m: (2,) displacement expected in the scan.
+            drifts_m: (n, 2) displacements in the references.
+            anywhere: ignore the expected displacement, so that all references may overlap.
         """
         fitting = []
         for number, kept in enumerate(self.kept):
@@ -104,11 +104,11 @@ class ReferenceScans:
         return [number for _, number in sorted(fitting)][: self.choice.compared]
 
     def is_alike(self, number: int, scan: DriftScan) -> bool:
-        """Return whether a reference has about the resolution of a scan, unlike an overview of a zoom."""
+        """Return whether a reference has about the resolution of a scan, unlike an overview compared with a zoom."""
         return _alike(self.kept[number].scan, scan) >= _LIKE
 
     def judged(self, tried: Table[int, bool], step: int) -> None:
-        """Update the refusals and the last use of each reference tried with the newest scan."""
+        """Update refusals and last use of each reference that was tried with the newest scan."""
         for number, succeeded in tried.items():
             kept = self.kept[number]
             if succeeded:
@@ -117,12 +117,12 @@ class ReferenceScans:
                 self.kept[number] = replace(kept, refusals=kept.refusals + 1)
 
     def known(self, numbers: Iterable[int]) -> None:
-        """Clear the adrift flag of references."""
+        """Clear the adrift flag of references with given indices."""
         for number in numbers:
             self.kept[number] = replace(self.kept[number], adrift=False)
 
     def needs_anchor(self, scan: DriftScan, drift_m: Array, drifts_m: Array) -> bool:
-        """Return whether no anchor stands for the area of a scan."""
+        """Return whether no anchor represents the area of a scan."""
         return not any(
             kept.anchor
             and self.is_alike(number, scan)
@@ -131,7 +131,7 @@ class ReferenceScans:
         )
 
     def superfluous(self) -> int | None:
-        """Return the number of a reference to remove; None if all may stay. The newest always stays."""
+        """Return the index of a reference to remove; None if all can stay. The newest always stays."""
         old = list(enumerate(self.kept))[:-1]
         stale = [n for n, one in old if one.anchor and one.refusals >= self.choice.stale_after]
         if stale:

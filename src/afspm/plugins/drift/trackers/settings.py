@@ -1,4 +1,4 @@
-"""The settings of the default tracker."""
+"""Settings of the default tracker."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ TRANSFORMS = ("translation", "similarity")
 class BankSettings:
     """Settings of the bank, tuned on simulated nights with 2 µm scans every 15 minutes.
 
-    They are wide enough for most microscopes.
+    The defaults cover most microscopes.
 
     Attributes:
-        densities_m2_s3: of the acceleration: how fast the velocity of drift wanders.
+        densities_m2_s3: spectral densities of the acceleration, a measure of how fast the drift velocity changes.
         fadings_s: time constants after which a velocity has decayed to 1/e; inf for a constant velocity.
-        walks_m2_s: variance per second of a random walk of the position. There is a filter for each density, fading and
-            walk.
-        jitter_m: standard deviation of a scan's position that no registration can measure.
+        walks_m2_s: variances per second of a random walk of the position. There is one filter for each combination of
+            density, fading and walk.
+        jitter_m: standard deviation of an error of a scan's position that registrations do not show.
         start_velocity_sd_m_s: standard deviation of the velocity at the start.
         start_px: standard deviation of the sample's position in the first scan, in its pixels.
         forget: share of the logarithm of the filters' weights that is kept from one scan to the next.
         rarest: least weight of a filter, relative to the largest.
-        inflation: factor on an estimator's covariance, above 1. The excess over 1 belongs to the pair, the rest half
-            to each of its scans.
+        inflation: factor on an estimator's covariance, above 1. The excess over 1 is an error of the pair; the rest is
+            divided equally between its scans.
         widening: factor on the covariance of an expected displacement, for the estimator's search.
-        doubt: chi2 above which a result is not believed until the next scan confirms it.
-        second_looks: references that are searched without a prediction if none matched with it.
-        lost_after: scans in a row that should have matched and did not.
-        transform: "translation"; or "similarity": rotation and scale are estimated as well.
+        doubt: chi² above which a result is ignored until the next scan confirms it.
+        second_looks: number of references searched without a prediction if none matched with one.
+        lost_after: number of scans in a row that should have matched, but did not, after which the tracker is lost.
+        transform: "translation", or "similarity" to estimate rotation and scale as well.
         linear_walk_per_s: variance per second of the angle (rad) and of the logarithm of the scale.
     """
 
@@ -84,7 +84,7 @@ class BankSettings:
         """Split settings into settings of the bank and settings of its references.
 
         Raises:
-            ConfigError: a name that neither has, or a meaningless value.
+            ConfigError: a name is unknown, or a value is invalid.
         """
         own, others = ({field.name for field in dataclasses.fields(one)} for one in (cls, Choice))
         for name in settings:
@@ -102,11 +102,11 @@ class BankSettings:
             raise ConfigError(f"the settings of the tracker: {error}") from error
 
     def models(self) -> Models:
-        """Return a model of motion for each density, fading and walk."""
+        """Return one model of motion for each combination of density, fading and walk."""
         densities, fadings, walks = np.meshgrid(self.densities_m2_s3, self.fadings_s, self.walks_m2_s, indexing="ij")
         return Models(densities.ravel(), 1.0 / fadings.ravel(), walks.ravel())
 
     def filters(self, first: DriftScan) -> Filters:
-        """Return all filters after the first scan."""
+        """Return the bank of filters after the first scan."""
         position_sd_m = self.start_px * min(first.pixel_m)
         return Filters.start(self.models(), first.mid_s, position_sd_m, self.start_velocity_sd_m_s, first.duration_s)

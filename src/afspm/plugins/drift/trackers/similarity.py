@@ -1,8 +1,8 @@
-"""Rotation and scale of the sample since the first scan, as a Kalman filter of two parameters.
+"""Kalman filter for rotation and scale of the sample since the first scan.
 
-Both are one complex number, the logarithm of the scale plus i times the angle in rad: successive changes add up. It is
-a random walk from zero, so it stays near zero without evidence. Besides the present, the state holds each stored
-reference, as the bank of filters does for positions.
+Both form one complex number, the logarithm of the scale plus i times the angle in rad, so that successive changes add
+up. Its model is a random walk from zero, so it stays near zero without evidence. The state contains the present value
+and a value for each stored reference, like the positions in the bank of filters.
 """
 
 from __future__ import annotations
@@ -29,15 +29,16 @@ _OF_SCALE, _OF_ANGLE = np.array([1.0, 0.0, 0.0, 1.0]), np.array([0.0, -1.0, 1.0,
 class Similarity:
     """Rotation and scale with their uncertainty; immutable.
 
-    Scans are registered straightened, with the known rotation and scale of their time undone. In these coordinates, u =
-    straight(x_tip), the sample is only displaced, x_sample = u - drift.
+    Scans are straightened before registration: their known rotation and scale are undone. In straightened coordinates u
+    = straight(x_tip), the sample is only displaced: x_sample = u - drift.
 
     Attributes:
-        straight: from tip coordinates to straightened ones, now.
-        pivot_m: (2,) the last place of the sample, straightened: later corrections rotate about this place.
-        error: (1 + n,) complex, expected rotation and scale left by `straight` now, and in each reference.
-        covariance: (1 + n, 1 + n), of scale and angle alike.
-        doubted: the newest measurement was far from its expectation.
+        straight: present mapping from tip coordinates to straightened coordinates.
+        pivot_m: (2,) last place of the sample, straightened; later corrections rotate about this place.
+        error: (1 + n,) complex, rotation and scale expected to remain after straightening, at present and in each
+            reference.
+        covariance: (1 + n, 1 + n) covariance of `error`, the same for scale and angle.
+        doubted: whether the newest measurement was far from its expected value.
     """
 
     straight: Mapping
@@ -61,19 +62,19 @@ class Similarity:
         return replace(scan, region=replace(self.straight.to_sample(scan.region), frame=Frame.TIP))
 
     def moved(self, variance: float) -> Similarity:
-        """Return a later state, with this variance added to the present."""
+        """Return the state at a later time, with a variance added to the present."""
         covariance = self.covariance.copy()
         covariance[0, 0] += variance
         return replace(self, covariance=covariance)
 
     def lever_m2(self, number: int, position_m: Array) -> Array:
-        """Return the (2, 2) covariance of a displacement from a reference by the uncertain rotation about the pivot."""
+        """Return the covariance (2, 2) of a displacement from a reference, by uncertain rotation about the pivot."""
         row = self._row(number)
         far_m = position_m - self.pivot_m
         return np.asarray(np.eye(2) * (row @ self.covariance @ row) * (far_m @ far_m))
 
     def learned(self, number: int, seen: SimilarityMeasurement) -> Similarity:
-        """Update by a registration with a reference."""
+        """Update with a registration with a reference."""
         row = self._row(number)
         crossed = self.covariance @ row
         expected = float(row @ crossed) + seen.variance
@@ -87,14 +88,14 @@ class Similarity:
         return replace(self, error=error, covariance=(covariance + covariance.T) / 2, doubted=False)
 
     def straight_about(self, position_m: Array) -> Similarity:
-        """Correct `straight` by the expected rotation and scale error, about a place (2,) that stays fixed."""
+        """Correct `straight` for the expected error of rotation and scale, about a fixed place (2,)."""
         error = self.error.copy()
         undone = _turned_about(position_m, -error[0])
         error[0] = 0.0
         return replace(self, straight=undone @ self.straight, pivot_m=position_m, error=error)
 
     def with_scan(self) -> Similarity:
-        """Add the newest scan, straightened as it was registered."""
+        """Return the state with the newest scan added, straightened as for its registration."""
         now = [*range(len(self.error)), 0]
         return replace(self, error=self.error[now], covariance=self.covariance[np.ix_(now, now)])
 
@@ -111,11 +112,11 @@ class Similarity:
 
 @dataclass(frozen=True)
 class SimilarityMeasurement:
-    """Rotation and scale between two scans.
+    """Measured rotation and scale between two scans.
 
     Attributes:
         value: logarithm of the scale, plus i times the angle in rad.
-        variance: of each of them.
+        variance: variance of each of them.
     """
 
     value: complex
@@ -123,9 +124,9 @@ class SimilarityMeasurement:
 
     @classmethod
     def of(cls, seen: LinearSeen, scans: tuple[DriftScan, DriftScan], inflation: float) -> SimilarityMeasurement:
-        """Fit rotation and scale to a linear part by generalised least squares, besides a shear by drift.
+        """Fit rotation and scale to a linear part by generalised least squares, allowing for a shear by drift.
 
-        A shear by drift during a scan displaces whole rows, so changes along a row carry most of the information.
+        Drift during a scan displaces whole rows, so changes along a row carry most of the information.
         """
         covariance = seen.covariance + _LEAST_SD**2 * np.eye(4)
         for scan in scans:
