@@ -283,6 +283,15 @@ def test_command_prints_json_for_programs(night: Path) -> None:
     assert [row["name"] for row in facts["table"]] == ["judge"]
 
 
-@pytest.mark.parametrize("given", [["x.toml"], ["run", "a.toml", "b.toml"], ["run", "--set", "judge"]])
+@pytest.mark.parametrize(
+    "given",
+    [
+        ["x.toml"],
+        ["run", "a.toml", "b.toml"],
+        ["run", "--set", "judge"],
+        ["run", "--page", "no-such-folder/page.html"],
+        ["run", "--closed", "--page", "page.html"],
+    ],
+)
 def test_command_refuses_what_it_can_not_read(given: list[str]) -> None:
     assert CliRunner().invoke(app, given).exit_code == 2

@@ -26,6 +26,9 @@ def test_recorded_run_with_kills_repeats_its_record(run: Run, tmp_path: Path, mo
     result = afspm.what_if(folder)
     assert result.first is None, result.first
     assert not result.unread
+    assert result.simulated
+    assert "microscope" in result.left_out
+    assert "series" not in result.left_out
     rows = {row.name: row for row in result.table()}
     assert rows["series"].same > 5
     assert rows["scheduler"].same > 50

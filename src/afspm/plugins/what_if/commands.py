@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 DIFFERS = 3
 """Exit code: a night differs."""
 _MOST_SHOWN = 10
-_LONGEST, _AROUND = 120, 25
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
 
 
@@ -51,6 +50,9 @@ def what_if(
         "runs"
     ),
     as_json: Annotated[bool, opt("For programs.", "--json")] = False,
+    page: Annotated[
+        Path | None, opt("Write the result as one HTML page, too.", "--page", metavar="FILE", dir_okay=False)
+    ] = None,
 ) -> None:
     """Replay recorded nights with a change, and show the differences.
 
@@ -58,12 +60,14 @@ def what_if(
     Needs runs with `requests = true` in [record]. Exit code 3: a night differs.
     """
     folders, changes = _given(paths, change or [])
+    if page is not None:
+        _require_page(page, closed=closed)
     differs = False
-    for folder in folders:
-        if closed:
+    if closed:
+        for folder in folders:
             differs |= _rerun(folder, changes, runs)
-        else:
-            differs |= _replay(folder, changes, names_in(component), as_json=as_json)
+    else:
+        differs = _replay(folders, changes, names_in(component), page, as_json=as_json)
     if differs:
         raise typer.Exit(DIFFERS)
 
@@ -96,15 +100,32 @@ def _value(text: str) -> Any:
         return text  # a text without its quotes
 
 
-def _replay(folder: Path, changes: Any, only: tuple[str, ...], *, as_json: bool) -> bool:
+def _require_page(page: Path, *, closed: bool) -> None:
+    # before the replays: they may take an hour
+    if closed:
+        raise typer.BadParameter("`afspm compare` writes a page of both runs", param_hint="--page with --closed")
+    if not page.parent.is_dir():
+        raise typer.BadParameter(f"there is no folder {page.parent}", param_hint="--page")
+
+
+def _replay(folders: list[Path], changes: Any, only: tuple[str, ...], target: Path | None, *, as_json: bool) -> bool:
+    from afspm.plugins.what_if.page import Page
     from afspm.plugins.what_if.what_if import what_if
 
-    result = what_if(folder, changes, only=only)
-    if as_json:
-        typer.echo(json.dumps(_facts(result), ensure_ascii=False))
-    else:
-        _print(result)
-    return result.differs
+    page, differs = Page(changes), False
+    for folder in folders:
+        result = what_if(folder, changes, only=only)
+        differs |= result.differs
+        if as_json:
+            typer.echo(json.dumps(_facts(result), ensure_ascii=False))
+        else:
+            _print(result)
+        if target is not None:
+            page.add(result)
+    if target is not None:
+        page.write(target)
+        typer.echo(target, err=as_json)
+    return differs
 
 
 def _rerun(folder: Path, changes: Any, runs: Path) -> bool:
@@ -120,11 +141,14 @@ def _rerun(folder: Path, changes: Any, runs: Path) -> bool:
 
 def _print(result: WhatIf) -> None:
     from afspm.cli.joining import plain_console, plain_table
+    from afspm.plugins.what_if.side_by_side import sides, where
 
     first = result.first
     typer.echo(f"{result.run.name}: {'differs' if first else 'no difference'}")
     if first is not None:
-        typer.echo("\n".join(_described(first)))
+        recorded, now = sides(first)
+        typer.echo(f"first difference: {first.component}, {where(first)}")
+        typer.echo(f"  recorded  {recorded}\n  now       {now}")
     if (since_ns := result.counterfactual_from_ns) is not None:
         typer.echo(
             f"after {day_and_time(since_ns, UTC)} the inputs are those of another night (counterfactual): differences "
@@ -139,8 +163,7 @@ def _print(result: WhatIf) -> None:
     shown = result.differences
     for one in shown[1:_MOST_SHOWN]:
         mark = " (counterfactual)" if one.counterfactual else ""
-        sides = " → ".join(_sides(one))
-        typer.echo(f"{day_and_time(one.at_ns, UTC)}  {one.component}: {sides}{mark}")
+        typer.echo(f"{day_and_time(one.at_ns, UTC)}  {one.component}: {' → '.join(sides(one))}{mark}")
     if len(shown) > _MOST_SHOWN:
         typer.echo(f"and {counted(len(shown) - _MOST_SHOWN, 'more difference')}")
     for name, hazards in result.hazards.items():
@@ -148,40 +171,6 @@ def _print(result: WhatIf) -> None:
             typer.echo(f"{name} depends on more than its inputs: it {hazard}")
     for name, why in result.unread.items():
         typer.echo(f"{name} was not replayed: {why}", err=True)
-
-
-def _described(first: Difference) -> list[str]:
-    packet = first.packet
-    at = f"{day_and_time(first.at_ns, UTC)}, at the packet {packet.envelope}" if packet else "before the first packet"
-    recorded, now = _sides(first)
-    return [f"first difference: {first.component}, {at}", f"  recorded  {recorded}", f"  now       {now}"]
-
-
-def _sides(one: Difference) -> tuple[str, str]:
-    if one.recorded is None or one.now is None:
-        return _side(one.recorded), _side(one.now)
-    before, after = one.recorded, one.now
-    if before.value == after.value:
-        return _side(before), f"the same, at another packet: {_place(after)}"
-    # of long messages the part that differs
-    if min(len(before.text), len(after.text)) <= _LONGEST:
-        return _side(before), _side(after)
-    pairs = enumerate(zip(before.text, after.text, strict=False))
-    common = next((at for at, (one, other) in pairs if one != other), 0)
-    since, until = max(0, common - _AROUND), common + _AROUND
-    return _side(before, since, until), _side(after, since, until)
-
-
-def _side(output: Output | None, since: int = 0, until: int = 120) -> str:
-    if output is None:
-        return "nothing"
-    text = f"{'…' if since else ''}{output.text[since:until]}{'…' if until < len(output.text) else ''}"
-    return text if output.reaches else f"{output.key or output.message}: {text}"
-
-
-def _place(output: Output) -> str:
-    packet = output.packet
-    return "none" if packet is None else f"{packet.envelope} of {day_and_time(packet.time_ns, UTC)}"
 
 
 def _facts(result: WhatIf) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from afspm.plugins.what_if.component_replay import ComponentReplay
 from afspm.plugins.what_if.port_replay import Life, PacketOf, read_lives
 from afspm.plugins.what_if.recorded_packets import recorded_packets
 from afspm.plugins.what_if.scheduler_replay import SchedulerReplay
-from afspm.record.run import open_run
+from afspm.record.run import Run, open_run
 from afspm.record.run_json import EXPERIMENT_FILE, run_json_or_empty
 from afspm.scheduler import step_log
 from afspm.storage.line_log import REQUESTS_FOLDER, read_lines
@@ -56,11 +56,21 @@ class WhatIf:
     """Differences between a recorded run and its replay with a change.
 
     Attributes:
+<<<<<<< HEAD
         run: folder of the recorded run.
         components: replays of components, by name.
         scheduler: replay of the scheduler; None if it was not replayed.
         controls: replays without the change, for each changed component that differs.
         unread: reasons why processes were not replayed, by name.
+=======
+        run: folder of the run.
+        components: the replays, by name.
+        scheduler: None: it was not replayed.
+        controls: replays of the unchanged component, of those components that differ and were changed.
+        unread: why processes could not be replayed, by name.
+        left_out: why processes were left out, by name.
+        simulated: the microscope was simulated.
+>>>>>>> whatifpage
     """
 
     run: Path
@@ -69,6 +79,8 @@ class WhatIf:
     scheduler_name: str = "scheduler"
     controls: dict[str, ComponentReplay] = field(default_factory=dict)
     unread: dict[str, str] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+    simulated: bool = False
 
     @property
     def first(self) -> Difference | None:
@@ -184,10 +196,11 @@ def what_if(run: str | Path, changes: Changes = None, *, only: Collection[str] =
                 where=str(record.folder),
                 hint=f"it has those of {', '.join(sorted(logs))}",
             )
-        result = WhatIf(record.folder)
+        result = WhatIf(record.folder, left_out=_without_log(record, logs), simulated=record.simulated)
         packet_of = recorded_packets(record)
         for name, path in sorted(logs.items()):
             if only and name not in only:
+                result.left_out[name] = "only others were chosen"
                 continue
             try:
                 if path.name.endswith(step_log.SUFFIX):
@@ -243,6 +256,17 @@ def _logs(folder: Path) -> dict[str, Path]:
             hint="set requests = true in [record] of the experiment file before a run",
         )
     return found
+
+
+def _without_log(record: Run, logs: Mapping[str, Path]) -> dict[str, str]:
+    why = "its requests are not in the record; only the scheduler and subclasses of Component keep them"
+    if not (record.folder / EXPERIMENT_FILE).is_file():
+        return {}
+    return {name: why for name, part in record.experiment.items() if _is_component(part) and name not in logs}
+
+
+def _is_component(part: object) -> bool:
+    return isinstance(part, dict) and bool(part.get("component"))
 
 
 def _changed(folder: Path, changes: Changes, logs: Mapping[str, Path]) -> dict[str, Changed]:
