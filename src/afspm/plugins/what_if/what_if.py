@@ -56,21 +56,13 @@ class WhatIf:
     """Differences between a recorded run and its replay with a change.
 
     Attributes:
-<<<<<<< HEAD
         run: folder of the recorded run.
         components: replays of components, by name.
         scheduler: replay of the scheduler; None if it was not replayed.
         controls: replays without the change, for each changed component that differs.
         unread: reasons why processes were not replayed, by name.
-=======
-        run: folder of the run.
-        components: the replays, by name.
-        scheduler: None: it was not replayed.
-        controls: replays of the unchanged component, of those components that differ and were changed.
-        unread: why processes could not be replayed, by name.
-        left_out: why processes were left out, by name.
-        simulated: the microscope was simulated.
->>>>>>> whatifpage
+        left_out: reasons why processes were left out, by name.
+        simulated: whether the microscope was simulated.
     """
 
     run: Path
