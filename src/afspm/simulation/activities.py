@@ -162,9 +162,7 @@ class ScanActivity:
         return drawn.truth if isinstance(drawn, SimulatedScan) else {}
 
     def signals(self, now_s: float) -> dict[str, float]:
-        """Return the present value of each channel; during the retrace, of the backward channel where it is
-        recorded.
-        """
+        """Return the present value of each channel; during the retrace, of a recorded backward channel."""
         if self._whole is None:
             self._whole = self._drawn.result().channels()
         rows, columns = self.shape

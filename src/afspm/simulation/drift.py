@@ -107,9 +107,7 @@ class Drift:
         return np.asarray(np.exp(rate * self._since_s(t_s)))
 
     def turned(self, x_m: Array, y_m: Array, t_s: ArrayLike) -> tuple[Array, Array]:
-        """Rotate and expand sample positions (x, y) to their state at experiment times, which broadcast with x and
-        y.
-        """
+        """Rotate and expand sample positions (x, y) to their state at times that broadcast with x and y."""
         return self._about(x_m, y_m, self.turn(t_s))
 
     def unturned(self, x_m: Array, y_m: Array, t_s: ArrayLike) -> tuple[Array, Array]:

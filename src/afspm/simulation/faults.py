@@ -45,8 +45,7 @@ class Fault:
 
     @classmethod
     def parse(cls, text: str) -> Fault:
-        """Parse `KIND[@SECONDS][,count=N][,duration=SECONDS]` of the command line; `count=every` repeats without
-        limit.
+        """Parse `KIND[@SECONDS][,count=N][,duration=SECONDS]` of the command line; `count=every` has no limit.
 
         Raises:
             ConfigError: the text has another form.

@@ -25,9 +25,7 @@ def is_separable(x_m: Array, y_m: Array) -> bool:
 
 
 def bspline_weights(fraction: Array) -> tuple[Array, Array, Array, Array]:
-    """Return B-spline weights of the lattice points -1, 0, 1, 2 for a position at `fraction` in [0, 1) after point
-    0.
-    """
+    """Return weights of the lattice points -1, 0, 1, 2 for a position at `fraction` in [0, 1) after point 0."""
     rest = 1.0 - fraction
     square, rest_square = fraction * fraction, rest * rest
     return (
@@ -55,8 +53,7 @@ def smooth_field(seed: int, x_m: Array, y_m: Array, spacing_m: float) -> Array:
 def rough_field(
     seed: int, x_m: Array, y_m: Array, *, largest_m: float, smallest_m: float, hurst: float, resolution_m: float
 ) -> Array:
-    """Return a self-affine field of unit rms: octaves from `largest_m` down, with amplitudes proportional to
-    wavelength**hurst.
+    """Return a self-affine field of unit rms: octaves from `largest_m` down, amplitudes as wavelength**hurst.
 
     Octaves finer than `resolution_m` fade out, since they cannot be resolved.
     """

@@ -148,9 +148,7 @@ class Instrument:
         return {name: unit for name, (unit, _) in scan.channels().items()}
 
     def doing(self, now_s: float) -> str:
-        """Return "scan", "spectrum", "move", "pulse", "crash", "approach", the name passed to `occupy`, or "" if
-        free.
-        """
+        """Return the activity: "scan", "spectrum", "move", "pulse", "crash", "approach", as in `occupy`, or ""."""
         return self._doing.what if self._doing is not None and self._doing.running(now_s) else ""
 
     def busy(self, now_s: float) -> bool:

@@ -115,9 +115,7 @@ class TipAnswers:
         return next(self.of_flaw[flaw] for flaw in (*PUBLIC_PRIORS, "blunt") if flaw in flaws or not flaws)
 
     def turned(self) -> TipAnswers:
-        """Return the answers with the opposite polarity, and with the cure probabilities of pulses and crashes
-        swapped.
-        """
+        """Return the answers with the polarity reversed, and with pulse and crash cure probabilities swapped."""
         return TipAnswers({
             flaw: replace(one, sign=-one.sign, pulse_cures=one.crash_cures, crash_cures=one.pulse_cures)
             for flaw, one in self.of_flaw.items()
