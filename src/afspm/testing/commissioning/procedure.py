@@ -28,8 +28,8 @@ class CommissioningResult:
 
     Attributes:
         progress: the steps.
-        lost: why it ended early; empty if it did not.
-        folder: of the run, with the log and the trace.
+        lost: why the commissioning ended early; empty if it did not.
+        folder: the run folder, with the log and the trace.
     """
 
     progress: CommissioningProgress

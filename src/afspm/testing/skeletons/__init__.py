@@ -24,7 +24,7 @@ def write(kind: str, name: str, into: Path) -> Path:
         name: of its folder; "my-scope" becomes my_scope, with the class MyScope.
 
     Returns:
-        its folder, new in `into`.
+        the new folder in `into`.
 
     Raises:
         ConfigError: the name is invalid.
