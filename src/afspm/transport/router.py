@@ -41,7 +41,7 @@ class PeerDisconnected(NamedTuple):
 
 
 class PeerAsked(NamedTuple):
-    """A request, as frames for `wire.decode_request`; without frames the peer only gives its name.
+    """A request, as frames for `wire.decode_request`; without frames it only announces the peer's name.
 
     Attributes:
         name: name of the peer; "" without a readable name.
@@ -91,7 +91,7 @@ class Router:
 
     @property
     def due_s(self) -> float:
-        """Return when `receive` must be called without a new message, in real monotonic time."""
+        """Return the real monotonic time at which `receive` must be called even without a new message."""
         return self._looks_s[0] if self._looks_s else math.inf
 
     def receive(self) -> list[RouterEvent]:
