@@ -1,4 +1,4 @@
-"""The dialog in which a person gives an agent a grant: a box of place, ranges, numbers and time.
+"""The dialog in which a person gives an agent a grant: limits of place, values, counts and time.
 
 Its fields are those of `afspm approve --grant`, and the same function reads them. The scheduler decides; its refusal is
 shown in the dialog, which stays open.
@@ -68,8 +68,8 @@ class GrantDialog:
     """The dialog of one viewer; it closes when the scheduler has accepted the grant, or at Cancel.
 
     Args:
-        agents: names that are suggested; the first is filled in.
-        region: fills in the place; None: the agent may set no place.
+        agents: suggested names; the first is filled in.
+        region: the initial place; None: the agent may set no place.
     """
 
     def __init__(self, session: SteeringSession, agents: Sequence[str], region: Region | None) -> None:

@@ -139,7 +139,7 @@ class RefusedRequest(Exception):
 
 
 def refused(response: Response) -> RefusedRequest:
-    """Return an unsuccessful response as a refusal."""
+    """Convert an unsuccessful response to a refusal."""
     if response.detail is ResponseDetail.EXPERIMENT_ENDED:
         return RefusedRequest(_C.EXPERIMENT_ENDED, response.reason)
     is_known = response.code in ControlResponse._value2member_map_
@@ -149,7 +149,7 @@ def refused(response: Response) -> RefusedRequest:
 
 
 def of_error(error: BaseException) -> RefusedRequest:
-    """Return an error as a refusal."""
+    """Convert an error to a refusal."""
     match error:
         case RefusedRequest():
             return error
