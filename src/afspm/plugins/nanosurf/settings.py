@@ -83,7 +83,7 @@ class Slopes(SettingsGroup):
 
 
 class TipPlace(SettingsGroup):
-    """The position where the tip was sent."""
+    """The target position of the tip."""
 
     names = POSITION
 
@@ -100,7 +100,7 @@ class TipPlace(SettingsGroup):
         self.go()
 
     def xy_m(self) -> tuple[float, float]:
-        """Return the position where the tip was sent, (x, y) in m."""
+        """Return the target position of the tip, (x, y) in m."""
         x, y = (float(value) for value in self._session().values(_TARGET).values())
         return x, y
 

@@ -110,8 +110,8 @@ class Passwords:
     def proves(self, person: str, password: str, address: str) -> bool:
         """Return whether a password is right; False also if it is not checked yet (see `wait_s`).
 
-        The check takes some hundredths of a second. A password that was right before, from the same address, is accepted
-        at once, after any number of wrong tries there.
+        The check takes some hundredths of a second. A password that was right before, from the same address, is
+        accepted at once, after any number of wrong tries there.
         """
         if self.is_open or (not person and self.lets_look):
             return True

@@ -1,6 +1,6 @@
-"""JavaScript scripts, each in an engine of its own, that wait for the instrument without blocking others.
+"""JavaScript scripts, each in a separate engine, that wait for the instrument without blocking others.
 
-An engine can't be left in the middle of a script, so each engine has a thread. The emulator's own thread executes the
+A script can't be suspended inside an engine, so each engine has a thread. The emulator's own thread executes the
 requests of a script to the instrument, and takes turns with the script's thread.
 """
 
@@ -85,14 +85,11 @@ class Script:
 
     @property
     def waits(self) -> bool:
-        """Return true while the script waits for the instrument."""
         return self._wait is not None
 
     @property
     def computes_for_s(self) -> float:
-        """Return the real seconds left for computing before the script is ended; infinite during a wait for the
-        instrument.
-        """
+        """Return the real seconds of computing left to the script; infinite while it waits for the instrument."""
         return math.inf if self.waits else self._computes_since_s + LONGEST_S - time.monotonic()
 
     def end(self) -> None:
