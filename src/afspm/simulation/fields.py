@@ -20,7 +20,7 @@ _SPLINE_RMS = 151.0 / 315.0
 
 
 def is_separable(x_m: Array, y_m: Array) -> bool:
-    """Return whether x is a single row and y a single column: a grid along the axes, much faster to compute."""
+    """Return whether x is one row and y one column: a grid along the axes, faster to compute."""
     return x_m.ndim == 2 and y_m.ndim == 2 and x_m.shape[0] == 1 and y_m.shape[1] == 1
 
 

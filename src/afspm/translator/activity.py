@@ -44,7 +44,7 @@ class Activity(ABC):
     program: ClassVar[str]
     """The name of the program, for messages."""
     settles_s: ClassVar[float] = 0.0
-    """Real time until a started measurement must be seen running."""
+    """Longest real time until a started measurement is running."""
     call_failures: ClassVar[tuple[type[AfspmError], ...]] = ()
     """The errors that a failed `call` raises."""
 

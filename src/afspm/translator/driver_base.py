@@ -193,16 +193,16 @@ class DriverBase(ABC):
     translated: ClassVar[Collection[str]] = ()
     """The parameters that `read` and `write` of the class translate, rather than `get` and `set` by a row."""
     eager_poll_s: ClassVar[float] = EAGER_S
-    """Real seconds between two looks when a scan may end at any moment."""
+    """Real seconds between two polls when a scan may end at any moment."""
     max_pixels: ClassVar[int] = 4096 * 4096
     live_real_s: ClassVar[float | None] = None
-    """Real seconds between the lines of a running scan where `live_lines_s` is not given; None: none are published."""
+    """Real seconds between publications of a running scan's lines if `live_lines_s` is not given; None: never."""
     maker: ClassVar[str] = ""
     """The company or project that makes the controller, for the files of a run."""
     software: ClassVar[str] = ""
     """The controller's program, for the files of a run."""
     simulated: ClassVar[bool] = False
-    """No tip can break: the experiment's clock may run at another speed than real time."""
+    """True if no real tip can break, so that the experiment's clock may differ from real time."""
     memory_is_all: ClassVar[bool] = False
     """The microscope (a simulated one) has no state outside `memory`: an action that is not in there was not done."""
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from afspm.translator.driver_base import DriverBase
 
 _LOCKED_BYTES = 1
-"""Windows lets no other process read locked bytes: the text begins behind them."""
+"""Number of locked bytes before the text: on Windows no other process can read locked bytes."""
 
 
 @dataclass(frozen=True)

@@ -235,7 +235,7 @@ class LiveLines:
         self._began_ns = 0
         self._lines = 0
         self.due_s: float | None = None
-        """When to `look` next; None: not before another scan begins."""
+        """Time of the next `look`; None until another scan begins."""
 
     def begin(self, now_ns: int) -> None:
         """Start reading the lines of a new scan."""

@@ -12,7 +12,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass
 
 EAGER_S = 0.01
-"""Between two looks when the end may come at any moment: the other half of the 20 ms is for the look itself."""
+"""Interval between polls when the end may come at any moment; the poll takes the rest of the 20 ms."""
 _PART = 0.1  # of the time left until the expected end passes between two looks
 _GUESSED, _BY_OTHERS, _SAME = (
     0.35,

@@ -22,14 +22,14 @@ from afspm.storage.formats import FileContent, read
 from afspm.translator.trace import TRACE
 
 SCAN: Final = "scan"
-"""The kind of a measurement that is no spectrum; a spectrum has the name of its own kind."""
+"""The kind of a scan; a spectrum has the name of its own kind."""
 _LISTED: Final = 16
 _OF_A_RESULT: Final = ("what", "frame", "position", "end_ns")
 
 XY = tuple[float, float]
 Content = Sequence[Scan | Spectrum]
 Entry = Plain
-"""A measurement in JSON: "what" kind it is, "frame" or "position" as they were set, "end_ns", keys of the driver."""
+"""A measurement in JSON: its kind ("what"), its set "frame" or "position", "end_ns", keys of the driver."""
 
 
 class ResultFiles(ABC):

@@ -28,7 +28,7 @@ MAX_REQUEST_BYTES = 1024 * 1024
 HAS_PRIVATE_SOCKETS = sys.platform != "win32" and zmq.has("ipc")
 """Whether the system has unix sockets, and modes of folders to protect them."""
 QUEUE_LENGTH = 4000
-"""Most messages that wait for one peer; a publisher drops further ones."""
+"""Limit of waiting messages for one peer; a publisher drops further ones."""
 
 _LINGER_MS = 200
 # ZMTP heartbeats: a peer that is frozen or cut off is noticed within seconds, not after hours as by TCP.

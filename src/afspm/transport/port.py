@@ -13,7 +13,7 @@ from afspm.basics.clock import Clock
 from afspm.model import Packet, Response
 
 CUT_OFF_SHOWS_WITHIN_S = 10.0
-"""Time within which a cut connection to the scheduler is noticed; until then it looks intact."""
+"""Longest time until a cut connection to the scheduler is noticed."""
 
 # Not frozen: packets, replies and requests come by the thousand, and frozen dataclasses take twice as long to make.
 

@@ -26,7 +26,7 @@ from afspm.transport.network import DISCONNECTED, REFUSED, Monitor, Network
 from afspm.transport.rate_limited_log import RateLimitedLog
 
 _LAST_WORDS = 200
-"""Most messages received before the end of a sender is reported."""
+"""Limit of messages received before the end of a sender is reported."""
 _LOOKS_S = (0.0, 0.02, 0.5)
 """Real times, after the end of a connection, at which its sender is probed: ZeroMQ reports the end a moment before it
 forgets the peer."""

@@ -42,7 +42,7 @@ class AsylumFiles(FolderFiles):
     """The measurement that is running or has just ended, and the results."""
 
     precision = FilePrecision(part=1e-4, angle_rad=1e-4 * math.tau)
-    """A note has five digits of a number."""
+    """Numbers in a note have five digits."""
 
     def __init__(self, kept: Entry, log: logging.Logger) -> None:
         super().__init__(kept, log)

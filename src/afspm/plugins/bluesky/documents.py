@@ -19,7 +19,7 @@ from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 
 Document = tuple[str, dict[str, object]]
-"""Name and content."""
+"""A document: its name and content."""
 DOCUMENTS_FILE = "documents.jsonl"
 _PLACE = {"center_x": "m", "center_y": "m", "width": "m", "height": "m", "angle": "rad"}
 

@@ -147,7 +147,7 @@ def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[
 
 
 def text_of(raw: bytes | bytearray | memoryview) -> str:
-    """Decode a text as UTF-8, otherwise in the western Windows encoding (a µ in a name, an umlaut in a path)."""
+    """Decode a text as UTF-8, otherwise as Latin-1 (a µ in a name, an umlaut in a path)."""
     raw = bytes(raw)
     try:
         return raw.decode()

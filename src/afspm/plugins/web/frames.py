@@ -14,7 +14,7 @@ from afspm.model import Region, Scan, ScanLines
 MEMORY_BYTES = 192 << 20
 MOST_CHANNELS = 64
 FrameKey = tuple[int, str]
-"""Time in ns and channel."""
+"""Key of a frame: time in ns, and channel."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -77,7 +77,7 @@ class Watch:
         self.frames = FrameStore()
         self.spectra = SpectrumStore()
         self.tip_to_sample: Array | None = None
-        """The newest mapping of drift, 2 x 3; None where nothing corrects drift."""
+        """The newest drift correction as a 2 x 3 matrix; None without drift correction."""
         self.connected = False
         self.ended = False
         self.changes = 0

@@ -96,7 +96,7 @@ class Emulator(ABC):
 
     vendor: ClassVar[str]
     usual: ClassVar[PlainMapping] = {}
-    """Settings that put it at the address of the vendor's own controller: for `afspm emulate` alone, on request."""
+    """Settings for the usual address of the vendor's own controller, used by `afspm emulate` on request."""
     fault_kinds: ClassVar[Mapping[str, str]] = {}
     """The faults of the maker's program, with the effect of each; `all_faults` adds the common ones."""
 
@@ -104,9 +104,9 @@ class Emulator(ABC):
     """The modes of the simulated feedback that the controller supports."""
 
     emulated: ClassVar[bool] = True
-    """An experiment with it counts as simulated: its clock may run at another speed."""
+    """An experiment with an emulator counts as simulated: its clock may run at another speed."""
     listens: ClassVar[tuple[str, ...]] = ()
-    """It receives only the end of the experiment."""
+    """An emulator receives only the end of the experiment."""
 
     clock: Clock
     log: logging.Logger

@@ -86,5 +86,5 @@ class InstrumentReport:
 
 
 def steps_of(progress: CommissioningProgress) -> dict[str, dict[str, str]]:
-    """Return the results in the form of the file."""
+    """Return the results of the steps in the format of the report file."""
     return {name: {"outcome": outcome_word(one.outcome), "line": one.line} for name, one in progress.results.items()}

@@ -125,11 +125,11 @@ def states(observed: list[Observation]) -> list[str]:
 
 
 STARTED_S = 30.0
-"""Real seconds until translator and scheduler are up and the microscope has reported that it is free."""
+"""Longest real seconds until translator and scheduler run and the microscope is free."""
 ANSWERED_S = 15.0
-"""Real seconds until an answer: longer than a scheduler waits for the translator's."""
+"""Longest real seconds until an answer: more than the scheduler's wait for the translator."""
 NOTICED_S = 10.0
-"""Real seconds until the effect of a request is published."""
+"""Longest real seconds until the effect of a request is published."""
 QUIET_S = 0.2
 """Real seconds without a packet that count as a pause."""
 MOVED_S = 60.0

@@ -16,7 +16,7 @@ from afspm.testing.translators.support import Support
 from afspm.testing.translators.translator_suite import TRANSLATOR_SUITE
 
 _LAST = (names.SCAN_SPEED, names.MOVE_SPEED)
-"""Restored last, since a change of the frame may change them."""
+"""Settings restored last, since a change of the frame may change them."""
 
 
 @dataclass(frozen=True)

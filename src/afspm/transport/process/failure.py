@@ -75,7 +75,7 @@ def describe(error: BaseException, name: str = "", package: Path = PACKAGE) -> s
 
 
 def may_pass(error: BaseException) -> bool:
-    """Return whether a retry may succeed, as after a failure of the controller, but not after a fault of the code."""
+    """Return whether a retry may succeed, as after a controller's failure, unlike after a code fault."""
     if isinstance(error, Refused):
         return error.response not in _REFUSED_AGAIN
     return isinstance(error, (RequestError, FileError, TransportError, OSError, MemoryError))

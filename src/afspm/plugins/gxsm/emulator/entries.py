@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 USER_UNITS: Final = {"Å": 1.0, "nm": 10.0, "µm": 1e4}
-"""In ångström."""
+"""Units of lengths on the panel, in ångström."""
 _FLOAT: Final = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _ANGSTROM: Final = "Å"
 _PADDING: Final = " " * 4

@@ -138,7 +138,7 @@ MODES: Final = {
 """The modes of measurement with the commands of each; (!) all measure as the mode of the emulator does."""
 
 CYCLES: Final = ("force_distance_z_z",)
-"""The ids of the cycles of spectroscopy."""
+"""The ids of spectroscopy cycles."""
 
 
 @dataclass

@@ -20,9 +20,9 @@ from afspm.basics.errors import AfspmError
 from afspm.simulation.emulation.scripted import ScriptFailed
 
 LONGEST_S: Final = 5.0
-"""Real seconds of computing before a script is ended. Its thread goes on: the engine can't be interrupted."""
+"""Limit of a script's computing, in real seconds. Its thread continues: the engine can't be interrupted."""
 _AT_ONCE_S: Final = 0.25
-"""Real seconds of waiting for a script before others are served; most scripts end within them."""
+"""Longest wait for a script before others are served, in real seconds; most scripts end earlier."""
 _MEMORY: Final = 64 << 20
 _PRELUDE: Final = Path(__file__).with_name("prelude.js")
 _REFUSALS: Final = (AfspmError, ArithmeticError, TypeError, ValueError)

@@ -49,7 +49,7 @@ class SlowContent:
 
 @dataclass(frozen=True)
 class Content:
-    """The page at one moment.
+    """The content of the page at one time.
 
     Attributes:
         trouble: why the page may be out of date; empty: it is current.

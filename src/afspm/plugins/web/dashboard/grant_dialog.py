@@ -20,7 +20,7 @@ from afspm.plugins.web.dashboard.approvals import grant_of
 from afspm.plugins.web.dashboard.steering_session import SteeringSession
 
 MEASURED = {names.START_SCAN: 10, names.START_SPEC: 0}
-"""The actions that are offered first, with the numbers that the dialog begins with."""
+"""The first offered actions, with their initial numbers."""
 TREATMENTS = (names.PULSE, names.CRASH)
 LASTS = "1 h"
 Pair = tuple[str, str]

@@ -24,7 +24,7 @@ from afspm.record.run import Run, open_run
 _log = logging.getLogger("afspm.plugins.web.dashboard")
 
 SPECTRA = 8
-"""Spectra read before a moment."""
+"""Limit of spectra read before the displayed time."""
 
 
 @dataclass(frozen=True, slots=True)

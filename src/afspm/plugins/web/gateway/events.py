@@ -50,7 +50,7 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True)
 class EventBatch:
-    """Events to send.
+    """A batch of events to send.
 
     Attributes:
         newest_ns: the time after which to continue.

@@ -58,7 +58,7 @@ _STATUS = {
     _C.EXPERIMENT_ENDED: _S.GONE,
     _C.FAILED: _S.INTERNAL_SERVER_ERROR,
 }
-"""All others: 409. The request is well-formed, and refused by the experiment."""
+"""HTTP status by code. Other codes give 409: a well-formed request that the experiment refuses."""
 _ADVICE = {
     _C.INVALID: "Correct the request; /openapi.json describes it.",
     _C.TOO_LARGE: "Send less: no request needs more than 64 KiB.",

@@ -15,7 +15,7 @@ ENDED_S = 4.0
 """Twice the documented limit, for a busy computer."""
 _WATCHED_S = 5.0
 _MOST_BEATS_APART = 4.0
-"""In periods: three missed beats count as dead; one more for a busy computer."""
+"""Longest pause in heartbeat periods: three missed beats count as dead; one more for a busy computer."""
 
 
 def await_beat(beats: BeatRecorder, pump: Pump) -> None:
