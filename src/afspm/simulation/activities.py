@@ -57,7 +57,7 @@ class ScanActivity:
     """A started scan, with the settings at its start and later changes.
 
     Attributes:
-        number: from 1 on.
+        number: number of the scan, from 1 on.
         region, shape: frame, and (rows, columns).
         line_s: duration of trace and retrace together.
         upwards: the first line is the one with the smallest y.

@@ -41,7 +41,7 @@ def smooth_field(seed: int, x_m: Array, y_m: Array, spacing_m: float) -> Array:
 
     Args:
         x_m, y_m: positions, broadcast against each other; one row and one column are fastest.
-        spacing_m: of the lattice.
+        spacing_m: spacing of the lattice.
     """
     # A random shift, so that the lattices of the octaves don't align at the origin.
     shift = chance.uniform(seed, np.arange(2)) * 64.0

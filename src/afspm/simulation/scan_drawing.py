@@ -31,7 +31,7 @@ class ScanDrawing:
 
     Attributes:
         wake: called from the thread of the computation when a scan is ready.
-        log: for unexpected errors.
+        log: receives unexpected errors.
     """
 
     def __init__(self, world: World, units: Callable[[], Mapping[str, str]], seed: int, run: RunWork) -> None:

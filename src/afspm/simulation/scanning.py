@@ -57,7 +57,7 @@ class Course:
         region: in tip coordinates.
         shape: (ny, nx).
         line_s: duration of trace and retrace together.
-        direction: of the slow axis, "up" (small y first) or "down".
+        direction: direction of the slow axis, "up" (small y first) or "down".
     """
 
     region: Region

@@ -164,9 +164,9 @@ class World:
         Args:
             region: in tip coordinates.
             shape: (ny, nx).
-            line_s: of trace and retrace together.
+            line_s: duration of trace and retrace together.
             feedback: its fields override the settings.
-            direction: of the slow axis, "up" (small y first) or "down".
+            direction: direction of the slow axis, "up" (small y first) or "down".
             slope: compensation of the sample's tilt, (x, y) in m/m.
             adjusted: changes during the scan, each in force from the next line on.
 
@@ -213,7 +213,7 @@ class World:
         With the feedback off, z is the value set by `hold`, or z at the end of the last scan.
 
         Args:
-            random: for the noise, so that other measurements stay the same.
+            random: generator for the noise, so that other measurements stay the same.
 
         Raises:
             InvalidValue: invalid feedback, or a value that is not finite.

@@ -226,7 +226,7 @@ class SuiteReport:
 
     Attributes:
         lost: why the checks could not be finished; empty if they were.
-        folder: of this run, with its log and files; empty before it is created.
+        folder: folder of this run, with its log and files; empty before it is created.
     """
 
     folder: str = ""

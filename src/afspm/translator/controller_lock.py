@@ -30,7 +30,7 @@ def commanding(address: str, run: str) -> Iterator[None]:
     """Lock the controller for this process against all processes and users of this computer.
 
     Args:
-        address: of the controller; empty: no other process can command it (a simulated one).
+        address: address of the controller; empty: no other process can command it (a simulated one).
         run: the name of this run, shown to refused runs.
 
     Raises:

@@ -62,7 +62,7 @@ class Translator:
 
     Args:
         driver: constructed with its settings, not yet connected.
-        port: to the network.
+        port: access to the network.
         memory: kept over a restart.
         step: entered around everything that takes time, so that a busy process is not taken for a frozen one.
         controller: the emulator of this run, the only controller to connect to; None: the driver knows the

@@ -71,7 +71,7 @@ def stay(folder: Path, name: str, settings: PlainMapping) -> None:
     """Show a run that has ended until Ctrl-C.
 
     Args:
-        name: of the dashboard component, whose settings are `settings`.
+        name: name of the dashboard component, whose settings are `settings`.
     """
     import subprocess
     import sys

@@ -29,7 +29,7 @@ class WebComponent(Component):
     Attributes:
         served: name of the server, in log lines and errors.
         usual_port: if none is given.
-        stalled_s: as of `WebServer`.
+        stalled_s: see `WebServer`.
 
     Args:
         host: the address to listen at.

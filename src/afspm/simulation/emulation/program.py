@@ -23,7 +23,7 @@ class MakerProgram(ABC):
     """A maker's control program, without its protocol. Not thread-safe.
 
     Args:
-        folder: for saved files.
+        folder: folder for saved files.
         start_s: duration of the ramp to the first line, experiment time.
         file_s: delay between the end and the first half of a file; the second half follows after the same delay.
 

@@ -41,8 +41,8 @@ class ScriptWire(Protocol):
     """The socket of a controller, which receives scripts and sends values.
 
     Attributes:
-        address: for clients.
-        port: of the listening socket.
+        address: address for clients.
+        port: port of the listening socket.
     """
 
     @property

@@ -38,7 +38,7 @@ class TcpServer:
 
     Args:
         ports: listening ports; 0 selects a free one.
-        stream_port: for clients that only read; 0: any free one, None: there is none.
+        stream_port: port for clients that only read; 0: any free one, None: there is none.
         one_each: a port serves one client at a time; others wait until it has gone.
         wakes: an object with a `fileno` that ends `poll`.
         on_bytes: called with a connection after new bytes in `received`.

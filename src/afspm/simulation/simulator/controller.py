@@ -63,7 +63,7 @@ class SimulatedController:
 
     Args:
         kept: the saved state, JSON-able; every call updates it.
-        folder: for saved files.
+        folder: folder for saved files.
         panel: actions of a person, in any order.
     """
 

@@ -51,7 +51,7 @@ class ClientBench:
 
     Args:
         command: the conformance program.
-        folder: for logs and files of the runs.
+        folder: folder for logs and files of the runs.
     """
 
     def __init__(self, command: Sequence[str], folder: Path) -> None:
@@ -119,7 +119,7 @@ class ClientBench:
 
         Args:
             ready: wait until it is ready.
-            changes: to its launch line.
+            changes: changes to its launch line.
         """
         with self._started(replace(experiment.launch, **changes), experiment.pump, experiment.wake) as client:
             if ready:
@@ -136,7 +136,7 @@ class ClientBench:
             ready: wait until it is ready.
             owner: the owner of the scheduler's keys; None: no encryption.
             also: the address of a second publisher, the judge's.
-            changes: to the client's launch line.
+            changes: changes to the client's launch line.
         """
         control, publish = self._ports.address(), self._ports.address()
         launch = replace(self._scripted_launch(control, publish, also), **changes)

@@ -73,7 +73,7 @@ class Bench:
         microscope: settings of the simulated microscope, as in the experiment file.
         problems: names and numbers of your own problems, as in the experiment file.
         limits: limits of the scheduler.
-        folder: for saved state and scans; None: a temporary one.
+        folder: folder for saved state and scans; None: a temporary one.
         seed: the same seed gives the same run.
         dies_in_call: the chance that the component is killed at a call to the network.
         keeps_requests: keep inputs and requests in `folder`, as `[record] requests = true` does.

@@ -21,7 +21,7 @@ def write(kind: str, name: str, into: Path) -> Path:
 
     Args:
         kind: "driver", "component" or "experiment".
-        name: of its folder; "my-scope" becomes my_scope, with the class MyScope.
+        name: name of its folder; "my-scope" becomes my_scope, with the class MyScope.
 
     Returns:
         the new folder in `into`.

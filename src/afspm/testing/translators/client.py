@@ -145,7 +145,7 @@ class CheckClient:
     """A component that records every publication.
 
     Args:
-        link: to the scheduler; may still be connecting.
+        link: connection to the scheduler; may still be connecting.
         direct: to the translator, bypassing the scheduler's own refusals; None if there is none.
         lost: returns the name of the process that has ended, after a link reports the end of the parent.
 

@@ -30,7 +30,7 @@ class ActionResult:
     """The result of an action.
 
     Attributes:
-        text: for the person, with the reason of a refusal.
+        text: message for the person, with the reason of a refusal.
         each: result by parameter name, if the action set or read several parameters.
     """
 

@@ -34,7 +34,7 @@ class PictureRequest:
     """The requested picture.
 
     Attributes:
-        time: of a finished scan, ns; 0: the newest.
+        time: time of a finished scan, ns; 0: the newest.
         beside: time of another scan for comparison, ns: both get the same range of values; 0: none.
     """
 

@@ -116,7 +116,7 @@ def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: 
     """Return log lines, newest first.
 
     Args:
-        names: of components; empty: all.
+        names: names of components; empty: all.
         level: the lowest level shown.
         text: filter for lines, in any case.
     """

@@ -92,7 +92,7 @@ class Measurements:
     """The measurements of all clients. Thread-safe.
 
     Args:
-        file: for saving over a restart; None: measurements end with this process.
+        file: file that keeps the measurements over a restart; None: measurements end with this process.
         now_s: real and monotonic.
     """
 

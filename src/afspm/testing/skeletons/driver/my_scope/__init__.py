@@ -21,7 +21,7 @@ class MyScope(Driver):
     """The driver of the microscope.
 
     Args:
-        address: of the controller.
+        address: address of the controller.
         settings: common to all drivers.
     """
 
