@@ -1,12 +1,12 @@
 """The simulated instrument: world, tip, feedback and noise; its driver; and the base of all emulated controllers.
 
 **Theory of operation.** A simulated night is a function of its settings and its seed. There is no clock: every call
-gets its time.
+passes the time.
 
-    comes in      settings, a seed, commands with their times, faults on demand
+    inputs        settings, a seed, commands with their times, faults on demand
     state         the sample, its drift, the tip with its history, the present activity
-    goes out      values of pixels and curves; the ground truth, written beside the record
-    always holds  the same seed and commands give the same values; simulated data are marked wherever they are shown
+    outputs       values of pixels and curves; the ground truth, written beside the record
+    invariant     the same seed and commands give the same values; simulated data are marked wherever they are shown
 """
 
 from __future__ import annotations

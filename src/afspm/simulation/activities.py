@@ -1,4 +1,4 @@
-"""Activities of a simulated instrument: a scan, a spectrum, or anything else that keeps it busy for a while."""
+"""Activities of a simulated instrument: scans, spectra, moves, and other activities that take time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RETRACE = " Retrace"
 
 
 class ScanValues(Protocol):
-    """The values of a scan, fixed at its start, and the number of rows available at a time."""
+    """The values of a scan, computed at its start; the caller limits the visible rows."""
 
     def channels(self, until_s: float | None = None) -> Channels: ...
 
@@ -54,14 +54,14 @@ class Move(Occupied):
 
 @dataclass
 class ScanActivity:
-    """A started scan, with the settings in force at its start, and those of `adjusted`.
+    """A started scan, with the settings at its start and later changes.
 
     Attributes:
-        number: from 1 on.
-        region, shape: of the frame; (rows, columns).
-        line_s: of trace and retrace together.
+        number: number of the scan, from 1 on.
+        region, shape: frame, and (rows, columns).
+        line_s: duration of trace and retrace together.
         upwards: the first line is the one with the smallest y.
-        feedback, bias_v, slope: in force at its start.
+        feedback, bias_v, slope: settings at the start of the scan.
         adjusted: changes during the scan, each in force from the next line on.
         stopped_s: the time of its interruption; None without.
     """
@@ -86,15 +86,18 @@ class ScanActivity:
 
     @property
     def course(self) -> Course:
-        """Place and time of the scan. Raises InvalidValue: it can't be scanned."""
+        """Positions and times of the scan.
+
+        Raises:
+            InvalidValue: the settings allow no scan.
+        """
         return Course(self.region, self.shape, self.line_s, self.start_s, "up" if self.upwards else "down")
 
     def draw(self, values: ScanValues) -> None:
-        """Set the values; `channels` waits for them."""
+        """Set the values; `channels` waits for this call."""
         self._drawn.set_result(values)
 
     def wait(self) -> None:
-        """Wait for the values."""
         wait([self._drawn])
 
     def redrawn(self, adjusted: tuple[Adjustment, ...]) -> None:
@@ -114,7 +117,7 @@ class ScanActivity:
 
     @property
     def drawing(self) -> bool:
-        """True while the values are being computed; the scan can't end earlier, at any speed of the clock."""
+        """True while the values are being computed; the scan cannot end earlier."""
         return not self._drawn.done()
 
     def running(self, now_s: float) -> bool:
@@ -134,7 +137,7 @@ class ScanActivity:
         return int((self._scanned_until_s(now_s) - self.start_s) / (self.line_s / 2) + 1e-9)
 
     def tip_m(self, now_s: float) -> tuple[float, float]:
-        """Return the position of the tip along the line and back."""
+        """Return the position (x, y) of the tip during trace or retrace, in m."""
         lines = (self._scanned_until_s(now_s) - self.start_s) / self.line_s
         row = min(int(lines), self.shape[0] - 1)
         there = 1.0 - abs(1.0 - 2.0 * min(lines - row, 1.0))
@@ -154,12 +157,12 @@ class ScanActivity:
 
     @property
     def truth(self) -> Mapping[str, object]:
-        """The ground truth of the values, JSON-able; empty in air. Waits as `channels` does."""
+        """The parameters of the simulation, JSON-able; empty without a sample. Waits until the values are computed."""
         drawn = self._drawn.result()
         return drawn.truth if isinstance(drawn, SimulatedScan) else {}
 
     def signals(self, now_s: float) -> dict[str, float]:
-        """Return the present value of each channel; on the way back, the retrace where it is recorded."""
+        """Return the present value of each channel; during the retrace, of a recorded backward channel."""
         if self._whole is None:
             self._whole = self._drawn.result().channels()
         rows, columns = self.shape
@@ -198,7 +201,7 @@ class ScanActivity:
 
 @dataclass(frozen=True)
 class SpectrumActivity:
-    """A started curve.
+    """A started spectrum.
 
     Attributes:
         values: [n_points, n_variables], complete from the start on; the caller must not publish them before `end_s`.
@@ -235,7 +238,7 @@ class ValuesInAir:
     """A scan without a sample: noise on every channel.
 
     Attributes:
-        units: of each channel.
+        units: the unit of each channel.
     """
 
     units: Mapping[str, str]
@@ -243,7 +246,7 @@ class ValuesInAir:
     seed: tuple[int, ...]
 
     def channels(self, until_s: float | None = None) -> Channels:
-        """Return noise in the form of a scan's channels."""
+        """Return the noise of each channel, in the form of `SimulatedScan.channels`."""
         random = np.random.default_rng(self.seed)
         missing = ~self.course.rows_taken(until_s)
         found: Channels = {}

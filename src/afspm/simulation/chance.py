@@ -1,4 +1,4 @@
-"""Random numbers as a function: the same seed and the same whole numbers give the same draw, in any order.
+"""Random numbers as a pure function: the same seed and keys give the same draw, in any order of calls.
 
 An unbounded surface and a drift defined at any time need this: the content of cell (i, j) is hashed from (seed, i, j),
 not drawn from a sequence. The hash is the finaliser of splitmix64 (Steele, Lea & Flood 2014).
@@ -16,12 +16,12 @@ _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 
 def subseed(seed: int, name: str) -> int:
-    """Return a separate seed for a part of the world, so that draws of one part don't affect others."""
+    """Return a separate seed for a part of the world, so that its draws do not affect other parts."""
     return int(hashes(seed, zlib.crc32(name.encode()))[()])
 
 
 def hashes(seed: int, *keys: ArrayLike) -> Hashes:
-    """Return 64 mixed bits for each combination (broadcast) of whole numbers."""
+    """Return a 64-bit hash for each combination of integer keys, which broadcast."""
     with np.errstate(over="ignore"):  # overflow is intended: arithmetic modulo 2**64
         state = _mix(np.asarray(seed % 2**64, dtype=np.uint64))
         for key in keys:
@@ -30,12 +30,12 @@ def hashes(seed: int, *keys: ArrayLike) -> Hashes:
 
 
 def uniform(seed: int, *keys: ArrayLike) -> NDArray[np.float64]:
-    """Return uniform numbers in [0, 1), shaped as the keys broadcast."""
+    """Return uniform random numbers in [0, 1), in the broadcast shape of the keys."""
     return _fraction(hashes(seed, *keys))
 
 
 def normal(seed: int, *keys: ArrayLike) -> NDArray[np.float64]:
-    """Return standard normal numbers (Box and Muller), shaped as the keys broadcast."""
+    """Return standard normal random numbers (Box and Muller), in the broadcast shape of the keys."""
     state = hashes(seed, *keys)
     with np.errstate(over="ignore"):
         first, second = 1.0 - _fraction(_with(state, 0)), _fraction(_with(state, 1))
@@ -44,12 +44,12 @@ def normal(seed: int, *keys: ArrayLike) -> NDArray[np.float64]:
 
 
 def whole(seed: int, low: int, high: int, *keys: ArrayLike) -> NDArray[np.int64]:
-    """Return uniform whole numbers in [low, high]."""
+    """Return uniform random integers in [low, high], in the broadcast shape of the keys."""
     return low + (uniform(seed, *keys) * (high - low + 1)).astype(np.int64)
 
 
 def generator(seed: int, *keys: int) -> np.random.Generator:
-    """Return a generator for draws in sequence within one call, selected by seed and whole numbers."""
+    """Return a generator for a sequence of draws, seeded by integers."""
     return np.random.Generator(np.random.PCG64(int(hashes(seed, *keys)[()])))
 
 

@@ -28,7 +28,7 @@ _FASTEST_EXPANSION_PER_S = 1e-4  # beyond any sample, and still finite after twe
 
 @dataclass(frozen=True)
 class Relaxation:
-    """The relaxation after a change of temperature or an approach: total_m * (1 - exp(-t / time_s))."""
+    """An exponential relaxation after a temperature change or an approach: total_m * (1 - exp(-t / time_s))."""
 
     total_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     time_s: float = 3600.0
@@ -39,16 +39,16 @@ class Relaxation:
 
 @dataclass(frozen=True)
 class DriftSettings:
-    """The sum of all contributions, each as (x, y, z) unless noted.
+    """The sum of all drift contributions, each as (x, y, z) unless noted.
 
     Attributes:
         velocity_m_per_s: constant drift, at most 1e-6 m/s along each axis.
-        relaxing: any number of exponential relaxations since the start.
+        relaxing: exponential relaxations since the start.
         walk_m_per_sqrt_hour: standard deviation in x and y of a random walk after one hour.
         walk_z_m_per_sqrt_hour: the same for z.
-        daily_m: amplitude of a sine of 24 hours.
+        daily_m: amplitude of a sine with a period of 24 hours.
         rotation_rad_per_s: constant rotation of the sample, counter-clockwise, in rad/s.
-        expansion_per_s: constant expansion in 1/s, at most 1e-4 either way: relative growth of lengths per second.
+        expansion_per_s: relative growth of lengths per second, between -1e-4 and 1e-4.
         about_m: the fixed point (x, y) of rotation and expansion, in tip coordinates at the start.
     """
 
@@ -98,7 +98,7 @@ class Drift:
         return np.asarray(total)
 
     def turn(self, t_s: ArrayLike) -> NDArray[np.complex128]:
-        """Return rotation and scale at experiment times as a complex factor about `about_m`: one at the start.
+        """Return rotation and scale about `about_m` as a complex factor, which is 1 at the start.
 
         Raises:
             InvalidValue: a time before the start.
@@ -107,11 +107,10 @@ class Drift:
         return np.asarray(np.exp(rate * self._since_s(t_s)))
 
     def turned(self, x_m: Array, y_m: Array, t_s: ArrayLike) -> tuple[Array, Array]:
-        """Rotate and expand positions (x, y) of the sample up to given times, which broadcast with x and y."""
+        """Rotate and expand sample positions (x, y) to their state at times that broadcast with x and y."""
         return self._about(x_m, y_m, self.turn(t_s))
 
     def unturned(self, x_m: Array, y_m: Array, t_s: ArrayLike) -> tuple[Array, Array]:
-        """Invert `turned`."""
         return self._about(x_m, y_m, 1.0 / self.turn(t_s))
 
     def _about(self, x_m: Array, y_m: Array, factor: NDArray[np.complex128]) -> tuple[Array, Array]:
@@ -130,13 +129,13 @@ class Drift:
 
 
 class ScannerCompensation:
-    """The displacement of a scanner with its own drift compensation, at velocities set from time to time."""
+    """The displacement of a scanner with its own drift compensation, from a history of velocities."""
 
     def __init__(self, turns: Iterable[tuple[float, float, float, float, float]] = ()) -> None:
         self.turns = list(turns)  # (time, x, y at that time, velocity from then on)
 
     def set(self, velocity_m_per_s: tuple[float, float], t_s: float) -> None:
-        """Set the velocity of the scanner from a time on.
+        """Set the velocity of the scanner from `t_s` on.
 
         Raises:
             InvalidValue: a time before the last change of velocity.
@@ -161,7 +160,7 @@ class ScannerCompensation:
 
 
 def random_walk(seed: int, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a Brownian path of unit variance a second, zero at zero, at any times t >= 0.
+    """Return a Brownian path at any times t >= 0: zero at t = 0, variance 1 per second.
 
     Lévy's construction: the ends of a long interval first, then midpoints between midpoints, each drawn by
     its index; so a value needs no history.

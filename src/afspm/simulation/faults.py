@@ -25,12 +25,12 @@ INSTRUMENT_FAULTS: Final[Mapping[str, str]] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault.
+    """A fault to inject.
 
     Attributes:
         kind: a kind of the microscope or the emulator.
-        at_s: experiment seconds after the start, from which on it strikes.
-        count: the number of strikes.
+        at_s: earliest time of the fault, in experiment seconds after the start.
+        count: how many times the fault occurs.
         duration_s: for kinds with a duration (experiment seconds).
     """
 
@@ -45,7 +45,7 @@ class Fault:
 
     @classmethod
     def parse(cls, text: str) -> Fault:
-        """Parse `KIND[@SECONDS][,count=N][,duration=SECONDS]` of the command line; count=every for each time.
+        """Parse `KIND[@SECONDS][,count=N][,duration=SECONDS]` of the command line; `count=every` has no limit.
 
         Raises:
             ConfigError: the text has another form.
@@ -114,9 +114,9 @@ class Faults:
         self._keep()
 
     def strikes(self, kind: str, now_s: float) -> Fault | None:
-        """Return the fault if one of this kind strikes now, and count it.
+        """Return and count the fault of this kind that is due now; None without one.
 
-        Call it once at the point where this kind would show: each call uses up one of `count`.
+        Call it once at the point where this kind has its effect: each call uses up one of `count`.
         """
         self._check(kind)
         for i, fault in enumerate(self._left):
@@ -130,7 +130,7 @@ class Faults:
         return None
 
     def lasts(self, kind: str, now_s: float) -> bool:
-        """Return whether a fault of this kind lasts: from its time on for its duration."""
+        """Return whether a fault of this kind is active: from its time on for its duration."""
         self._check(kind)
         begun = ((self._start_s + fault.at_s, fault.duration_s) for fault in self._left if fault.kind == kind)
         return any(at_s <= now_s < at_s + duration_s for at_s, duration_s in begun)

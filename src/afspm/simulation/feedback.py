@@ -51,18 +51,18 @@ class SensorSettings:
         return np.asarray(-self._strength / (nearest * (nearest + 2.0 * self.oscillation_m)) ** 1.5)
 
     def distance_m(self, shift_hz: float) -> float:
-        """Return the distance at which the resonance shifts by `shift_hz`, which is negative."""
+        """Return the distance at which the resonance shifts by `shift_hz`, a negative value."""
         squared = (self._strength / -shift_hz) ** (2.0 / 3.0)
         return math.sqrt(self.oscillation_m**2 + squared) - self.oscillation_m
 
     def slope_hz_per_m(self, distance_m: float) -> float:
-        """Return the derivative of the shift by the distance: positive."""
+        """Return the derivative of the frequency shift with respect to distance: positive."""
         both = distance_m + 2.0 * self.oscillation_m
         return float(1.5 * self._strength * (distance_m + both) / (distance_m * both) ** 2.5)
 
     @property
     def largest_hz(self) -> float:
-        """The shift in contact, the lowest possible one."""
+        """The frequency shift in contact, the most negative one."""
         return float(self.shift_hz(np.zeros(())))
 
     @property
@@ -118,7 +118,7 @@ class FeedbackSettings:
             raise ConfigError(refusal, where="setpoint")
 
     def refusal_of(self, setpoint: float) -> str:
-        """Return why a setpoint is impossible in this mode; empty if it is possible."""
+        """Return the reason why a setpoint is impossible in this mode; empty if it is possible."""
         if self.mode != "frequency-shift":
             return "" if 0 < setpoint < math.inf else f"a setpoint is above zero, not {setpoint:g}"
         largest = self.sensor.largest_hz
@@ -139,7 +139,7 @@ class Loop:
 
     @classmethod
     def of(cls, settings: FeedbackSettings, feedback: Feedback | None) -> Loop:
-        """Return the settings, overridden by the fields of `feedback`.
+        """Create a loop from the settings, overridden by the fields of `feedback`.
 
         Raises:
             InvalidValue: a negative gain, an impossible setpoint of this mode, or a value that is not finite.
@@ -158,7 +158,7 @@ class Loop:
 
     @property
     def engages(self) -> bool:
-        """Whether the setpoint can be reached: an amplitude above the free one can't."""
+        """Whether the setpoint can be reached: an amplitude above the free amplitude cannot."""
         return self.settings.mode != "amplitude" or self.setpoint < self.settings.free_amplitude_v
 
     @property
@@ -181,7 +181,7 @@ class Loop:
 
     @property
     def error_limits_m(self) -> tuple[float, float]:
-        """The largest errors that the detector can show: (tip too high, tip too low), both positive."""
+        """The largest errors that the detector can measure: (tip too high, tip too low), both positive."""
         s = self.settings
         if s.mode == "current":
             below = math.log(max(self.setpoint / s.current_floor_a, math.e)) * s.decay_m
@@ -192,11 +192,11 @@ class Loop:
         return (s.free_amplitude_v - self.setpoint) * s.sensitivity_m_per_v, self.setpoint * s.sensitivity_m_per_v
 
     def follow(self, height_m: Array, step_s: float, start_v: Array) -> Array:
-        """Return z along paths, one a column.
+        """Return z along the paths, one path per column.
 
         Args:
             height_m: at which the setpoint would be reached, shape (steps, paths), `step_s` apart, linear in between.
-            start_v: speed of z at the start, one a path; from it an oscillation of the loop grows.
+            start_v: initial speed of z for each path, from which an oscillation of the loop grows.
         """
         splits = self._splits(step_s)
         dt = step_s / splits
@@ -229,7 +229,7 @@ class Loop:
         return np.clip(self.setpoint + gap_m / s.sensitivity_m_per_v, 0.0, s.free_amplitude_v)
 
     def frequency_shift_hz(self, gap_m: Array) -> Array:
-        """Return the sensor's frequency shift; gap as of `amplitude_v`."""
+        """Return the sensor's frequency shift; gap is z minus the height at which the setpoint is reached."""
         sensor = self.settings.sensor
         return sensor.shift_hz(sensor.distance_m(self.setpoint) + gap_m)
 

@@ -1,7 +1,7 @@
 """Smooth random fields on the whole plane, used for meandering, roughness and patches.
 
-A field is a cubic B-spline whose coefficients, one for each lattice point, are hashed from the point's indices: defined
-everywhere, without period, and independent of the sampling.
+A field is a cubic B-spline. Its coefficients, one for each lattice point, are hashed from the point's indices. So the
+field is defined everywhere, never repeats, and does not depend on the sampling.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ _SPLINE_RMS = 151.0 / 315.0
 
 
 def is_separable(x_m: Array, y_m: Array) -> bool:
-    """Return whether x is one row and y one column: a grid along the axes, which is much faster to fill."""
+    """Return whether x is one row and y one column: a grid along the axes, faster to compute."""
     return x_m.ndim == 2 and y_m.ndim == 2 and x_m.shape[0] == 1 and y_m.shape[1] == 1
 
 
 def bspline_weights(fraction: Array) -> tuple[Array, Array, Array, Array]:
-    """Return weights of the lattice points at -1, 0, 1, 2 for a position at `fraction` in [0, 1) after point 0."""
+    """Return weights of the lattice points -1, 0, 1, 2 for a position at `fraction` in [0, 1) after point 0."""
     rest = 1.0 - fraction
     square, rest_square = fraction * fraction, rest * rest
     return (
@@ -41,7 +41,7 @@ def smooth_field(seed: int, x_m: Array, y_m: Array, spacing_m: float) -> Array:
 
     Args:
         x_m, y_m: positions, broadcast against each other; one row and one column are fastest.
-        spacing_m: of the lattice.
+        spacing_m: spacing of the lattice.
     """
     # A random shift, so that the lattices of the octaves don't align at the origin.
     shift = chance.uniform(seed, np.arange(2)) * 64.0
@@ -55,7 +55,7 @@ def rough_field(
 ) -> Array:
     """Return a self-affine field of unit rms: octaves from `largest_m` down, amplitudes as wavelength**hurst.
 
-    Octaves finer than `resolution_m` fade out, since they can't be resolved.
+    Octaves finer than `resolution_m` fade out, since they cannot be resolved.
     """
     octaves = max(1, 1 + math.floor(math.log2(largest_m / smallest_m)))
     amplitudes = [2.0 ** (-hurst * octave) for octave in range(octaves)]

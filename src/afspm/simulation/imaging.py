@@ -1,7 +1,7 @@
-"""Imaging by a tip of a given shape: grey dilation, band limit, and the value at any position.
+"""Imaging by a tip of a given shape: grey dilation, band limit, and interpolation at any position.
 
-The path of the tip's apex over a surface is the grey dilation of the surface by the reflected tip (Villarrubia 1997).
-A convex tip, a paraboloid that continues as a cone, is the infimal convolution of both shapes. So a dilation by the
+The path of the tip's apex over a surface is the grey dilation of the surface by the reflected tip (Villarrubia 1997). A
+convex tip, a paraboloid that continues as a cone, is the infimal convolution of both shapes. So a dilation by the
 paraboloid and then by the cone is exact; each is done axis by axis.
 """
 
@@ -22,7 +22,7 @@ _SPLINE_VARIANCE = 1.0 / 3.0  # of the cubic B-spline as a blur, in samples squa
 
 @dataclass(frozen=True)
 class SampleGrid:
-    """Points at which the sample is computed, finer than the scan, along the axes of the sample.
+    """A grid along the sample's axes on which the sample is computed, finer than the scan.
 
     Attributes:
         x0_m, y0_m: the first point.
@@ -46,7 +46,7 @@ class SampleGrid:
         return cls(first[0] * step_m[0], first[1] * step_m[1], *step_m, shape)
 
     def axes_m(self) -> tuple[Array, Array]:
-        """Return x as one row, y as one column."""
+        """Return x as a single row and y as a single column, in m."""
         ny, nx = self.shape
         x: Array = self.x0_m + self.dx_m * np.arange(nx, dtype=np.float64)
         y: Array = self.y0_m + self.dy_m * np.arange(ny, dtype=np.float64)
@@ -58,7 +58,7 @@ class SampleGrid:
 
 @dataclass
 class Sampler:
-    """Positions on a grid, prepared for reading several images at them."""
+    """Positions on a grid, prepared for interpolating several images."""
 
     grid: SampleGrid
     x_m: Array
@@ -75,7 +75,7 @@ class Sampler:
         self._u, self._v = u - column, v - row
 
     def spline(self, picture: Single) -> Array:
-        """Return the cubic B-spline with the image as coefficients: smooth, with a slight blur."""
+        """Interpolate with a cubic B-spline whose coefficients are the image: smooth, with a slight blur."""
         flat, width = np.ravel(picture), self.grid.shape[1]
         total = np.zeros(self._u.shape)
         u_weights = bspline_weights(self._u)
@@ -89,7 +89,7 @@ class Sampler:
         return total
 
     def linear(self, picture: Array) -> Array:
-        """Interpolate between the four points around each position."""
+        """Interpolate linearly between the four points around each position."""
         flat, width = np.ravel(picture), self.grid.shape[1]
         lower = flat.take(self._index) * (1 - self._u) + flat.take(self._index + 1) * self._u
         upper = flat.take(self._index + width) * (1 - self._u) + flat.take(self._index + width + 1) * self._u
@@ -114,7 +114,7 @@ def felt(height_m: Array, grid: SampleGrid, tip: TipShape, blur_steps: tuple[flo
     """Return the path of the tip's apex over a surface, on the same grid, band limited.
 
     Args:
-        blur_steps: standard deviation of the whole blur (y, x) in grid steps, including the blur of `Sampler.spline`.
+        blur_steps: standard deviation of the total blur (y, x) in grid steps, including the blur of `Sampler.spline`.
 
     Returns:
         The path minus an offset (single precision then suffices), and the offset in m.

@@ -1,16 +1,16 @@
-"""`Instrument`: the one simulated instrument, behind the Simulator's driver and behind every emulated controller.
+"""`Instrument`: the simulated instrument that the Simulator's driver and all emulated controllers use.
 
-**Theory of operation.** A driver or a maker's protocol changes the settings (`setup`), starts one activity after
-the other, and polls its progress. The instrument has no clock and no threads: every call gets the time (experiment
-seconds), and the computation of a scan is handed to `run`, which may use a thread.
+**Theory of operation.** A driver or a maker's protocol changes the settings (`setup`), starts one activity after the
+other, and polls its progress. The instrument has no clock and no threads: every call passes the time (experiment
+seconds), and the computation of a scan is passed to `run`, which may use a thread.
 
 | | |
 | --- | --- |
-| comes in | `setup`, commands with their time |
+| inputs | `setup`, commands with their time |
 | state | the world (tip, sample, drift), one activity, the probe's position |
-| goes out | activities with their values, a `note` of each event |
+| outputs | activities with their values, a `note` of each event |
 
-Invariants: one activity at a time; the world is touched by the computation of a scan or by the caller, never by both
+Invariants: one activity at a time; the world is used by the computation of a scan or by the caller, never by both
 (`ScanDrawing.wait`); the same seed and the same commands at the same times give the same values; `state` at any moment
 suffices to continue after a kill: a running scan is computed again from the world at its start.
 
@@ -47,19 +47,19 @@ _STATE_VERSION = 2
 
 
 class InstrumentBusy(AfspmError):
-    """The error that another activity is running, which must end or be stopped first."""
+    """The error that another activity is running; wait for its end or stop it first."""
 
     code = "instrument-busy"
 
 
 class InstrumentSetup:
-    """The settings in force.
+    """The present settings of the instrument.
 
     Attributes:
-        region, shape, line_s, upwards: of the next scan: the frame, (rows, columns), seconds of trace and retrace, and
+        region, shape, line_s, upwards: for the next scan: the frame, (rows, columns), seconds of trace and retrace, and
             whether it begins with the smallest y.
         slope: compensation of tilt, (x, y).
-        move_speed_m_s: of the probe outside of scans.
+        move_speed_m_s: speed of the probe outside of scans.
         approach_s: duration of an approach or a withdrawal.
     """
 
@@ -92,20 +92,20 @@ class InstrumentState:
 
 
 class Instrument:
-    """A simulated instrument with one activity at a time. For one thread at a time.
+    """A simulated instrument with one activity at a time. Not thread-safe.
 
     Args:
         world_settings: `surface`, `tip`, `drift` … of the simulated world, as of the Simulator.
-        seed: of all random numbers.
+        seed: seed of all random numbers.
         start_s: the first time of any call.
         run: runs the computation of scans; by default at once.
         note: called with each event, for the ground truth.
 
     Attributes:
-        setup: the settings in force.
-        drawing: of scans.
+        setup: the present settings.
+        drawing: the computation of scans.
         engaged: the tip is at the sample; otherwise all channels show noise.
-        scan, spectrum: the scan and the spectrum started last, also after their end; None before the first.
+        scan, spectrum: the last started scan and spectrum, also after their end; None before the first.
         world: the physics, with its ground truth (`world.truth`).
         ledger: the damage so far, counted up to the last call.
     """
@@ -142,13 +142,13 @@ class Instrument:
 
     @cached_property
     def channels(self) -> Mapping[str, str]:
-        """The channels of every scan, with their units: from a scan of a few pixels in a new world."""
+        """The channels of every scan with their units, determined by a scan of a few pixels in a new world."""
         few = World.from_settings(self._world_settings, self.seed, 0.0)
         scan = few.scan(Region((0.0, 0.0), (1e-9, 1e-9)), _FEW, 1.0, 0.0)
         return {name: unit for name, (unit, _) in scan.channels().items()}
 
     def doing(self, now_s: float) -> str:
-        """Return "scan", "spectrum", "move", "pulse", "crash", "approach", the activity of `occupy`, or "" if free."""
+        """Return the activity: "scan", "spectrum", "move", "pulse", "crash", "approach", as in `occupy`, or ""."""
         return self._doing.what if self._doing is not None and self._doing.running(now_s) else ""
 
     def busy(self, now_s: float) -> bool:
@@ -156,19 +156,19 @@ class Instrument:
 
     @property
     def ends_s(self) -> float | None:
-        """The end of the last activity until `ended` has returned it; None if free, paused or being computed."""
+        """The end of the last activity until `ended` returns it; None if free, paused or being computed."""
         doing = self._doing
         if doing is None or (isinstance(doing, ScanActivity) and (doing.paused or doing.drawing)):
             return None
         return doing.end_s
 
     def next_change_s(self, now_s: float) -> float | None:
-        """Return the time at which the instrument becomes free; None if free, paused or awaiting `drawing.wake`."""
+        """Return the time at which the instrument becomes free; None if free, paused, or waiting for a computation."""
         ends_s = self.ends_s
         return None if ends_s is None or ends_s <= now_s else ends_s
 
     def ended(self, now_s: float) -> Doing | None:
-        """Return an activity that has ended since the last call, or None."""
+        """Return the activity that has ended since the last call; None without one."""
         doing = self._doing
         if doing is None or doing.running(now_s):
             return None
@@ -186,7 +186,7 @@ class Instrument:
         return self._probe_m
 
     def signals(self, now_s: float) -> Mapping[str, float]:
-        """Return the present value of each channel with its noise: along the line during a scan, else at rest."""
+        """Return the present value of each channel with its noise, during a scan or at rest."""
         scan, place = self.scan, self.probe_at(now_s)
         if not self.engaged:
             return self._noise_alone()
@@ -210,7 +210,7 @@ class Instrument:
 
     @property
     def probe_m(self) -> tuple[float, float]:
-        """The target of the last move, (x, y), the position of spectra, pulses and crashes."""
+        """The target (x, y) of the last move: the position of spectra, pulses and crashes."""
         return self._probe_m
 
     # -- scans
@@ -254,7 +254,7 @@ class Instrument:
             self.account(now_s)
 
     def adjust(self, now_s: float) -> None:
-        """Continue a running scan with the present feedback and bias."""
+        """Apply the present feedback settings and bias to the running scan."""
         if self._scans and self.scan is not None and self.scan.running(now_s):
             self.drawing.wait()
             self.world.restore(self._before)
@@ -285,7 +285,7 @@ class Instrument:
         """Take a curve of a kind ("IV", "force") at the probe's position, the mean of `sweeps`.
 
         Raises:
-            InstrumentBusy. InvalidValue: there is no such kind.
+            InstrumentBusy. InvalidValue: an unknown kind.
         """
         self._check_free(now_s)
         taken = [
@@ -316,13 +316,13 @@ class Instrument:
     # -- moves
 
     def move_probe(self, xy_m: tuple[float, float], now_s: float, *, way_m: float = 0.0) -> None:
-        """Move the tip at the move speed. A running move is redirected to the new position.
+        """Move the tip at the move speed. A call during a move changes its target.
 
         Args:
             way_m: path length of the frame, if it moves at the same time.
 
         Raises:
-            InstrumentBusy: with another activity. InvalidValue: the position is not finite.
+            InstrumentBusy: during another activity. InvalidValue: the position is not finite.
         """
         _finite("the position of the probe", *xy_m)
         if self.doing(now_s) != "move":
@@ -337,7 +337,7 @@ class Instrument:
             self._probe_m, self._doing = self.probe_at(now_s), None
 
     def shift_sample(self, by_m: tuple[float, float], lasts_s: float, now_s: float) -> None:
-        """Move the sample with a coarse stage, so that the tip is `by_m` (x, y) further on the sample.
+        """Move the sample with the coarse stage, which shifts the tip by `by_m` (x, y) on the sample.
 
         Raises:
             InstrumentBusy. InvalidValue: distance or duration is not finite.
@@ -351,7 +351,7 @@ class Instrument:
             self.world.compensate((0.0, 0.0), now_s + lasts_s)
 
     def follow(self, velocity_m_per_s: tuple[float, float], now_s: float) -> None:
-        """Move the scanner at this velocity (x, y) from now on to follow the sample, also during a scan.
+        """Set the velocity (x, y) at which the scanner follows the sample from now on, also during a scan.
 
         Raises:
             InvalidValue: faster than any drift.
@@ -372,7 +372,7 @@ class Instrument:
         self.world.hold(z_m)
 
     def switch_feedback(self, now_s: float, *, on: bool) -> None:
-        """Switch the feedback, and count the time that it was off."""
+        """Switch the feedback on or off, and count the time up to now in the ledger."""
         self.account(now_s)
         self.setup.feedback = replace(self.setup.feedback, on=on)
 
@@ -386,7 +386,7 @@ class Instrument:
         return outcome
 
     def pulsed(self, voltage_v: float, duration_s: float, now_s: float) -> str:
-        """Apply the effect of a finished pulse: the bias was set and restored by the caller."""
+        """Apply the effect of a pulse during which the caller set and restored the bias; return as `pulse`."""
         self.drawing.wait()
         if not self.engaged or duration_s <= 0.0:
             return "unchanged"
@@ -400,7 +400,7 @@ class Instrument:
         return outcome
 
     def crash(self, depth_m: float, speed_m_s: float, now_s: float) -> str:
-        """Drive the tip into the sample at the probe's position, and out again; return as `pulse`."""
+        """Drive the tip into the sample and back at the probe's position; return as `pulse`."""
         if not min(depth_m, speed_m_s) > 0.0:
             raise InvalidValue(f"a crash {depth_m} m deep with {speed_m_s} m/s", hint="depth and speed must be above 0")
         self._check_free(now_s)
@@ -423,7 +423,7 @@ class Instrument:
         self.occupy("approach", self.setup.approach_s, now_s)
 
     def withdraw(self, now_s: float) -> None:
-        """End the activity, and withdraw the tip."""
+        """Stop the activity and withdraw the tip."""
         self.stop_scan(now_s)
         self.stop_spectrum(now_s)
         self.account(now_s)
@@ -451,9 +451,9 @@ class Instrument:
     # -- the damage ledger
 
     def account(self, now_s: float) -> None:
-        """Count an ended measurement, and the time since the last call, with the feedback as it was.
+        """Count an ended measurement and the time since the last call in the ledger.
 
-        Call it before `setup.feedback` or `engaged` is changed, and at any time.
+        Call it before changing `setup.feedback` or `engaged`: the elapsed time counts with the previous values.
         """
         self._count(now_s, "feedback", self.ledger)
         measured = self._uncounted
@@ -497,7 +497,7 @@ class Instrument:
     # -- after a kill
 
     def state(self) -> Plain:
-        """Return the state for `restore`, JSON-able; during a scan with the world at its start."""
+        """Return the state for `restore`, JSON-able; during a scan with the state of the world at its start."""
         doing = self._doing
         world = self._before if self._scans or self.drawing.goes_on else self.world.state()
         state = InstrumentState(

@@ -1,7 +1,7 @@
-"""The damage ledger: what was done to tip and sample, as totals of the ground truth.
+"""The damage ledger: totals of all actions that can damage tip or sample, as part of the ground truth.
 
-**Theory of operation.** The instrument adds each treatment, scan and stretch of time. The totals go to `truth.jsonl`
-as a line of their own each time that they have grown. They are no verdict: compare them with a budget.
+**Theory of operation.** The instrument adds each treatment, scan and interval of time. Whenever the totals have grown,
+they are appended to `truth.jsonl` as a separate line. They are no verdict: compare them with a budget.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ class DamageLedger:
         cured, worsened: treatments that had this effect on the tip.
         marked_m2: area of the marks that treatments left on the sample, each a disc.
         in_keep_away: treatments nearer than `keep_away_m` to a place scanned before.
-        pressed_scans, pressed_m: scans whose mean indentation was at least `PRESSED_FROM_M`, and the sum of theirs.
+        pressed_scans, pressed_m: number of scans whose mean indentation was at least `PRESSED_FROM_M`, and the sum of
+            these indentations.
         saturated_s: time that the preamplifier was saturated in scans and spectra.
         feedback_off_s: time that the tip was engaged with the feedback off, spectra excluded.
         stage_moves: moves of the coarse stage while the tip was engaged.
@@ -50,7 +51,7 @@ class DamageLedger:
     stage_moves: int = 0
 
     def at(self, now_s: float, *, feedback_off: bool) -> DamageLedger:
-        """Return the ledger with the time since `until_s` counted, in which the feedback was off or on."""
+        """Return the ledger with the time from `until_s` to `now_s` counted."""
         if now_s <= self.until_s:
             return self
         off_s = now_s - self.until_s if feedback_off else 0.0
@@ -76,7 +77,7 @@ class DamageLedger:
         )
 
     def scanned(self, pressed_m: float, saturated_s: float) -> DamageLedger:
-        """Return the ledger after a scan or spectrum with this mean indentation and time of saturation."""
+        """Return the ledger after a scan or spectrum with this mean indentation and duration of saturation."""
         pressed = pressed_m >= PRESSED_FROM_M
         return replace(
             self,
@@ -86,11 +87,10 @@ class DamageLedger:
         )
 
     def line(self) -> dict[str, object]:
-        """Return the totals, JSON-able."""
         return asdict(self)
 
     def same_totals(self, other: DamageLedger) -> bool:
-        """Return whether nothing but time has passed between two ledgers."""
+        """Return whether two ledgers differ at most in `until_s`."""
         return replace(self, until_s=other.until_s) == other
 
 
@@ -111,7 +111,7 @@ def distance_m(xy_m: tuple[float, float], region: Region) -> float:
 
 
 def with_place(places: Iterable[ScannedPlace], place: ScannedPlace) -> list[ScannedPlace]:
-    """Return the places with a new one, which replaces an earlier scan of the same frame at the same place."""
+    """Add a scanned place; it replaces an earlier scan of the same frame at the same place."""
     size_m = max(place.region.size_m)
 
     def same(one: ScannedPlace) -> bool:

@@ -1,4 +1,4 @@
-"""From sample, tip, drift and feedback to the channels of one scan."""
+"""Computation of a scan's channels from sample, tip, drift and feedback."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class SignalSettings:
     Attributes:
         dissipation: energy lost to the sample per cycle, relative to the cantilever's own loss, mean of both
             materials; dissipation_contrast: their difference.
-        conductance_s: of the contact when the tip taps gently (mean over the cycle).
+        conductance_s: mean conductance of the contact over a cycle of gentle tapping.
         conductance_contrast: ln of the ratio of both materials' conductances.
-        current_decay_m: the gap over which that current falls by e.
+        current_decay_m: increase of the gap over which the tapping current falls by a factor e.
         preamplifier_a: current at which the amplifier saturates.
     """
 
@@ -57,7 +57,7 @@ def phase_deg(settings: SignalSettings, loop: Loop, amplitude_v: Array, material
 
 
 def current_a(settings: SignalSettings, loop: Loop, gap_m: Array, material: Array, bias_v: float) -> Array:
-    """Return the current, exponential in the gap; tunnelling at the setpoint, tapping at the contact's conductance."""
+    """Return the tunnelling or tapping current, exponential in the gap."""
     contrast = settings.conductance_contrast * (material - 0.5)
     if loop.settings.mode == "current":
         # The feedback keeps the current constant, so conductance shows in the height; the current shows the error.
@@ -102,15 +102,15 @@ class Setup:
     """The constant conditions of a scan.
 
     Attributes:
-        sample: returns the relief of the sample at present, from (x, y, resolution_m).
-        drift_m: (x, y, z) at times.
-        turn: rotation and scale of the sample at times, as complex factors.
-        unturned: (x, y) without rotation and scale, from (x, y, times).
+        sample: returns the present relief of the sample from (x, y, resolution_m).
+        drift_m: returns (x, y, z) at times.
+        turn: returns rotation and scale of the sample at times, as complex factors.
+        unturned: returns (x, y) without rotation and scale, from (x, y, times).
         held_z_m: z while the feedback is off.
         slope: (x, y) compensation of tilt set on the instrument, m/m.
         sharp_m: radius of the sharp tip.
         origin_m: the fixed point (x, y) of tilt and slope.
-        offset_m: (x, y) remaining distance of the scanner to its target (creep), at times.
+        offset_m: returns the remaining distance (x, y) of the scanner to its target (creep), at times.
     """
 
     sample: Callable[[Array, Array, float], Relief]
@@ -134,7 +134,7 @@ class Felt:
 
     Attributes:
         height_m: (trace, retrace), each [y, x].
-        material: as height_m.
+        material: (trace, retrace), each [y, x], from 0 to 1.
     """
 
     height_m: tuple[Array, Array]
@@ -143,14 +143,14 @@ class Felt:
 
 @dataclass(frozen=True)
 class Measured:
-    """The channels of a scan, z at its end, and the mean indentation by errors of the feedback."""
+    """The channels of a scan, z at its end, and the mean indentation due to feedback errors."""
 
     channels: Channels
     last_z_m: float
     pressed_m: float
 
     def continued(self, anew: Measured, rows: NDArray[np.bool_]) -> Measured:
-        """Return the measurement with `rows` taken from its continuation, the first argument."""
+        """Return the measurement with `rows` replaced by the rows of its continuation, the first argument."""
         channels = {
             name: (unit, np.where(rows[:, None], anew.channels[name][1], values))
             for name, (unit, values) in self.channels.items()
@@ -161,7 +161,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Adjustment:
-    """A change during a scan: its time, and the settings from then on."""
+    """A change during a scan: its time, and the new settings."""
 
     t_s: float
     feedback: Feedback | None

@@ -13,17 +13,17 @@ from afspm.simulation.tip import TipShape
 
 @dataclass(frozen=True)
 class NoiseSettings:
-    """Root mean squares, unless noted.
+    """Settings of the noise, as root mean squares unless noted.
 
     Attributes:
-        white_m: of the height, independent for each pixel.
-        one_over_f_m: of the height, a time series over the whole scan, power as 1 / frequency.
-        line_offset_m: of the height, independent for each line, the same in trace and retrace.
+        white_m: noise of the height, independent for each pixel.
+        one_over_f_m: noise of the height as a time series over the whole scan, with a power of 1 / frequency.
+        line_offset_m: noise of the height, independent for each line, the same in trace and retrace.
         scar_probability: probability of a disturbed interval in a line.
         scar_m: height of the disturbance.
-        hum_m, hum_hz: amplitude and frequency of the mains in the height.
+        hum_m, hum_hz: amplitude and frequency of mains hum in the height.
         debris_jumps_per_s: rate of jumps of debris on a contaminated tip.
-        amplitude_v, phase_deg, current_a, frequency_hz: white, in those channels.
+        amplitude_v, phase_deg, current_a, frequency_hz: white noise of those channels.
     """
 
     white_m: float = 0.05e-9
@@ -47,10 +47,10 @@ class NoiseSettings:
 def disturbances(
     settings: NoiseSettings, tips: list[TipShape], line_s: float, nx: int, random: np.random.Generator
 ) -> Array | None:
-    """Return scars and jumps of debris, which happen between tip and sample; the feedback follows them.
+    """Return the height of scars and jumps of debris, which the feedback follows.
 
     Args:
-        tips: of each line, in the order of time.
+        tips: the tip of each line, in the order of time.
 
     Returns:
         Added height, shape (lines, 2 nx): trace, then retrace in the order of time; None without disturbances.
@@ -88,7 +88,7 @@ def height_noise(
 
 
 def one_over_f(count: int, random: np.random.Generator) -> Array:
-    """Return a time series of unit rms (on average) and zero mean with a power spectrum as 1 / frequency."""
+    """Return a time series of zero mean and, on average, unit rms, with a power spectrum of 1 / frequency."""
     size = 1 << max(4, (count - 1).bit_length())
     amplitude = 1.0 / np.sqrt(np.arange(1, size // 2 + 1, dtype=np.float32))
     shape = (2, len(amplitude))

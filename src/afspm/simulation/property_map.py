@@ -1,4 +1,4 @@
-"""A quantity that varies from place to place: a map with known truth, which the curves of spectra show."""
+"""A quantity that varies over the sample: a map with known truth, which spectra can reveal."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ KINDS = ("none", "smooth", "spotty")
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity of a spectrum: the kind of curve that shows it, its unit and its usual range."""
+    """A measurable quantity: the kind of spectrum that reveals it, its unit and its usual range."""
 
     spectrum: str
     unit: str
@@ -39,12 +39,12 @@ _REACH = 3.5  # of a spot, in its standard deviations
 
 @dataclass(frozen=True)
 class PropertyMapSettings:
-    """A quantity of spectra that varies over the sample, in place of the one of the surface's two materials.
+    """A quantity of spectra that varies over the sample, instead of depending on the two materials.
 
     Attributes:
-        kind: "none", "smooth" (hills and valleys everywhere) or "spotty" (round spots on even ground).
+        kind: "none", "smooth" (hills and valleys everywhere) or "spotty" (round spots on a uniform background).
         quantity: "gap" of I(V) curves in eV, "modulus" of force curves in Pa, or their "adhesion" in J/m^2.
-        low, high: range of the quantity, in its unit; equal: the usual one of the quantity.
+        low, high: range of the quantity, in its unit; if both are equal, the usual range of the quantity.
         size_m: width of hills, or mean width of spots at half their height.
         spacing_m: mean distance of spots.
     """
@@ -71,12 +71,12 @@ class PropertyMapSettings:
 
 
 class PropertyMap:
-    """The map of a seed, without bounds.
+    """An unbounded map, determined by its seed.
 
     Attributes:
-        is_on: whether there is a map at all; otherwise spectra depend on the two materials.
+        is_on: whether there is a map; otherwise spectra depend on the two materials.
         quantity: name of the quantity.
-        unit: of the quantity.
+        unit: unit of the quantity.
     """
 
     def __init__(self, settings: PropertyMapSettings, seed: int) -> None:
@@ -86,7 +86,7 @@ class PropertyMap:
         self.quantity, self.unit = settings.quantity, QUANTITIES[settings.quantity].unit
 
     def at(self, x_m: ArrayLike, y_m: ArrayLike) -> Array:
-        """Return the true values at sample coordinates, shaped as x and y broadcast."""
+        """Return the true values at sample coordinates, in the broadcast shape of x and y."""
         x, y = np.broadcast_arrays(np.asarray(x_m, dtype=np.float64), np.asarray(y_m, dtype=np.float64))
         flat_x, flat_y = x.reshape(-1, 1), y.reshape(-1, 1)
         share = self._hills(flat_x, flat_y) if self._settings.kind == "smooth" else self._spots(flat_x, flat_y)

@@ -19,11 +19,11 @@ from afspm.simulation.surfaces.relief import Relief, around
 
 @dataclass(frozen=True)
 class SurfaceMark:
-    """A round crater with a rim, or with negative depth a mound.
+    """A round crater with a rim, or a mound if its depth is negative.
 
     Attributes:
         sample_xy_m: its centre, in sample coordinates.
-        depth_m, radius_m: of the crater.
+        depth_m, radius_m: depth and radius of the crater.
         t_s: the time of its creation.
         kind: "crash" or "pulse".
     """
@@ -77,7 +77,7 @@ class Sample:
         return np.stack(self.drift.unturned(at[..., 0], at[..., 1], t_s), axis=-1)
 
     def to_tip(self, xy_m: ArrayLike, t_s: ArrayLike) -> Array:
-        """Invert `to_sample`."""
+        """Map positions from tip to sample coordinates backwards: the inverse of `to_sample`."""
         at = np.asarray(xy_m, dtype=np.float64)
         turned = np.stack(self.drift.turned(at[..., 0], at[..., 1], t_s), axis=-1)
         return np.asarray(turned + self.drift.at(t_s)[..., :2])
@@ -92,7 +92,7 @@ class Sample:
         self.marks.append(SurfaceMark(self.under(position_m, t_s), depth_m, radius_m, t_s, kind))
 
     def turn(self, t_s: float) -> dict[str, object]:
-        """Return rotation and scale at a time, JSON-able."""
+        """Return rotation and scale of the sample at a time, JSON-able."""
         turn = complex(self.drift.turn(t_s))
         return {"angle_rad": cmath.phase(turn), "scale": abs(turn), "about_m": list(self._about_m)}
 
@@ -105,7 +105,7 @@ class Sample:
         return relief
 
     def surface_m(self, x_m: ArrayLike, y_m: ArrayLike, t_s: float = math.inf) -> Array:
-        """Return the true heights at sample coordinates, shaped as x and y broadcast; see `relief`."""
+        """Return the true heights at sample coordinates, in the broadcast shape of x and y; see `relief`."""
         x, y = np.asarray(x_m, dtype=np.float64), np.asarray(y_m, dtype=np.float64)
         shape = np.broadcast_shapes(x.shape, y.shape)
         x, y = (a if a.ndim == 2 else a.reshape((1,) * (2 - a.ndim) + a.shape) if a.ndim < 2 else a for a in (x, y))

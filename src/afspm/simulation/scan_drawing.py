@@ -1,4 +1,4 @@
-"""Computation of the values of a scan, before it starts or in parallel to it."""
+"""Computation of the values of a scan, before its start or while it runs."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ScanDrawing:
 
     Attributes:
         wake: called from the thread of the computation when a scan is ready.
-        log: for unexpected errors.
+        log: receives unexpected errors.
     """
 
     def __init__(self, world: World, units: Callable[[], Mapping[str, str]], seed: int, run: RunWork) -> None:
@@ -41,7 +41,7 @@ class ScanDrawing:
         self.log = logging.getLogger(__name__)
 
     def start(self, scan: ScanActivity, draw: Draw) -> None:
-        """Start the computation that `prepared` returned."""
+        """Start the computation returned by `prepared`."""
 
         def work() -> None:
             try:
@@ -66,7 +66,11 @@ class ScanDrawing:
             self._newest.wait()
 
     def prepared(self, scan: ScanActivity, *, engaged: bool) -> Draw:
-        """Return the computation of a scan. Raises InvalidValue: it can't be simulated."""
+        """Return the computation of a scan as a function.
+
+        Raises:
+            InvalidValue: the scan cannot be simulated.
+        """
         _check_scannable(scan)
         if not all(map(math.isfinite, (scan.bias_v, *scan.slope))):
             raise InvalidValue(f"bias and slope: {scan.bias_v}, {scan.slope}", hint="finite")

@@ -51,13 +51,13 @@ class ScannerSettings:
 
 @dataclass(frozen=True)
 class Course:
-    """The course of a scan in place and time.
+    """Positions and times of a scan's pixels.
 
     Attributes:
         region: in tip coordinates.
         shape: (ny, nx).
-        line_s: trace and retrace.
-        direction: of the slow axis, "up" (small y first) or "down".
+        line_s: duration of trace and retrace together.
+        direction: direction of the slow axis, "up" (small y first) or "down".
     """
 
     region: Region
@@ -89,20 +89,20 @@ class Course:
         return rows if self.direction == "up" else rows[::-1]
 
     def row_times_s(self, part: float) -> Array:
-        """Return the time of each row (by index) at a fraction of its line: 0.25 mid-trace, 0.75 mid-retrace, 1 end."""
+        """Return the time of each row at a fraction of its line: 0.25 mid-trace, 0.75 mid-retrace, 1 end."""
         times = np.empty(self.shape[0])
         times[self.order] = self.start_s + (np.arange(self.shape[0]) + part) * self.line_s
         return times
 
     def rows_taken(self, until_s: float | None) -> NDArray[np.bool_]:
-        """Return which rows are complete at a time."""
+        """Return a mask of the rows that are complete at `until_s`; None selects all rows."""
         if until_s is None:
             return np.ones(self.shape[0], dtype=bool)
         return np.asarray(self.row_times_s(1.0) <= until_s + 1e-9 * self.line_s)
 
     @property
     def pixel_m(self) -> tuple[float, float]:
-        """The distance of pixels (x, y)."""
+        """The distance (x, y) between pixels, in m."""
         ny, nx = self.shape
         width, height = self.region.size_m
         return (width / (nx - 1) if nx > 1 else width, height / (ny - 1) if ny > 1 else height)
@@ -126,12 +126,12 @@ class ScannerPlace:
         self.at_m, self.came_from_m, self.came_s = (0.0, 0.0), (0.0, 0.0), start_s
 
     def move_to(self, position_m: tuple[float, float], t_s: float) -> None:
-        """Move to a position, unless it is the target already."""
+        """Set the target; a repeated target has no effect on the creep."""
         if position_m != self.at_m:
             self.came_from_m, self.came_s, self.at_m = self.at_m, t_s, position_m
 
     def creep_m(self, t_s: Array) -> Array:
-        """Return the remaining part of the last move at times, (n, 2)."""
+        """Return the remaining part (x, y) of the last move at times, shape (n, 2)."""
         move = np.subtract(self.at_m, self.came_from_m)
         since = np.maximum(np.asarray(t_s) - self.came_s, 0.0) + 1.0
         left = self._creep * np.maximum(1.0 - np.log10(since) / 4.0, 0.0)
@@ -140,10 +140,10 @@ class ScannerPlace:
 
 @dataclass(frozen=True)
 class SimulatedScan:
-    """A scan, computed when it starts; the caller decides how much of it is visible before its end.
+    """A scan that is computed at its start; the caller limits the visible rows.
 
     Attributes:
-        course: place and time.
+        course: positions and times.
         drift_m: (x, y, z) at the middle of each row's trace, by row index.
         truth: the parameters of the simulation, JSON-able.
     """

@@ -19,10 +19,10 @@ T = TypeVar("T")
 
 
 def build(cls: type[T], settings: object, where: str) -> T:
-    """Return an instance of the frozen dataclass `cls` from a table.
+    """Create an instance of the frozen dataclass `cls` from a table.
 
     Raises:
-        ConfigError: an unknown key (the nearest name is offered), a value of the wrong type, or a refusal of the
+        ConfigError: an unknown key (with the most similar name as hint), a value of the wrong type, or an error of the
             dataclass itself; several errors together as `ConfigErrors`.
     """
     if not isinstance(settings, Mapping):
@@ -54,7 +54,7 @@ def build(cls: type[T], settings: object, where: str) -> T:
 
 
 def nearest(name: str, names: Iterable[str]) -> str:
-    """Return a hint: the most similar name, else all names."""
+    """Return a hint with the most similar name, or with all names."""
     names = list(names)
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     return f"did you mean {close[0]!r}?" if close else "there are " + ", ".join(names)
@@ -71,7 +71,10 @@ def one_of(value: str, choices: Iterable[str], where: str) -> str:
 def check(settings: object, *, above_zero: str = "", from_zero: str = "", fraction: str = "") -> None:
     """Check the named attributes (separated by spaces) of a dataclass in its `__post_init__`.
 
-    A fraction lies in [0, 1]. Raises ConfigError with the attribute as `where`, for all of them at once.
+    A fraction lies in [0, 1].
+
+    Raises:
+        ConfigError: invalid attributes, all at once, each named in `where`.
     """
     errors = ErrorCollector()
     rules: tuple[tuple[str, str, Callable[[float], bool]], ...] = (

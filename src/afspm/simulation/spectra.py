@@ -24,13 +24,13 @@ class IVSettings:
     """Sweep and sample of current-voltage curves.
 
     Attributes:
-        range_v: from -range to +range.
+        range_v: the sweep goes from -range to +range.
         set_bias_v, set_current_a: the current at this bias before the feedback is opened (tunnelling: the setpoint at
-            the bias in force).
+            the present bias).
         gap_ev: band gap of material 0; material 1 is a metal.
-        band_offset_ev: of the gap's middle against the Fermi level (doping).
-        noise_a: white; `relative_noise` adds a share of the current.
-        duration_s: of the curve.
+        band_offset_ev: middle of the gap relative to the Fermi level (doping).
+        noise_a: white noise; `relative_noise` adds a fraction of the current.
+        duration_s: duration of a curve.
     """
 
     points: int = 256
@@ -55,11 +55,11 @@ class ForceSettings:
     """Cantilever, sample and sweep of force-distance curves; pairs are (material 0, material 1).
 
     Attributes:
-        range_m: from the contact away.
+        range_m: largest distance from the contact.
         trigger_n: the force at which the approach reverses.
         modulus_pa: reduced Young's modulus.
-        adhesion_j_per_m2: work of adhesion during retraction; while approaching, `approach_share` of it.
-        hamaker_j: of the attraction before contact.
+        adhesion_j_per_m2: work of adhesion during retraction; `approach_share` of it acts during the approach.
+        hamaker_j: Hamaker constant of the attraction before contact.
     """
 
     points: int = 512
@@ -81,10 +81,10 @@ class ForceSettings:
 def current_voltage(
     settings: IVSettings, tip: TipShape, material: float, bias_v: float, loop: Loop, random: np.random.Generator
 ) -> Curves:
-    """Return I(V), forward and backward, and dI/dV as a lock-in amplifier shows it.
+    """Return I(V), forward and backward, and dI/dV as a lock-in amplifier measures it.
 
-    The current is the integral of the sample's density of states times the tip's times the barrier's transmission,
-    scaled to the current that the feedback had held.
+    The current is the integral of the densities of states of sample and tip times the transmission of the barrier,
+    scaled to the current that the feedback held before.
     """
     bias = np.linspace(-settings.range_v, settings.range_v, settings.points)
     energy = np.linspace(-settings.range_v - 0.5, settings.range_v + 0.5, 1201)

@@ -1,4 +1,4 @@
-"""The tip: its shape, its changes, and the effects of repairs."""
+"""The shape of the tip, its changes, and the effects of repairs."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ CONDITIONS = ("sharp", *FLAWS)
 
 @dataclass(frozen=True)
 class TipShape:
-    """One shape of the tip.
+    """A shape of the tip.
 
     Attributes:
-        radius_m: of the apex, without debris.
-        half_angle_deg: of the cone behind the apex.
+        radius_m: radius of the apex, without debris.
+        half_angle_deg: half angle of the cone behind the apex.
         second_apex_m: (x, y, height) of a second apex beside the first, height (negative) below it; None without.
         debris_m: size of debris that sticks to the tip and jumps; 0 for a clean one.
         length_m: relative to the first tip; a change makes the height jump.
@@ -46,13 +46,13 @@ class TipShape:
 
     @property
     def imaging_radius_m(self) -> float:
-        """The radius of the part that touches the sample: apex with debris."""
+        """The radius of the part that touches the sample: the apex with its debris."""
         return self.radius_m + self.debris_m
 
 
 @dataclass(frozen=True)
 class TipSettings:
-    """The sharp tip, and its possible flaws, whose sizes are in units of its radius.
+    """The sharp tip and its possible flaws, whose sizes are relative to its radius.
 
     Attributes:
         condition: at the start: "sharp", "blunt", "double" or "contaminated".
@@ -150,7 +150,7 @@ class TipChangeSettings(TipRepairSettings):
 
 @dataclass(frozen=True)
 class TipChange:
-    """A change: the tip is `tip` from t_s on; cause is "start", "chance", "schedule", "pulse", "crash" or "wear"."""
+    """A change of the tip to `tip` at `t_s`; cause is "start", "chance", "schedule", "pulse", "crash" or "wear"."""
 
     t_s: float
     cause: str
@@ -164,12 +164,12 @@ class TipMaker:
         self._s = settings
 
     def first(self, random: np.random.Generator) -> TipShape:
-        """Return the first tip: exactly as in the settings, and possibly with a flaw."""
+        """Return the tip at the start: as in the settings, with their flaw if any."""
         sharp = TipShape(self._s.radius_m, self._s.half_angle_deg)
         return sharp if self._s.condition == "sharp" else self.changed(sharp, self._s.condition, random)
 
     def changed(self, tip: TipShape, condition: str, random: np.random.Generator) -> TipShape:
-        """Return the tip after a change of condition; other flaws stay unless it becomes sharp."""
+        """Return the tip after a change of condition; a change to "sharp" removes all flaws, other changes add one."""
         s, radius = self._s, self._s.radius_m
         length = tip.length_m + s.length_jump_radii * radius * float(random.normal())
         if condition == "sharp":
@@ -192,15 +192,15 @@ class TipMaker:
 
 @dataclass(frozen=True)
 class Chances:
-    """Probabilities that a treatment cures a tip, and that it worsens it."""
+    """The probabilities that a treatment cures a tip and that it worsens the tip."""
 
     cures: float
     worsens: float
 
     def of_times(self, times: float) -> Chances:
-        """Return the probabilities for `times` treatments (any number), which end with the first effect.
+        """Return the probabilities of `times` treatments (any number), which end with the first effect.
 
-        Both grow with the number; their ratio stays, and their sum is 1 at most.
+        Both probabilities grow with the number; their ratio stays, and their sum is at most 1.
         """
         once = min(1.0, self.cures + self.worsens)
         if once <= 0.0:
@@ -210,12 +210,12 @@ class Chances:
         return Chances(ever * cures / once, ever * (once - cures) / once)
 
     def weakened(self, share: float) -> Chances:
-        """Return both probabilities multiplied by a factor."""
+        """Return both probabilities multiplied by `share`."""
         return Chances(share * self.cures, share * self.worsens)
 
 
 def pulse_times(settings: TipChangeSettings, duration_s: float) -> float:
-    """Return the equivalent number of pulses of the usual duration: from 0 to 2, 1 for the usual.
+    """Return the equivalent number of pulses of the usual duration: from 0 to 2, and 1 for the usual duration.
 
     Simulated, without a source: the field moves atoms of the apex, so the voltage matters most; movable atoms go soon,
     and the longer the pulse lasts, the fewer remain. Half of them are gone after the usual duration.
@@ -224,7 +224,7 @@ def pulse_times(settings: TipChangeSettings, duration_s: float) -> float:
 
 
 def crash_times(settings: TipChangeSettings, depth_m: float) -> float:
-    """Return the number of crashes of the usual depth equivalent to one `depth_m` deep.
+    """Return the equivalent number of crashes of the usual depth for a crash `depth_m` deep.
 
     Simulated, without a source: material is removed from the apex, or left there, all along the way in, so each further
     interval of depth has the same chance as the one before.
@@ -233,17 +233,17 @@ def crash_times(settings: TipChangeSettings, depth_m: float) -> float:
 
 
 def indented_m(tip: TipShape, depth_m: float) -> float:
-    """Return the indentation of the sample by a tip that is driven `depth_m` beyond the surface.
+    """Return the indentation of the sample by a tip that moves `depth_m` beyond the surface.
 
-    Simulated, without a source: at first the sample yields by the whole depth. The deeper, the more the apex yields,
-    and blunts; the limit is three of its radii. A blunt apex is stiffer.
+    Simulated, without a source: at first the sample yields by the whole depth. At larger depth the apex yields more and
+    becomes blunt; the indentation is limited to three apex radii. A blunt apex is stiffer.
     """
     most_m = 3.0 * tip.imaging_radius_m
     return -most_m * math.expm1(-depth_m / most_m)
 
 
 def drawn_flaw(settings: TipChangeSettings, random: np.random.Generator) -> str | None:
-    """Return the next random flaw; None when all weights are zero."""
+    """Draw the next random flaw; None if all weights are zero."""
     weights = np.array([settings.blunt_weight, settings.double_weight, settings.contaminated_weight])
     return str(random.choice(FLAWS, p=weights / weights.sum())) if weights.sum() else None
 
@@ -264,7 +264,7 @@ def chance_changes(
 
 
 class SimulatedTip:
-    """The tip through the night: every shape by time, and the causes of its changes.
+    """The shapes of the tip over time, and the causes of its changes.
 
     Predicted changes (tip changes and wear in the rest of a stopped scan) can be revoked.
 
@@ -291,13 +291,13 @@ class SimulatedTip:
         return [change for change in self.history if start_s < change.t_s <= end_s]
 
     def begin(self, t_s: float) -> None:
-        """Revoke all changes later than `t_s`, which becomes the present."""
+        """Revoke all changes later than `t_s`, and apply scheduled changes up to `t_s`."""
         self.history = [c for c in self.history if c.t_s <= t_s or c.cause == "start"]
         self.scheduled_until_s = min(self.scheduled_until_s, t_s)
         self.advance(t_s)
 
     def schedule(self, condition: str, t_s: float) -> None:
-        """Add a change to the schedule, so that it also affects scans that are computed again."""
+        """Add a change to the schedule, so that scans computed again include it."""
         change = (t_s - self._start_s, condition)
         self._settings = replace(self._settings, schedule=(*self._settings.schedule, change))
 
@@ -328,13 +328,13 @@ class SimulatedTip:
             self._add(TipChange(course.end_s, "wear", replace(tip, radius_m=tip.radius_m + worn_m)))
 
     def answers(self, t_s: float) -> TipAnswers | None:
-        """Return the hidden answers in force at a time; None if every flaw answers alike."""
+        """Return the present response of each flaw to treatments; None if all flaws respond alike."""
         turn_s = self._settings.answers_turn_s
         turned = self._answers is not None and 0.0 < turn_s <= t_s - self._start_s
         return self._answers.turned() if self._answers is not None and turned else self._answers
 
     def pulse(self, voltage_v: float, duration_s: float, t_s: float, random: np.random.Generator) -> str:
-        """Return the effect of a bias pulse, which depends mostly on the voltage; see `_treat`."""
+        """Apply a bias pulse and return its effect, which depends mostly on the voltage."""
         s, answers = self._settings, self.answers(t_s)
         if answers is not None:
             once = Chances(*answers.of(self.at(t_s).flaws).pulse(voltage_v))
@@ -347,7 +347,7 @@ class SimulatedTip:
         return self._treat("pulse", t_s, chances, random)
 
     def crash(self, depth_m: float, speed_m_s: float, t_s: float, random: np.random.Generator) -> str:
-        """Return the effect of a crash; see `_treat`."""
+        """Apply a crash and return its effect."""
         s, answers = self._settings, self.answers(t_s)
         effect = min(1.0, speed_m_s / s.crash_speed_m_per_s)
         if answers is not None:

@@ -1,9 +1,9 @@
-"""The hidden answers of the tip: how each flaw responds to pulses and crashes of each kind, drawn for each night.
+"""The hidden answers of the tip: each flaw's response to pulses and crashes, drawn once per night.
 
 **Theory of operation.** A prior states, for each flaw, which treatments usually cure it. The answers of one night are
 one draw from the prior: a component that repairs tips can learn the draw within the night, and the prior from night to
-night. The parameters of one prior are public (below, and in the documentation). Those of the other are drawn with a key
-that is not in the repository, so that nothing can be tuned to them.
+night. The parameters of the "public" prior are in this module and in the documentation. The parameters of the "sealed"
+prior are drawn with a key outside of the repository, so that no component can be tuned to them.
 
 All of it is simulated, without a source. The pictures behind it: the field of a pulse desorbs debris, or moves atoms of
 the apex, at one polarity more than at the other, above a threshold; a crash reshapes the apex where the depth fits the
@@ -33,15 +33,15 @@ MOST_WORSENS = 0.6
 
 @dataclass(frozen=True)
 class Answers:
-    """Numbers of one flaw's answers to treatments.
+    """The response of one flaw to treatments.
 
     Attributes:
         threshold_v: voltage below which no pulse has an effect.
         pulse_cures: probability that a pulse of the better polarity, far above the threshold, cures.
         other_polarity: factor on that probability for the other polarity.
-        pulse_worsens: probability that a strong pulse adds a flaw; of the other polarity twice that.
+        pulse_worsens: probability that a strong pulse adds a flaw; doubled for the other polarity.
         depth_m: depth at which a crash cures best.
-        crash_cures: probability that such a crash cures.
+        crash_cures: probability that a crash of that depth cures.
         crash_worsens: probability that a crash of that depth adds a flaw, in proportion to the depth.
     """
 
@@ -77,10 +77,10 @@ _CERTAINTY = 12.0  # of probabilities: a beta distribution of the prior's mean a
 
 @dataclass(frozen=True)
 class FlawAnswers(Answers):
-    """The answers of one flaw in one night.
+    """The response of one flaw in one night.
 
     Attributes:
-        sign: of the voltage of better pulses.
+        sign: sign of the voltage of the better pulses.
     """
 
     sign: float
@@ -104,8 +104,8 @@ class FlawAnswers(Answers):
 class TipAnswers:
     """The answers of all flaws.
 
-    A tip with several flaws answers as its first one in the order blunt, double, contaminated: an apex without its end
-    hides the rest. A sharp tip answers like a blunt one, and has nothing to cure.
+    A tip with several flaws answers as its first flaw in the order blunt, double, contaminated, since a missing apex
+    hides the other flaws. A sharp tip answers like a blunt one, and has no flaw to cure.
     """
 
     def __init__(self, of_flaw: Mapping[str, FlawAnswers]) -> None:
@@ -115,19 +115,18 @@ class TipAnswers:
         return next(self.of_flaw[flaw] for flaw in (*PUBLIC_PRIORS, "blunt") if flaw in flaws or not flaws)
 
     def turned(self) -> TipAnswers:
-        """Return the answers after a turn: the other polarity cures, and crashes and pulses swap their success."""
+        """Return the answers with the polarity reversed, and with pulse and crash cure probabilities swapped."""
         return TipAnswers({
             flaw: replace(one, sign=-one.sign, pulse_cures=one.crash_cures, crash_cures=one.pulse_cures)
             for flaw, one in self.of_flaw.items()
         })  # fmt: skip
 
     def truth(self) -> dict[str, object]:
-        """Return the answers, JSON-able."""
         return {flaw: asdict(one) for flaw, one in self.of_flaw.items()}
 
 
 def drawn_answers(priors: Mapping[str, AnswerPrior], seed: int) -> TipAnswers:
-    """Return the answers of one night."""
+    """Draw the answers of one night from the priors."""
     of_flaw = {}
     for number, (flaw, prior) in enumerate(priors.items()):
         random = chance.generator(seed, number)
@@ -152,7 +151,7 @@ def drawn_answers(priors: Mapping[str, AnswerPrior], seed: int) -> TipAnswers:
 
 
 def sealed_priors(key: bytes) -> Mapping[str, AnswerPrior]:
-    """Return the priors of a key: the values of the public ones redistributed and scattered over the flaws."""
+    """Return the priors of a key: the public values, permuted over the flaws and scattered."""
     random = np.random.default_rng(list(hmac.digest(key, b"afspm tip answers, sealed half", hashlib.sha256)))
     public = list(PUBLIC_PRIORS.values())
     of_pulses, of_crashes = random.permutation(len(public)), random.permutation(len(public))
@@ -180,7 +179,7 @@ def answers_of(kind: str, seed: int) -> TipAnswers | None:
     """Return the answers for a setting and a night's seed; None for "even".
 
     Raises:
-        ConfigError: the sealed half is asked for, and there is no key.
+        ConfigError: "sealed" without a key.
     """
     if kind == "even":
         return None

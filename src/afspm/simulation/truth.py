@@ -1,4 +1,4 @@
-"""The ground truth, for later evaluation: `truth.jsonl` in the run folder, never published."""
+"""The ground truth for later evaluation: `truth.jsonl` in the run folder, never published."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from afspm.storage.disk import DiskThread, DiskTimeout
 
 
 class Truth:
-    """A file of JSON objects, one a line: `n`, `time_s` (experiment), `event` and its facts.
+    """A file of JSON objects, one per line, with `n`, `time_s` (experiment), `event` and its facts.
 
     While the disk hangs, lines are queued: the microscope does not wait for the disk.
 

@@ -58,7 +58,7 @@ _FITTING: dict[str, dict[str, dict[str, object]]] = {
 
 @dataclass(frozen=True)
 class WorldSettings:
-    """All settings but the surface, whose kind determines its own."""
+    """All settings of the world except its surface."""
 
     tip: TipSettings = field(default_factory=TipSettings)
     tip_changes: TipChangeSettings = field(default_factory=TipChangeSettings)
@@ -73,7 +73,7 @@ class WorldSettings:
 
 
 def read_settings(settings: Mapping[str, object]) -> tuple[object, WorldSettings]:
-    """Return the surface's table and the other settings, from one table.
+    """Split a table into the surface's table and the other settings, and check them.
 
     Raises:
         ConfigError: unknown names or invalid values, of all tables at once; FileError: the surface's file.
@@ -105,7 +105,7 @@ _SAME_PLACE_M = 20e-12
 
 @dataclass(frozen=True)
 class WorldState:
-    """The saved state of a world, which continues without a difference; see `World`, `SimulatedTip` and `Sample`."""
+    """The saved state of a world; a restored world continues with the same values."""
 
     seed: int
     start_s: float
@@ -121,7 +121,7 @@ class WorldState:
 
 
 class World:
-    """The simulated world. All times are experiment seconds, all positions tip coordinates unless named sample."""
+    """The simulated world. Times are experiment seconds; positions are tip coordinates unless named "sample"."""
 
     def __init__(
         self, surface: object = "steps", settings: WorldSettings | None = None, *, seed: int = 0, start_s: float = 0.0
@@ -138,7 +138,7 @@ class World:
 
     @classmethod
     def from_settings(cls, settings: Mapping[str, object], seed: int, start_s: float) -> World:
-        """Return the world described by tables: `surface`, and the fields of `WorldSettings`.
+        """Create a world from a table: `surface`, and the fields of `WorldSettings`.
 
         Raises:
             ConfigError: unknown names or invalid values. FileError: the surface's file.
@@ -164,9 +164,9 @@ class World:
         Args:
             region: in tip coordinates.
             shape: (ny, nx).
-            line_s: of trace and retrace together.
+            line_s: duration of trace and retrace together.
             feedback: its fields override the settings.
-            direction: of the slow axis, "up" (small y first) or "down".
+            direction: direction of the slow axis, "up" (small y first) or "down".
             slope: compensation of the sample's tilt, (x, y) in m/m.
             adjusted: changes during the scan, each in force from the next line on.
 
@@ -208,12 +208,12 @@ class World:
         slope: tuple[float, float] = (0.0, 0.0),
         random: np.random.Generator,
     ) -> dict[str, float]:
-        """Return the value of each channel while the tip stands still, without any effect on the world.
+        """Return the value of each channel while the tip stands still, without changing the world.
 
         With the feedback off, z is the value set by `hold`, or z at the end of the last scan.
 
         Args:
-            random: for the noise, so that other measurements stay the same.
+            random: generator for the noise, so that other measurements stay the same.
 
         Raises:
             InvalidValue: invalid feedback, or a value that is not finite.
@@ -280,7 +280,7 @@ class World:
         return {"property": {"quantity": quantity, "value": value, "unit": self.property_map.unit, "sample_m": [x, y]}}
 
     def saturated(self, current_a: Array, kind: str = "") -> float:
-        """Return the share of the values at which the preamplifier is saturated, in a scan or in a kind of spectrum."""
+        """Return the fraction of values at which the preamplifier saturates, in a scan or in a kind of spectrum."""
         s = self.settings
         # the preamplifier's noise is added behind the clipping in a scan, and before it in a spectrum
         limit_a = s.iv.preamplifier_a if kind else s.signals.preamplifier_a - 4.0 * s.noise.current_a
@@ -302,7 +302,7 @@ class World:
     # -- treating the tip
 
     def change_tip(self, condition: str, t_s: float) -> None:
-        """Change the tip at a time that has not passed: "sharp", "blunt", "double" or "contaminated"."""
+        """Schedule a tip change to "sharp", "blunt", "double" or "contaminated" at a time not yet passed."""
         if condition not in CONDITIONS:
             raise InvalidValue(f"a tip is not {condition!r}", hint=f"one of {', '.join(CONDITIONS)}")
         self._tip.schedule(condition, t_s)
@@ -329,9 +329,9 @@ class World:
         return outcome
 
     def crash(self, position_m: tuple[float, float], depth_m: float, speed_m_s: float, t_s: float) -> str:
-        """Drive the tip into the sample: it may cure or worsen it (`tip.crash_times`), and leaves a crater.
+        """Drive the tip into the sample: it may cure or worsen the tip (`tip.crash_times`), and leaves a crater.
 
-        A part of its depth (`tip.indented_m`) springs back. Simulated: material is pushed aside over three times the
+        A part of the depth (`tip.indented_m`) springs back. Simulated: material is pushed aside over three times the
         radius of contact, about as far as plastic flow reaches around an indenter.
 
         Args:
@@ -356,7 +356,7 @@ class World:
     def drift_m(self, t_s: ArrayLike) -> Array:
         """Return the displacement (x, y, z) of the sample: x_tip = x_sample + drift. Shape t.shape + (3,).
 
-        On a sample that turns or expands this holds at the fixed point only: see `to_sample` and `to_tip`.
+        For a sample that rotates or expands this holds only at the fixed point; use `to_sample` and `to_tip`.
         """
         return self.sample.drift.at(t_s)
 
@@ -366,7 +366,7 @@ class World:
         return self._tip.history[-1].tip
 
     def truth(self, t_s: float) -> dict[str, object]:
-        """Return the ground truth, which is never published, JSON-able: drift, tip, its changes, marks."""
+        """Return the ground truth, JSON-able: drift, tip, its changes, marks. It is never published."""
         answers = self._tip.answers(t_s)
         return {
             **({} if answers is None else {"tip_answers": answers.truth()}),

@@ -1,6 +1,6 @@
 """Conformance suites, commissioning, skeletons and a bench, for authors of drivers, components and clients.
 
-No process of a run imports this room. `Bench` is loaded when it is first used.
+No process of a run imports this package. `Bench` is loaded on first use.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ REPORT_FILE = "report.json"
 
 
 class CheckOutcome(Enum):
-    """The outcome of one check; `BLOCKED` if it needs another check that has not passed."""
+    """The outcome of a check; `BLOCKED` if a required check has not passed."""
 
     PASSED = "passed"
     FAILED = "failed"
@@ -60,7 +60,7 @@ class Failed(CheckEnded, AssertionError):
     """The exception that the program under test behaves differently from the requirement.
 
     Args:
-        expected, came: in a physicist's words, without a full stop.
+        expected, came: expectation and observation in a physicist's words, without a full stop.
     """
 
     outcome = CheckOutcome.FAILED
@@ -98,7 +98,7 @@ class CheckResult:
     Attributes:
         line: expectation and observation, or the reason for skipping.
         complaints: the evidence of a failed check: warnings and errors logged meanwhile, the remedy.
-        real_s: its duration.
+        real_s: duration of the check.
     """
 
     name: str
@@ -121,14 +121,14 @@ def near(a: float, b: float, relative: float = 1e-3, absolute: float = 0.0) -> b
 
 @dataclass(frozen=True)
 class Check:
-    """One requirement.
+    """A requirement and the function that checks it.
 
     Attributes:
         name: "scan/cancel": the subject, and the requirement.
         title: a sentence that is true of a program that passes.
         do: takes the suite's fixture; raises a CheckEnded, or returns a remark on a pass.
         needs: actions and parameters required by the check.
-        remedy: what to do if it fails.
+        remedy: advice for a failed check.
     """
 
     name: str
@@ -162,14 +162,14 @@ class Suite(Generic[K]):
         self._checks: list[K] = []
 
     def add(self, check: K) -> None:
-        """Add a check; the checks of a module are run in the order of their addition."""
+        """Add a check; the checks of a module run in the order of their addition."""
         self._checks.append(check)
 
     def checks(self, only: Collection[str] = ()) -> tuple[K, ...]:
-        """Return the checks with one of `only` in their names; all of them, if it is empty.
+        """Return the checks whose names contain one of `only`; all checks if it is empty.
 
         Raises:
-            ConfigError: there are none.
+            ConfigError: no check has such a name.
         """
         for module in self._modules:
             import_module(module)
@@ -196,7 +196,7 @@ class Fixture(Protocol[K_contra]):
 
         Raises:
             Skipped: the program is not at fault.
-            Lost: there can be no next check.
+            Lost: no further check is possible.
         """
 
 
@@ -226,7 +226,7 @@ class SuiteReport:
 
     Attributes:
         lost: why the checks could not be finished; empty if they were.
-        folder: of this run, with its log and files; empty before it is created.
+        folder: folder of this run, with its log and files; empty before it is created.
     """
 
     folder: str = ""
@@ -237,7 +237,7 @@ class SuiteReport:
 
     @property
     def passed(self) -> bool:
-        """True if no check failed; an unsupported action is no fault."""
+        """True if checks ran, none failed and none was prevented by a lost process."""
         return bool(self.results) and not (self.failed or self.lost)
 
     @property
@@ -255,7 +255,7 @@ class SuiteReport:
         return {}
 
     def to_json(self) -> str:
-        """Return the report for programs: `passed`, the checks, and the facts about the program."""
+        """Return the report as JSON: `passed`, the checks, and the facts about the program."""
         facts: dict[str, object] = {
             "passed": self.passed,
             "afspm": self.afspm,
@@ -290,7 +290,7 @@ class SuiteReport:
 
     @contextmanager
     def written(self) -> Iterator[None]:
-        """Write `report.json` into the folder at the end of the block, with the reason of an early end."""
+        """Write `report.json` at the end of the `with` block, with the reason of an early end."""
         try:
             yield
         except Lost as lost:
@@ -305,7 +305,11 @@ class SuiteReport:
     def run(
         self, checks: Iterable[K], fixture: Fixture[K], done: Callable[[CheckResult], None] = lambda result: None
     ) -> None:
-        """Run checks in order; `done` is called with each result. Raises Lost."""
+        """Run checks in order; `done` is called with each result.
+
+        Raises:
+            Lost: no further check is possible.
+        """
         for check in checks:
             result = attempt(check, fixture)
             self.results.append(result)
@@ -322,12 +326,12 @@ _MARKS = {CheckOutcome.PASSED: ("✓", "green"), CheckOutcome.FAILED: _FAILED}
 
 
 def mark(outcome: CheckOutcome) -> tuple[str, str]:
-    """Return the mark of an outcome, and its style in a terminal."""
+    """Return the symbol of an outcome, and its style in a terminal."""
     return _MARKS.get(outcome, _OTHERWISE)
 
 
 def show_result(result: CheckResult, console: Console) -> None:
-    """Print one check, with the line and the complaints below it."""
+    """Print a check's result, with its line and complaints below."""
     symbol, style = mark(result.outcome)
     text = Text.assemble((symbol, style), f" {result.name:{NAME_WIDTH}} ", (result.title, "dim"))
     for line in filter(None, (result.line, *result.complaints)):
@@ -336,7 +340,7 @@ def show_result(result: CheckResult, console: Console) -> None:
 
 
 def show_verdict(report: SuiteReport, verdict: str, console: Console) -> None:
-    """Print the verdict of all checks in a line, and the run's folder."""
+    """Print the verdict of all checks on one line, and the run folder."""
     if report.lost:
         console.print(Text(f"not completed: {report.lost}", "bold red"), soft_wrap=True)
     line = f"{report.counts or 'nothing checked'}{verdict}"

@@ -1,4 +1,4 @@
-"""Translator, scheduler and emulated controller as real processes: started, killed for a check, and ended."""
+"""Translator, scheduler and emulated controller as real processes, which checks can start, kill and restart."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ ASKED_S, KILLED_S = 5.0, 3.0
 
 
 class Processes:
-    """Running processes; the end of one without a request is an error.
+    """Running processes; an unrequested end of a process is an error.
 
     Args:
         log: receives their output.
-        woken: called, from any thread, after one of them has ended.
+        woken: called, from any thread, after the end of a process.
         complaints: receives their warnings and errors, each with the name of its process.
     """
 
@@ -54,13 +54,17 @@ class Processes:
         self._await(KILLED_S, lambda: name in self._ended)
 
     def start_again(self, name: str) -> None:
-        """Start a process that has ended. Raises AfspmError: it can't be started."""
+        """Start a process that has ended.
+
+        Raises:
+            AfspmError: the process can't be started.
+        """
         del self._ended[name]
         self.start([self._starts[name]])
 
     @property
     def ended(self) -> str:
-        """A text about all ended processes; empty while all run."""
+        """A description of all ended processes; empty while all run."""
         return "; ".join(f"the process {name} {how}" for name, how in self._ended.items())
 
     @property
@@ -70,7 +74,7 @@ class Processes:
         return "; ".join(f"{name}: {error}" for name, error in errors.items() if error)
 
     def close(self) -> None:
-        """Ask all running processes to end, and kill the remaining ones."""
+        """Request the end of all running processes, and kill any that remain."""
         for process in self._running.values():
             process.close_stdin()
         self._await(ASKED_S, self._all_ended)

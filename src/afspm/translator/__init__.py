@@ -1,14 +1,14 @@
 """The Microscope Translator: the process between the scheduler and one microscope, around a maker's `Driver`.
 
-**Theory of operation.** One loop waits for requests and for the next look at the controller.
+**Theory of operation.** One loop waits for requests and for the next reading of the controller.
 
-    comes in      requests of the scheduler; readings of the driver from the controller
+    inputs        requests of the scheduler; readings of the driver from the controller
     state         the last observed state of the microscope; answers to recent requests; finished scans not yet
                   published (all on disk)
-    goes out      commands to the controller; states, settings, scans and spectra as packets
-    always holds  a request is checked as a whole before anything is set; none is executed twice; only one scheduler is
-                  obeyed (`fencing`); a result is published once, also over a kill (`outbox`); when no process is left
-                  to command, the measurement is stopped and the tip is safe (`safe_exit`)
+    outputs       commands to the controller; states, settings, scans and spectra as packets
+    invariants    a request is checked as a whole before anything is set; no request is executed twice; only one
+                  scheduler is obeyed (`fencing`); a result is published once, even after a kill (`outbox`); when no
+                  process is left to command, the measurement is stopped and the tip is safe (`safe_exit`)
 
 A driver (`driver`) reads and sets the parameters of its table (`parameters`), starts and stops measurements, and
 returns their results. It may fail at any time with `ControllerLost`; the translator reconnects.

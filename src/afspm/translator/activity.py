@@ -1,18 +1,18 @@
-"""`Activity`: the measurement that runs at a maker's program, from its start to its file.
+"""`Activity`: the measurement that runs in a maker's program, from its start to its file.
 
 Theory of operation. A program is polled (`status`), and most programs do not report that a measurement began or ended.
 The life of a measurement is the same with all of them:
 
 | step | by |
 | --- | --- |
-| it begins: on request, or at the panel, where only the next look shows it | `begin`, `follow` |
+| it begins: on request, or at the panel, where only the next poll shows it | `begin`, `follow` |
 | it settles: a request is answered once the measurement is seen running, or its file exists | `settle` |
 | it ends: no measurement is seen running any more, and its file is awaited | `follow`, `end` |
 | it is stopped on request: a measurement that still runs for a moment is not a new one, and has no result | `stopped` |
 | an interruption or a failure is reported once as INTERRUPTED | `at_rest` |
 
-A curve may have to wait for the tip to arrive at its place (`curve_awaited`), and a command may last as long as the
-measurement itself (`call`). A maker's driver decides how to see a running measurement, and records it with the files.
+A curve may have to wait until the tip arrives at its position (`curve_awaited`), and a command may last as long as the
+measurement itself (`call`). A maker's driver detects a running measurement and records it with the files.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from afspm.translator.result_files import SCAN, ResultFiles
 
 
 class Activity(ABC):
-    """The running measurement, begun by a request or at the program's panel.
+    """A running measurement, started by a request or at the program's panel.
 
     Args:
         files: the awaited results.
 
     Attributes:
-        call: the command that lasts as long as its measurement; None: there is none.
+        call: the command that lasts as long as its measurement; None without one.
         curve_awaited: the kind of the curve that starts once the tip has arrived; empty: none.
     """
 
     program: ClassVar[str]
     """The name of the program, for messages."""
     settles_s: ClassVar[float] = 0.0
-    """Real time until a started measurement must be seen running."""
+    """Longest real time until a started measurement is running."""
     call_failures: ClassVar[tuple[type[AfspmError], ...]] = ()
     """The errors that a failed `call` raises."""
 
@@ -60,7 +60,7 @@ class Activity(ABC):
 
     @abstractmethod
     def begin(self, what: str) -> None:
-        """Record the start of a measurement, with the values in force. `what` is `SCAN`, or the kind of a curve."""
+        """Record the start of a measurement and its settings. `what` is `SCAN`, or the kind of a curve."""
 
     @abstractmethod
     def end(self) -> None:
@@ -73,7 +73,7 @@ class Activity(ABC):
     # --- the life of a measurement ---
 
     def follow(self, what: str) -> None:
-        """Compare with the program: end a measurement that stopped running, and begin one started at the panel.
+        """Compare with the program: record the end of a measurement, and the start of one at the panel.
 
         Args:
             what: `SCAN`, the kind of a curve, or empty.
@@ -86,7 +86,7 @@ class Activity(ABC):
             self.begin(what)
 
     def settle(self, what: str, is_seen: Callable[[], bool]) -> None:
-        """Wait until the started measurement is seen running, or has ended already: its file exists.
+        """Wait until the started measurement is running, or has already produced its file.
 
         Raises:
             Refused: ACTION_ERROR: the program did not start it, and reported no error.
@@ -137,7 +137,11 @@ class Activity(ABC):
     # --- commands that take as long as what they do ---
 
     def watched_call(self) -> LongCall | None:
-        """Return the call while it goes on; log a call that has failed. Raises ControllerLost."""
+        """Return the running call, or None; log a failed call.
+
+        Raises:
+            ControllerLost
+        """
         call = self.call
         if call is None:
             return None
@@ -175,11 +179,11 @@ class TipWay:
 
     @property
     def arrives_s(self) -> float:
-        """Experiment time of the arrival, at the latest."""
+        """The latest arrival, in experiment time."""
         return float(self._kept.get("arrives_s", 0.0))
 
     def sets_out(self, lasts_s: float, *, after_last_way: bool = False) -> None:
-        """Record a move of `lasts_s` that starts now, or after the move in progress (`after_last_way`)."""
+        """Record a move of `lasts_s` that starts now, or after the present move (`after_last_way`)."""
         now_s = self._clock.now_s()
         self._kept["arrives_s"] = (max(now_s, self.arrives_s) if after_last_way else now_s) + lasts_s
 

@@ -1,4 +1,4 @@
-"""Executes requests: checks everything first, then has the driver do it."""
+"""Execution of requests: check everything first, then call the driver."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class CommandOutcome:
     """The response to a request, with its consequences.
 
     Attributes:
-        steps: to publish after the response.
-        announce: messages to publish even if nothing in them changed: the peer waits for them.
+        steps: steps to publish after the response.
+        announce: messages to publish even if unchanged: the peer waits for them.
     """
 
     response: Response
@@ -41,11 +41,11 @@ class CommandOutcome:
 
 
 class Commands:
-    """The executor of requests at one microscope.
+    """The executor of requests to one microscope.
 
     Args:
-        sequence: knows whether the microscope is free, and in which order states are published.
-        about_to_act: called right before the first step that can't be undone.
+        sequence: decides whether the microscope is free, and the order of published states.
+        about_to_act: called right before the first step that cannot be undone.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The connection to the controller: made, lost, and retried."""
+"""The connection to the controller, with retries after a loss."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ class Connection:
     """The connection of a driver to its controller; it decides which errors mean that the controller is lost.
 
     Args:
-        controller: the emulator of this run, in whose place no other controller is ever reached; None: the driver
-            knows the address of its controller.
+        controller: the emulator of this run, the only controller to connect to; None: the driver knows the
+            address of its controller.
         on_lost: called to publish the loss.
 
     Attributes:
         is_reached: True while the driver is connected.
-        stands: True while it is connected, and its state is observed.
+        stands: True while the driver is connected, and its state is observed.
         why_lost: the reason of the last loss.
-        ever_stood: True from the first time that it stood.
+        ever_stood: True once `stands` has been True.
     """
 
     def __init__(
@@ -63,7 +63,11 @@ class Connection:
         return True
 
     def reach(self) -> None:
-        """Connect at once, unless connected. Raises the errors of `LOST`."""
+        """Connect at once, unless connected.
+
+        Raises:
+            an error in `LOST`.
+        """
         if self.is_reached:
             return
         if self._controller is None:

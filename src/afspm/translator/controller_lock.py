@@ -1,4 +1,4 @@
-"""One run at a time commands a controller: its translator holds a lock, which ends with its process."""
+"""A lock on a controller, held by one run's translator process until the process ends."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class ControllerTaken(AfspmError):
 
 @contextlib.contextmanager
 def commanding(address: str, run: str) -> Iterator[None]:
-    """Give this process the only right, on this computer and among all users, to command the controller.
+    """Lock the controller for this process against all processes and users of this computer.
 
     Args:
-        address: of the controller; empty: no other process can command it (a simulated one).
-        run: the name of this run, for the refusal of others.
+        address: address of the controller; empty: no other process can command it (a simulated one).
+        run: the name of this run, shown to refused runs.
 
     Raises:
         ControllerTaken: another process commands it.

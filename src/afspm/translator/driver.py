@@ -1,4 +1,4 @@
-"""`Driver`: the class to write for a new controller. The `Translator` does everything else, once for all makers."""
+"""`Driver`: the base class for drivers of new controllers. The `Translator` does everything else."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Driver(DriverBase):
     __doc__ = DriverBase.__doc__
 
     def run_process(self, context: ProcessContext) -> int:
-        """Run the translator of an experiment (called by the host of processes)."""
+        """Run the translator of an experiment. Called by the host of processes."""
         from afspm.translator.translator import run_translator
 
         return run_translator(self, context)

@@ -26,13 +26,17 @@ MEASURING = frozenset({ScopeState.SCANNING, ScopeState.SPEC})
 
 
 class ControllerLost(AfspmError):
-    """The error that the controller can't be reached: the translator refuses requests with this reason, and retries."""
+    """The error that the controller is unreachable: the translator refuses requests with this reason, and retries."""
 
     code = "controller-lost"
 
 
 def connected(link: T | None, program: str, address: str = "") -> T:
-    """Return the connection to a maker's program. Raises ControllerLost: there is none (None)."""
+    """Return the connection to a maker's program.
+
+    Raises:
+        ControllerLost: the connection is None.
+    """
     if link is None:
         raise ControllerLost(f"{program} is not connected", where=address)
     return link
@@ -44,14 +48,14 @@ LOST = (ControllerLost, ConnectionError, TimeoutError)
 
 @dataclass(frozen=True)
 class Action:
-    """One generic action of a microscope.
+    """A generic action of a microscope.
 
     Attributes:
         name: the generic name, e.g. "start-scan".
         do: starts the action and returns at once; `Driver.status` shows its effect.
-        state: the state of the microscope once the action is accepted, until `status` reports another.
-        while_busy: it is accepted while the microscope is not free.
-        interrupts: the states that it interrupts.
+        state: the state of the microscope after the action is accepted, until `status` reports another.
+        while_busy: the action is accepted while the microscope is not free.
+        interrupts: the states that the action interrupts.
     """
 
     name: str
@@ -94,8 +98,8 @@ def action(name: str, *, state: ScopeState | None = None, while_busy: bool | Non
     """Mark a method of a `Driver` as the generic action `name`.
 
     Args:
-        state: the state of the microscope once the action is accepted; known for the base actions.
-        while_busy: it is accepted while the microscope is not free; known for the base actions.
+        state: the state of the microscope after the action is accepted; known for the base actions.
+        while_busy: the action is accepted while the microscope is not free; known for the base actions.
     """
     known = _KNOWN.get(name, Action(name, _not_implemented))
     mark = replace(
@@ -112,7 +116,7 @@ def action(name: str, *, state: ScopeState | None = None, while_busy: bool | Non
 
 
 class Introduction(Protocol):
-    """The first lines of a connection, which are not in a trace, since they prove a secret.
+    """The authentication at the start of a connection; not traced, since it proves a secret.
 
     Attributes:
         is_over: True once both sides have proven that they know the secret.
@@ -121,7 +125,7 @@ class Introduction(Protocol):
     is_over: bool
 
     def reply_to(self, line: bytes) -> str:
-        """Return the controller's answer to a line; empty: hang up."""
+        """Return the controller's answer to a line; empty to disconnect."""
 
 
 @dataclass(frozen=True)
@@ -189,16 +193,16 @@ class DriverBase(ABC):
     translated: ClassVar[Collection[str]] = ()
     """The parameters that `read` and `write` of the class translate, rather than `get` and `set` by a row."""
     eager_poll_s: ClassVar[float] = EAGER_S
-    """Real seconds between two looks when a scan may end at any moment."""
+    """Real seconds between two polls when a scan may end at any moment."""
     max_pixels: ClassVar[int] = 4096 * 4096
     live_real_s: ClassVar[float | None] = None
-    """Real seconds between the lines of a running scan where `live_lines_s` is not given; None: none are published."""
+    """Real seconds between publications of a running scan's lines if `live_lines_s` is not given; None: never."""
     maker: ClassVar[str] = ""
     """The company or project that makes the controller, for the files of a run."""
     software: ClassVar[str] = ""
     """The controller's program, for the files of a run."""
     simulated: ClassVar[bool] = False
-    """No tip can break: the experiment's clock may run at another speed than real time."""
+    """True if no real tip can break, so that the experiment's clock may differ from real time."""
     memory_is_all: ClassVar[bool] = False
     """The microscope (a simulated one) has no state outside `memory`: an action that is not in there was not done."""
 
@@ -235,15 +239,15 @@ class DriverBase(ABC):
         self._last_written: dict[str, Value] = {}
 
     def patience_s(self, of_s: float) -> float:
-        """Return how long to wait, in experiment seconds, for a step that takes the controller `of_s` at most.
+        """Return the time to wait for a step that takes the controller at most `of_s` (experiment seconds).
 
-        It is at least `program_s` of real time: a fast clock leaves the program of an emulated controller little of it.
+        It is at least `program_s` of real time: with a fast clock an emulated controller needs more experiment time.
         """
         return max(of_s, self.program_s / self.clock.real_s(1.0))
 
     @classmethod
     def rows(cls, settings: PlainMapping) -> Mapping[str, Mapping[str, object]]:
-        """Return the rows that these settings add to the table, or change in it."""
+        """Return the rows that these settings add to the table or change."""
         return settings.get("parameters") or {}
 
     @classmethod
@@ -258,7 +262,7 @@ class DriverBase(ABC):
 
     @classmethod
     def introductions(cls) -> Callable[[str], Introduction] | None:
-        """Return a factory of introductions by address, for the replay of a trace; None: there is no secret.
+        """Return a factory of introductions by address, for the replay of a trace; None without a secret.
 
         Raises:
             OSError, ValueError: the secret can't be read.
@@ -267,12 +271,12 @@ class DriverBase(ABC):
 
     @classmethod
     def technique(cls, settings: Mapping[str, object]) -> str:
-        """Return STM or AFM, if these settings always give the same; else an empty text."""
+        """Return STM or AFM if the settings determine the technique; otherwise an empty text."""
         return ""
 
     @classmethod
     def excused(cls, controller: str) -> Mapping[str, str]:
-        """Return the checks of the conformance suite that a controller itself makes impossible, with the reason.
+        """Return the conformance checks that a controller cannot pass, with the reasons.
 
         Args:
             controller: its name and version, as in `x-controller`.
@@ -284,7 +288,7 @@ class DriverBase(ABC):
         """Connect to the controller. Called at the start, and again after a `ControllerLost`."""
 
     def close(self) -> None:  # noqa: B027 (many have nothing to close)
-        """Close the connection to the controller. The tip stays as it is."""
+        """Close the connection to the controller; the tip does not move."""
 
     @abstractmethod
     def status(self) -> ScopeStatus:
@@ -296,40 +300,40 @@ class DriverBase(ABC):
 
     @abstractmethod
     def set(self, values: Mapping[str, Value]) -> None:
-        """Set parameters together, by the vendor's names, in the vendor's units. All or none, if possible."""
+        """Set parameters together by the vendor's names, in the vendor's units; all or none if possible."""
 
     @abstractmethod
     def results(self) -> Sequence[str]:
-        """Return the finished scans and spectra, oldest first: as a rule the names of the controller's files.
+        """Return the finished scans and spectra, oldest first, usually as names of the controller's files.
 
-        The translator remembers, also over a restart, which ones it has published.
+        The translator remembers, also after a restart, which results it has published.
         """
 
     @abstractmethod
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
-        """Read one of `results`: every channel of a scan, or a spectrum, with the parameters it was taken with.
+        """Read a result: all channels of a scan, or a spectrum, with the settings of the measurement.
 
         Raises:
-            FileError: it is incomplete; `load` is called again until `result_timeout_s` is over.
+            FileError: the file is incomplete; `load` is called again until `result_timeout_s` is over.
         """
 
     def followed(self) -> bool | None:
-        """Return the outcome of a measurement whose end `status` missed, since another one followed at once.
+        """Return the outcome of a measurement that `status` missed, because the next followed at once.
 
         Override where a panel can repeat scans. Called after `results`, which must list the measurement by then.
 
         Returns:
-            once for each such measurement: True if it was complete, False if it was interrupted; None: there was none.
+            once for each such measurement: True if it was complete, False if it was interrupted; None without one.
         """
         return None
 
     def lines(self, start: int) -> Sequence[ScanLines]:
-        """Return the complete lines of a running scan beyond the first `start`, in the order of scanning.
+        """Return the complete lines of a running scan after the first `start`, in the order of scanning.
 
-        To be written where the controller has them during the scan (`live_lines_s`).
+        Override where the controller provides lines during the scan (`live_lines_s`).
 
         Returns:
-            for each channel the same lines, rows and columns ascending; nothing while there are no new ones.
+            for each channel the same lines, rows and columns ascending; empty without new lines.
         """
         return ()
 
@@ -338,13 +342,13 @@ class DriverBase(ABC):
         raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, f"{type(self).__name__} does not take commands as text")
 
     def next_change_s(self) -> float | None:
-        """Return the experiment time of the next known change; None: nothing is known."""
+        """Return the experiment time of the next known change; None if unknown."""
         return None
 
     def read(self, wanted: Collection[str]) -> dict[str, Value]:
-        """Return the values of parameters by their generic names, in SI; others may be among them.
+        """Return the values of parameters by their generic names, in SI; the result may contain other parameters.
 
-        To be overridden only where neither the table nor `groups` can describe the controller's form.
+        Override only where neither the table nor `groups` can describe the controller's form.
         """
         found: dict[str, Value] = {}
         for group in self.groups:
@@ -353,11 +357,11 @@ class DriverBase(ABC):
         return found | self.read_rows([name for name in wanted if name not in found])
 
     def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
-        """Read parameters that the table alone describes."""
+        """Read parameters that need only the table."""
         return {name: self.table[name].from_vendor(self.get(self.table[name].vendor)) for name in wanted}
 
     def write(self, values: Mapping[str, Value]) -> None:
-        """Set parameters by their generic names, in SI: each group at once, in their order, and then the rest."""
+        """Set parameters by generic names, in SI: each group together and in order, then the rest."""
         left = dict(values)
         for group in self.groups:
             asked = {name: left.pop(name) for name in group.names if name in left}
@@ -367,13 +371,13 @@ class DriverBase(ABC):
             self.write_rows(left)
 
     def write_rows(self, values: Mapping[str, Value]) -> None:
-        """Set parameters that the table alone describes."""
+        """Set parameters that need only the table."""
         self.set({self.table[name].vendor: self.table[name].to_vendor(value) for name, value in values.items()})
 
     def wait_for(self, condition: Callable[[], bool], at_most_s: float) -> bool:
-        """Poll the controller until a condition holds. Return False if it does not within `at_most_s`, real time.
+        """Poll the controller until a condition holds. Return False after `at_most_s` of real time.
 
-        There is no pause between two polls: each takes as long as the controller's answer.
+        There is no pause between polls: each takes as long as the controller's answer.
         """
         until_s = self.clock.monotonic_s() + at_most_s
         while not (holds := condition()) and self.clock.monotonic_s() < until_s:
@@ -386,17 +390,17 @@ class DriverBase(ABC):
         self.for_a_while({names.TIP_BIAS_VOLTAGE: wanted[names.PULSE_VOLTAGE]}, float(wanted[names.PULSE_DURATION]))
 
     def same(self, name: str, a: Value, b: Value, among: Mapping[str, Value]) -> bool:
-        """Return True if two values of a parameter are equal to the controller's precision.
+        """Return whether two values of a parameter are equal within the controller's precision.
 
-        To be overridden only where a `resolution` in the table can't describe the precision.
+        Override only where a `resolution` in the table can't describe the precision.
 
         Args:
-            among: the values that `a` was read with.
+            among: the values that were read together with `a`.
         """
         return self.table[name].same(a, b)
 
     def in_force(self, wanted: Collection[str]) -> dict[str, Value]:
-        """Return the values of `read`; one that equals the value set last, within the precision, is replaced by it.
+        """Return the values of `read`, each replaced by the last set value if equal within the precision.
 
         Raises:
             InvalidValue: the controller returned a number that is not finite, which can't be published.
@@ -414,9 +418,9 @@ class DriverBase(ABC):
         }
 
     def put_in_force(self, values: Mapping[str, Value]) -> None:
-        """Write values, and remember them.
+        """Write values and remember them.
 
-        Feedback is switched on after everything else is written, and off before: it must not act on the former values.
+        Feedback is switched on after all other values are written, and off before: it must not act on old values.
         """
         rest = {name: value for name, value in values.items() if name != names.FEEDBACK_ON}
         parts = [rest] if rest else []

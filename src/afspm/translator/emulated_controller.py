@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from afspm.translator.driver_base import DriverBase
 
 _LOCKED_BYTES = 1
-"""Windows lets no other process read locked bytes: the text begins behind them."""
+"""Number of locked bytes before the text: on Windows no other process can read locked bytes."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Listening:
 
 
 class AddressNotice:
-    """The published address of an emulated controller, valid as long as the emulator's process lives.
+    """The published address of an emulated controller, valid while the emulator's process runs.
 
     Args:
         file: see `notice_file`.
@@ -54,7 +54,7 @@ class AddressNotice:
         self.tell("")
 
     def tell(self, address: str) -> None:
-        """Write the address of the controller; an empty one means that the controller does not listen."""
+        """Write the address of the controller; an empty address means that it does not listen."""
         text = json.dumps({"address": address, "run": self._run, "life": os.urandom(8).hex()})
         self._file.truncate(0)
         self._file.write(b" " * _LOCKED_BYTES + text.encode())
@@ -65,12 +65,12 @@ class AddressNotice:
 
 
 class EmulatedController:
-    """The emulator that a translator is connected to, found by its notice.
+    """The emulator to which a translator connects, found by its notice.
 
     Args:
-        name: of the emulator's process.
+        name: name of the emulator's process.
         file: see `notice_file`.
-        run: the identity of the run, which the emulator must have, too.
+        run: the identity of the run, which must equal the emulator's.
     """
 
     def __init__(self, name: str, file: Path, run: str) -> None:
@@ -96,7 +96,7 @@ class EmulatedController:
         """Check that the connected emulator still listens at the same address.
 
         Raises:
-            ControllerLost: it does not.
+            ControllerLost: the emulator has ended, restarted or moved.
         """
         if self._reached is None or self._find() != self._reached:
             what = "the emulated controller was restarted, or moved to another address"
@@ -129,7 +129,7 @@ def notice_file(state_dir: str, name: str) -> Path:
 
 
 def wired_to(launch: Launch, microscope: DriverBase) -> EmulatedController | None:
-    """Return the emulator that a translator may connect to; None: the controller in its settings, or none at all.
+    """Return the emulator that a translator must connect to; None for a real controller or none.
 
     Raises:
         ConfigError: the experiment is simulated, and the controller in the settings is not proved to be an emulator.

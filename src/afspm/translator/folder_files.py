@@ -22,11 +22,11 @@ from afspm.translator.result_files import (
 
 
 class FolderFiles(ResultFiles):
-    """The running measurement, or the one just ended, and the results.
+    """The running or last measurement and the results of a controller, as files in a folder.
 
     Attributes:
-        pattern: of the names of its files, as in `Path.glob`.
-        precision: of its files.
+        pattern: pattern of the file names, as in `Path.glob`.
+        precision: precision of the numbers in the files.
     """
 
     pattern: str = "*"

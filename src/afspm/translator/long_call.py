@@ -1,4 +1,4 @@
-"""`LongCall`: a command that runs until the instrument is done, on a connection of its own."""
+"""`LongCall`: a command that runs until the instrument is done, on a separate connection."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ class LongLink(Protocol):
     """A connection on which a command is running."""
 
     def reply(self, what: str) -> tuple[bool, Any]:
-        """Return whether the reply has arrived, and its content. Raises the controller's error, or ControllerLost."""
+        """Return whether the reply has arrived, and its content.
+
+        Raises:
+            the controller's error, or ControllerLost.
+        """
 
     def close(self) -> None:
         """Close the connection."""
@@ -21,10 +25,10 @@ class LongCall:
 
     Args:
         what: the command, in words.
-        is_unfinished: decides from the content of the reply whether the instrument still goes on.
+        is_unfinished: decides from the content of the reply whether the instrument still runs.
 
     Attributes:
-        value: the content of the reply, once it has come.
+        value: the content of the reply, after its arrival.
     """
 
     def __init__(self, what: str, link: LongLink, is_unfinished: Callable[[Any], bool] = lambda value: False) -> None:
@@ -34,7 +38,11 @@ class LongCall:
         self._came = False
 
     def running(self) -> bool:
-        """Return whether the command is still running. Raises the controller's error, or ControllerLost."""
+        """Return whether the command is still running.
+
+        Raises:
+            the controller's error, or ControllerLost.
+        """
         if not self._came:
             self._came, self.value = self._link.reply(self.what)
         return not self._came or self._is_unfinished(self.value)

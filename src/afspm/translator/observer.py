@@ -1,4 +1,4 @@
-"""Observes the controller and publishes every change, made by a request or at the panel."""
+"""Observation of the controller; publishes every change by a request or at the panel."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from afspm.transport.port import ServerPort
 
 
 class Observer:
-    """The observer that reads values, status and results of the controller, and publishes them in order.
+    """An observer that reads values, status and results of the controller, and publishes them in order.
 
     Attributes:
-        values: in force at the last look.
+        values: values at the last reading.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Observer:
         self._replayed = False
 
     def begin(self) -> None:
-        """Publish everything in force after connecting; after a restart, the last results first."""
+        """Publish the last results (after a restart), then all present settings and the state."""
         if not self._replayed:
             self._replayed = True
             for packet in self._outbox.start():
@@ -65,7 +65,7 @@ class Observer:
         self.publish_all()
 
     def look(self) -> None:
-        """Publish the changes at the controller since the last look."""
+        """Read the controller, and publish the changes since the last reading."""
         published = self._state.sequence.published
         self._temporary.end_if_due()
         if self._clock.monotonic_s() >= self._all_at_s:
@@ -77,7 +77,7 @@ class Observer:
             self._port.publish(name, payload, self._state.stamp()[0], keep=False)
 
     def wait_s(self) -> float:
-        """Return the real seconds until the next look is due."""
+        """Return the real seconds until the next reading is due."""
         real_now_s, now_s = self._clock.monotonic_s(), self._clock.now_s()
         wait_s = min(self._polling.wait_s(real_now_s), self._all_at_s - real_now_s)
         sequence_s = self._state.sequence.deadline_s()
@@ -92,7 +92,7 @@ class Observer:
         """Publish all changes.
 
         Args:
-            announce: messages to publish even if nothing in them changed.
+            announce: messages to publish even if unchanged.
             values: False leaves out the settings, which take one question for each parameter.
             status: the status just read, since a driver reports an interruption only once; None: read it.
         """
@@ -114,9 +114,9 @@ class Observer:
     def play(self, steps: Sequence[SequenceStep]) -> None:
         """Carry out the steps of a status sequence: save all their changes at once, then publish.
 
-        A process killed in between publishes the results again, at the same times, before the state that follows them.
-        If that state were saved first, a restarted process would publish it without the results, and a component that
-        waits for the scan would start it a second time.
+        A process killed in between publishes the results again, at the same times, before the next state. If that
+        state were saved first, a restarted process would publish it without the results, and a component that waits
+        for the scan would start it a second time.
         """
         if not steps:
             return
@@ -139,7 +139,7 @@ class Observer:
                 self._adapt_polling(step.status.state)
 
     def publish_all(self) -> None:
-        """Publish everything in force, for a scheduler that has just connected."""
+        """Publish all present settings and states, for a newly connected scheduler."""
         for thing in setting_groups.messages(self.values).values():
             self.publish(thing)
         published = self._state.sequence.published
@@ -226,7 +226,7 @@ class LiveLines:
     """A reader of new lines of the running scan. Times are in experiment seconds.
 
     Args:
-        microscope: its `live_lines_s` decides how often its lines are read.
+        microscope: its `live_lines_s` sets the interval between readings of lines.
     """
 
     def __init__(self, microscope: DriverBase) -> None:
@@ -235,20 +235,20 @@ class LiveLines:
         self._began_ns = 0
         self._lines = 0
         self.due_s: float | None = None
-        """When to `look` next; None: not before another scan begins."""
+        """Time of the next `look`; None until another scan begins."""
 
     def begin(self, now_ns: int) -> None:
-        """Start with a new scan."""
+        """Start reading the lines of a new scan."""
         if self._every_s is not None:
             self._began_ns, self._lines = now_ns, 0
             self.due_s = now_ns / NS_PER_S + self._every_s
 
     def end(self) -> None:
-        """Stop reading: the scan is over, and only its file follows."""
+        """Stop reading lines, at the end of the scan."""
         self.due_s = None
 
     def look(self, now_s: float) -> list[tuple[str, bytes]]:
-        """Return the messages with the new lines, if they are due."""
+        """Return the messages with the new lines if they are due."""
         if self._every_s is None or self.due_s is None or now_s < self.due_s:
             return []
         self.due_s = now_s + self._every_s

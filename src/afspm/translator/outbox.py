@@ -1,7 +1,7 @@
-"""Finished scans and spectra on their way out: each is published once, also over a kill of the process.
+"""Publication of finished scans and spectra, each once, even if the process is killed.
 
-A subscriber recognises a duplicate by its time. So the times are saved before anything is published; after a kill in
-between the same results are published again at the same times.
+A subscriber recognises a duplicate by its time. So the times are saved before publishing; after a kill in between, the
+same results are published again at the same times.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ class Outgoing(NamedTuple):
 
 
 class Outbox:
-    """New results of the controller, read and made into packets.
+    """New results of the controller, converted to packets.
 
     Args:
-        microscope: has the results.
+        microscope: the driver that lists and loads the results.
         kept: the outbox's part of the translator's memory; the memory's owner saves it.
         stamp: returns `count` strictly increasing times, ns.
     """
@@ -52,10 +52,10 @@ class Outbox:
         self._complained: set[str] = set()
 
     def start(self) -> list[Outgoing]:
-        """Return the packets to publish again after connecting. Results from before the experiment are ignored.
+        """Return the packets to publish again after connecting; results from before the experiment are ignored.
 
         Returns:
-            the packets of the last results, which an earlier process has published or was going to.
+            the packets of the last results, which an earlier process may have published.
         """
         # at the first start of the experiment, all results listed are older
         if "known" not in self._kept:
@@ -72,7 +72,7 @@ class Outbox:
         return again
 
     def look(self) -> bool:
-        """Return True if there are new results that can be read."""
+        """Read new results; return True if there are any."""
         listed = list(self._microscope.results())
         known = set(self._kept["known"])
         new = [result for result in listed if result not in known]
@@ -84,7 +84,7 @@ class Outbox:
         return bool(self._read)
 
     def take(self) -> list[Outgoing]:
-        """Return the packets of the new results, to be published after the memory was saved."""
+        """Return the packets of the new results; save the memory before publishing them."""
         packets = []
         for result, messages in self._read.items():
             # one time each: subscribers recognise a duplicate by its time

@@ -39,7 +39,7 @@ class FileFacts:
 
 
 def encode_scan(region: Region, channels: Mapping[str, tuple[str, np.ndarray]], facts: FileFacts) -> bytes:
-    """Return a scan file: a variable over (y, x) per channel; x and y are those of the unrotated frame."""
+    """Return a scan file with a variable over (y, x) per channel; axes of the unrotated frame."""
     rows, columns = next(iter(channels.values()))[1].shape
     (left, low), (width, height) = region.top_left_m, region.size_m
     variables = {

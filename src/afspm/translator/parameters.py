@@ -35,7 +35,7 @@ def refuse_value(name: str, reason: str) -> Refused:
 
 @dataclass(frozen=True)
 class ParameterSpec:
-    """One parameter of one microscope: a row of its table.
+    """A parameter of a microscope: a row of its table.
 
     Attributes:
         name: the generic name, e.g. "scan-speed".
@@ -44,10 +44,10 @@ class ParameterSpec:
         type: "float", "int", "bool" or "text".
         range: the smallest and largest value accepted, in SI.
         choices: the texts accepted; empty: any.
-        read_only: it can be read, not set.
-        while_busy: it may be set during a scan or a move.
-        sign: -1 where the controller counts the other way round (an axis pointing down, angles clockwise).
-        resolution: smaller differences are none (rounding by the controller, noise of a read-back), in SI.
+        read_only: the parameter can be read, but not set.
+        while_busy: the parameter may be set during a scan or a move.
+        sign: -1 where the controller's sign is opposite (an axis pointing down, angles clockwise).
+        resolution: smaller differences are ignored (rounding by the controller, noise of a read-back), in SI.
         where: the file of the row.
     """
 
@@ -65,20 +65,20 @@ class ParameterSpec:
 
     @property
     def si_unit(self) -> str:
-        """The SI unit of the value. The setpoint's depends on the operating mode: its row has the unit."""
+        """The SI unit of the value; for the setpoint it depends on the operating mode and comes from the row."""
         si = names.BASE_PARAMETERS.get(self.name)
         return units.si_unit(self.unit) if si is None else si
 
     @property
     def wire_unit(self) -> str:
-        """The unit of a value without one, from or to a peer: lengths in m, angles in deg."""
+        """The unit of values on the wire that carry no unit: lengths in m, angles in deg."""
         return "deg" if self.si_unit == "rad" else self.si_unit
 
     def parse(self, text: str, unit: str | None = None) -> Value:
         """Return a peer's value, converted and checked.
 
         Raises:
-            Refused: PARAM_ERROR, with the value, the bound that it breaks and where that was set.
+            Refused: PARAM_ERROR, with the value, the violated bound and the place where the bound was set.
         """
         if len(text) > _LONGEST_TEXT:
             raise refuse_value(self.name, f"a value of {len(text)} characters is too long")
@@ -93,7 +93,7 @@ class ParameterSpec:
         return self.checked(self.from_unit(number, unit))
 
     def from_unit(self, number: float, unit: str | None) -> float:
-        """Return a number in a peer's unit in SI; None: the unit of the wire.
+        """Convert a number from a peer's unit to SI; None: the unit of the wire.
 
         Raises:
             Refused: PARAM_ERROR: the unit is unknown or of another dimension.
@@ -134,14 +134,14 @@ class ParameterSpec:
         return math.isclose(a, b, rel_tol=1e-12, abs_tol=self.resolution)
 
     def to_vendor(self, value: Value) -> Value:
-        """Return a value in SI in the controller's unit and sign."""
+        """Convert a value from SI to the controller's unit and sign."""
         if isinstance(value, bool | str):
             return value
         number = units.convert(float(value), self.si_unit, self.unit) * self.sign
         return round(number) if self.type == "int" else number
 
     def from_vendor(self, value: Value) -> Value:
-        """Return a value of the controller in SI.
+        """Convert a value of the controller to SI.
 
         Raises:
             Refused: PARAM_ERROR: the value is not of the type in the table.
@@ -163,7 +163,7 @@ class ParameterSpec:
         return number
 
     def for_peer(self, value: Value, unit: str | None = None) -> tuple[str, str]:
-        """Return a value in SI as (text, unit), in the peer's unit or the wire's."""
+        """Convert a value in SI to (text, unit), in the peer's unit or the unit of the wire."""
         if isinstance(value, bool):
             return ("true" if value else "false"), ""
         if isinstance(value, str):
@@ -177,14 +177,14 @@ class ParameterSpec:
         return f"{units.convert(value, self.si_unit, wanted):.15g}", wanted
 
     def quantity(self, value: Value) -> str:
-        """Return a value in SI with its unit, for a person."""
+        """Return a value in SI as readable text with the controller's unit."""
         if isinstance(value, bool | str):
             return str(value)
         number = units.convert(float(value), self.si_unit, self.unit)
         return f"{number:.6g} {unit_text(self.unit)}".rstrip()
 
     def range_text(self) -> str:
-        """Return the range for a person, and where it was set."""
+        """Return the range as readable text, with the place where it was set."""
         text = f"{self.quantity(self.range[0])} to {self.quantity(self.range[1])}"
         return f"{text} (set in {self.where})" if self.where else text
 

@@ -1,8 +1,8 @@
 """The polling interval of a controller: short near the expected end of a measurement, long otherwise. Pure.
 
-The end of a scan has to be noticed within 20 ms of the controller's report. A controller that serves one request after
-the other must not be kept busy by polling meanwhile. So the interval shrinks in proportion to the time
-left until the expected end, and grows again in proportion to the time since.
+The end of a scan must be noticed within 20 ms of the controller's report. But polling must not keep a controller busy
+that serves one request at a time. So the interval shrinks in proportion to the time left until the expected end, and
+grows again in proportion to the time since.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass
 
 EAGER_S = 0.01
-"""Between two looks when the end may come at any moment: the other half of the 20 ms is for the look itself."""
+"""Interval between polls when the end may come at any moment; the poll takes the rest of the 20 ms."""
 _PART = 0.1  # of the time left until the expected end passes between two looks
 _GUESSED, _BY_OTHERS, _SAME = (
     0.35,
@@ -25,7 +25,7 @@ _REMEMBERED = 64
 
 @dataclass(frozen=True)
 class ExpectedEnd:
-    """The expected end of a measurement that began at `began_s`, with its uncertainty; None: not known."""
+    """The expected end of a measurement that began at `began_s`, with its uncertainty; None if unknown."""
 
     began_s: float
     end_s: float | None = None
@@ -33,11 +33,11 @@ class ExpectedEnd:
 
 
 class AdaptivePolling:
-    """The learnt durations of measurements, which give the time until the next look. All times are real seconds.
+    """The learnt durations of measurements, which determine the time until the next poll. All times are real seconds.
 
     Args:
-        idle_s: between two looks when no change is expected.
-        eager_s: between two looks when a change is expected at once.
+        idle_s: interval between polls when no change is expected.
+        eager_s: interval between polls when a change is expected at once.
     """
 
     def __init__(self, idle_s: float, eager_s: float = EAGER_S) -> None:
@@ -54,7 +54,7 @@ class AdaptivePolling:
 
         Args:
             what: equal for measurements of equal duration.
-            guess_s: the duration by its settings; None: not known.
+            guess_s: the duration by its settings; None if unknown.
         """
         self._measuring, self._over_s = (what, guess_s), None
         lasts_s, doubt = self._lasted_s.get(what), _SAME
@@ -77,7 +77,7 @@ class AdaptivePolling:
             self._expected = ExpectedEnd(self._expected.began_s, now_s)
 
     def ended(self, now_s: float, *, as_expected: bool) -> None:
-        """Record that the result is there, and learn the duration, unless the measurement was interrupted."""
+        """Record the arrival of the result, and learn the duration unless the measurement was interrupted."""
         if as_expected and self._measuring is not None and self._expected is not None:
             what, guess_s = self._measuring
             lasted_s = (now_s if self._over_s is None else self._over_s) - self._expected.began_s
@@ -90,7 +90,7 @@ class AdaptivePolling:
         self._measuring = self._expected = self._over_s = None
 
     def wait_s(self, now_s: float) -> float:
-        """Return the time until the next look."""
+        """Return the time until the next poll."""
         expected = self._expected
         if expected is None:
             return self._idle_s

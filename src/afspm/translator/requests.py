@@ -1,4 +1,4 @@
-"""Answers requests: obeys one scheduler, executes no request twice, and reports a lost controller."""
+"""Handling of requests: obey one scheduler, execute no request twice, and report a lost controller."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class RequestHandler:
 
     Args:
         fence: decides which scheduler is obeyed.
-        is_connected: returns whether an earlier connection still stands.
+        is_connected: returns whether an earlier connection still exists.
         reply: sends a response, and logs a refusal at a level.
     """
 
@@ -86,7 +86,7 @@ class RequestHandler:
         return True
 
     def answer(self, frames: Sequence[bytes]) -> None:
-        """Execute a request, unless that was done before, and answer it."""
+        """Execute and answer a request; a repeated request gets its earlier answer."""
         try:
             request = wire.decode_request(frames)
         except WireError as error:

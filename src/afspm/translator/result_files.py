@@ -1,6 +1,6 @@
-"""Finds the files that a controller saves: the running measurement, the one just ended, and the results.
+"""Files saved by a controller, assigned to the running measurement, the last ended one, and the results.
 
-All of this is kept over a restart of the translator.
+This state is saved and survives a restart of the translator.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from afspm.storage.formats import FileContent, read
 from afspm.translator.trace import TRACE
 
 SCAN: Final = "scan"
-"""The kind of a measurement that is no spectrum; a spectrum has the name of its own kind."""
+"""The kind of a scan; a spectrum has the name of its own kind."""
 _LISTED: Final = 16
 _OF_A_RESULT: Final = ("what", "frame", "position", "end_ns")
 
 XY = tuple[float, float]
 Content = Sequence[Scan | Spectrum]
 Entry = Plain
-"""A measurement in JSON: "what" kind it is, "frame" or "position" as they were set, "end_ns", keys of the driver."""
+"""A measurement in JSON: its kind ("what"), its set "frame" or "position", "end_ns", keys of the driver."""
 
 
 class ResultFiles(ABC):
-    """The measurements of one controller.
+    """The measurements of one controller and their files.
 
     Args:
         kept: a JSON dict on disk: "running" and "ended" are an `Entry` or None; "results" are entries with a name, by
             "result".
 
     Attributes:
-        broken_off: True if the measurement that has ended was interrupted at the controller; until the next `results`.
+        broken_off: True if the ended measurement was interrupted at the controller; until the next `results`.
     """
 
     def __init__(self, kept: Entry, log: logging.Logger) -> None:
@@ -53,7 +53,11 @@ class ResultFiles(ABC):
 
     @abstractmethod
     def read(self, entry: Entry) -> Content:
-        """Return the content of a result, with the parameters it was taken with. Raises FileError."""
+        """Return the content of a result, with the settings of the measurement.
+
+        Raises:
+            FileError
+        """
 
     @property
     def what(self) -> str:
@@ -63,19 +67,19 @@ class ResultFiles(ABC):
 
     @property
     def frame(self) -> list[float] | None:
-        """The frame of the running scan (`as_list`); None: none is running."""
+        """The frame of the running scan (`as_list`); None without a scan."""
         running = self._kept["running"]
         return None if running is None else running.get("frame")
 
     def forget(self) -> None:
-        """Forget the running or ended measurement: it was interrupted."""
+        """Discard the running or ended measurement after an interruption."""
         self._kept["running"] = self._kept["ended"] = None
 
     def load(self, result: str) -> Content:
-        """Read one of the results.
+        """Read a result by its name.
 
         Raises:
-            FileError: the result is not among the last ones, or its file is gone.
+            FileError: the result is not among the last results, or its file is gone.
         """
         entry = next((one for one in self._kept["results"] if one["result"] == result), None)
         if entry is None:
@@ -101,10 +105,10 @@ class ResultFiles(ABC):
 
 @dataclass(frozen=True)
 class FilePrecision:
-    """The precision of a controller's files: the difference between the numbers in a file and those set.
+    """The precision of a controller's files: the difference between set numbers and numbers in a file.
 
     Attributes:
-        part: the rounding of a length, as a part of the largest length.
+        part: the rounding of a length, relative to the largest length.
         angle_rad: the rounding of the angle.
         positions: True if the file of a spectrum has its position as it was set.
     """
@@ -114,14 +118,14 @@ class FilePrecision:
     positions: bool = False
 
     def same(self, a: Region, b: Region) -> bool:
-        """Return True if two frames are equal to the digits of a file."""
+        """Return whether two frames are equal within the precision."""
         lengths_m = [*a.center_m, *a.size_m]
         scale_m = self.part * max(*map(abs, a.center_m), *a.size_m)
         close = np.allclose(lengths_m, [*b.center_m, *b.size_m], rtol=0.0, atol=scale_m)
         return bool(close) and abs(math.remainder(a.angle_rad - b.angle_rad, math.tau)) <= self.angle_rad
 
     def as_set(self, one: Scan | Spectrum, measured: Entry) -> Scan | Spectrum:
-        """Return a scan or spectrum of a file with the frame or position that was set, and with our time.
+        """Return a scan or spectrum with its set frame or position, and with afspm's time.
 
         The file's own frame or position stays if it differs by more than its precision.
         """
@@ -144,30 +148,34 @@ class FilePrecision:
 
 
 def read_result(path: Path | str) -> FileContent:
-    """Read a file of the controller, and add it to the trace. Raises FileError."""
+    """Read a file of the controller, and add it to the trace.
+
+    Raises:
+        FileError
+    """
     content = read(path)
     TRACE.file(Path(path))
     return content
 
 
 def as_list(region: Region) -> list[float]:
-    """Return a frame as a list, to be kept as JSON."""
+    """Return a frame as a list for JSON."""
     return [*region.center_m, *region.size_m, region.angle_rad]
 
 
 def as_region(kept: Sequence[float]) -> Region:
-    """Return the frame that `as_list` converted; the reverse of `as_list`."""
+    """Return the frame of a list made by `as_list`."""
     x, y, width, height, angle_rad = kept
     return Region((x, y), (width, height), angle_rad)
 
 
 def lines_missing(content: Iterable[Scan | Spectrum]) -> int:
-    """Return how many lines of the scans have no value at all: the scans were interrupted."""
+    """Return the number of lines without any value: lines missing from interrupted scans."""
     return max((one.lines_missing for one in content if isinstance(one, Scan)), default=0)
 
 
 def modified_ns(path: Path) -> int:
-    """Return the time of the last write of a file; 0: the file does not exist."""
+    """Return the modification time of a file in ns; 0 if the file does not exist."""
     # the controller may delete or rename a file at any time
     try:
         return path.stat().st_mtime_ns
@@ -176,6 +184,6 @@ def modified_ns(path: Path) -> int:
 
 
 def newest(files: Iterable[Path], after_ns: int = 0) -> tuple[int, Path | None]:
-    """Return the file written last after a time, and when; (0, None): there is none."""
+    """Return (modification time in ns, file) of the newest file after `after_ns`; (0, None) without one."""
     times = [(modified_ns(file), file) for file in files]
     return max((one for one in times if one[0] > after_ns), default=(0, None))

@@ -1,4 +1,4 @@
-"""Makes the end of a run safe: the measurement is stopped, and a tip without feedback is retracted."""
+"""The safe end of a run: the measurement is stopped, and a tip without feedback is retracted."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ little less than `transport.process.parent` allows."""
 
 
 class SafeExit:
-    """The end of a run: it stops the running measurement, and retracts a tip left without feedback.
+    """The end of a run: stops the running measurement, and retracts a tip left without feedback.
 
     Args:
         retracts: True to retract the tip when a request has switched the feedback off and no process is left to switch
-            it on again.
+            the feedback on again.
         act: executes an action of the translator itself.
         observe: publishes all changes.
     """
@@ -51,20 +51,20 @@ class SafeExit:
         self._observe = observe
 
     def is_owed(self) -> bool:
-        """Return True if the tip has to be retracted before the process ends. May be called from another thread."""
+        """Return whether the tip must be retracted before the process ends. Thread-safe."""
         return self._retracts and self._state.feedback.in_danger
 
     def end(self) -> None:
-        """End on the scheduler's request; the scheduler has made the tip safe."""
+        """Stop measuring and restore temporary settings, on the scheduler's request."""
         with contextlib.suppress(*LOST):  # the process ends in any case
             self._stop_measuring()
             self._temporary.end()
 
     def leave(self, wait: Callable[[float], None]) -> None:
-        """End without a scheduler. A feedback that was switched off at the panel is left to the person there.
+        """Stop measuring and make the tip safe without a scheduler; a person's own changes at the panel stay.
 
         Args:
-            wait: lets a time in real seconds pass, and then looks at the controller.
+            wait: waits for a time in real seconds, and then polls the controller.
         """
         self._connection.guarded(self._stop_measuring)
         if self._connection.stands:

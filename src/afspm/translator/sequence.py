@@ -1,6 +1,6 @@
-"""The order in which peers see the states of a microscope (wire format, "What a translator does"). Pure.
+"""The order in which peers receive the states of a microscope (wire format, "What a translator does"). Pure.
 
-The controller is polled: it may be free again before it was ever seen scanning, and its file may come after its state.
+The controller is polled: it may be free again before a poll finds it scanning, and its file may come after its state.
 The published sequence is always complete: SS_SCANNING, the results, SS_FREE; or SS_SCANNING, SS_INTERRUPTED, SS_FREE.
 """
 
@@ -26,7 +26,7 @@ class PublishResults:
 
 @dataclass(frozen=True)
 class DiscardResults:
-    """The step that drops new results, if any: they belong to an interrupted measurement."""
+    """The step that drops new results of an interrupted measurement."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class StatusSequence:
     """The conversion of observed states of the controller into published states.
 
     Args:
-        published: the status published last (by an earlier process of this translator).
-        result_timeout_s: how long after the end results may come, and how long a stop may take.
+        published: the last published status (perhaps by an earlier process of this translator).
+        result_timeout_s: longest time from the end to the results, and longest duration of a stop.
     """
 
     def __init__(self, published: ScopeStatus, result_timeout_s: float) -> None:
@@ -56,7 +56,7 @@ class StatusSequence:
         self._broken_off = ScopeState.UNDEFINED
 
     def begin(self, state: ScopeState) -> list[SequenceStep]:
-        """Publish `state`: a request was accepted that leads to it, whether or not it was observed already."""
+        """Publish the state that follows from an accepted request, even if the controller does not show it yet."""
         return self._publish(ScopeStatus(state))
 
     def interrupt(self) -> list[SequenceStep]:
@@ -64,7 +64,7 @@ class StatusSequence:
         return self._publish(_INTERRUPTED)
 
     def follow(self, *, is_whole: bool) -> list[SequenceStep]:
-        """Publish the end of a measurement whose end was never observed, since another one followed at once.
+        """Publish the end of a measurement whose end was missed, because the next followed at once.
 
         Args:
             is_whole: False if it was interrupted.
@@ -128,7 +128,7 @@ class StatusSequence:
         return now_s - self._waiting_since_s >= self._timeout_s
 
     def deadline_s(self) -> float | None:
-        """Return when `observe` is due at the latest, experiment time; None: no deadline."""
+        """Return the latest experiment time for the next `observe`; None without a deadline."""
         return None if self._waiting_since_s is None else self._waiting_since_s + self._timeout_s
 
     def _publish(self, status: ScopeStatus) -> list[SequenceStep]:

@@ -1,4 +1,4 @@
-"""Sets parameters: checks all of them first, then sets them, then reads them back; or changes nothing."""
+"""Setting of parameters: all are checked first, then set, then read back; otherwise nothing changes."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _UNBOUNDED: Final = (-math.inf, math.inf)
 
 
 def wanted_values(request: Request, driver: DriverBase) -> dict[str, Value] | None:
-    """Return the values in SI that a request sets, each checked by itself; None if it only reads.
+    """Return the values in SI that a request sets, each checked separately; None if the request only reads.
 
-    A value that can't be set, and is in force already, is no change: peers send back a whole message after changing one
-    field of it.
+    A read-only value that equals the present one is no change: peers change one field and send back
+    a whole message.
 
     Raises:
         Refused: PARAM_NOT_SUPPORTED or PARAM_ERROR.
@@ -60,7 +60,7 @@ def apply(driver: DriverBase, values: Mapping[str, Value], about_to_act: Callabl
         about_to_act: called after all checks, right before the first change.
 
     Raises:
-        Refused: PARAM_ERROR: the values do not fit together, or the controller set other ones.
+        Refused: PARAM_ERROR: the values do not fit together, or the controller set other values.
     """
     table = driver.table
     # the whole frame: when a part of it is set, a controller may change the rest

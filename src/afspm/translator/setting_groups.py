@@ -1,4 +1,4 @@
-"""The settings in force at the microscope: read together, checked together, published together."""
+"""Groups of settings that are read together, checked together and published together."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class SettingsGroup(ABC):
 
 
 class KeptSettings(SettingsGroup):
-    """Settings that are sent to a controller with an action, and that the controller itself does not keep.
+    """Settings that are sent to a controller with an action, because the controller does not store them.
 
     Args:
         at_first: the initial values.
@@ -87,12 +87,12 @@ class KeptSettings(SettingsGroup):
 
 
 def watched(table: ParameterTable) -> list[str]:
-    """Return the parameters whose changes are published, as far as the microscope has them."""
+    """Return the parameters of this microscope whose changes are published."""
     return [name for name in (*FRAME, *FEEDBACK, names.ENGAGED, *POSITION) if name in table]
 
 
 def messages(values: Mapping[str, Value]) -> dict[str, Published]:
-    """Return the messages to publish, by name; a message is left out if the microscope lacks a parameter of it."""
+    """Return the messages to publish, by name; messages with a missing parameter are left out."""
     published: dict[str, Published] = {}
     if all(name in values for name in FRAME if name != names.SCAN_ANGLE):
         published[_FRAME_MESSAGE] = scan_parameters(values)
@@ -113,10 +113,10 @@ def scan_parameters(values: Mapping[str, Value]) -> ScanParameters:
 
 
 def frame(values: Mapping[str, Value]) -> tuple[Region, tuple[int, int]]:
-    """Return the frame that values describe: its region and (rows, columns).
+    """Return the region and (rows, columns) of the frame in `values`.
 
     Raises:
-        InvalidValue: they describe none.
+        InvalidValue: the values describe no frame.
     """
     corner = (_number(values, names.SCAN_TOP_LEFT_X), _number(values, names.SCAN_TOP_LEFT_Y))
     size = (_number(values, names.SCAN_SIZE_X), _number(values, names.SCAN_SIZE_Y))
@@ -126,15 +126,15 @@ def frame(values: Mapping[str, Value]) -> tuple[Region, tuple[int, int]]:
 
 
 def frame_values(region: Region, shape: tuple[int, int]) -> dict[str, Value]:
-    """Return the values that describe a frame, by generic names, in SI: the reverse of `frame`."""
+    """Return the values of a frame by generic names, in SI: the reverse of `frame`."""
     corner, size, (rows, columns) = region.top_left_m, region.size_m, shape
     return dict(zip(FRAME, (*corner, *size, region.angle_rad, columns, rows), strict=True))
 
 
 def feedback(values: Mapping[str, Value]) -> Feedback:
-    """Return the z feedback that values describe.
+    """Return the z feedback in `values`.
 
-    For a withdrawn tip, a feedback that is off is not published: at the sample it would be a danger.
+    For a withdrawn tip, a feedback that is off is left out: at the sample it would be a danger.
     """
     on = values.get(FEEDBACK_ON)
     is_away = values.get(names.ENGAGED) is False

@@ -1,4 +1,4 @@
-"""The state that a translator keeps on disk, so that a restart repeats no action and no state."""
+"""The state that a translator keeps on disk, so that a restart repeats no action and no published state."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class FeedbackWatch:
         return self.is_off or bool(self._kept.get("may_have_switched"))
 
     def saw(self, on: bool | None) -> bool:
-        """Store the observed feedback. Return True if a request has just switched it off."""
+        """Store the observed feedback; return True if a request has just switched it off."""
         kept = self._kept
         # off without a request in between: switched off at the panel, where a person takes care of it (decision 0007)
         switched_off = on is False and bool(kept.get("feedback_was_on") and kept.get("may_have_switched"))
@@ -43,7 +43,7 @@ class FeedbackWatch:
         return switched_off
 
     def may_switch(self, request: Request) -> bool:
-        """Record that a request is about to be executed. Return True if this must be saved first."""
+        """Record that a request will be executed; return True if the record must be saved first."""
         affects = request.kind == ControlRequest.ACTION or feedback_of(request) is not None
         in_doubt = affects and not self._kept.get("may_have_switched")
         self._kept["may_have_switched"] = True
@@ -73,7 +73,7 @@ class TranslatorState:
         self.sequence = StatusSequence(ScopeStatus(ScopeState(self.kept["said"])), result_timeout_s)
 
     def save(self) -> None:
-        """Write everything to disk. A full disk is logged, and the translator goes on protecting the tip."""
+        """Write everything to disk. If the disk is full, log the error and continue, to protect the tip."""
         self.kept["said"] = int(self.sequence.published.state)
         self.kept["seen_ns"] = self._clock.now_ns()  # a resumed run continues after this time
         self._memory.save()

@@ -1,4 +1,4 @@
-"""A TCP connection to a controller that answers one request at a time, and sends nothing unrequested."""
+"""A TCP connection to a controller that answers one request at a time, and sends only answers."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Receiver:
         """Return at least one byte.
 
         Raises:
-            TimeoutError: none came in time. ControllerLost: the connection was closed. OSError.
+            TimeoutError: no byte came in time. ControllerLost: the connection was closed. OSError.
         """
         left_s = self._until_s - self._monotonic_s()
         if left_s <= 0.0:
@@ -60,14 +60,14 @@ class Receiver:
 
 
 class TcpConnection:
-    """A connection, for one thread at a time but for `close`.
+    """A TCP connection to a controller. Not thread-safe, except `close`.
 
     Any error closes it: a late answer must never be taken for the answer to the next question.
 
     Args:
-        timeout_s: how long an answer may take, in real time.
+        timeout_s: longest time to an answer, in real time.
         monotonic_s: real time.
-        hints: what to check when the connection is refused, and when no answer comes.
+        hints: advice for a refused connection, and for a missing answer.
 
     Attributes:
         where: "HOST:PORT", as it was given; peer: the same in numbers.
@@ -101,12 +101,12 @@ class TcpConnection:
         longer_s: float = 0.0,
         is_secret: bool = False,
     ) -> T:
-        """Send a question, and return `read` of the bytes of its answer. See `send` and `receive`."""
+        """Send a question, and return its answer, decoded by `read`. See `send` and `receive`."""
         self.send(what, message, is_secret=is_secret)
         return self.receive(what, read, longer_s=longer_s)
 
     def send(self, what: str, message: bytes, *, is_secret: bool = False) -> None:
-        """Send a question; its answer must be received before the next is sent.
+        """Send a question; receive its answer before sending the next.
 
         Args:
             what: the question in words, for messages.
@@ -125,7 +125,7 @@ class TcpConnection:
             self._guarded(what, self._timeout_s, send)
 
     def receive(self, what: str, read: Callable[[Receiver], T], *, longer_s: float = 0.0) -> T:
-        """Return `read` of the bytes of the answer.
+        """Receive an answer, decoded by `read`.
 
         Args:
             longer_s: added to the usual timeout.
@@ -141,7 +141,7 @@ class TcpConnection:
             return found
 
     def has_answer(self) -> bool:
-        """Return True if an answer has begun to arrive, or the connection is lost, as `receive` will report."""
+        """Return True if an answer has begun to arrive, or if the connection is lost."""
         try:
             self._socket.settimeout(0.0)
             self._socket.recv(1, socket.MSG_PEEK)
@@ -168,14 +168,18 @@ class TcpConnection:
             raise
 
     def close(self) -> None:
-        """Close the connection, from any thread: a thread that waits for an answer gets ControllerLost."""
+        """Close the connection, from any thread; a waiting thread gets ControllerLost."""
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
 
 
 def host_and_port(address: str, hint: str = '"host:port"') -> tuple[str, int]:
-    """Return both parts of the setting `address`. Raises ConfigError: it is no address."""
+    """Split the setting `address` into host and port.
+
+    Raises:
+        ConfigError: it is no address.
+    """
     host, _, port = address.rpartition(":")
     if not (host and port.isdigit()):
         raise ConfigError(f"{address!r} is not an address", where="address", hint=hint)

@@ -1,4 +1,4 @@
-"""Values that are in force for a limited time, as in a bias pulse: the former values are restored afterwards.
+"""Values set for a limited time, as in a bias pulse; the former values are restored afterwards.
 
 The microscope counts as busy meanwhile. The former values are kept on disk: a translator that is restarted, or
 reconnects to a lost controller, restores them first.
@@ -20,7 +20,7 @@ _KEY = "temporary"
 
 
 class TemporarySettings:
-    """The values in force for a limited time, if any."""
+    """Values that are set for a limited time, and the former values to restore."""
 
     def __init__(self, driver: DriverBase, state: TranslatorState, log: logging.Logger) -> None:
         self._driver = driver
@@ -51,23 +51,31 @@ class TemporarySettings:
 
     @property
     def until_s(self) -> float | None:
-        """Experiment time at which the former values are restored; None: nothing is temporary."""
+        """Experiment time at which the former values are restored; None without temporary values."""
         found = self._kept.get(_KEY)
         return None if found is None else float(found["until_s"])
 
     @property
     def status(self) -> ScopeStatus | None:
-        """The state of the microscope meanwhile; None: nothing is temporary."""
+        """The state of the microscope during a temporary change; None without one."""
         found = self._kept.get(_KEY)
         return None if found is None else ScopeStatus(state_for(found["former"]))
 
     def end_if_due(self) -> None:
-        """Restore the former values once their time has come. Raises the errors of `LOST`."""
+        """Restore the former values once they are due.
+
+        Raises:
+            an error in `LOST`.
+        """
         if self.until_s is not None and self._driver.clock.now_s() >= self.until_s:
             self.end()
 
     def end(self) -> None:
-        """Restore the former values, if any are kept. Raises the errors of `LOST`."""
+        """Restore the former values, if any.
+
+        Raises:
+            an error in `LOST`.
+        """
         found = self._kept.get(_KEY)
         if found is None:
             return
@@ -86,5 +94,5 @@ class TemporarySettings:
 
 
 def state_for(values: Mapping[str, Value]) -> ScopeState:
-    """Return the state of the microscope while such values are in force."""
+    """Return the state of the microscope while these values are set temporarily."""
     return ScopeState.MOVING if MOVES & values.keys() else ScopeState.BUSY_PARAM

@@ -1,8 +1,8 @@
 """The trace of a controller: its exchanges and the files that it writes, as JSON lines.
 
-One process talks to one controller, so there is one trace in a process. `begin` opens it, and each vendor's connection
-adds an exchange as one line. Without `begin` nothing is recorded. A connection leaves out its own secrets. Text is
-written as it is, other bytes in base64, so that a person can read the file.
+One process communicates with one controller, so there is one trace in a process. `begin` opens it, and each vendor's
+connection adds an exchange as one line. Without `begin` nothing is recorded. A connection leaves out its own secrets.
+Text is written unchanged, other bytes in base64, so that a person can read the file.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class TracedExchange:
         what: the name of the question, for people.
         asked: None: a secret.
         answered: empty with `lost`: there was no answer, for this reason.
-        command: the request that the exchange belongs to; empty: it only observes the controller.
+        command: the request to which the exchange belongs; empty: it only observes the controller.
         after: number of lines in the file when the question was sent: the lines between belong to other connections.
         at_s, took_s: real seconds since the beginning, and until the answer.
     """
@@ -75,7 +75,7 @@ TraceLine = TraceHeader | TracedExchange | TracedFile
 
 
 def read_trace(file: Path) -> list[TraceLine]:
-    """Read a trace; a last line that was cut off by a power cut is left out.
+    """Read a trace; an incomplete last line is left out.
 
     Raises:
         FileError: it is no trace, or one of another version.
@@ -111,7 +111,7 @@ class Trace:
             self._write(asdict(header))
 
     def end(self) -> None:
-        """Record nothing more."""
+        """Stop recording."""
         with self._lock:
             if self._file is not None:
                 self._file.close()
@@ -122,7 +122,7 @@ class Trace:
         return self._file is not None
 
     def connection(self, transport: str) -> TracedConnection:
-        """Number a new connection."""
+        """Register a new connection, and return its recorder."""
         with self._lock:
             self._connections += 1
             return TracedConnection(self, self._connections - 1, transport)
@@ -163,7 +163,7 @@ class Trace:
 
 
 class TracedConnection:
-    """One connection, for its vendor's part: `with connection.asking(name, message) as answer: answer.add(reply)`."""
+    """A recorder for one connection: `with connection.asking(name, message) as answer: answer.add(reply)`."""
 
     def __init__(self, trace: Trace, number: int, transport: str) -> None:
         self._trace = trace
@@ -177,7 +177,7 @@ class TracedConnection:
 
     @contextmanager
     def answering(self) -> Iterator[TracedAnswer]:
-        """Record at the end of the block the answer to the last question, or its error."""
+        """Record the answer to the last question, or its error, at the end of the `with` block."""
         answer = TracedAnswer(is_kept=self._trace.is_kept)
         lost = ""
         try:
@@ -191,7 +191,7 @@ class TracedConnection:
 
     @contextmanager
     def failing(self) -> Iterator[None]:
-        """Record that the last question could not be sent, if the block raises."""
+        """Record that the last question could not be sent if the `with` block raises."""
         try:
             yield
         except BaseException as error:  # raised again; the trace shows any end of an exchange, also an interruption
@@ -216,7 +216,7 @@ class TracedAnswer:
     """The bytes of an answer, as they arrive.
 
     Attributes:
-        is_whole: all of it has arrived, valid or not.
+        is_whole: the answer has arrived completely, valid or not.
     """
 
     def __init__(self, *, is_kept: bool) -> None:

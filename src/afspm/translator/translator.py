@@ -1,6 +1,6 @@
 """`Translator`: the process between the scheduler and one microscope, the same for every microscope.
 
-One loop waits for requests and for the next look at the controller. Four parts around the driver do the work:
+One loop waits for requests and for the next poll of the controller. Four parts around the driver do the work:
 `Connection`, `Observer`, `RequestHandler` and `SafeExit`.
 """
 
@@ -44,9 +44,9 @@ class TranslatorRun:
     """The run that a translator belongs to.
 
     Attributes:
-        folder: of the run.
-        name: the identity of the run: only its scheduler is obeyed; empty: the first scheduler that asks.
-        simulated: True if the microscope is, so that the scheduler of a simulated experiment may ask.
+        folder: the run folder.
+        name: the identity of the run: only its scheduler is obeyed; empty: the first scheduler that sends a request.
+        simulated: True if the microscope is simulated, so that the scheduler of a simulated experiment may use it.
         retracts: True to retract the tip when a request has switched the feedback off and no process is left to switch
             it on again.
     """
@@ -62,11 +62,11 @@ class Translator:
 
     Args:
         driver: constructed with its settings, not yet connected.
-        port: to the network.
+        port: access to the network.
         memory: kept over a restart.
         step: entered around everything that takes time, so that a busy process is not taken for a frozen one.
-        controller: the emulator of this run, in whose place no other controller is ever reached; None: the driver
-            knows the address of its controller.
+        controller: the emulator of this run, the only controller to connect to; None: the driver knows the
+            address of its controller.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Translator:
         self._ended = False
 
     def run(self) -> ExitCode:
-        """Run until the experiment ends, or until the parent process has gone or stops this one."""
+        """Run until the experiment ends, the parent process ends, or the parent stops this process."""
         try:
             while not self._ended:
                 with self._step():
@@ -131,7 +131,7 @@ class Translator:
             self._port.close()
 
     def leaves_danger(self) -> bool:
-        """Return True if the tip has to be retracted before this process ends. May be called from another thread."""
+        """Return whether the tip must be retracted before this process ends. Thread-safe."""
         return self._safe_exit.is_owed()
 
     def handle(self, arrived: RequestReceived | SubscriberJoined) -> None:
@@ -148,11 +148,11 @@ class Translator:
                 self.requests.answer(arrived.frames)
 
     def look(self) -> None:
-        """Publish the changes at the controller since the last look."""
+        """Poll the controller, and publish the changes since the last poll."""
         self._connection.guarded(self._look)
 
     def wait_s(self) -> float:
-        """Return the real seconds until the next look is due."""
+        """Return the real seconds until the next poll or connection attempt."""
         return self.observer.wait_s() if self._connection.stands else self._connection.wait_s()
 
     def reply(self, response: Response, level: int = logging.INFO) -> None:
@@ -176,7 +176,7 @@ class Translator:
 
 
 def run_translator(driver: DriverBase, context: ProcessContext, make: Callable[..., Translator] = Translator) -> int:
-    """Run a translator (called by the host of processes); end if another run commands the controller."""
+    """Run a translator; end if another run commands the controller. Called by the host of processes."""
     with contextlib.ExitStack() as stack:
         controller = wired_to(context.launch, driver)
         # a real controller of this address is not touched, so not locked

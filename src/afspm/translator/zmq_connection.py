@@ -1,4 +1,4 @@
-"""A ZeroMQ connection to a controller that answers one request after the other, and sends nothing unasked."""
+"""A ZeroMQ connection to a controller that answers one request at a time, and sends only answers."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _OUTCOMES: Final = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_CLOSED | zmq.EVENT_
 
 
 class ZmqConnection:
-    """A connection, for one thread.
+    """A ZeroMQ connection to a controller. Not thread-safe.
 
     It uses a DEALER socket, since a REQ socket is unusable after one lost reply. Any error closes it: a late reply must
     never be taken for the reply to the next request. It never reconnects: another program may listen there by then.
 
     Args:
         address: e.g. "tcp://127.0.0.1:5555".
-        timeout_s: how long a reply may take, in real time.
+        timeout_s: longest time to a reply, in real time.
         monotonic_s: real time.
-        hints: what to check when the address is invalid, when no program listens, and when no reply comes.
+        hints: advice for an invalid address, for a missing program, and for a missing reply.
 
     Raises:
         ControllerLost: no program listens there. ConfigError: it is no address.
@@ -56,7 +56,7 @@ class ZmqConnection:
         self._trace = TRACE.connection(ZEROMQ)
 
     def ask(self, what: str, message: bytes, parse: Callable[[bytes], T | None]) -> T:
-        """Send a request, and return `parse` of the reply; None from `parse`: the reply belongs to another request.
+        """Send a request and return its reply, decoded by `parse`, which returns None for another request's reply.
 
         Raises:
             ControllerLost: no reply, or one that `parse` rejects.
@@ -77,7 +77,11 @@ class ZmqConnection:
             raise self._lost(what, error) from error
 
     def begin(self, what: str, message: bytes) -> None:
-        """Send a request whose reply takes long: see `reply`. Raises ControllerLost."""
+        """Send a request with a slow reply; `reply` returns it.
+
+        Raises:
+            ControllerLost
+        """
         self._trace.asked(what, message)
         try:
             with self._trace.failing():
@@ -86,14 +90,22 @@ class ZmqConnection:
             raise self._lost(what, error) from error
 
     def wait(self, within_s: float) -> None:
-        """Wait for the reply to `begin`, in real time. Raises ControllerLost."""
+        """Wait for the reply to `begin`, in real time.
+
+        Raises:
+            ControllerLost
+        """
         try:
             self._socket.poll(max(0, round(within_s * 1000.0)))
         except zmq.ZMQError as error:
             raise self._lost("a reply", error) from error
 
     def reply(self, what: str) -> bytes | None:
-        """Return the reply to `begin`, or None while there is none. Raises ControllerLost."""
+        """Return the reply to `begin`, or None while there is none.
+
+        Raises:
+            ControllerLost
+        """
         try:
             if not self._socket.poll(0):
                 return None

@@ -1,12 +1,12 @@
-"""Sockets between processes: packets, requests and answers, keys, heartbeats. The only room that knows ZeroMQ.
+"""Sockets between processes: packets, requests and answers, keys, heartbeats. The only package that uses ZeroMQ.
 
 **Theory of operation.** Packets flow one way, requests the other.
 
-    comes in      packets of one publisher (`subscriber`), requests (`router`, `zmq_server`), answers (`control_client`,
+    inputs        packets of one publisher (`subscriber`), requests (`router`, `zmq_server`), answers (`control_client`,
                   `scheduler_sockets`)
     state         the connected peers and their names; for each subscriber, the time up to which it has all packets
-    goes out      events of a port (`port`): PacketReceived, RequestReceived, ParentGone …, in one poller per process
-    always holds  each packet arrives once and in order, or the subscriber detects the gap; no send waits
+    outputs       events of a port (`port`): PacketReceived, RequestReceived, ParentGone …, in one poller per process
+    invariants    each packet arrives once and in order, or the subscriber detects the gap; no send waits
                   for a peer; a socket accepts only this experiment's processes
 
 A late or restarted subscriber sends a marker with the time of its newest packet. The publisher then replays the kept

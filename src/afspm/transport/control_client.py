@@ -18,10 +18,10 @@ from afspm.transport.rate_limited_log import RateLimitedLog
 
 
 class ControlClient:
-    """A client that sends requests to the scheduler: the bytes of a REQ socket, without its lock step.
+    """A client that sends requests to the scheduler as a REQ socket does, but need not wait for each answer.
 
     Args:
-        name: name of the component; after a restart the scheduler sees the same client.
+        name: name of the component; after a restart the scheduler recognises the same client.
     """
 
     def __init__(self, network: Network, name: str, address: str, log: RateLimitedLog) -> None:
@@ -73,7 +73,7 @@ class ControlClient:
             return []
 
     def follow(self) -> list[Incoming]:
-        """Return connections and disconnections of the scheduler."""
+        """Return the scheduler's connection and disconnection events."""
         found: list[Incoming] = []
         for event in self.monitor.drain():
             self._connected, self._unanswered = event.kind == CONNECTED, b""

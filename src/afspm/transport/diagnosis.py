@@ -1,4 +1,4 @@
-"""Diagnoses from the measurements of `afspm doctor`: each problem in a physicist's terms, with its remedy."""
+"""Diagnoses from the measurements of `afspm doctor`: each problem in plain terms, with its remedy."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Diagnosis:
 
 @dataclass(frozen=True)
 class Versions:
-    """Versions of the programs of one computer."""
+    """Versions of the programs on one computer."""
 
     afspm: str
     python: str
@@ -69,7 +69,7 @@ class Versions:
 
 
 def of_packages(declared: Iterable[DeclaredName]) -> Iterator[Diagnosis]:
-    """Yield the names that each package adds to afspm, one line for each group, and the names that can't be used.
+    """Yield the names that each package adds to afspm, one line for each group, then the unusable names.
 
     An unusable name is a warning: only an experiment with this name fails.
     """
@@ -113,7 +113,7 @@ _UNREACHED: Mapping[Reach, tuple[str, str]] = {
 
 
 def of_address(owner: str, address: str, reach: Reach, *, is_here: bool, expected: bool) -> Diagnosis:
-    """Judge an address at which `owner` listens.
+    """Return the diagnosis of an address at which `owner` listens.
 
     Args:
         is_here: whether the address belongs to this computer.
@@ -133,7 +133,7 @@ def of_address(owner: str, address: str, reach: Reach, *, is_here: bool, expecte
 
 
 def of_handshake(address: str, handshake: Handshake, key: str, server: str) -> Diagnosis:
-    """Judge the key exchange of `key` at an address of `server`."""
+    """Return the diagnosis of the key exchange of `key` at an address of `server`."""
     code = f"key-{handshake.value}"
     if handshake is Handshake.DONE:
         return fine(code, address, f"the key of {key} is accepted" if key else "no key is needed")
@@ -151,7 +151,7 @@ MOST_AHEAD_S = 1.0
 
 
 def of_clock(ahead_s: float, uncertain_s: float) -> Diagnosis:
-    """Judge the lead of this computer's clock over the scheduler's clock."""
+    """Return the diagnosis of the difference between this computer's clock and the scheduler's."""
     where = "the clock of this computer"
     if abs(ahead_s) <= MOST_AHEAD_S + uncertain_s:
         return fine("clock", where, f"agrees with the scheduler's clock to {abs(ahead_s) + uncertain_s:.2f} s")
@@ -162,7 +162,7 @@ def of_clock(ahead_s: float, uncertain_s: float) -> Diagnosis:
 
 
 def of_versions(ours: Versions, theirs: Versions | None) -> Diagnosis:
-    """Compare the versions here with those of the scheduler."""
+    """Return the diagnosis of the versions on this computer and on the scheduler's."""
     here = f"afspm {ours.afspm}, Python {ours.python}, libzmq {ours.libzmq}"
     if theirs is None or theirs == ours:
         return fine("versions", "this computer", here)
@@ -198,7 +198,7 @@ LEAST_MEMORY_BYTES = 1 << 30
 
 
 def of_memory(available: int, used: Mapping[str, int]) -> Diagnosis:
-    """Judge the memory of this computer; `used`: bytes of each process of the experiment on it."""
+    """Return the diagnosis of this computer's memory; `used` is in bytes per process of the experiment."""
     largest = sorted(used.items(), key=lambda one: -one[1])[:5]
     users = "".join(f", {name} {size / 1e6:.0f} MB" for name, size in largest)
     what = f"{available / 1e9:.1f} GB available{users}"
@@ -218,17 +218,15 @@ class Heard:
 
     @property
     def rate_hz(self) -> float:
-        """Return packets per second."""
         return self.count / self.listened_s
 
     @property
     def bytes_per_s(self) -> float:
-        """Return bytes per second."""
         return self.size / self.listened_s
 
 
 def of_publisher(address: str, heard: Iterable[Heard], *, caught_up: bool) -> Diagnosis:
-    """Judge the packets received from the scheduler's publisher."""
+    """Return the diagnosis of the packets received from the scheduler's publisher."""
     count = sum(one.count for one in heard)
     if caught_up:
         return fine("heard", address, f"{count} packets while listening, after all that was cached")
@@ -238,5 +236,5 @@ def of_publisher(address: str, heard: Iterable[Heard], *, caught_up: bool) -> Di
 
 
 def is_well(found: Iterable[Diagnosis]) -> bool:
-    """Return true if no diagnosis is an error."""
+    """Return whether no diagnosis is an error."""
     return all(one.severity is not Severity.ERROR for one in found)

@@ -1,4 +1,4 @@
-"""Whole messages to and from sockets, without copies of large frames."""
+"""Sending and receiving of whole messages, without copies of large frames."""
 
 from __future__ import annotations
 

@@ -134,10 +134,10 @@ class HeartbeatListener:
         self._poller.register(descriptor, zmq.POLLIN)
 
     def listen(self, name: str, *, token: str = "", needs_token: bool = False) -> tuple[str, bytes | None]:
-        """Start to listen to the process `name`; return the address and the key for it, None for a plain socket.
+        """Listen to heartbeats of the process `name`; return the address and its key, None for a plain socket.
 
         Args:
-            token: token that the process gets, too.
+            token: the token that the process also receives.
             needs_token: whether the token is required from the first heartbeat on; otherwise after its first use.
         """
         socket = self._network.socket(zmq.SUB)

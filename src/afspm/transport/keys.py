@@ -89,7 +89,7 @@ class Keys:
         return self.everywhere or (self.guards and (requests or not is_private(address)))
 
     def user_as(self, user: str | None, name: str) -> str | None:
-        """Return the user of a key under a name. The guests' key fits every process without its own key."""
+        """Return the user of a key that acts under a name; the guests' key fits every process without a key."""
         component = component_of(name)
         return component if user == GUEST and component not in self.peers.values() else user
 
@@ -115,14 +115,14 @@ def is_private(address: str) -> bool:
 def routing_id(name: str) -> bytes:
     """Return a new, random socket identity for requests under a name.
 
-    A ROUTER socket sends answers to the newest connection of an identity: with the bare name as identity, a second
+    A ROUTER socket sends answers to the newest connection of an identity. With the bare name as identity, a second
     process would cut off the first.
     """
     return name.encode() + MARK + secrets.token_hex(8).encode()
 
 
 def load(folder: str | Path, name: str, servers: Mapping[str, str] | None = None) -> Keys:
-    """Return the keys of the component `name` from a folder that `generate` made.
+    """Return the keys of the component `name` from a folder made by `generate`.
 
     Raises:
         ConfigError: a folder or key is missing, a file is not a certificate, or other users may read the secret key.
@@ -198,7 +198,7 @@ def from_launch(name: str, entries: PlainMapping | None) -> Keys | None:
 
 
 def with_server(name: str, entries: PlainMapping | None, address: str, key: bytes) -> Plain:
-    """Return the keys of a launch line with one more server: the supervisor's heartbeat socket.
+    """Return the launch line's keys with one more server: the supervisor's heartbeat socket.
 
     Args:
         name: name of the process; without keys, the process gets a new pair.

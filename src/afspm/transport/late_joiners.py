@@ -71,12 +71,12 @@ def topic(name: str, nonce: int) -> bytes:
 
 
 def is_reserved(subscription: bytes) -> bool:
-    """Return whether a subscription begins like a marker, even a malformed one."""
+    """Return whether a subscription begins like a marker, even if malformed."""
     return subscription.startswith(b"\0")
 
 
 def spelled_out(prefixes: Iterable[bytes]) -> list[bytes]:
-    """Return the prefixes for the socket: the empty prefix becomes all first bytes of envelopes."""
+    """Return the prefixes for the socket; an empty prefix is replaced by all first bytes of envelopes."""
     found: list[bytes] = []
     for prefix in prefixes:
         found.extend([prefix] if prefix else FIRST_BYTES)
@@ -84,9 +84,9 @@ def spelled_out(prefixes: Iterable[bytes]) -> list[bytes]:
 
 
 class PublishedHistory:
-    """The kept packets of a publisher; it also gives packets their times.
+    """The kept packets of a publisher, which also assigns times to packets.
 
-    It keeps the last packet of every envelope, and the newest other packets within bounds.
+    It keeps the last packet of every envelope, and a limited number of other new packets.
     """
 
     def __init__(self, clock: Clock, *, most_packets: int = _MOST_PACKETS, most_bytes: int = _MOST_BYTES) -> None:
@@ -99,7 +99,7 @@ class PublishedHistory:
         self._newest_ns = 0
 
     def stamp(self, envelope: str, payload: Buffer, time_ns: int | None = None, *, keep: bool = True) -> Packet:
-        """Return a packet with a later time than all before, and keep it unless `keep` is False.
+        """Return a packet with a time later than all earlier packets, and keep it unless `keep` is False.
 
         Args:
             time_ns: the time of a packet that already has one.

@@ -28,7 +28,7 @@ MAX_REQUEST_BYTES = 1024 * 1024
 HAS_PRIVATE_SOCKETS = sys.platform != "win32" and zmq.has("ipc")
 """Whether the system has unix sockets, and modes of folders to protect them."""
 QUEUE_LENGTH = 4000
-"""Most messages that wait for one peer; a publisher drops further ones."""
+"""Limit of waiting messages for one peer; a publisher drops further ones."""
 
 _LINGER_MS = 200
 # ZMTP heartbeats: a peer that is frozen or cut off is noticed within seconds, not after hours as by TCP.
@@ -119,7 +119,7 @@ class Network:
 
     @classmethod
     def connecting(cls, name: str, entries: Mapping[str, object] | None) -> Network:
-        """Return a network as `from_launch`, for this computer only, with plain connections to servers without keys."""
+        """Return a network for this computer only, with plain connections to servers without keys."""
         from afspm.transport.keys import from_launch
 
         own = from_launch(name, entries)
@@ -282,8 +282,7 @@ class ConnectionEvent(NamedTuple):
 class Monitor:
     """The connection events of one socket, in order.
 
-    The thread that delivers messages also sends these events: after a message was received, `drain` returns every event
-    before it.
+    The thread that delivers messages also sends these events. So `drain` after a message returns every earlier event.
     """
 
     def __init__(self, network: Network, socket: zmq.Socket[bytes], events: int) -> None:

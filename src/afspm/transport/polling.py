@@ -16,14 +16,14 @@ _LONGEST_MS = 2**31 - 1  # 24 days
 
 
 def milliseconds(timeout_s: float | None) -> int | None:
-    """Return a timeout rounded up, so that a wait does not end just before a deadline; None for no limit."""
+    """Return a timeout in ms, rounded up to avoid waking before a deadline; None for no limit."""
     return None if timeout_s is None else max(0, math.ceil(min(timeout_s * 1000.0, _LONGEST_MS)))
 
 
 class WakeUp(Generic[T]):
-    """A queue with a descriptor to poll: `post` from any thread, `take` from the polling thread.
+    """A queue with a descriptor to poll: `post` from any thread, `take` in the polling thread.
 
-    It uses a pair of sockets, not a pipe: Windows can wait only on sockets.
+    It uses a pair of sockets instead of a pipe: Windows can wait only on sockets.
     """
 
     def __init__(self) -> None:
@@ -49,7 +49,7 @@ class WakeUp(Generic[T]):
             self._writer.send(b"\0")
 
     def take(self) -> list[T]:
-        """Return the items posted since the last call, oldest first; later ones wait for the next call."""
+        """Return the items posted since the last call, oldest first; items posted later wait for the next call."""
         with contextlib.suppress(BlockingIOError, OSError):
             while len(self._reader.recv(4096)) == 4096:
                 pass

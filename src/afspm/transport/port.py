@@ -1,4 +1,4 @@
-"""A process's access to the network: packets and requests come in, requests and packets go out.
+"""A process's access to the network: it receives and sends packets and requests.
 
 No socket library is named here, so that the in-memory network of `afspm.testing` can replace the real one.
 """
@@ -13,7 +13,7 @@ from afspm.basics.clock import Clock
 from afspm.model import Packet, Response
 
 CUT_OFF_SHOWS_WITHIN_S = 10.0
-"""Time within which a cut connection to the scheduler is noticed; until then it looks intact."""
+"""Longest time until a cut connection to the scheduler is noticed."""
 
 # Not frozen: packets, replies and requests come by the thousand, and frozen dataclasses take twice as long to make.
 
@@ -45,12 +45,12 @@ class CaughtUp:
 
 @dataclass(frozen=True, slots=True)
 class Killed:
-    """The signal KILL: the experiment has ended, and the process closes."""
+    """The signal KILL: the experiment has ended, and the process must close."""
 
 
 @dataclass(frozen=True, slots=True)
 class ParentGone:
-    """The event that the parent process has ended, or stops this process, which closes."""
+    """The event that the parent process has ended or stops this process, which must close."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,11 +98,11 @@ class Port(Protocol):
     def wake_up(self, incoming: Incoming | None = None) -> None:
         """End the present or next `poll`, which returns `incoming` with all other events.
 
-        May be called from any thread: the watch over the parent process posts `ParentGone()` this way.
+        Thread-safe: the watch over the parent process posts `ParentGone()` this way.
         """
 
     def wakeup_fileno(self) -> int:
-        """Return the descriptor for `signal.set_wakeup_fd`, so that a signal ends the present `poll`; -1: none."""
+        """Return the descriptor for `signal.set_wakeup_fd`, so that a signal ends `poll`; -1 without one."""
 
     def close(self) -> None:
         """Close all sockets after all sent messages have left, within a fraction of a second. Safe to repeat."""
@@ -126,7 +126,7 @@ class RequestReceived:
 
 @dataclass(frozen=True, slots=True)
 class SubscriberJoined:
-    """The event that a peer (the scheduler of a translator) subscribed and received the earlier packets."""
+    """The event that a peer (such as the scheduler) subscribed and received the earlier packets."""
 
 
 Served = RequestReceived | SubscriberJoined | ParentGone
@@ -167,7 +167,7 @@ class ServerPort(Protocol):
         """
 
     def wake_up(self, incoming: Served | None = None) -> None:
-        """End the present or next `poll`, which returns `incoming` with all other events. From any thread."""
+        """End the present or next `poll`, which returns `incoming` with all other events. Thread-safe."""
 
     def close(self) -> None:
         """Close all sockets after all sent messages have left, within a fraction of a second. Safe to repeat."""

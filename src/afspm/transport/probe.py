@@ -1,4 +1,4 @@
-"""Attempts to reach an address, step by step: its name, the connection, ZeroMQ's greeting, the keys."""
+"""Attempts to reach an address in steps: its name, the connection, ZeroMQ's greeting, the keys."""
 
 from __future__ import annotations
 

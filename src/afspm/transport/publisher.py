@@ -11,7 +11,7 @@ from afspm.transport.late_joiners import LONGEST, History, Marker, is_reserved, 
 from afspm.transport.network import Network
 
 _BATCH, _MOST_REPLAYS = 100, 5
-"""Messages received, and replays sent, in one turn, so that the other sockets get theirs."""
+"""Limit of received messages and sent replays in one turn, so that other sockets get a turn."""
 
 
 class Publisher:

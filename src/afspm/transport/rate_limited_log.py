@@ -1,4 +1,4 @@
-"""A log that passes a few warnings and counts the rest, so that a flood does not fill the log."""
+"""A log that writes a few warnings and counts the rest, so that a flood does not fill the log."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _PERIOD_S = 10.0
 
 
 class RateLimitedLog:
-    """A log of at most five warnings every ten seconds; later it adds the number of dropped warnings."""
+    """A log of at most five warnings in ten seconds; the next warning adds the number of dropped ones."""
 
     def __init__(self, log: logging.Logger, clock: Clock) -> None:
         self._log = log
@@ -21,7 +21,7 @@ class RateLimitedLog:
         self._dropped = 0
 
     def warning(self, text: str) -> None:
-        """Log `text`, or count it."""
+        """Log `text`, or only count it after too many warnings."""
         now_s = self._clock.monotonic_s()
         if now_s - self._since_s > _PERIOD_S:
             if self._dropped:

@@ -26,7 +26,7 @@ from afspm.transport.network import DISCONNECTED, REFUSED, Monitor, Network
 from afspm.transport.rate_limited_log import RateLimitedLog
 
 _LAST_WORDS = 200
-"""Most messages received before the end of a sender is reported."""
+"""Limit of messages received before the end of a sender is reported."""
 _LOOKS_S = (0.0, 0.02, 0.5)
 """Real times, after the end of a connection, at which its sender is probed: ZeroMQ reports the end a moment before it
 forgets the peer."""
@@ -41,7 +41,7 @@ class PeerDisconnected(NamedTuple):
 
 
 class PeerAsked(NamedTuple):
-    """A request, as frames for `wire.decode_request`; without frames the peer only gives its name.
+    """A request, as frames for `wire.decode_request`; without frames it only announces the peer's name.
 
     Attributes:
         name: name of the peer; "" without a readable name.
@@ -91,7 +91,7 @@ class Router:
 
     @property
     def due_s(self) -> float:
-        """Return when `receive` must be called without a new message, in real monotonic time."""
+        """Return the real monotonic time at which `receive` must be called even without a new message."""
         return self._looks_s[0] if self._looks_s else math.inf
 
     def receive(self) -> list[RouterEvent]:

@@ -1,4 +1,4 @@
-"""The sockets of a scheduler, in one poller; among them its connection to the translator's control socket."""
+"""The sockets of a scheduler in one poller, including its connection to the translator's control socket."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class TranslatorLink:
         return LinkReply(int(number), content)
 
     def follow(self) -> list[LinkUp | LinkDown]:
-        """Return connections and disconnections of the translator."""
+        """Return the translator's connection and disconnection events."""
         return [LinkUp() if event.kind == CONNECTED else LinkDown() for event in self.monitor.drain()]
 
 
@@ -125,14 +125,14 @@ class SchedulerSockets:
             self._poller.register(monitor.socket, monitor)
 
     def wait(self, timeout_ms: int | None) -> list[Source]:
-        """Return the sources with something to receive; returns early, perhaps without sources, after `wake_up`."""
+        """Return the readable sources; return early, perhaps without sources, after `wake_up`."""
         sources, woken = self._poller.wait(timeout_ms)
         if woken:
             self._wake_up.take()
         return sources
 
     def wake_up(self) -> None:
-        """End the present or next `wait`. From any thread."""
+        """End the present or next `wait`. Thread-safe."""
         self._wake_up.post()
 
     def close(self) -> None:

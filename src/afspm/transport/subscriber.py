@@ -1,4 +1,4 @@
-"""Receiving from one publisher: each packet once, and missed packets before newer ones."""
+"""Reception from one publisher: each packet once, and missed packets before newer ones."""
 
 from __future__ import annotations
 

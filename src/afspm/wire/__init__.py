@@ -1,13 +1,13 @@
-"""The wire format: messages as bytes, and bytes as values of the model. The only room that knows protobuf.
+"""The wire format: conversion between bytes and values of the model. The only package that uses protobuf.
 
 **Theory of operation.** `proto/` defines the messages of the paper; a build step generates Python classes from
 it. One registry declares each message once: its name, its envelope, whether it is a measurement or a state, the
 handler of a component for it. Every other list of messages is derived from the registry.
 
-    comes in      frames from sockets and the packet log; values of the model
+    inputs        frames from sockets and the packet log; values of the model
     state         the registry; the user's message types are added to it once, at the start of a process
-    goes out      values of the model; bytes
-    always holds  equal values give equal bytes (reference bytes in `proto/golden.json`); unreadable bytes raise
+    outputs       values of the model; bytes
+    invariants    equal values give equal bytes (reference bytes in `proto/golden.json`); unreadable bytes raise
                   WireError and disturb no other message; a scan's values are a view of the received buffer, never a
                   copy
 """

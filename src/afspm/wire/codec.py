@@ -52,7 +52,7 @@ def decode(name: str, payload: Buffer) -> Any:
 
 
 def header(name: str, payload: Buffer) -> model.PacketHeader:
-    """Return the header of a message, on which its envelope may depend, without reading its values.
+    """Return the fields of a message that determine its envelope, without reading its values.
 
     Raises:
         WireError: the bytes are no such message.

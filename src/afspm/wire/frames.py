@@ -44,7 +44,7 @@ BEAT: Final = b"\x00"
 CLOSING: Final = b"\x01"
 LONGEST_ID: Final = 200
 LONGEST_ENVELOPE: Final = 1000
-"""In bytes."""
+"""Limit of an envelope, in bytes."""
 
 
 def encode_time(time_ns: int) -> bytes:

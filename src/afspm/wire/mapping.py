@@ -45,7 +45,7 @@ def time_ns(stamp: Timestamp) -> int:
 
 
 def known(kind: type[E], number: int) -> E:
-    """Return the member with this number; UNDEFINED (0) for a number that only a newer peer knows."""
+    """Return the enum member with this number; UNDEFINED (0) for an unknown number from a newer peer."""
     return kind(number) if number in kind._value2member_map_ else kind(0)
 
 
@@ -59,10 +59,10 @@ def shortest(number: float) -> float:
 
 
 class FieldMapping(NamedTuple):
-    """One field of a message, and the conversion of its value in both directions.
+    """A field of a message, and the conversion of its value in both directions.
 
     Attributes:
-        sparse: whether an empty or zero value is not sent.
+        sparse: whether an empty or zero value is omitted.
     """
 
     name: str
@@ -319,7 +319,7 @@ MAPPINGS: tuple[MessageMapping[Any], ...] = (
 
 
 def encode_orders(restart: Iterable[str]) -> bytes:
-    """Return the object in the answer to RELAY_REQUEST."""
+    """Return the answer to RELAY_REQUEST in bytes: the names of the processes to restart."""
     return journal_pb2.Orders(restart=restart).SerializeToString()
 
 

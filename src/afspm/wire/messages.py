@@ -51,7 +51,7 @@ M = TypeVar("M", bound=Message)
 
 
 class MessageKind(Enum):
-    """The kinds of messages; receivers treat each differently."""
+    """The kinds of messages, each with its own treatment by receivers."""
 
     MEASUREMENT = "a finished measurement, with its values"
     LINES = "rows of a running scan, for the moment: not kept"
@@ -63,20 +63,20 @@ class MessageKind(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class MessageDeclaration:
-    """All properties of a message by its name.
+    """The properties of one message type.
 
     Attributes:
         type: the generated class.
         kind: see `MessageKind`.
         source: role of the process that publishes the message; None: only published on behalf of another process.
-        always: whether every process of that role publishes the message; else only on some request or event.
+        always: whether every process of that role publishes the message; otherwise only on some request or event.
         named: its envelopes continue after the message's name with size and channel, kind or owner.
         history: number of packets for each envelope that the scheduler keeps for late joiners.
         handler: method of a `Component` and of an `Overview` for this message.
         attribute: attribute of a client's view for the newest message; empty: not kept.
         set_by: the request that sets the content of the message.
         event: kind of the event in the gateway; empty: not streamed.
-        in_past: whether an overview of an earlier part of a run needs all packets, not only the newest.
+        in_past: whether an overview of an earlier part of a run needs all packets instead of only the newest.
         name: name of the message, with which its envelopes begin.
     """
 
@@ -282,7 +282,7 @@ for _module in _MODULES:
 
 
 def declare(declaration: MessageDeclaration) -> MessageDeclaration:
-    """Register a message of another package with its declaration.
+    """Register a message of another package with its declaration, and return the declaration.
 
     Raises:
         InvalidValue: another type has this name.
@@ -343,9 +343,7 @@ def known_messages() -> tuple[str, ...]:
 
 
 def messages_of_the_experiment() -> tuple[str, ...]:
-    """Return the names of messages about sample, microscope and control, without those about processes, requests and
-    logs.
-    """
+    """Return the names of messages about sample, microscope and control; others concern processes and logs."""
     beside = journal_pb2.DESCRIPTOR.name
     return tuple(name for name, one in _declared.items() if one.type.DESCRIPTOR.file.name != beside)
 

@@ -1,4 +1,4 @@
-"""Serialised messages with other values or at another place, changed without decoding the rest."""
+"""Changes of the values or the place in a serialised message, without decoding the rest."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def with_values(message: str, head: bytes, values: NDArray[np.float64]) -> bytes
 
 
 def with_nan(head: bytes) -> bytes:
-    """Return a spectrum from `without_values` with NaN as values.
+    """Return a spectrum from `without_values` with NaN for every value.
 
     Raises:
         WireError: the bytes are no spectrum.
@@ -89,7 +89,7 @@ def with_nan(head: bytes) -> bytes:
 
 
 def encode_place(place: Region | ProbePosition) -> bytes:
-    """Return a place as the part of a message that holds it: a SpatialAspects, or a ProbePosition."""
+    """Return a place in bytes as the message field: a SpatialAspects, or a ProbePosition."""
     if isinstance(place, Region):
         return unit_conversion.spatial_to_wire(place).SerializeToString()
     return unit_conversion.position_to_wire(place).SerializeToString()

@@ -3,13 +3,13 @@
 **Theory of operation.** Each request calls one Igor function (`xop`, `link`), and Igor answers when it is idle. The
 state is polled from two sources, ARGetStatus and the values behind the panels (`session`).
 
-    comes in      replies, matched by their id; new .ibw files in Asylum's data folder
+    inputs        replies, matched by their id; new .ibw files in Asylum's data folder
     state         the running and the ended measurement, the frame of the open image (origin of spots), whether a scan
                   has moved the tip: all persistent (`activity`)
-    goes out      calls of Asylum's functions and of `afspm.ipf`; scans and force curves from files (`result_files`)
-    always holds  one request is in flight; a reply without a result (NaN) is neither success nor failure: the state
-                  decides; all dependent values of a frame are set together, since PV updates none of them; a scan runs
-                  once (LastScan)
+    outputs       calls of Asylum's functions and of `afspm.ipf`; scans and force curves from files (`result_files`)
+    invariants    one request is pending at a time; a reply without a result (NaN) is neither success nor failure: the
+                  state decides; all dependent values of a frame are set together, since PV updates none of them; a
+                  scan runs once (LastScan)
 """
 
 from __future__ import annotations
@@ -216,7 +216,7 @@ class Asylum(Driver):
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
-        """Take a force curve at the spot where the tip was sent, or at its present place if it was never sent."""
+        """Take a force curve at the tip's target spot; without one, at its present position."""
         # ScanStatus and FMapStatus do not show single force curves
         if self._igor().doing().bits is None:
             reason = "Igor lacks ARGetStatus, without which the end of a force curve can't be detected"
@@ -246,7 +246,7 @@ class Asylum(Driver):
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
-        """Bring the tip to the sample, like the button Engage."""
+        """Approach the sample, like the button Engage."""
         # the function takes the name of the pressed button
         if not self._igor().do("SimpleEngageMe", "SimpleEngageButton"):
             raise Refused(ControlResponse.ACTION_ERROR, "Asylum refused to engage")

@@ -92,7 +92,7 @@ class AsylumActivity(Activity):
         return as_region(self._kept["image"])
 
     def find_image(self) -> None:
-        """Use the frame in force as the open image's frame, unless an earlier run has stored a frame."""
+        """Use the present frame as the open image's frame, unless an earlier run has stored one."""
         self._kept.setdefault("image", as_list(self._frame_in_force()))
 
     def _image_begins(self) -> None:
@@ -102,7 +102,7 @@ class AsylumActivity(Activity):
             self._kept["image"] = frame
 
     def begin(self, what: str) -> None:
-        """Register the start of a measurement. Of a force curve from the panel, only the file has the position."""
+        """Register the start of a measurement. The position of a panel's force curve comes from its file."""
         taken: dict[str, object] = {"position": None}
         if what == SCAN:
             # only if the tip was ever sent to a spot: else a force curve stays where it is
@@ -112,7 +112,7 @@ class AsylumActivity(Activity):
         self._files.begin_at(what, self._target(what), taken)
 
     def begin_curve(self) -> None:
-        """Register the start of a force curve at the spot where the tip was sent."""
+        """Register the start of a force curve at the tip's target spot."""
         spot_m = None if self._spot_m is None else list(self._spot_m())
         self._files.begin_at(FORCE, self._target(FORCE), {"position": spot_m})
 
@@ -140,7 +140,7 @@ class AsylumActivity(Activity):
         return local(self._session.text("GS", _SAVED_TO[what]), self._folders)
 
     def call_files(self, base: str) -> None:
-        """Set the files' base name, and a number above all existing ones: Asylum overwrites files."""
+        """Set the files' base name, and a number above all existing ones, since Asylum overwrites files."""
         self._session.do("SetBaseName", base)
         self._session.put("BaseSuffix", max(free_suffix(self.folder(what), base) for what in _SAVED_TO))
         try:
@@ -151,20 +151,24 @@ class AsylumActivity(Activity):
                 raise
 
     def await_begin(self, what: str) -> None:
-        """Wait until the measurement is seen running or has a file. Raises Refused."""
+        """Wait until the measurement is running or has a file.
+
+        Raises:
+            Refused
+        """
         state = ScopeState.SCANNING if what == SCAN else ScopeState.SPEC
         self.settle(what, lambda: self._session.doing().state is state or self._files.has_file())
         self._image_begins()
 
     def refuse(self, what: str) -> Refused:
-        """Forget the measurement, and return the refusal for a request that Asylum declined."""
+        """Discard the measurement, and return the refusal for a request that Asylum declined."""
         self.forget()
         return Refused(
             ControlResponse.ACTION_ERROR, f"Asylum refused to begin the measurement ({what}): see its history window"
         )
 
     def moves(self, lasts_s: float) -> None:
-        """Register a move that takes at most `lasts_s`, experiment time; Asylum does not report arrival."""
+        """Register a move of at most `lasts_s`, experiment time; Asylum does not report arrival."""
         self.way.sets_out(lasts_s)
         self._kept["led_away"] = False
 

@@ -42,7 +42,7 @@ class AsylumFiles(FolderFiles):
     """The measurement that is running or has just ended, and the results."""
 
     precision = FilePrecision(part=1e-4, angle_rad=1e-4 * math.tau)
-    """A note has five digits of a number."""
+    """Numbers in a note have five digits."""
 
     def __init__(self, kept: Entry, log: logging.Logger) -> None:
         super().__init__(kept, log)
@@ -54,12 +54,12 @@ class AsylumFiles(FolderFiles):
         self.begin(what, target.folder, {**place, **taken})
 
     def result_name(self, path: Path) -> str:
-        """Return a unique name: the number distinguishes files that Asylum overwrites by a new one of the same name."""
+        """Return a unique name; its number distinguishes a file from a later one with the same name."""
         self._kept["taken"] += 1
         return f"{self._kept['taken']}: {path.name}"
 
     def check(self, path: Path, one: Scan | Spectrum, measured: Entry) -> None:
-        """Log a warning if the scanned frame differs from the one set; the file is right then."""
+        """Log a warning if the frame in the file differs from the set frame; the file's frame is kept."""
         if isinstance(one, Scan) and one.region != (wanted := as_region(measured["frame"])):
             self._log.warning(
                 "%s has the frame %s instead of %s, which was set; it is published with the file's frame",
@@ -89,7 +89,7 @@ def _frame_text(region: Region) -> str:
 
 
 def free_suffix(folder: Path, base: str) -> int:
-    """Return the lowest number above those of all files with this base name."""
+    """Return the lowest number above all numbers of files with this base name."""
     named = re.compile(rf"{re.escape(base)}(\d{{4,}})\.ibw", re.IGNORECASE)
     taken = [int(match[1]) for path in _numbered(folder) if (match := named.fullmatch(path.name))]
     return max(taken, default=-1) + 1

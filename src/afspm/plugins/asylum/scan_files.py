@@ -100,7 +100,7 @@ def end_ns(note: Note, zone: tzinfo | None) -> int | None:
 
 
 def start_ns(note: Note, rows: int, zone: tzinfo | None) -> int | None:
-    """Return the start of the first row: the lines' duration before saving, twice that with a second pass (NapMode)."""
+    """Return the start of the first row: end minus the duration of the lines, doubled with a second pass (NapMode)."""
     rate_hz, end = number(note, "ScanRate"), end_ns(note, zone)
     if end is None or rate_hz is None or rate_hz <= 0.0:
         return None

@@ -46,12 +46,12 @@ class Doing:
 
     @property
     def engaged(self) -> bool:
-        """True if the tip is at the sample; also if unknown, so that the tip is treated with care."""
+        """True if the tip is at the sample, or if unknown, so that the tip is treated with care."""
         return self.bits is None or bool(self.bits & (_ENGAGED | _SCANNING)) or self.scanning
 
 
 class Session:
-    """One connection, and the abilities of the peer.
+    """A connection to Igor, and the features of the installation.
 
     Args:
         link: connected.
@@ -76,7 +76,7 @@ class Session:
     def do(self, name: str, *parameters: xop.Parameter) -> bool:
         """Call a function for its effect; return False if it reports a refusal.
 
-        Asylum's own functions return 1 for a refusal. Functions without a result arrive as NaN, which means nothing.
+        Asylum's own functions return 1 for a refusal. Functions without a result return NaN, which has no meaning.
         """
         return self.ask(name, *parameters) != 1.0
 
@@ -84,7 +84,7 @@ class Session:
         self._link.close()
 
     def feedback_on(self) -> bool:
-        """Return True if the z feedback runs; without `afspm.ipf`, if the tip is at the sample."""
+        """Return True if the z feedback is on; without `afspm.ipf`, if the tip is at the sample."""
         return bool(self.number("AfspmFeedbackOn")) if self.at_once else self.doing().engaged
 
     def controller(self) -> str:

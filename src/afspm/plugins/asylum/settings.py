@@ -125,7 +125,7 @@ class TipPlace(SettingsGroup):
         self._on_move = on_move
 
     def xy_m(self) -> tuple[float, float]:
-        """Return the position where the tip was sent, (x, y) in m."""
+        """Return the target position of the tip, (x, y) in m."""
         spot_m = (self._igor().number("GetProbePosX"), self._igor().number("GetProbePosY"))
         return spot_m if self._image is None else from_image(spot_m, self._image())
 

@@ -46,7 +46,7 @@ T = TypeVar("T")
 
 
 class _PlanSession:
-    """The handle to the experiment, used in its own thread since its calls block."""
+    """The connection to the experiment, used in its own thread since its calls block."""
 
     def __init__(self, where: str | Path, name: str) -> None:
         self.source = f"afspm://{Path(where).as_posix()}"
@@ -127,7 +127,7 @@ class _ParameterBackend(SignalBackend[float]):
 
 
 class _Measurement(StandardReadable, Triggerable):
-    """A measurement at the place of its signals, with an array for each channel or variable."""
+    """A measurement at the position in its signals, with an array for each channel or variable."""
 
     def __init__(self, session: _PlanSession, name: str = "") -> None:
         self._session = session
@@ -200,9 +200,7 @@ class ScanDevice(_Measurement):
 
 
 class SpectrumDevice(_Measurement):
-    """A spectrum device: `trigger` takes a spectrum at `x`, `y` (m), and a reading gives its variables over the
-    points.
-    """
+    """A spectrum device: `trigger` takes a spectrum at `x`, `y` (m), and a reading gives its variables."""
 
     def __init__(self, session: _PlanSession, name: str = "") -> None:
         with self.add_children_as_readables(StandardReadableFormat.UNCACHED_SIGNAL):

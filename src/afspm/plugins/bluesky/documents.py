@@ -1,8 +1,8 @@
 """A run as documents of Bluesky's event model: start, descriptors with events, stop.
 
-Each group of measurements with equal arrays has one descriptor. Values stay in the files of the record, to which
-StreamResource and StreamDatum point. Identifiers follow from the run, so that the same run always gives the same
-documents.
+Each group of measurements with equal arrays has one descriptor. Values stay in the files of the record;
+StreamResource and StreamDatum point to them. Identifiers follow from the run, so that the same run always gives the
+same documents.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 
 Document = tuple[str, dict[str, object]]
-"""Name and content."""
+"""A document: its name and content."""
 DOCUMENTS_FILE = "documents.jsonl"
 _PLACE = {"center_x": "m", "center_y": "m", "width": "m", "height": "m", "angle": "rad"}
 
 
 def tables(run: Run, scans: Sequence[ScanRow], spectra: Sequence[SpectrumRow]) -> Iterator[tuple[str, bytes]]:
-    """Yield the file of all documents: a line for each, as JSON [name, document]."""
+    """Yield the file of all documents, one JSON line [name, document] each."""
     lines = (json.dumps(document, ensure_ascii=False) for document in documents(run, scans, spectra))
     yield DOCUMENTS_FILE, "".join(f"{line}\n" for line in lines).encode()
 

@@ -4,13 +4,14 @@
 anything. So names are checked against GXSM's own lists at the start, values are read back, and states are derived from
 polls of status bits, line numbers and file names (`activity`).
 
-    comes in      results of calls (`link`: `shared_memory` or `bridge_client`); new files, which appear late, one by
+    inputs        results of calls (`link`: `shared_memory` or `bridge_client`); new files, which appear late, one by
                   one, and half written (`result_files`)
-    state         the running and the ended measurement, rows of GXSM's memory before it (`scan_memory`), the position
-                  where the tip was sent: all persistent
-    goes out      calls; scans and spectra from files; lines of the running scan from memory
-    always holds  one call at a time; a blocking call is never made, as it would wedge GXSM; a scan whose first or last
-                  row still holds the previous scan is not published; a file is read only once it has stopped growing
+    state         the running and the ended measurement, rows of GXSM's memory before it (`scan_memory`), the target
+                  position of the tip: all persistent
+    outputs       calls; scans and spectra from files; lines of the running scan from memory
+    invariants    one call at a time; a blocking call is never made, as it would block GXSM forever; a scan whose first
+                  or last row still holds the previous scan is not published; a file is read only once it has stopped
+                  growing
 """
 
 from __future__ import annotations
@@ -128,7 +129,7 @@ class Gxsm(Driver):
         }
 
     def connect(self) -> None:
-        """Open the link, and find out the hardware, the unit of lengths and the way of saving."""
+        """Open the link, and detect the hardware, the unit of lengths and the way of saving."""
         self.close()
         address = Address.parse(self.controller_at)
         ask = self._asking = Asking(self._open(address, monotonic_s=self.clock.monotonic_s))
@@ -275,7 +276,7 @@ class Gxsm(Driver):
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
-        """Take a spectrum of the kind `x-spec-kind` at the probe position. A scan moves the tip: it goes back first."""
+        """Take a spectrum of the kind `x-spec-kind` at the probe position, after moving the tip back there."""
         kind = str(self._kept[names.SPEC_KIND])
         if execute(kind) not in self._offered.actions:
             reason = f"this GXSM has no {execute(kind)} with its hardware ({self._offered.kind}): see x-spec-kind"

@@ -70,7 +70,7 @@ class LineWatch:
 
 @dataclass
 class ScanProgress:
-    """The running scan as observed so far.
+    """The observed progress of the running scan.
 
     Attributes:
         endings: endings of its channels' file names.
@@ -79,7 +79,7 @@ class ScanProgress:
         goes_up: True if the top row of the picture is scanned last; None: unknown.
         settles_until_s, ended_ns: end of GXSM's own work after the scan, and end of the scan.
         y_before, y_moved: last line of the previous scan, and whether GXSM has reported another line since.
-        follows: True if it started before the end of the previous scan was seen.
+        follows: True if it started before the end of the previous scan was observed.
     """
 
     endings: list[str] = field(default_factory=list)
@@ -108,7 +108,11 @@ class ConnectedGxsm:
     frame: ScanFrame
 
     def doing(self) -> Doing:
-        """Return the state that GXSM reports. Raises BadReply: the value is no set of bits."""
+        """Return the state that GXSM reports.
+
+        Raises:
+            BadReply: the value is no set of bits.
+        """
         return decoded(self.hardware, self.ask.numbers("rtquery", STATUS))
 
 
@@ -347,7 +351,7 @@ class GxsmActivity(Activity):
         self.gxsm.ask.call("action", action)
 
     def begin(self, what: str) -> None:
-        """Register a measurement that was started at the panel since the last poll."""
+        """Register a measurement that the panel started since the last poll."""
         if what != SCAN:
             self._begin_curve(what, self.gxsm.frame.tip())
             return

@@ -1,6 +1,6 @@
 """Bridge between afspm and GXSM: run this file in GXSM's Python console, and leave it running.
 
-The bridge listens on the loopback interface, and passes on calls of the functions listed below only. A client and the
+The bridge listens on the loopback interface, and passes on only calls of the functions listed below. A client and the
 bridge first prove to each other that they know a secret, which is in a file that only this user can read. The secret
 itself is never sent, so a program that listens here in place of the bridge learns nothing (`Introduction`). A line that
 is neither a proof nor a call ends its connection, so that no page in a browser can command GXSM. Several clients are
@@ -59,7 +59,7 @@ def secret() -> bytes:
 
 
 def proof(known: bytes, side: str, address: str, client_nonce: str, bridge_nonce: str) -> str:
-    """Return the proof that a side ("bridge" or "client") knows the secret, for the nonces of both.
+    """Return the proof that a side ("bridge" or "client") knows the secret, for the nonces of both sides.
 
     The proof includes the address of the bridge as both ends of the connection see it, so that a program in between,
     which listens at another address, can't pass a proof on.
@@ -83,11 +83,11 @@ class Introduction:
         self.is_over = False
 
     def reply_to(self, line: bytes) -> str:
-        """Return the answer to a line; empty: disconnect."""
+        """Return the answer to a line; empty to disconnect."""
         return self.reply(parsed(line))
 
     def reply(self, call) -> str:  # type: ignore[no-untyped-def]
-        """Return the answer to a parsed line; empty: disconnect."""
+        """Return the answer to a parsed line; empty to disconnect."""
         step, *arguments = call or [""]
         text = arguments[0] if len(arguments) == 1 and isinstance(arguments[0], str) else ""
         if step == "challenge" and len(text) == NONCE and not self._expected:
@@ -131,7 +131,7 @@ def wanted() -> bool:
 
 
 class Client:
-    """A connection. Times are monotonic.
+    """A connection of a client. Times are monotonic.
 
     Attributes:
         until_s: deadline for the proof, later for receiving an answer.
@@ -172,7 +172,7 @@ class Client:
             self.is_open = bool(part) and len(self._received) <= longest
 
     def reply(self) -> str:
-        """Return the answer to the next line; empty: disconnect."""
+        """Return the answer to the next line; empty to disconnect."""
         line, self._received = self._received.split(b"\n", 1)
         call = parsed(line)
         if self.is_stranger:
@@ -180,7 +180,7 @@ class Client:
         return answer(call[0], call[1:]) if call else ""
 
     def send(self, reply: str, now_s: float) -> None:
-        """Send an answer, as far as the connection accepts it now."""
+        """Send the part of an answer that the connection accepts now, and queue the rest."""
         self._unsent += reply.encode()
         try:
             sent = self.connection.send(self._unsent)

@@ -1,4 +1,4 @@
-"""Hardware behind GXSM: its drivers ("HwI") differ in their names and in the meaning of their status bits."""
+"""The hardware drivers ("HwI") of GXSM, which differ in names and in the meaning of status bits."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Hardware(Enum):
 
 @dataclass(frozen=True)
 class Offered:
-    """The names that a running GXSM has, and the kind of its hardware."""
+    """The names that a running GXSM offers, and the kind of its hardware."""
 
     refnames: frozenset[str]
     actions: frozenset[str]
@@ -62,7 +62,7 @@ class Doing:
 
 
 def recognised(refnames: Collection[str], actions: Collection[str]) -> Hardware:
-    """Return the kind of hardware, by the names that it adds to GXSM's lists."""
+    """Return the kind of hardware, recognised by the names that it adds to GXSM's lists."""
     if any(name.startswith("dsp-GVP-") for name in refnames) or any(name.startswith("GVP_CMD_") for name in actions):
         return Hardware.RPSPMC
     if any(name.startswith(("sim-", "template-")) for name in refnames):

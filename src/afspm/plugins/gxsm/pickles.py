@@ -87,7 +87,7 @@ def loads(content: bytes) -> object:
 
 
 class _Values:
-    """The replacement of stand-ins by arrays. It counts parts, so that it ends for a list that contains itself."""
+    """The replacement of stand-ins by arrays; a limit on parts stops it for a list that contains itself."""
 
     def __init__(self) -> None:
         self._left = _MOST_PARTS

@@ -1,4 +1,4 @@
-"""The process to signal. A signal to the wrong process would end it. Linux only."""
+"""The GXSM process that receives signals. A signal to the wrong process would end it. Linux only."""
 
 from __future__ import annotations
 

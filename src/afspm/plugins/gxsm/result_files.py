@@ -1,4 +1,4 @@
-"""Results of measurements: GXSM's files, which appear late, one for each channel, one after the other."""
+"""Results of measurements: GXSM's files, one per channel, which appear late and one after the other."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class GxsmFiles(ResultFiles):
 
     @property
     def before(self) -> tuple[Rows, int | None] | None:
-        """Rows in GXSM's memory before the running scan, and the line being scanned when they were read.
+        """Rows in GXSM's memory before the running scan, and the line being scanned when the rows were read.
 
         The line is None if the scan had not started. None: no rows were read.
         """
@@ -107,7 +107,7 @@ class GxsmFiles(ResultFiles):
 
     @property
     def program(self) -> str:
-        """GXSM's name and version, known from its files only; empty before the first one."""
+        """GXSM's name and version, known only from its files; empty before the first file."""
         found: str = self._kept["program"]
         return found
 
@@ -179,7 +179,7 @@ class GxsmFiles(ResultFiles):
         return self._kept["ended"] is not None and "names" in self._kept["ended"]
 
     def followed(self) -> bool | None:
-        """Return, once, whether a measurement directly followed by another one was complete; None: there was none."""
+        """Return once whether a measurement that another one directly followed was complete; else None."""
         found, self._outcome = self._outcome, None
         return found
 

@@ -80,7 +80,7 @@ def _stored(file: FileContent) -> np.ndarray:
 
 
 def only(rows: Rows, row: int) -> Rows:
-    """Return the digests of one row only."""
+    """Return the digests of a single row."""
     digests = {channel: {str(row): there[str(row)]} for channel, there in rows["digests"].items() if str(row) in there}
     return Rows(columns=rows["columns"], digests=digests)
 

@@ -69,7 +69,7 @@ class ScanFrame:
         return frame_values(Region(center_m, size_m, angle_rad), (round(rows), round(columns)))
 
     def write(self, values: Mapping[str, Value]) -> None:
-        """Set the given parameters. X is set before Y, since GXSM changes Y with X."""
+        """Set the given parameters. X is set before Y, since setting X also changes Y in GXSM."""
         asked = values.keys()
         before = {} if asked >= set(FRAME) else self.read()
         region, (rows, columns) = frame({**before, **values})
@@ -97,7 +97,7 @@ class ScanFrame:
             raise Refused(ControlResponse.PARAM_ERROR, reason)
 
     def tip(self) -> tuple[float, float]:
-        """Return the position where the tip was last sent in the frame, (x, y) in m; if unknown the frame's centre."""
+        """Return the target of the tip in the frame, (x, y) in m; if unknown, the frame's centre."""
         region = self.region()
         try:
             u_m, v_m = (number(self._ask, ref) * self._unit_m for ref in ("ScanX", "ScanY"))
@@ -135,7 +135,7 @@ class FrameSettings(SettingsGroup):
 
 
 class TipPlace(SettingsGroup):
-    """The position where the tip was sent, which GXSM's files of spectra lack.
+    """The target position of the tip, which GXSM's files of spectra lack.
 
     Args:
         kept: persistent, JSON-able.
@@ -150,7 +150,7 @@ class TipPlace(SettingsGroup):
         self.on_move = on_move
 
     def xy_m(self) -> tuple[float, float]:
-        """Return the position where the tip was sent, (x, y) in m."""
+        """Return the target position of the tip, (x, y) in m."""
         sent = self._kept.get("probe")
         return self.frame.tip() if sent is None else (float(sent[0]), float(sent[1]))
 

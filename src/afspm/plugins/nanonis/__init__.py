@@ -1,17 +1,17 @@
 """Driver of Nanonis controllers (SPECS), over their TCP programming interface. See the README in this folder.
 
-**Theory of operation.** The first connection carries quick requests, the second one blocking call at a time, in a
-thread of its own (`session`): the wait for the end of a scan, or a spectrum with its data. Nanonis sends nothing
+**Theory of operation.** The first connection carries quick requests, the second one blocking call at a time, in its
+own thread (`session`): the wait for the end of a scan, or a spectrum with its data. Nanonis sends nothing
 unrequested.
 
-    comes in      replies, decoded by the fields of the software's release (`protocol`); events of the second
+    inputs        replies, decoded by the fields of the software's release (`protocol`); events of the second
                   connection; new files in the session folder
     state         the running and the ended measurement, and the present occupation, all persistent (`activity`);
-                  the goal of the tip (`settings`)
-    goes out      requests; scans and spectra from files (`result_files`), or from Nanonis' memory (`fetched`)
-    always holds  a reply that does not fit its request ends the connection; a value of a getter never goes into a
-                  setter as it is, since both count differently; a scan that was never seen running is not published,
-                  because Nanonis' memory then holds the previous one
+                  the target of the tip (`settings`)
+    outputs       requests; scans and spectra from files (`result_files`), or from Nanonis' memory (`fetched`)
+    invariants    a reply that does not fit its request ends the connection; a value of a getter is converted before
+                  it goes into a setter, since both count differently; a scan that was never observed running is not
+                  published, because Nanonis' memory then holds the previous one
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ class Nanonis(Driver):
         return geometry.same_float32(name, a, b, among)
 
     def get(self, vendor: str) -> Value:
-        """Return a value by the prefix of a pair of functions: "Bias." stands for Bias.Get."""
+        """Return a value by the prefix of a pair of functions: "Bias." means Bias.Get."""
         if vendor == names.CONTROLLER:
             return self._there.controller
         value: Value = parameter_groups.numbers(self._ask, f"{vendor}Get")[0]
@@ -174,7 +174,7 @@ class Nanonis(Driver):
         return [fetched.spectrum(curve, ended["what"], (ended["position"][0], ended["position"][1]))]
 
     def lines(self, start: int) -> Sequence[ScanLines]:
-        """Return new lines from Nanonis' memory, where lines not yet scanned are NaN."""
+        """Return new lines from Nanonis' memory, in which lines not yet scanned are NaN."""
         region, _ = frame(self.in_force(FRAME))
         return fetched.new_lines(fetched.images(self._ask, self._grabbing), region, start)
 
@@ -201,7 +201,7 @@ class Nanonis(Driver):
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
-        """Take a spectrum of the kind `x-spec-kind` at the tip's place."""
+        """Take a spectrum of the kind `x-spec-kind` at the tip's position."""
         self._activity.refuse_safe_tip()
         kind = str(self._kept[names.SPEC_KIND])
         if MODULES[kind] not in self._there.opened:
@@ -222,7 +222,7 @@ class Nanonis(Driver):
 
     @action(names.CRASH, state=ScopeState.MOVING)
     def crash(self) -> None:
-        """Shape the tip: `x-crash-depth` down at `x-crash-speed` and up again; the z controller is restored."""
+        """Shape the tip: `x-crash-depth` down at `x-crash-speed` and back; the z controller is restored."""
         self._activity.refuse_safe_tip()
         depth_m = self._kept.number(names.CRASH_DEPTH)
         ramp_s = depth_m / self._kept.number(names.CRASH_SPEED)
@@ -247,7 +247,7 @@ class Nanonis(Driver):
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
-        """Switch the z controller on, which brings back a tip withdrawn by `x-retract` or the safe tip."""
+        """Switch the z controller on, which also ends a withdrawal by `x-retract` or the safe tip."""
         on = 1
         self._ask("ZCtrl.OnOffSet", on)
 

@@ -1,4 +1,4 @@
-"""State of Nanonis, from both connections."""
+"""State of Nanonis, from events and replies of both connections."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class NanonisActivity(Activity):
     # --- start and stop ---
 
     def begin_scan(self, region: Region) -> None:
-        """Register the start of a scan, or a scan found running."""
+        """Register a scan that starts, or that was found running."""
         self._stopping = False
         self._listener.scan()
         self._files.begin(SCAN, self._session_folder(), {"frame": as_list(region)})
@@ -85,7 +85,7 @@ class NanonisActivity(Activity):
         self._await_curve(f"{MODULES[kind]}.StatusGet")
 
     def begin(self, what: str) -> None:
-        """Register the start of a measurement; of a scan with the frame read from Nanonis."""
+        """Register the start of a measurement; a scan gets the frame read from Nanonis."""
         if what == SCAN:
             self.begin_scan(frame(ScanFrame(self._ask).read())[0])
             return
@@ -136,7 +136,7 @@ class NanonisActivity(Activity):
 
     @contextmanager
     def occupied(self, state: ScopeState, lasts_s: float) -> Iterator[None]:
-        """Register that the action in the block occupies the controller for `lasts_s`, experiment time.
+        """Register that the action in the `with` block occupies the controller for `lasts_s`, experiment time.
 
         Nanonis does not report the end of such an action. The occupation persists if the answer, the connection or this
         process is lost.

@@ -1,4 +1,4 @@
-"""Scans and spectra that Nanonis has not saved: fetched over TCP, and kept in files of the translator."""
+"""Scans and spectra that Nanonis has not saved: fetched over TCP, and written to files by the translator."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Image:
 
 
 def images(ask: Ask, how: Grabbing) -> list[Image]:
-    """Fetch every channel of the scan in Nanonis' memory, forward and backward."""
+    """Fetch all channels of the scan in Nanonis' memory, forward and backward."""
     signals = ask("Signals.NamesGet")[0]
     found = []
     for channel in ask("Scan.BufferGet")[0]:
@@ -81,7 +81,7 @@ def images(ask: Ask, how: Grabbing) -> list[Image]:
 
 
 def new_lines(found: Sequence[Image], region: Region, start: int) -> list[ScanLines]:
-    """Return the complete lines beyond the first `start`, in scanning order."""
+    """Return the complete lines after the first `start`, in scanning order."""
     lines = []
     # Lines not yet scanned are NaN; channels may differ by the line being scanned.
     done = min((int(np.isfinite(image.values).all(axis=1).sum()) for image in found), default=0)

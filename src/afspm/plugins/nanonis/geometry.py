@@ -24,7 +24,7 @@ _ADDED_UP: Final = frozenset(FRAME) - {names.SCAN_ANGLE, names.SCAN_RESOLUTION_X
 
 
 class ScanFrame(Group):
-    """The scan frame: Nanonis has the centre, a clockwise angle in degrees, and the range of N pixels of range / N."""
+    """The scan frame; Nanonis uses the centre, a clockwise angle in degrees, and N pixels of range / N."""
 
     names = FRAME
 
@@ -66,7 +66,7 @@ def _share(pixels: int) -> float:
 
 
 class Probe(Group):
-    """The position of the tip: the goal during a move, the position before during a scan.
+    """The position of the tip; during a move its target, during a scan the position before.
 
     Args:
         now_s: returns experiment time.
@@ -120,7 +120,7 @@ class Probe(Group):
         self.arrives_s = self._now_s() + (math.dist(before_m, (x, y)) / speed_m_s if speed_m_s > 0.0 else 0.0)
 
     def arrived(self) -> bool:
-        """Return True if the tip has reached its goal, which then counts as its exact position."""
+        """Return True if the tip has reached its target, which then counts as its exact position."""
         if self._goal_m is None:
             return True
         if not self._near(self._numbers("FolMe.XYPosGet", 0), self._goal_m):
@@ -129,7 +129,7 @@ class Probe(Group):
         return True
 
     def give_up(self) -> None:
-        """Give up the goal: the measured position counts."""
+        """Give up the target, and use the measured position."""
         self._goal_m = self._seen_m = None
 
     def _near(self, a: tuple[Any, ...], b: tuple[float, float]) -> bool:

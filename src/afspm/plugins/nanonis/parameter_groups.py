@@ -1,7 +1,7 @@
-"""Parameters that Nanonis groups, scales or signs in ways that a table can't express; those of geometry: `geometry`.
+"""Parameters that Nanonis groups, scales or signs in ways that a table can't express (except `geometry`).
 
-A group is read by one request and written by one command, by generic names, in SI. Values of a `…Get` are never passed
-to a `…Set` as they are where both count differently (the table of `protocol`, "Traps" in the README).
+A group is read by one request and written by one command, by generic names, in SI. Where `…Get` and `…Set` count
+differently, values are converted (the table of `protocol`, "Traps" in the README).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Group(SettingsGroup):
 
 
 def numbers(ask: Ask, name: str, *arguments: object) -> tuple[Any, ...]:
-    """Return the numbers that a function replies.
+    """Return the numbers in a function's reply.
 
     Raises:
         BadReply: a number is not finite, so that nothing can be set by it.
@@ -48,7 +48,7 @@ def numbers(ask: Ask, name: str, *arguments: object) -> tuple[Any, ...]:
 
 
 class ScanSpeed(Group):
-    """The scan speed forward. The backward speed keeps its ratio; the speeds are kept when the frame changes."""
+    """The forward scan speed. The backward speed keeps its ratio; both are kept when the frame changes."""
 
     names = (names.SCAN_SPEED,)
 
@@ -89,7 +89,7 @@ class Gains(Group):
 
 
 class FeedbackOn(Group):
-    """The switch of the z controller, as its real-time part reports it, with a delay.
+    """The switch of the z controller, as its real-time part reports it with a delay.
 
     Args:
         wait_for: waits for a condition, up to a time limit.

@@ -1,7 +1,7 @@
-"""Nanonis' TCP protocol: requests to bytes, results from bytes. No sockets here.
+"""Nanonis' TCP protocol: encoding of requests and decoding of results. No sockets here.
 
-A header of 40 bytes (name, size of the body), then the body; every reply ends with an error block. The functions stand
-in `functions.txt`; some fields exist only from a release of the software on.
+A header of 40 bytes (name, size of the body), then the body; every reply ends with an error block. `functions.txt`
+lists the functions; some fields exist only from a release of the software on.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _NUMBERS: Final = {code: struct.Struct(">" + code) for code in "HIifd"}
 
 
 class BadReply(ControllerLost):
-    """Received bytes that can't be the reply: later bytes of the connection can't be trusted either."""
+    """The error that received bytes can't be the reply, so that later bytes can't be trusted either."""
 
     code = "nanonis-reply"
 
@@ -147,7 +147,7 @@ def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[
 
 
 def text_of(raw: bytes | bytearray | memoryview) -> str:
-    """Decode a text: UTF-8, else the western Windows encoding (a µ in a name, an umlaut in a path)."""
+    """Decode a text as UTF-8, otherwise as Latin-1 (a µ in a name, an umlaut in a path)."""
     raw = bytes(raw)
     try:
         return raw.decode()
@@ -170,7 +170,7 @@ def _parsed(body: bytes | bytearray, codes: Sequence[str]) -> tuple[tuple[object
 
 
 class _Reader:
-    """A reader of one field after the other from a body, never beyond its end."""
+    """A reader of consecutive fields of a body, never beyond its end."""
 
     def __init__(self, body: memoryview) -> None:
         self._body = body

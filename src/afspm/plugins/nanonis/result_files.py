@@ -63,7 +63,7 @@ class NanonisFiles(ResultFiles):
 
     @property
     def was_seen(self) -> bool:
-        """True if the running measurement was seen running; else Nanonis' memory still holds the previous scan."""
+        """True if the running measurement was observed; otherwise Nanonis' memory still holds the previous scan."""
         return self._kept["running"] is not None and bool(self._kept["running"].get("seen", True))
 
     def seen(self) -> None:
@@ -94,7 +94,7 @@ class NanonisFiles(ResultFiles):
         return running is not None and self._file({**running, "reported": None}) is not None
 
     def next_s(self) -> float | None:
-        """Return the time of the next necessary look."""
+        """Return the time of the next necessary poll."""
         ended = self._kept["ended"]
         return None if ended is None else float(ended["fetch_at_s"])
 

@@ -73,11 +73,11 @@ class Session:
         driver: the driver that uses them.
         addresses: addresses of both; equal only if a port serves several clients.
         timeout_s: longest wait for an answer, real time.
-        release: release of the software; None: ask Nanonis.
+        release: release of the software; None: query Nanonis.
 
     Attributes:
         controller: name and version, for people.
-        opened: available modules: Nanonis has the bought ones, which answer only once open.
+        opened: available modules: Nanonis has the purchased ones, which answer only once open.
         listener: user of the second connection.
 
     Raises:
@@ -158,7 +158,7 @@ ListenerEvent = ScanEnded | CurveEnded | AfspmError
 
 
 class Listener:
-    """Thread for blocking calls on the second connection, one at a time.
+    """A thread that makes blocking calls on the second connection, one at a time.
 
     Args:
         wake: called from that thread when `events` has new entries.

@@ -18,7 +18,7 @@ _LAYOUT = "%d.%m.%Y %H:%M:%S"
 
 
 def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
-    """Read a spectrum with all sweeps, a column each; `kind` is Nanonis' own, e.g. "bias spectroscopy".
+    """Read a spectrum with one column per sweep; `kind` is Nanonis' own, e.g. "bias spectroscopy".
 
     A file truncated between two lines can't be distinguished from a shorter one.
 

@@ -1,12 +1,12 @@
 """Driver of Nanosurf microscopes, over the scripting interface of Nanosurf Studio. See the README in this folder.
 
 **Theory of operation.** Every request is a Lua script, and its value the reply (`link`, `lua_values`). Quick scripts
-share the first connection; each long command (approach, withdrawal, curve) has a connection of its own (`session`).
+share the first connection; each long command (approach, withdrawal, curve) has a separate connection (`session`).
 
-    comes in      values of scripts; new .nhf files in Studio's gallery
+    inputs        values of scripts; new .nhf files in Studio's gallery
     state         the running and the ended measurement (persistent), the running long command (`activity`)
-    goes out      scripts (`commands`); scans and force curves from files; lines from a low-level buffer
-    always holds  all commands and units are checked before the first is used; values are set all or none; a stop that
+    outputs       scripts (`commands`); scans and force curves from files; lines from a low-level buffer
+    invariants    all commands and units are checked before the first is used; values are set all or none; a stop that
                   may have overtaken its start is repeated
 """
 
@@ -150,7 +150,7 @@ class Nanosurf(Driver):
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
-        """Take a force curve where the tip was sent, with the cycle selected in Studio."""
+        """Take a force curve at the tip's target position, with the cycle selected in Studio."""
         self._doing.start_curve()
 
     @action(names.STOP_SPEC)
@@ -165,7 +165,7 @@ class Nanosurf(Driver):
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
-        """Bring the tip to the sample, with the approach selected in Studio."""
+        """Approach the sample, with the approach selected in Studio."""
         self._doing.approach()
 
     def command(self, text: str) -> None:

@@ -1,4 +1,4 @@
-"""State of Studio, and the measurements that wait for their end."""
+"""State of Studio, and the measurements in progress."""
 
 from __future__ import annotations
 
@@ -98,7 +98,11 @@ class StudioActivity(Activity):
         self.started(SCAN, lambda: self._session.do(commands.START), is_seen)
 
     def start_curve(self) -> None:
-        """Take a force curve where the tip was sent. A scan moves the tip, so it moves back first. Raises Refused."""
+        """Take a force curve at the tip's target position, after moving back there if a scan moved the tip.
+
+        Raises:
+            Refused
+        """
         self._stopping = False
         self._place.go()
         self.curve_awaited = FORCE

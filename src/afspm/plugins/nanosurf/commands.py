@@ -79,7 +79,7 @@ return 0
 """Sets values; if Studio refuses one, restores the ones set before."""
 
 BUFFER_LEVEL: Final = 2
-"""The level of a session from which on the low-level buffers are there."""
+"""The lowest session level with low-level buffers."""
 BUFFER_LINES: Final = """
 local found, acquisition, buffer = {}, root.core.acquisition, %d
 acquisition.synchronize_lu_data_buffer(buffer)

@@ -38,7 +38,7 @@ class Scanning:
 
 
 class Session:
-    """A measurement session of Studio, for one thread.
+    """A measurement session of Studio. Not thread-safe.
 
     Args:
         open_link: opens a new connection.
@@ -119,7 +119,11 @@ class Session:
         return Scanning(*found)
 
     def begin(self, what: str, command: str, first: str = "") -> LongCall:
-        """Start a long command on a connection of its own, after the script `first`. Raises ControllerLost."""
+        """Start a long command on a separate connection, after the script `first`.
+
+        Raises:
+            ControllerLost
+        """
         link = self._open_link()
         try:
             self._select(link)
@@ -180,7 +184,7 @@ def _field(path: str) -> str:
 def new_lines(
     session: Session, buffer: int, region: Region, shape: tuple[int, int], start: int, *, upwards: bool
 ) -> list[ScanLines]:
-    """Return the complete lines beyond the first `start` that all channels have, in scanning order."""
+    """Return the complete lines after the first `start` that all channels have, in scanning order."""
     # (!) which buffer holds the image, and that its values are the lines as they were scanned, is not known
     found = session.run(commands.BUFFER_LINES % buffer)[0]
     channels = [_buffered_channel(one, shape[1]) for one in found.values()]

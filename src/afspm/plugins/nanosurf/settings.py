@@ -83,7 +83,7 @@ class Slopes(SettingsGroup):
 
 
 class TipPlace(SettingsGroup):
-    """The position where the tip was sent."""
+    """The target position of the tip."""
 
     names = POSITION
 
@@ -100,7 +100,7 @@ class TipPlace(SettingsGroup):
         self.go()
 
     def xy_m(self) -> tuple[float, float]:
-        """Return the position where the tip was sent, (x, y) in m."""
+        """Return the target position of the tip, (x, y) in m."""
         x, y = (float(value) for value in self._session().values(_TARGET).values())
         return x, y
 
@@ -110,7 +110,7 @@ class TipPlace(SettingsGroup):
         self._moving = True
 
     def arrived(self) -> bool:
-        """Return True if the tip has reached the target, within 1 nm or 0.1 % of its distance from the origin."""
+        """Return whether the tip is within 1 nm of the target, or 0.1 % of its distance from the origin."""
         if self._moving:
             x, y, to_x, to_y = (float(value) for value in self._session().values((*_PLACE, *_TARGET)).values())
             self._moving = math.dist((x, y), (to_x, to_y)) > max(1e-9, 1e-3 * math.hypot(to_x, to_y))

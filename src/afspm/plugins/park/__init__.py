@@ -1,14 +1,14 @@
 """Driver of Park microscopes, over SmartScan's SmartRemote. See the README in this folder.
 
 **Theory of operation.** Every request is a JavaScript expression in JSON-RPC over ZeroMQ (`link`), wrapped so that it
-returns its own error. Each long script has a connection of its own (`session`). Several answers of SmartScan are
+returns its own error. Each long script has a separate connection (`session`). Several answers of SmartScan are
 unconfirmed: the driver accepts each plausible form, and refuses unknown words instead of guessing.
 
-    comes in      replies; new TIFF files below SmartScan's base folder, one for each channel and direction
-    state         the running and the ended measurement, the position where the tip was sent: persistent; the running
+    inputs        replies; new TIFF files below SmartScan's base folder, one for each channel and direction
+    state         the running and the ended measurement, the target position of the tip: persistent; the running
                   long script (`activity`)
-    goes out      expressions; scans and curves from files
-    always holds  a reply of unknown form ends the connection; the files of a scan are read once no further file appears
+    outputs       expressions; scans and curves from files
+    invariants    a reply of unknown form ends the connection; the files of a scan are read once no further file appears
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ class Park(Driver):
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
-        """Take a curve of the kind `x-spec-kind` where the tip was sent, with SmartScan's settings."""
+        """Take a curve of the kind `x-spec-kind` at the tip's target position, with SmartScan's settings."""
         self._doing.start_curve(str(self._kept[names.SPEC_KIND]), self._place.xy_m())
 
     @action(names.STOP_SPEC)
@@ -177,7 +177,7 @@ class Park(Driver):
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
-        """Bring the tip to the sample by SmartScan's quick and safe approach."""
+        """Approach the sample by SmartScan's quick and safe approach."""
         self._doing.approach()
 
     def command(self, text: str) -> None:

@@ -85,7 +85,7 @@ class SmartScanActivity(Activity):
         self.started(SCAN, lambda: self._session.do(START), lambda: self._session.scanning() or self._files.has_file())
 
     def start_curve(self, kind: str, place_m: XY) -> None:
-        """Take a curve where the tip was sent. A scan moves the tip, so it moves back first."""
+        """Take a curve at the tip's target position, after moving back there if a scan moved the tip."""
         self._stopping = False
         # The scanner is where the scan has left it: the curve needs a move first.
         self.watch(self._session.begin(kind, way_to(place_m)))
@@ -95,7 +95,11 @@ class SmartScanActivity(Activity):
         self.watch(self._session.begin("approach", APPROACH))
 
     def evaluate(self, expression: str) -> None:
-        """Evaluate an expression; one without a value after 0.5 s keeps the microscope busy. Raises SmartScanError."""
+        """Evaluate an expression; if it takes longer than 0.5 s, it keeps the microscope busy.
+
+        Raises:
+            SmartScanError
+        """
         call = self._session.begin("command", f"({expression}, 0)", _ANSWERS_S)
         try:
             goes_on = call.running()

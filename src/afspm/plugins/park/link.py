@@ -103,7 +103,7 @@ class Link:
 
 
 def wrapped(expression: str) -> str:
-    """Return a script whose value reports a failure of the expression: SmartScan's form of errors is unconfirmed."""
+    """Return a script that returns the expression's value or error, since SmartScan's error form is unconfirmed."""
     ok, error = f'JSON.stringify({{"{OK}": ({expression})}})', f'JSON.stringify({{"{ERROR}": String(e)}})'
     return f"(function() {{ try {{ return {ok}; }} catch (e) {{ return {error}; }} }})()"
 
@@ -114,7 +114,11 @@ def shown(script: str) -> str:
 
 
 def numbers(reply: object, count: int) -> list[float]:
-    """Return `count` finite numbers of a list, or of a text with commas. Raises ControllerLost."""
+    """Parse `count` finite numbers from a list, or from a text with commas.
+
+    Raises:
+        ControllerLost
+    """
     parts = reply.split(",") if isinstance(reply, str) else reply
     try:
         found = [float(one) for one in parts] if isinstance(parts, list) else []

@@ -27,7 +27,7 @@ _GEOMETRY: Final = ("pixelHeight", "pixelWidth", "width", "height", "offsetX", "
 
 
 class Session:
-    """SmartScan over one connection, with a further one for each long script; for one thread.
+    """SmartScan over one connection, with a further one for each long script. Not thread-safe.
 
     Args:
         open_link: opens a new connection.
@@ -103,10 +103,13 @@ class Session:
         return self._word(SCRIPT_RUNS, TRUE, FALSE, "report it, with a trace")
 
     def begin(self, what: str, expression: str, wait_s: float = 0.0) -> LongCall:
-        """Start a long script on a connection of its own; wait up to `wait_s` for its reply. Raises ControllerLost.
+        """Start a long script on a separate connection; wait up to `wait_s` for its reply.
 
         Whether the reply arrives at the end of a script, or at once without a value, is unconfirmed. After an early
         reply SmartScan is polled for the end.
+
+        Raises:
+            ControllerLost
         """
         link = self._open_link()
         try:

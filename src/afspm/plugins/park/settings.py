@@ -89,7 +89,7 @@ class Gains(SettingsGroup):
 
 
 class TipPlace(KeptSettings):
-    """The position where the tip was sent: SmartScan reports its stage's position only (!)."""
+    """The target position of the tip; SmartScan reports only its stage's position (!)."""
 
     def __init__(self, session: Callable[[], Session], begun: Callable[[LongCall], None]) -> None:
         super().__init__(dict.fromkeys(POSITION, 0.0))
@@ -101,7 +101,7 @@ class TipPlace(KeptSettings):
         super().write(values)
 
     def xy_m(self) -> XY:
-        """Return the position where the tip was sent, (x, y) in m."""
+        """Return the target position of the tip, (x, y) in m."""
         x, y = map(self.number, POSITION)
         return x, y
 

@@ -5,11 +5,11 @@ Theory of operation
 
 `dashboard/` serves pages for people, `gateway/` a JSON API for programs. Both are components (`component`): messages
 published so far come from the record (`archive`), later ones from their subscriptions. The component's thread
-writes them into a `Watch`; the server's thread (`server`) reads them under its lock. Requests of a person go to the
-scheduler over a connection of that person's own (`persons`, `person_commands`): roles, limits and arbitration hold as
-for any other client. A name is believed only with its password (`passwords`), and a request is answered only if it
-comes from an allowed origin (`asgi`).
+writes the messages into a `Watch`; the server's thread (`server`) reads them under its lock. Requests of a person go to
+the scheduler over a separate connection for each person (`persons`, `person_commands`): roles, limits and arbitration
+hold as for any other client. A name is accepted only with its password (`passwords`), and a request is answered only if
+it comes from an allowed origin (`asgi`).
 
-Invariants: a slow browser delays nothing but itself; nothing is drawn twice for two viewers; other processes
+Invariants: a slow browser delays only its own page; nothing is drawn twice for two viewers; other processes
 have priority for the processor.
 """

@@ -1,4 +1,4 @@
-"""The run's folder: measurements before the start of this component, scans no longer in memory, and the limits."""
+"""The run's folder: earlier measurements, scans no longer in memory, and the limits."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Archive:
     """A thread-safe reader of the recorder's files in the run's folder.
 
     Args:
-        folder: of the run; None if it is on another computer.
+        folder: the run folder; None if it is on another computer.
     """
 
     def __init__(self, folder: Path | None) -> None:
@@ -98,7 +98,7 @@ def adjustable_parameters(folder: Path) -> tuple[str, ...]:
 
 
 def agents_in(folder: Path) -> tuple[str, ...]:
-    """Return names of agents in the expanded experiment file, for suggestions; the scheduler decides which there are.
+    """Return names of agents in the expanded experiment file, as suggestions; the scheduler has the valid list.
 
     A component without `people` admits any name: its suggestion ends with the colon.
     """

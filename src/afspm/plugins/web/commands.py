@@ -71,7 +71,7 @@ def stay(folder: Path, name: str, settings: PlainMapping) -> None:
     """Show a run that has ended until Ctrl-C.
 
     Args:
-        name: of the dashboard component, whose settings are `settings`.
+        name: name of the dashboard component, whose settings are `settings`.
     """
     import subprocess
     import sys
@@ -89,7 +89,7 @@ def stay(folder: Path, name: str, settings: PlainMapping) -> None:
 
 
 def page_of(experiment: Experiment, started: Sequence[str]) -> tuple[str, PlainMapping] | None:
-    """Return name and settings of a dashboard among the processes started here; None: there is none."""
+    """Return name and settings of a dashboard among the processes started here; None without one."""
     for process in experiment.resolved.processes.values():
         if process.class_path.rpartition(".")[2] == NAME_OF_CLASS and process.name in started:
             return process.name, process.settings

@@ -1,4 +1,4 @@
-"""`WebComponent`: a component that serves pages or an API beside its subscriptions."""
+"""`WebComponent`: a component that serves pages or an API beside its other work."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class WebComponent(Component):
     Attributes:
         served: name of the server, in log lines and errors.
         usual_port: if none is given.
-        stalled_s: as of `WebServer`.
+        stalled_s: see `WebServer`.
 
     Args:
         host: the address to listen at.
@@ -70,14 +70,14 @@ class WebComponent(Component):
         return Path(folder) / f"{self.name}.{ending}" if folder else None
 
     def open_port(self) -> socket.socket:
-        """Return the listening socket: at the port of the last start, which clients know, if that is free."""
+        """Return the listening socket, at the port of the last start if that is free."""
         before = self.memory.get("port")
         earlier = (before,) if isinstance(before, int) else ()
         usual = earlier if self._port == 0 else (*earlier, self.usual_port)
         return listening(self._host, self._port or None, usual, what=self.served)
 
     def watch_run(self) -> tuple[Archive, Watch]:
-        """Return the record of the run so far, and the watch that receives later messages."""
+        """Return the record of the run so far, and the `Watch` that receives later messages."""
         archive = Archive(self.run_dir if self._context.launch.run_dir else None)
         problems = self._context.problems
         launch = self._context.launch
@@ -89,7 +89,7 @@ class WebComponent(Component):
         return archive, watch
 
     def serve(self, app: AsgiApp, bound: socket.socket, *, most_requests: int | None = None) -> None:
-        """Start to serve, and note the URL."""
+        """Start the server, and store its URL."""
         self._server = WebServer(
             app, bound, self._certificate, self._certificate_key,
             most_requests=most_requests, stalled_s=self.stalled_s,

@@ -1,4 +1,4 @@
-"""The newest picture of each channel, growing or finished, and earlier ones within a memory bound."""
+"""The newest picture of each channel, partial or finished, and earlier pictures within a memory bound."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from afspm.model import Region, Scan, ScanLines
 MEMORY_BYTES = 192 << 20
 MOST_CHANNELS = 64
 FrameKey = tuple[int, str]
-"""Time in ns and channel."""
+"""Key of a frame: time in ns, and channel."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -24,11 +24,11 @@ class ChannelFrame:
     Attributes:
         number: higher than the number of every earlier frame of any channel.
         values: [y, x], y ascending, as published; NaN in rows that have not arrived yet.
-        time_ns: the end; None while it grows.
-        began_ns: the time that its lines carry; None if it arrived in one piece.
+        time_ns: the end; None while the scan runs.
+        began_ns: start of the scan, from its lines; None if the scan arrived in one piece.
         rows: number of rows that have arrived.
-        newest_row: index of the last of them; None for a finished frame.
-        changed_row: index of the first row with a changed tip, by the lines; None if none was seen.
+        newest_row: index of the last arrived row; None for a finished frame.
+        changed_row: index of the first row with a changed tip, by the lines; None without one.
     """
 
     number: int
@@ -58,7 +58,7 @@ class FrameStore:
     """A store of frames for pictures. Not thread-safe.
 
     Args:
-        memory_bytes: bound for finished frames besides the newest of each channel, and for growing ones.
+        memory_bytes: bound for earlier finished frames, and for partial frames.
     """
 
     def __init__(self, memory_bytes: int = MEMORY_BYTES) -> None:
@@ -127,19 +127,19 @@ class FrameStore:
         ))  # fmt: skip
 
     def take_change(self, began_ns: int | None, row: int) -> None:
-        """Mark the first row with a changed tip in all channels of a scan, by its start."""
+        """Mark the first row with a changed tip in all channels of the scan that began at `began_ns`."""
         self._changed = began_ns, row
         for frame in list(self._newest.values()):
             if frame.began_ns is not None and frame.began_ns == began_ns:
                 self._put(replace(frame, number=self._next(), changed_row=row))
 
     def newest(self, channel: str | None = None) -> ChannelFrame | None:
-        """Return the newest frame of a channel (None: the channel seen first); a growing one is copied."""
+        """Return the newest frame of a channel (None: the first channel); a partial frame is copied."""
         frame = self._of(channel)
         return frame if frame is None or frame.complete else replace(frame, values=frame.values.copy())
 
     def newest_number(self, channel: str | None = None) -> tuple[int, bool]:
-        """Return (number, True if it is finished) of the newest frame, without a copy; 0 if there is none."""
+        """Return (number, True if finished) of the newest frame, without a copy; 0 if there is none."""
         frame = self._of(channel)
         return (0, False) if frame is None else (frame.number, frame.complete)
 

@@ -33,18 +33,18 @@ def hashed(password: str) -> str:
 
 
 def matches(password: str, kept: str) -> bool:
-    """Return whether a password belongs to `kept`, a result of `hashed`."""
+    """Return whether a password matches `kept`, a result of `hashed`."""
     _, salt, digest = kept.split(":")
     return hmac.compare_digest(_scrypt(password, base64.b64decode(salt)), base64.b64decode(digest))
 
 
 def is_hash(text: str) -> bool:
-    """Return whether a text has the form of `hashed`."""
+    """Return whether a text has the form of a result of `hashed`."""
     return re.fullmatch(r"scrypt:[A-Za-z0-9+/=]{24}:[A-Za-z0-9+/=]{44,88}", text) is not None
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether an address to listen at is reached from this computer only."""
+    """Return whether a listening address can be reached only from this computer."""
     if host == "localhost":
         return True
     try:
@@ -54,20 +54,20 @@ def is_loopback(host: str) -> bool:
 
 
 def check_name(name: str) -> str:
-    """Return a person's name in the form for the record; empty if it is not allowed."""
+    """Return a person's name in its recorded form; empty if it is not allowed."""
     name = " ".join(name.split())
     return name if len(name) <= LONGEST_NAME and _NAME.fullmatch(name) else ""
 
 
 class Passwords:
-    """The check whether a viewer may look, and whether a claimed name is accepted.
+    """The check of passwords for looking and of passwords for names.
 
     On loopback without passwords every viewer may look, and any name is accepted. With a common password, a viewer
     needs it to look. With persons, only they have names, each with a password.
 
     Args:
         host: the address to listen at.
-        password_hash: of the common password, see `hashed`.
+        password_hash: hash of the common password, see `hashed`.
         people: the hash of each person's password.
         now_s: the time in real seconds, for the rate limit of attempts.
 
@@ -110,8 +110,8 @@ class Passwords:
     def proves(self, person: str, password: str, address: str) -> bool:
         """Return whether a password is right; False also if it is not checked yet (see `wait_s`).
 
-        It takes some hundredths of a second. A password that was right before, from the same address, is accepted at
-        once, after any number of wrong tries there.
+        The check takes some hundredths of a second. A password that was right before, from the same address, is
+        accepted at once, after any number of wrong tries there.
         """
         if self.is_open or (not person and self.lets_look):
             return True

@@ -35,7 +35,7 @@ SETTLED_S = 2.0  # a changed setting is published within this time
 
 
 class PersonCommands:
-    """The requests of one person, for use in one thread. Each returns the response, also if it is a refusal."""
+    """The requests of one person, for use in one thread. Each returns the response, even a refusal."""
 
     def __init__(self, link: ExperimentLink, watch: Watch) -> None:
         self._link = link
@@ -44,7 +44,7 @@ class PersonCommands:
     # --- the experiment ---
 
     def request_control(self, problem: int = 0) -> Response:
-        """Ask for control, to solve a problem (0: none)."""
+        """Request control, to solve a problem (0: none)."""
         return self._ask(ControlRequest.REQUEST_CTRL, problem)
 
     def renew(self, lease_s: float) -> Response:
@@ -71,7 +71,7 @@ class PersonCommands:
         return self._ask(RESTART_REQUEST, process)
 
     def note(self, text: str, scan_ns: int | None = None, time_ns: int | None = None) -> Response:
-        """Write a note on a scan or on a time; default: the present."""
+        """Write a note about a scan or a time, by default the present."""
         now_ns = self._link.clock.now_ns()
         about_ns = next(one for one in (time_ns, scan_ns, now_ns) if one is not None)
         note = Note(about_ns, self._link.name, text, scan_ns, now_ns)
@@ -94,7 +94,7 @@ class PersonCommands:
         return self._ask(ControlRequest.ACTION, action)
 
     def prepare_scan(self, region: Region | None, shape: tuple[int, int] | None) -> Response | None:
-        """Set the place of the next scan, and wait for its publication. Returns None, or a refusal."""
+        """Set the place of the next scan, and wait for its publication. Return None, or a refusal."""
         if region is None and shape is None:
             return None
         wanted = ScanParameters(region, shape)
@@ -105,7 +105,7 @@ class PersonCommands:
         return None
 
     def prepare_spectrum(self, at_m: XY | None) -> Response | None:
-        """Move the probe to (x, y), and wait for its publication. Returns None, or a refusal."""
+        """Move the probe to (x, y), and wait for its publication. Return None, or a refusal."""
         if at_m is None:
             return None
         response = self._ask(ControlRequest.SET_PROBE_POS, ProbePosition(at_m))
@@ -115,10 +115,10 @@ class PersonCommands:
         return None
 
     def act_when_free(self, action: str, next_id: Callable[[], str] = str) -> Response:
-        """Request an action, and repeat the request while the microscope is not free.
+        """Request an action, and repeat the request while the microscope is busy.
 
         Args:
-            next_id: returns the id of the next attempt, under which it is executed once even if it is repeated.
+            next_id: returns the id of the next attempt; requests with the same id are executed once.
         """
         until_s = self._link.clock.monotonic_s() + FREE_S
         while True:
@@ -140,7 +140,7 @@ class PersonCommands:
             return overview.status is not None and overview.status.state is ScopeState.SPEC
 
     def request(self, kind: int, subject: object = None) -> Response:
-        """Send a request that has no method here."""
+        """Send a request without a method in this class."""
         return self._ask(kind, subject)
 
     # --- within ---

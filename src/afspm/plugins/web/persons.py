@@ -1,4 +1,4 @@
-"""Connections to the scheduler in the names of persons, and a thread for each."""
+"""Connections to the scheduler in the names of persons, each with its own thread."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Persons:
     """Thread-safe connections that send each person's requests to the scheduler in order, under the person's name.
 
     Args:
-        launch: of the component; persons reach the scheduler by its addresses, with its keys.
+        launch: launch line of the component, with the scheduler's addresses and keys.
     """
 
     def __init__(self, launch: Launch, clock: Clock, watch: Watch) -> None:

@@ -1,4 +1,4 @@
-"""A server for an ASGI application, in a thread of its own."""
+"""A server for an ASGI application, in a separate thread."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def _bound(host: str, port: int) -> socket.socket:
 
 
 def url_of(host: str, port: int, *, encrypted: bool) -> str:
-    """Return the page's URL, valid on other computers, too, if the server listens at all addresses."""
+    """Return the page's URL; if the server listens at all addresses, a URL for other computers."""
     with contextlib.suppress(ValueError):  # a name
         if ipaddress.ip_address(host).is_unspecified:
             host = socket.gethostname()
@@ -77,7 +77,7 @@ def url_of(host: str, port: int, *, encrypted: bool) -> str:
 
 
 class _TlsListener(socket.socket):
-    """A listening socket that ends connections whose TLS handshake takes too long, or is the oldest of too many.
+    """A listening socket that limits the duration and the number of pending TLS handshakes.
 
     The server learns of a connection only after its handshake, and asyncio waits a minute for that: a client that never
     begins would use up the process's file descriptors. (On Windows, whose event loop accepts connections by itself,
@@ -200,8 +200,8 @@ class WebServer:
 
     Args:
         certificate, key: PEM files, for https; None: http.
-        most_requests: at a time; further ones are answered by 503. None: any number.
-        stalled_s, head_s: real; see `STALLED_S` and `HEAD_S`.
+        most_requests: limit of simultaneous requests; further ones are answered by 503. None: no limit.
+        stalled_s, head_s: real seconds; see `STALLED_S` and `HEAD_S`.
 
     Raises:
         ConfigError: the files are no certificate with its key.
@@ -248,11 +248,11 @@ class WebServer:
         self._thread = threading.Thread(target=self._run, name="web", daemon=True)
 
     def start(self) -> None:
-        """Begin to serve; earlier requests are then answered, too."""
+        """Start serving, including connections that are already waiting."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop, within seconds; open connections are cut off."""
+        """Stop within seconds, and cut off open connections."""
         self._server.should_exit = True
         self._thread.join(_STOPPED_S)
         for one in (self._listener, self._bound):

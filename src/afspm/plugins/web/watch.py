@@ -41,7 +41,7 @@ class SpectrumStore:
             self._bytes -= self._kept.popleft()[1].values.nbytes
 
     def newest(self, count: int = 1) -> list[tuple[int, Spectrum]]:
-        """Return (time_ns, spectrum), newest last."""
+        """Return the newest (time_ns, spectrum) pairs, newest last."""
         return list(self._kept)[-count:]
 
     def at(self, time_ns: int) -> Spectrum | None:
@@ -53,9 +53,9 @@ class Watch:
     """The overview, the newest pictures and spectra, and the time of the last message.
 
     Args:
-        clock: of the experiment.
+        clock: clock of the experiment.
         past: the overview before the start; None: unknown.
-        cut_off: returns a text if no process runs the experiment any more, else an empty text.
+        cut_off: returns a text if the experiment's processes are gone, else an empty text.
         plans: planned work of each component; None: no estimate.
         began_ns: experiment time at the start; None: unknown.
     """
@@ -77,7 +77,7 @@ class Watch:
         self.frames = FrameStore()
         self.spectra = SpectrumStore()
         self.tip_to_sample: Array | None = None
-        """The newest mapping of drift, 2 x 3; None where nothing corrects drift."""
+        """The newest drift correction as a 2 x 3 matrix; None without drift correction."""
         self.connected = False
         self.ended = False
         self.changes = 0
@@ -87,17 +87,17 @@ class Watch:
 
     @property
     def moment_ns(self) -> int | None:
-        """The recorded moment shown; None: now."""
+        """The displayed time of a recorded night; None for the present."""
         return None
 
     @property
     def revision(self) -> int:
-        """A number that changes with a jump to another time: content made before is invalid."""
+        """A number that changes with a jump to another time, which invalidates earlier content."""
         return 0
 
     @property
     def is_over(self) -> bool:
-        """Whether no process of the run is left at the moment shown."""
+        """Whether no process of the run is left at the displayed time."""
         return self.ended
 
     def expected_end_ns(self, overview: Overview, now_ns: int) -> int | None:
@@ -106,7 +106,7 @@ class Watch:
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[Overview]:
-        """Lock the state while in the block; keep the block short."""
+        """Lock the state during the `with` block; keep the block short."""
         with self._changed:
             yield self.overview
 
@@ -145,12 +145,12 @@ class Watch:
         self._callbacks.append(callback)
 
     def wait_for(self, condition: Callable[[Overview], bool], within_s: float) -> bool:
-        """Wait in another thread until `condition`; return False when the time is up."""
+        """Wait in another thread until `condition` holds; return False after a timeout."""
         with self._changed:
             return self._changed.wait_for(lambda: condition(self.overview), within_s)
 
     def wait_free(self, within_s: float) -> bool:
-        """Wait until the microscope is free; return False when the time is up."""
+        """Wait until the microscope is free; return False after a timeout."""
         return self.wait_for(lambda o: o.status is not None and o.status.state is ScopeState.FREE, within_s)
 
     def _announce(self) -> None:
@@ -186,7 +186,7 @@ class Bell:
         self._event = asyncio.Event()
 
     async def wait(self, timeout_s: float) -> bool:
-        """Wait until the bell rings; return False when the time is up."""
+        """Wait until the bell rings; return False after a timeout."""
         try:
             await asyncio.wait_for(self._event.wait(), timeout_s)
         except TimeoutError:
@@ -195,7 +195,7 @@ class Bell:
 
 
 class Audience:
-    """A thread-safe register of open pages: the server stops once all show the end."""
+    """A thread-safe register of open pages: the server stops once all pages show the end."""
 
     def __init__(self) -> None:
         self._pages: set[int] = set()
@@ -212,6 +212,6 @@ class Audience:
             self._changed.notify_all()
 
     def wait_until_end_shown(self, within_s: float) -> bool:
-        """Wait until every page shows the end; return False when the time is up."""
+        """Wait until every page shows the end; return False after a timeout."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._pages, within_s)

@@ -1,3 +1,3 @@
-"""Emulated controllers of vendors: each speaks a real protocol, with the simulated instrument behind it."""
+"""Emulated controllers of vendors: each speaks a real protocol and controls the simulated instrument."""
 
 from __future__ import annotations

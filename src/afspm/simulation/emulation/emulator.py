@@ -1,4 +1,4 @@
-"""`Emulator`: a vendor's controller with the simulated instrument behind it, as a process of an experiment or alone."""
+"""`Emulator`: a vendor's controller that controls the simulated instrument, inside an experiment or standalone."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ FAREWELL_S = 0.5
 
 
 class Crashed(AfspmError):
-    """The error that ends the emulated controller without any further answer, like a crash."""
+    """The error that ends the emulated controller without a reply, like a crash."""
 
     code = "emulator-crashed"
 
@@ -96,7 +96,7 @@ class Emulator(ABC):
 
     vendor: ClassVar[str]
     usual: ClassVar[PlainMapping] = {}
-    """Settings that put it at the address of the vendor's own controller: for `afspm emulate` alone, on request."""
+    """Settings for the usual address of the vendor's own controller, used by `afspm emulate` on request."""
     fault_kinds: ClassVar[Mapping[str, str]] = {}
     """The faults of the maker's program, with the effect of each; `all_faults` adds the common ones."""
 
@@ -104,9 +104,9 @@ class Emulator(ABC):
     """The modes of the simulated feedback that the controller supports."""
 
     emulated: ClassVar[bool] = True
-    """An experiment with it counts as simulated: its clock may run at another speed."""
+    """An experiment with an emulator counts as simulated: its clock may run at another speed."""
     listens: ClassVar[tuple[str, ...]] = ()
-    """It receives only the end of the experiment."""
+    """An emulator receives only the end of the experiment."""
 
     clock: Clock
     log: logging.Logger
@@ -153,33 +153,33 @@ class Emulator(ABC):
 
     @classmethod
     def all_faults(cls) -> dict[str, str]:
-        """Return every fault with its effect: those of the class, and those common to all emulators."""
+        """Return every fault with its effect: faults of the class and faults common to all emulators."""
         return {**cls.fault_kinds, "hang": "the whole program hangs for the duration (real time)"}
 
     # -- what one writes
 
     @abstractmethod
     def open(self) -> str:
-        """Start to listen; return the address for clients."""
+        """Start listening and return the address for clients."""
 
     @abstractmethod
     def serve(self, timeout_s: float) -> None:
         """Wait up to `timeout_s` real seconds for clients or `woken`, and answer received requests.
 
-        Answer each request on its own, and catch its errors with the vendor's own error: an exception that reaches the
-        base class is logged, and that client gets no answer.
+        Answer each request separately, and turn its errors into the vendor's own error replies: an exception that
+        reaches the base class is logged, and that client gets no answer.
 
         Raises:
             Crashed: to end without an answer.
         """
 
     def tick(self, now_s: float) -> float | None:
-        """Advance to now, in experiment time: end scans, write files.
+        """Advance to `now_s` (experiment time): end scans and write files.
 
         Called before every `serve`, so also right after each request.
 
         Returns:
-            the time of the next event, except events of the rig and the faults.
+            the time of the next event, apart from events of the rig and the faults.
         """
         return None
 
@@ -188,7 +188,7 @@ class Emulator(ABC):
         """Stop listening. Also called if `open` failed."""
 
     def abandon(self) -> None:
-        """Drop the present activity, after `tick` or `serve` has raised. Override if more than the rig is active."""
+        """Drop the present activity after an error in `tick` or `serve`. Override if other activities can run."""
         self.rig.abandon(self.clock.now_s())
 
     # -- services for subclasses
@@ -213,7 +213,7 @@ class Emulator(ABC):
         self.log.warning("%s: delete %s to press the button", why, file)
 
     def take_button_away(self) -> None:
-        """Remove the button."""
+        """Remove the button and its file."""
         button, self._button = self._button, None
         if button is not None:
             with suppress(OSError):  # the button is gone: a file that stays has no effect
@@ -223,7 +223,7 @@ class Emulator(ABC):
         """Run the controller until `stop`.
 
         Args:
-            listening: called with the address, once there is one; empty: none for now.
+            listening: called with the address whenever it changes; empty while there is none.
 
         Raises:
             Crashed: an emulated crash.
@@ -259,7 +259,7 @@ class Emulator(ABC):
             ) from error
 
     def stop(self) -> None:
-        """End `run` soon. Thread-safe, also before its start."""
+        """Stop `run` soon. Thread-safe, also before `run` starts."""
         self._stop.set()
         self._wake()
 
@@ -269,10 +269,10 @@ class Emulator(ABC):
 
     @contextmanager
     def running(self, folder: Path, clock: Clock | None = None) -> Iterator[str]:
-        """Run the controller in a thread while in the block, for tests and scripts; yields the address.
+        """Run the controller in a thread inside the `with` block, for tests and scripts; yield the address.
 
         Raises:
-            any exception of `run` up to the end of the block, before listening too, except an emulated crash.
+            any exception of `run` except an emulated crash, even before the controller listens.
         """
         opened: list[str] = []
         failed: list[BaseException] = []
@@ -308,7 +308,7 @@ class Emulator(ABC):
             raise failed[0]
 
     def run_process(self, context: ProcessContext) -> int:
-        """Run as a process of an experiment (called by the host): with its clock, and files in its run folder."""
+        """Run as a process of an experiment, with its clock and its run folder. Called by the host."""
         context.when_stopping(self.stop)
         threading.Thread(target=self._await_experiment_end, args=(context,), name="experiment", daemon=True).start()
 
@@ -379,15 +379,15 @@ class Emulator(ABC):
 
 
 def emulator_names() -> list[str]:
-    """Return the short names of all emulators that installed packages declare: "nanonis" for `NanonisEmulator`."""
+    """Return the short names of all installed emulators: "nanonis" for `NanonisEmulator`."""
     return sorted(map(_short_name, entry_points.names(entry_points.EMULATORS)))
 
 
 def find_emulator(name: str) -> type[Emulator]:
-    """Return the emulator of a short name, or a user's own by "module.Class".
+    """Return the emulator with a short name, or a user's own emulator by "module.Class".
 
     Raises:
-        ConfigError: there is none, or its module can't be imported.
+        ConfigError: an unknown name, or a module that cannot be imported.
     """
     module_name, _, class_name = name.rpartition(".")
     if module_name:

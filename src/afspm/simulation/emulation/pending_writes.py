@@ -1,4 +1,4 @@
-"""Files that a controller writes late, and in two parts."""
+"""Files that an emulated controller writes late, and in two parts."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ class PendingWrites:
         self._writes: list[FilePart] = []
 
     def save(self, path: Path, content: bytes, at_s: float, rest_at_s: float) -> None:
-        """Schedule half of a file at one time, the other half at another."""
+        """Schedule the first half of a file at one time and the second half at another."""
         half = len(content) // 2
         self._writes += [FilePart(at_s, path, content[:half]), FilePart(rest_at_s, path, content[half:], begins=False)]
         self._writes.sort(key=lambda write: write.at_s)
 
     def advance(self, now_s: float, *, there: bool) -> float | None:
-        """Write all due parts, if the drive is `there`; return the time of the next part."""
+        """Write all due parts if the drive is present (`there`); return the time of the next part."""
         while self._writes and self._writes[0].at_s <= now_s:
             write = self._writes.pop(0)
             with contextlib.suppress(OSError):

@@ -2,8 +2,7 @@
 
 A request (`TracedExchange.command`) must be repeated as it was recorded, in the same order. A read of the controller
 may be repeated more or less often and in another order: its frequency depends on timing. Request ids of the client are
-not
-compared, and secrets are left out: they differ each time.
+not compared, and secrets are left out: they differ each time.
 """
 
 from __future__ import annotations
@@ -21,16 +20,16 @@ _SHOWN: Final = 200
 
 
 class Deviation(Exception):
-    """The error that the client differs from the recording; its text gives the place and both questions."""
+    """The error that the client differs from the recording; its text gives the line and both requests."""
 
 
 @dataclass(frozen=True)
 class PlayedAnswer:
-    """An answer.
+    """A recorded answer.
 
     Attributes:
-        line: of the trace, from 1.
-        content: None: the connection was lost here.
+        line: line of the trace, from 1.
+        content: None if the connection was lost here.
     """
 
     line: int
@@ -46,10 +45,10 @@ class _Cursor:
 
 
 class Playback:
-    """The state of a playback.
+    """The progress of a playback.
 
     Args:
-        lines: of the trace (`read_trace`).
+        lines: the lines of the trace (`read_trace`).
     """
 
     def __init__(self, lines: Sequence[TraceLine]) -> None:
@@ -82,7 +81,7 @@ class Playback:
         return number
 
     def ask(self, connection: int, content: bytes) -> PlayedAnswer | None:
-        """Return the answer to a question; None if it is due later, or the question is incomplete.
+        """Return the answer to a request; None if the answer is due later, or the request is incomplete.
 
         Raises:
             Deviation: the recording differs.
@@ -107,7 +106,7 @@ class Playback:
         return PlayedAnswer(line, _with_ids_of(content, exchange.answered))
 
     def files(self) -> list[TracedFile]:
-        """Return the files that the controller has written since the last call, at this point of the recording."""
+        """Return the files that the recorded controller wrote since the last call."""
         due = [file for file in self._files if self._last_before(*file) <= self._reached]
         self._files = [file for file in self._files if file not in due]
         return [file for _, file in due]

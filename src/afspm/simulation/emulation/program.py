@@ -1,4 +1,4 @@
-"""`MakerProgram`: a maker's program around the instrument, which starts, ends and saves scans and curves."""
+"""`MakerProgram`: a maker's control program, which starts, ends and saves scans and curves."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ NamedFile = tuple[str, bytes]
 
 
 class MakerProgram(ABC):
-    """The program, without its protocol. For one thread at a time.
+    """A maker's control program, without its protocol. Not thread-safe.
 
     Args:
-        folder: for saved files.
+        folder: folder for saved files.
         start_s: duration of the ramp to the first line, experiment time.
         file_s: delay between the end and the first half of a file; the second half follows after the same delay.
 
@@ -61,7 +61,11 @@ class MakerProgram(ABC):
 
     @abstractmethod
     def prepare_scan(self) -> None:
-        """Copy the panel's values to `rig.setup`, right before a scan. Raises AfspmError: they are invalid."""
+        """Copy the panel's values to `rig.setup`, right before a scan.
+
+        Raises:
+            AfspmError: invalid values.
+        """
 
     @abstractmethod
     def prepare_curve(self) -> None:
@@ -102,7 +106,7 @@ class MakerProgram(ABC):
         return self.rig.engaged or self._engages
 
     def advance(self, now_s: float) -> float | None:
-        """Advance to now; return the time of the next event, except events of the rig."""
+        """Advance to `now_s`; return the time of the next event, apart from events of the rig."""
         if self._engages and not self.rig.busy(now_s):
             self._engages = False
             self.rig.engage(now_s)
@@ -132,7 +136,7 @@ class MakerProgram(ABC):
                 self._save(self.scan_files(ended, now_s), now_s)
 
     def start_curve(self, kind: str, now_s: float) -> None:
-        """Take a curve at the position of the tip. Raises InstrumentBusy, InvalidValue."""
+        """Take a curve at the tip's position. Raises InstrumentBusy, InvalidValue."""
         self._refuse_busy()
         if not self.faults.strikes("spectrum-refused", now_s):
             self.prepare_curve()
@@ -144,20 +148,20 @@ class MakerProgram(ABC):
             self.rig.stop_spectrum(self.now_s)
 
     def engage(self) -> None:
-        """Approach the sample, after a running withdrawal. Raises InstrumentBusy."""
+        """Approach the sample once a running withdrawal has ended. Raises InstrumentBusy."""
         if self.scanning or self.measuring_curve:
             raise InstrumentBusy("a measurement is running")
         self._engages = True
 
     def stop_engaging(self) -> None:
-        """Stop the approach; the tip stays away from the sample."""
+        """Stop the approach; the tip stays withdrawn."""
         if self._engages or self.rig.doing(self.now_s) == "approach":
             self._engages = False
             self.rig.stop("approach", self.now_s)
             self.rig.engaged = False
 
     def withdraw(self, now_s: float) -> None:
-        """End the activity, and withdraw the tip."""
+        """Stop the activity and withdraw the tip."""
         self.stop_scan(now_s)
         self._engages, self._curve = False, None
         self.rig.withdraw(now_s)

@@ -1,4 +1,4 @@
-"""`TraceReplay`: an emulated controller that plays back a recorded trace, so that a bug report becomes a test."""
+"""`TraceReplay`: an emulated controller that plays back a recorded trace, to reproduce a bug report."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _AT_ONCE = 1 << 16
 
 @dataclass
 class ReplayClient:
-    """A client: of TCP by its socket, of ZeroMQ by its identity.
+    """A client, identified by its TCP socket or its ZeroMQ identity.
 
     Attributes:
-        introduction: the greeting that precedes its questions; None without one.
+        introduction: the greeting before its first request; None without one.
     """
 
     number: int
@@ -42,16 +42,16 @@ class ReplayClient:
 
 
 class TraceReplay(Emulator):
-    """An emulated controller that gives a trace's recorded answers, and reports the first different question.
+    """An emulated controller that gives a trace's recorded answers, and reports the first different request.
 
     Args:
         trace: the file (`afspm trace`).
         files: the folder for the controller's files; by default the emulator's. The translator must look there:
             session_dir, folders or scan_dir in its section.
-        common: as of every emulator.
+        common: arguments of every emulator.
 
     Attributes:
-        deviation: the first difference; empty if there is none so far.
+        deviation: the first difference; empty without one.
     """
 
     vendor: ClassVar[str] = "replayed"

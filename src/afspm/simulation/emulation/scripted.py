@@ -1,4 +1,4 @@
-"""`ScriptedEmulator`: a controller whose clients send scripts, and get a value for each.
+"""`ScriptedEmulator`: a controller that runs scripts of its clients and replies with their values.
 
 The maker's emulator provides the wire (`open_wire`), the interpreter (`answer`) and the text of an error (`failure`);
 this module provides the queue of requests, waiting replies, and all faults of communication.
@@ -41,8 +41,8 @@ class ScriptWire(Protocol):
     """The socket of a controller, which receives scripts and sends values.
 
     Attributes:
-        address: for clients.
-        port: of the listening socket.
+        address: address for clients.
+        port: port of the listening socket.
     """
 
     @property
@@ -58,13 +58,13 @@ class ScriptWire(Protocol):
         """Send a reply to a client, unless it is gone."""
 
     def send_half(self, client: Client, reply: bytes) -> None:
-        """Send half a reply, truncated as this transport would truncate it."""
+        """Send a truncated reply, as this transport would truncate it."""
 
     def close(self) -> None: ...
 
 
 class ScriptFailed(AfspmError):
-    """The error that a script can't be run; the interpreter's message becomes the reply."""
+    """The error of a script that cannot be run; its message becomes the reply."""
 
     code = "script-failed"
 
@@ -82,7 +82,7 @@ class Unfinished:
 
 @dataclass
 class Waiting:
-    """A client with a pending reply: for a time, or for the end of its script."""
+    """A client with a pending reply, due at a time or at the end of its script."""
 
     client: Client
     reply: bytes | Unfinished
@@ -90,7 +90,7 @@ class Waiting:
 
 
 class ScriptedEmulator(Emulator):
-    """A controller that answers scripts. Subclasses write the abstract methods; all are called from one thread.
+    """A controller that runs scripts. Subclasses write the abstract methods; all are called from one thread.
 
     Attributes:
         program: the maker's program behind the interpreter, created by `make_program`.
@@ -103,18 +103,18 @@ class ScriptedEmulator(Emulator):
 
     @abstractmethod
     def make_program(self) -> MakerProgram:
-        """Create the program, with its interpreter. `rig`, `faults`, `folder`, `clock` and `log` exist."""
+        """Create the program with its interpreter. `rig`, `faults`, `folder`, `clock` and `log` are already set."""
 
     @abstractmethod
     def open_wire(self, port: int, on_request: OnRequest) -> ScriptWire:
-        """Listen at a port; 0: any free one."""
+        """Listen at a port; 0 selects a free one."""
 
     @abstractmethod
     def answer(self, client: Client, request: bytes) -> bytes | Unfinished:
-        """Run the script of a request, and return the reply.
+        """Run the script of a request and return the reply.
 
         Raises:
-            ScriptFailed, or another AfspmError: the reply is its `failure`.
+            ScriptFailed, or another AfspmError: `failure` makes the reply from it.
         """
 
     @abstractmethod
@@ -128,7 +128,7 @@ class ScriptedEmulator(Emulator):
     # -- steps of the script
 
     def open(self) -> str:
-        """Create the program, and listen."""
+        """Create the program and start listening."""
         self._queue: deque[tuple[Client, bytes]] = deque()
         self._waiting: list[Waiting] = []
         self._open_again_at_s = math.inf
@@ -138,7 +138,6 @@ class ScriptedEmulator(Emulator):
         return self._wire.address
 
     def serve(self, timeout_s: float) -> None:
-        """Receive requests and answer them."""
         if self._wire is None:
             select.select([self.woken], [], [], timeout_s)
             return
@@ -161,7 +160,7 @@ class ScriptedEmulator(Emulator):
         return min((at_s for at_s in times if at_s is not None and at_s > now_s), default=None)
 
     def abandon(self) -> None:
-        """Drop the program's activity, too."""
+        """Drop the present activity of the instrument and of the program."""
         super().abandon()
         self.program.abandon()
 

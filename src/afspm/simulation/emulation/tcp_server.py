@@ -1,4 +1,4 @@
-"""TCP connections of clients: requests in, replies out, in order on each, with emulated faults of communication."""
+"""TCP connections of clients, with replies in the order of requests and emulated communication faults."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ READ_AT_ONCE = 1 << 16
 
 @dataclass(eq=False)
 class ClientConnection:
-    """One client.
+    """A connection of a client.
 
     Attributes:
         received: bytes not yet answered; sending: bytes not yet sent.
         waits_for: the condition of the reply to the current request; no other request is answered meanwhile.
         closing: no more answers; the connection ends once all bytes are sent.
-        memory: the controller's state about the client.
+        memory: the controller's state for this client.
     """
 
     socket: socket.socket
@@ -34,11 +34,11 @@ class ClientConnection:
 
 
 class TcpServer:
-    """Ports and connections, without a thread: `poll` does all the work.
+    """Listening ports and their connections, without a thread: `poll` does all the work.
 
     Args:
-        ports: to listen on; 0: any free one.
-        stream_port: for clients that only read; 0: any free one, None: there is none.
+        ports: listening ports; 0 selects a free one.
+        stream_port: port for clients that only read; 0: any free one, None: there is none.
         one_each: a port serves one client at a time; others wait until it has gone.
         wakes: an object with a `fileno` that ends `poll`.
         on_bytes: called with a connection after new bytes in `received`.
@@ -101,7 +101,7 @@ class TcpServer:
                 self._accept(key.data)
 
     def send(self, connection: ClientConnection, content: bytes = b"") -> None:
-        """Send as much as the client accepts now, and the rest later."""
+        """Send the bytes that the client accepts now, and the rest in later polls."""
         connection.sending += content
         try:
             while connection.sending:

@@ -221,7 +221,7 @@ class Simulator(Driver):
         return _merged({} if loop is None else _rows_for(loop.mode), settings.get("parameters") or {})
 
     def change_tip(self, condition: str) -> None:
-        """Change the tip now, also during a scan: "sharp", "blunt", "double" or "contaminated"."""
+        """Change the tip now, also during a scan, to "sharp", "blunt", "double" or "contaminated"."""
         self._reached(refuses=False).instrument.change_tip(condition, self.clock.now_s())
 
     def run_drawing(self, work: Callable[[], None]) -> None:

@@ -1,6 +1,6 @@
-"""The simulated controller: settings in force, a panel, and files of the simulated instrument's measurements.
+"""The simulated controller: present settings, a panel, and files of the simulated instrument's measurements.
 
-Every activity is saved with its settings and its start time, so that a restarted process finds a measurement running or
+Every activity is saved with its settings and its start time. So a restarted process finds a measurement running or
 finished, as with a real controller.
 """
 
@@ -59,11 +59,11 @@ class PanelEvent:
 
 
 class SimulatedController:
-    """The controller.
+    """The controller of the simulated instrument.
 
     Args:
         kept: the saved state, JSON-able; every call updates it.
-        folder: for saved files.
+        folder: folder for saved files.
         panel: actions of a person, in any order.
     """
 
@@ -114,7 +114,7 @@ class SimulatedController:
         return _STATES[self.instrument.doing(now_s)]
 
     def next_change_s(self) -> float | None:
-        """Return the time of the next event; None without one, or if the computation of a scan wakes the driver."""
+        """Return the time of the next event; None if there is none, or while a scan is being computed."""
         times = (self._panel_s(), self._files.whole_s(), self.instrument.ends_s)
         return min((at_s for at_s in times if at_s is not None), default=None)
 
@@ -123,7 +123,7 @@ class SimulatedController:
         return list(self._kept["results"])
 
     def lines(self, start: int, now_s: float) -> list[ScanLines]:
-        """Return the complete lines of the running scan after the first `start`."""
+        """Return the complete lines of the running scan, without the first `start` lines."""
         scan = self.instrument.scan
         if scan is None or scan.drawing or self.instrument.doing(now_s) != "scan":
             return []
@@ -207,7 +207,7 @@ class SimulatedController:
             self._measures()
 
     def start_spectrum(self, now_s: float) -> None:
-        """Take a curve of the set kind, at the probe's position."""
+        """Take a curve of the selected kind at the probe's position."""
         self._prepare(now_s)
         if not self._faults.strikes("spectrum-refused", now_s):
             with _refusing():
@@ -229,7 +229,7 @@ class SimulatedController:
         self._keep()
 
     def crash(self, now_s: float) -> None:
-        """Drive the tip into the sample at the probe's position, and out again."""
+        """Drive the tip into the sample and back at the probe's position."""
         self._prepare(now_s)
         values = self._si()
         with _refusing():
@@ -237,7 +237,7 @@ class SimulatedController:
         self._keep()
 
     def retract(self, now_s: float) -> None:
-        """End the activity, and withdraw the tip."""
+        """Stop the activity and withdraw the tip."""
         self._kept["values"][names.ENGAGED] = False
         self.instrument.withdraw(now_s)
         self._keep()
@@ -319,7 +319,7 @@ def _distance(before: dict[str, Value], after: dict[str, Value], *axes: str) -> 
 
 
 class SavedFiles:
-    """The files of the simulated controller; faults make some late or incomplete at first."""
+    """The files of the simulated controller; faults delay some files or leave them incomplete at first."""
 
     def __init__(self, folder: Path, kept: Kept, faults: Faults) -> None:
         self._folder = folder

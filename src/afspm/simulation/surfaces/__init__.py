@@ -25,7 +25,7 @@ __all__ = ["KINDS", "Relief", "Surface", "surface_from"]
 
 
 def surface_from(settings: object, where: str = "surface") -> Surface:
-    """Return the surface of a table: its `kind` and the settings of that kind.
+    """Create a surface from a table with its `kind` and the settings of that kind.
 
     Raises:
         ConfigError: an unknown kind or setting, or an invalid value.

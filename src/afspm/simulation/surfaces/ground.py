@@ -14,7 +14,7 @@ from afspm.simulation.surfaces.relief import Relief, Sites, around, grain, patch
 
 @dataclass(frozen=True)
 class Steps:
-    """Terraces that rise along a direction by one `step_m` each, with meandering edges and a few islands.
+    """Terraces of height `step_m` that rise along one direction, with meandering edges and a few islands.
 
     Attributes:
         angle_deg: direction of the rise, counter-clockwise from x.

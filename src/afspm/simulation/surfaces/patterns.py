@@ -93,7 +93,7 @@ _FRAME = 588  # channel bits of an EFM frame of a compact disc; lengths of bumps
 
 @dataclass(frozen=True)
 class Stamper:
-    """Bumps 3 to 11 channel bits long on straight tracks.
+    """Bumps on straight tracks, 3 to 11 channel bits long.
 
     Attributes:
         angle_deg: direction of the tracks, counter-clockwise from x.

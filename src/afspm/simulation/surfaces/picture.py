@@ -36,7 +36,7 @@ def read(path: Path) -> Heightmap:
     """Return the heights in a file; gaps (lines that were not scanned) are filled with the mean.
 
     Raises:
-        FileError: missing, not readable, or a format without a reader.
+        FileError: a file that is missing, unreadable, or has no reader for its format.
     """
     if not path.is_file():
         raise FileError("no such file", where=str(path))
@@ -54,7 +54,7 @@ def read(path: Path) -> Heightmap:
 
 
 def read_picture(path: Path) -> Heightmap:
-    """Return the heights of any image that pillow reads: bright is high, its top at large y."""
+    """Return the heights of an image that Pillow can read: bright is high, the top is at large y."""
     from PIL import Image
 
     with Image.open(path) as image:
@@ -68,7 +68,7 @@ def read_array(path: Path) -> Heightmap:
 
 
 def read_scan(path: Path) -> Heightmap:
-    """Return the heights of a scan file of any controller that afspm reads."""
+    """Return the heights of a scan file in any format that afspm reads."""
     content = files.read(path)
     scan = content.topography
     if scan is None:
@@ -85,7 +85,7 @@ def _reader(suffix: str) -> Reader:
 
 @dataclass(frozen=True)
 class PictureSurface:
-    """Heights of a file, centred at the origin and mirrored at its borders, so without a seam.
+    """Heights read from a file, centred at the origin and mirrored at their borders, which avoids seams.
 
     Attributes:
         path: an image (bright is high) or an SPM file.
@@ -116,7 +116,7 @@ class PictureSurface:
         return Relief(height_m, np.clip((height_m - low) / ((high - low) or 1.0), 0.0, 1.0))
 
     def load(self) -> None:
-        """Read the file now, so that a wrong path is detected before the first scan."""
+        """Read the file now, to detect a wrong path before the first scan."""
         _load(self)
 
 

@@ -15,7 +15,7 @@ from afspm.simulation.fields import Array, is_separable, rough_field, smooth_fie
 
 @dataclass(frozen=True)
 class Relief:
-    """A piece of surface: heights in m and material from 0 to 1, of one shape.
+    """A part of the surface: heights in m and material from 0 to 1, in equal shapes.
 
     The material determines phase and current independently of the height.
     """
@@ -25,26 +25,26 @@ class Relief:
 
 
 class Surface(Protocol):
-    """A sample without bounds; its relief depends on the seed and the position only."""
+    """An unbounded sample; its relief depends only on the seed and the position."""
 
     def relief(self, x_m: Array, y_m: Array, resolution_m: float, seed: int) -> Relief:
-        """Return the sample at positions in sample coordinates.
+        """Return height and material at sample coordinates.
 
         Args:
             x_m, y_m: arrays that broadcast; one row and one column (a grid) are fastest.
-            resolution_m: edges and roughness are not finer than this; 0 for the sample as it is.
+            resolution_m: lower limit for the width of edges and roughness; 0 without a limit.
         """
         ...
 
 
 def smooth_step(t: Array) -> Array:
-    """Return 0 below 0, 1 above 1, and a smooth rise in between."""
+    """Return a smooth step: 0 for t < 0, 1 for t > 1."""
     t = np.clip(t, 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 def turned(x_m: Array, y_m: Array, angle_deg: float) -> tuple[Array, Array]:
-    """Return coordinates along and across a direction; a grid stays a grid where possible."""
+    """Return coordinates along and across a direction; for an angle of 0 a grid remains a grid."""
     if angle_deg == 0.0:
         return x_m, y_m
     cos, sin = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
@@ -52,7 +52,7 @@ def turned(x_m: Array, y_m: Array, angle_deg: float) -> tuple[Array, Array]:
 
 
 def grain(seed: int, x_m: Array, y_m: Array, rms_m: float, size_m: float, resolution_m: float) -> Array | float:
-    """Return fine roughness of this rms, with largest grains `size_m` wide."""
+    """Return fine roughness with this rms; its largest grains are `size_m` wide."""
     if rms_m == 0.0:
         return 0.0
     field = rough_field(seed, x_m, y_m, largest_m=size_m, smallest_m=size_m / 4, hurst=0.6, resolution_m=resolution_m)
@@ -60,12 +60,12 @@ def grain(seed: int, x_m: Array, y_m: Array, rms_m: float, size_m: float, resolu
 
 
 def patches(seed: int, x_m: Array, y_m: Array, size_m: float) -> Array:
-    """Return two materials in patches with soft borders, from 0 to 1."""
+    """Return the material from 0 to 1, in patches of two materials with soft borders."""
     return smooth_step(0.5 + 2.0 * smooth_field(seed, x_m, y_m, size_m))
 
 
 def around(x_m: Array, y_m: Array, x0_m: float, y0_m: float, reach_m: float) -> Iterator[tuple[Any, Array, Array]]:
-    """Yield (index, x - x0, y - y0) of the positions within reach of a point; nothing if there are none.
+    """Yield (index, x - x0, y - y0) for the positions near a point; nothing if there are none.
 
     `index` selects those positions from the broadcast array.
     """
@@ -83,7 +83,7 @@ def around(x_m: Array, y_m: Array, x0_m: float, y0_m: float, reach_m: float) -> 
 
 @dataclass(frozen=True)
 class Sites:
-    """Random points: positions and, for each, a whole number that seeds its properties."""
+    """Random points, each with an integer that seeds its properties."""
 
     x_m: Array
     y_m: Array
@@ -91,7 +91,7 @@ class Sites:
 
     @classmethod
     def within(cls, seed: int, x_m: Array, y_m: Array, margin_m: float, spacing_m: float) -> Sites:
-        """Return the points in view: on average one (none, one or two) in each cell of `spacing_m`, anywhere in it."""
+        """Return the points in view: one per cell of `spacing_m` on average (0, 1 or 2), anywhere in the cell."""
         i = np.arange(
             math.floor((x_m.min() - margin_m) / spacing_m), math.floor((x_m.max() + margin_m) / spacing_m) + 1
         )

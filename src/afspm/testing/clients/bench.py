@@ -1,4 +1,4 @@
-"""The test bench of a client: a scripted scheduler or a real experiment, with the client beside it."""
+"""The test bench of a client: a scripted scheduler or a real experiment to which the client connects."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LOG_FILE = "client.txt"
 
 @dataclass
 class JudgedClient:
-    """A started client with the recorder of its heartbeats."""
+    """A started client and the recorder of its heartbeats."""
 
     program: ClientProgram
     beats: BeatRecorder
@@ -51,7 +51,7 @@ class ClientBench:
 
     Args:
         command: the conformance program.
-        folder: for logs and files of the runs.
+        folder: folder for logs and files of the runs.
     """
 
     def __init__(self, command: Sequence[str], folder: Path) -> None:
@@ -65,7 +65,7 @@ class ClientBench:
 
     @property
     def experiment(self) -> JudgedExperiment:
-        """A real, encrypted experiment that several checks share; replaced once it has ended."""
+        """A real, encrypted experiment shared by several checks; replaced once it has ended."""
         if self._experiment is not None and self._experiment.ended:
             self.restart_experiment()
         if self._experiment is None:
@@ -73,11 +73,15 @@ class ClientBench:
         return self._experiment
 
     def new_experiment(self, security: Security = Security.EVERYWHERE) -> JudgedExperiment:
-        """Start a real experiment, which the caller closes."""
+        """Start a real experiment; the caller must close it."""
         return JudgedExperiment(self.folder / f"run-{next(self._runs)}", security)
 
     def perform(self, check: Check) -> str | None:
-        """Run a check. Raises Failed, also for an unreadable answer, and for errors in the experiment."""
+        """Run a check.
+
+        Raises:
+            Failed: a failed check, an unreadable answer, or an error in the experiment.
+        """
         try:
             remark: str | None = check.do(self)
             return remark
@@ -93,7 +97,7 @@ class ClientBench:
             ) from error
 
     def explain(self, check: Check, failure: Failed) -> tuple[str, ...]:
-        """Return the remedy; the next check gets a new experiment."""
+        """Return the remedy, and end the shared experiment."""
         self.restart_experiment()
         return (f"→ {check.remedy}",)
 
@@ -115,7 +119,7 @@ class ClientBench:
 
         Args:
             ready: wait until it is ready.
-            changes: to its launch line.
+            changes: changes to its launch line.
         """
         with self._started(replace(experiment.launch, **changes), experiment.pump, experiment.wake) as client:
             if ready:
@@ -132,7 +136,7 @@ class ClientBench:
             ready: wait until it is ready.
             owner: the owner of the scheduler's keys; None: no encryption.
             also: the address of a second publisher, the judge's.
-            changes: to the client's launch line.
+            changes: changes to the client's launch line.
         """
         control, publish = self._ports.address(), self._ports.address()
         launch = replace(self._scripted_launch(control, publish, also), **changes)
@@ -147,7 +151,7 @@ class ClientBench:
 
     @contextmanager
     def second_publisher(self) -> Iterator[tuple[str, Callable[..., object]]]:
-        """Bind a PUB socket of the judge, without replay; yield its address and a function that sends frames."""
+        """Bind a second PUB socket, without replay; yield its address and a function that sends frames."""
         network = Network(keys.load(self._keys, JUDGE))
         try:
             socket = network.socket(zmq.PUB)

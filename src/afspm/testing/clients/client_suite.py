@@ -20,7 +20,7 @@ CLIENT_SUITE: Final = Suite[Check](
 
 
 def client_check(name: str, title: str, remedy: str) -> Callable[[Judging], Judging]:
-    """Add the decorated function to the suite of clients."""
+    """Return a decorator that adds a check to the suite of clients."""
 
     def add(do: Judging) -> Judging:
         CLIENT_SUITE.add(Check(name, title, do, remedy=remedy))

@@ -1,4 +1,4 @@
-"""A real experiment around the client: scheduler, translator and simulated microscope, with the judge beside them."""
+"""A real experiment for checks of a client: scheduler, translator, simulated microscope and the judge."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ max = "3 V"
 
 
 class Security(Enum):
-    """The kinds of encryption of an experiment; each is a section of its file."""
+    """The kinds of encryption of an experiment; each is a section of the experiment file."""
 
     EVERYWHERE = f'[security]\nkeys = "{KEYS}"\n'
     REQUESTS = ""
@@ -87,17 +87,17 @@ class JudgedExperiment:
     """A running experiment.
 
     Args:
-        folder: of this run.
+        folder: the folder of this run.
         security: the encrypted connections.
 
     Attributes:
-        launch: of the client; the caller adds the heartbeat's address.
-        scope: the judge's.
-        clock: of the experiment.
+        launch: the client's launch line; the caller adds the heartbeat's address.
+        scope: the judge's connection to the microscope.
+        clock: the clock of the experiment.
         seen: every packet that the scheduler has published since the judge joined.
 
     Raises:
-        Lost: it does not start.
+        Lost: the experiment does not start.
     """
 
     def __init__(self, folder: Path, security: Security) -> None:
@@ -162,7 +162,7 @@ class JudgedExperiment:
         return [packet for packet in self.seen if packet.envelope.split("_", 1)[0] == message]
 
     def restart(self, name: str) -> None:
-        """Kill a process, like a crash, and start it again."""
+        """Kill a process as in a crash, and start it again."""
         self.processes.kill(name)
         self.processes.start_again(name)
 

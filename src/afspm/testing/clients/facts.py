@@ -1,4 +1,4 @@
-"""The facts of a packet, as a client must report them."""
+"""The facts that a client must report about a packet."""
 
 from __future__ import annotations
 

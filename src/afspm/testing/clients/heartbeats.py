@@ -18,7 +18,7 @@ from afspm.wire import CLOSING
 
 @dataclass(frozen=True)
 class ReceivedBeat:
-    """One received beat; times in real seconds."""
+    """A received heartbeat; times in real seconds."""
 
     at_s: float
     frames: list[bytes]

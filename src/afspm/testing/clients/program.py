@@ -1,4 +1,4 @@
-"""The conformance program of a client, as a process: steps go to standard input, answers come from standard output."""
+"""The conformance program of a client as a process, with steps on standard input and answers on standard output."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LAST_WORDS = 3
 
 
 class Pump(Protocol):
-    """The service of the judge's own sockets during a wait for the client."""
+    """The function that processes the judge's own sockets while waiting for the client."""
 
     def __call__(self, done: Callable[[], bool], within_s: float) -> bool:
         """Wait until `done()`; return False on a timeout."""
@@ -54,7 +54,7 @@ class ClientProgram:
         log: the file for its standard error.
 
     Raises:
-        ConfigError: it can't be started.
+        ConfigError: the program can't be started.
     """
 
     def __init__(self, command: Sequence[str], launch: Launch, pump: Pump, wake: Callable[[], None], log: Path) -> None:
@@ -101,7 +101,7 @@ class ClientProgram:
         """Return the answer to a step.
 
         Raises:
-            Failed: no answer arrives, or it is not one.
+            Failed: no answer arrives, or the output is no valid answer.
         """
         self._pump(lambda: step in self._answers or not self.is_running, within_s)
         self._finish_reading()
@@ -117,14 +117,18 @@ class ClientProgram:
         """Send a step, and return the answer.
 
         Raises:
-            Failed: no answer arrives, or the program could not do the step.
+            Failed: no answer arrives, or the answer is an error.
         """
         answer = self.do_quietly(do, **arguments)
         expect("error" not in answer, f"the step {do} to be done", str(answer))
         return answer
 
     def do_quietly(self, do: str, **arguments: Any) -> Answer:
-        """Send a step, and return the answer, even an error. Raises Failed: no answer arrives."""
+        """Send a step, and return the answer, even an error.
+
+        Raises:
+            Failed: no answer arrives.
+        """
         return self.answer(self.begin(do, **arguments), ANSWER_S + float(arguments.get("timeout_s", 0.0)))
 
     def succeed(self, do: str, **arguments: object) -> Answer:
@@ -151,18 +155,18 @@ class ClientProgram:
 
     @property
     def last_words(self) -> str:
-        """The last lines on standard error, and on standard output beside answers; empty if there are none."""
+        """The last lines on standard error, and invalid lines on standard output; empty if there are none."""
         lines = [*self._garbage, *self._stderr_lines]
         return f"; its last lines: {' / '.join(lines)}" if lines else ""
 
     def close_stdin(self) -> None:
-        """Close its standard input, which requests its end."""
+        """Close the program's standard input, which requests its end."""
         assert self._popen.stdin is not None
         with contextlib.suppress(OSError):
             self._popen.stdin.close()
 
     def wait_ended(self, within_s: float) -> bool:
-        """Wait until it has ended; return False on a timeout."""
+        """Wait until the program has ended; return False on a timeout."""
         return self._pump(lambda: not self.is_running, within_s)
 
     def kill(self) -> None:
@@ -177,7 +181,7 @@ class ClientProgram:
         self._finish_reading()
 
     def require_clean_output(self) -> None:
-        """Raise Failed if standard output contained anything but answers."""
+        """Raise Failed if standard output contained any line except answers."""
         expect(not self._garbage, "only answers on standard output", " / ".join(self._garbage))
 
     # --- lines ---

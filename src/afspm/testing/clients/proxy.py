@@ -20,7 +20,7 @@ _LONG, _COMMAND = 0x02, 0x04
 
 @dataclass
 class FrameCounter:
-    """The number of frames in a stream of ZMTP, except commands."""
+    """The count of frames in a ZMTP stream, without commands."""
 
     messages: int = 0
     _skip: int = _GREETING
@@ -48,8 +48,9 @@ class CuttingProxy:
 
     Args:
         target: the scheduler's address, "tcp://host:port".
-        longest: one connection is cut at its first chunk with replies, the next at its second and so on, up to this.
-            A cut at the first chunk loses the answer to the greeting; later cuts lose replies to requests.
+        longest: the first connection is cut at its first chunk with replies, the second at its second chunk, and
+            so on up to this number. A cut at the first chunk loses the answer to the greeting; later cuts lose
+            replies to requests.
 
     Attributes:
         cuts: the number of cut connections.

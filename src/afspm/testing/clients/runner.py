@@ -44,7 +44,7 @@ def judge(
         done: called with each result.
 
     Raises:
-        ConfigError: the program can't be started, or there are no such checks.
+        ConfigError: the program can't be started, or no check has such a name.
     """
     checks = CLIENT_SUITE.checks(only)
     folder = run_folder.create(runs, "test-client", datetime.fromtimestamp(ExperimentClock.real().now_s()).astimezone())

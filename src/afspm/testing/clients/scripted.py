@@ -1,4 +1,4 @@
-"""A scripted scheduler: every byte from the client is recorded, and every byte to it is scripted."""
+"""A scripted scheduler: every byte from the client is recorded, and every byte to the client is scripted."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ Reply = Callable[[ScriptedRequest], Sequence[Sequence[bytes]]]
 
 
 def success(request: ScriptedRequest) -> Sequence[Sequence[bytes]]:
-    """Answer with success."""
+    """Return a response that reports success."""
     return [request.answered()]
 
 
 class ScriptedScheduler:
-    """A scheduler for tests: real sockets, scripted answers.
+    """A scheduler for tests with real sockets and scripted answers.
 
     Args:
         control, publish: addresses to bind.
@@ -55,7 +55,7 @@ class ScriptedScheduler:
     Attributes:
         requests: received requests, in order.
         greetings: received greetings (request number 101).
-        connections: the number of connections to `control`, including those refused for their keys.
+        connections: the number of connections to `control`, including connections with refused keys.
         prefixes, markers: received subscriptions.
         cached: packets, as frames, for clients that request them by a marker.
         reply: returns the answer to a request.
@@ -76,7 +76,7 @@ class ScriptedScheduler:
         self.open()
 
     def open(self) -> None:
-        """Bind the sockets, the first time or again."""
+        """Bind the sockets, also again after `shut`."""
         control, publish, keys = self._bound
         self._network = Network(keys)
         self._router = self._network.socket(zmq.ROUTER)
@@ -95,11 +95,11 @@ class ScriptedScheduler:
         self._poller.register(self._publisher, self._take_subscription)
 
     def shut(self) -> None:
-        """Close the sockets; connections are lost."""
+        """Close the sockets, which breaks all connections; `open` binds them again."""
         self._network.close()
 
     def close(self) -> None:
-        """Close for good."""
+        """Close the sockets permanently."""
         self.shut()
         self._woken.close()
 
@@ -125,7 +125,7 @@ class ScriptedScheduler:
         self.pump(lambda: False, for_s)
 
     def publish(self, *frames: bytes) -> None:
-        """Publish frames, whether they are a packet or not."""
+        """Publish any frames, even if they form no valid packet."""
         self._publisher.send_multipart(list(frames))
 
     def send(self, peer: bytes, frames: Sequence[bytes]) -> None:

@@ -1,4 +1,4 @@
-"""`Guide`: gives a step access to the microscope, through the suite's client, and to the person at the panel."""
+"""`Guide`: gives a step access to the microscope and to the person at the panel."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Prompts(Protocol):
     def show(self, text: str) -> None: ...
 
     def confirm(self, question: str) -> bool:
-        """Ask yes or no; no answer means no."""
+        """Ask a yes-or-no question; return False without an answer."""
 
     def text(self, question: str) -> str:
         """Ask for a line, which may be empty."""
@@ -39,8 +39,8 @@ class Guide:
     """The fixture of the steps of one commissioning.
 
     Attributes:
-        folder: of the run, for pictures.
-        has_panel: True of a real controller. Without a panel, each question about it is shown and skipped.
+        folder: the run folder, for pictures.
+        has_panel: True for a real controller. Without a panel, each question about it is shown and skipped.
         program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
         in_contact: the person has approached the tip; it is withdrawn after the steps at the sample.
     """
@@ -57,7 +57,11 @@ class Guide:
         return self.kit.clock
 
     def perform(self, step: CommissioningStep) -> str:
-        """Explain a step, ask for confirmation if it moves anything, and run it. Raises a CheckEnded."""
+        """Explain a step, ask for confirmation if it moves anything, and run it.
+
+        Raises:
+            CheckEnded: a step that failed, was skipped or was declined.
+        """
         if missing := self.kit.support.missing(step.needs):
             raise Unsupported(", ".join(missing))
         self.prompts.show(f"\n{step.title}\n{step.explained}")
@@ -68,7 +72,11 @@ class Guide:
         return step.do(self) or ""
 
     def explain(self, step: CommissioningStep, failure: Failed) -> tuple[str, ...]:
-        """Stop the microscope's activity. Raises Lost: it does not stop."""
+        """Stop the microscope's activity, and return the remedy.
+
+        Raises:
+            Lost: the activity does not stop.
+        """
         try:
             self.kit.client.come_to_rest()
         except Failed as restless:
@@ -76,28 +84,44 @@ class Guide:
         return (f"What to do: {step.remedy}",)
 
     def unseen(self) -> str:
-        """Return the line of a step whose outcome was not seen at the panel. Raises Skipped if there is a panel."""
+        """Return the result line of a step that was not observed at the panel.
+
+        Raises:
+            Skipped: the controller has a panel.
+        """
         line = "set and read back; not seen at the panel"
         if self.has_panel:
             raise Skipped(line)
         return line
 
     def require(self, question: str, expected: str) -> None:
-        """Ask the person to confirm. Raises Failed unless they do."""
+        """Ask the person to confirm.
+
+        Raises:
+            Failed: the person says no.
+        """
         if not self.prompts.confirm(question):
             raise Failed(expected, "the person says no")
 
     def require_at_panel(self, question: str, expected: str) -> None:
-        """Ask the person to confirm at the panel, if there is one. Raises Failed unless they do."""
+        """Ask the person to confirm at the panel, if there is one.
+
+        Raises:
+            Failed: the person says no.
+        """
         if self._can_be_seen(question):
             self.require(question, expected)
 
     def at_panel(self, question: str) -> str | None:
-        """Ask for a line about the panel. Return None if there is no panel."""
+        """Ask for a line of text about the panel; return None without a panel."""
         return self.prompts.text(question) if self._can_be_seen(question) else None
 
     def require_choice(self, question: str, right: str, wrong: Sequence[str], what: str) -> bool:
-        """Ask what the panel shows; return False if it can't be seen. Raises Failed for a wrong answer."""
+        """Ask which option the panel shows; return False if it can't be seen.
+
+        Raises:
+            Failed: a wrong option.
+        """
         if not self._can_be_seen(question):
             return False
         seen = self.prompts.choose(question, [right, *wrong, UNSEEN], UNSEEN)
@@ -106,9 +130,12 @@ class Guide:
         return seen == right
 
     def compare(self, what: str, value: float, unit: str, absolute: float = 0.0) -> bool:
-        """Ask for a value shown at the panel; return False if it is not shown. Raises Failed if it differs.
+        """Ask for a value shown at the panel; return False if it is not shown.
 
-        The person types it before afspm shows its own, so that a wrong value is not misread as the expected one.
+        The person types the value before afspm shows its own, so that a wrong value is not misread as the expected one.
+
+        Raises:
+            Failed: the values differ.
         """
         shown = f"{value:.6g} {unit}".rstrip()
         question = f"{what}, as the panel shows it{f', e.g. in {unit}' if unit else ''}"

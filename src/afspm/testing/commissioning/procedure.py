@@ -28,8 +28,8 @@ class CommissioningResult:
 
     Attributes:
         progress: the steps.
-        lost: why it ended early; empty if it did not.
-        folder: of the run, with the log and the trace.
+        lost: why the commissioning ended early; empty if it did not.
+        folder: the run folder, with the log and the trace.
     """
 
     progress: CommissioningProgress
@@ -54,7 +54,7 @@ def commission(
     """Guide a person through all steps.
 
     Args:
-        file: for the report, written after each step.
+        file: file for the report, written after each step.
         tried_on: see `TRIED_ON`.
         before: the report of an unfinished commissioning of the same controller, to continue.
         has_panel: False skips questions about the panel; None: a simulated microscope has no panel.

@@ -25,27 +25,31 @@ _WORSE = (
 
 
 def outcome_word(outcome: CheckOutcome) -> str:
-    """Return the word for an outcome in reports and in the public matrix."""
+    """Return the name of an outcome in reports and in the public matrix."""
     return _MISMATCH if outcome is CheckOutcome.FAILED else outcome.value
 
 
 def outcome_of(word: str) -> CheckOutcome:
-    """Return the outcome of a report's word. Raises ValueError."""
+    """Return the outcome for its name in a report.
+
+    Raises:
+        ValueError: an unknown name.
+    """
     return CheckOutcome.FAILED if word == _MISMATCH else CheckOutcome(word)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CommissioningStep(Check):
-    """One step.
+    """A step of the commissioning.
 
     Attributes:
         explained: shown to the person before the step.
         after: required earlier steps: none may have failed or been declined.
-        moves: it acts on the microscope, so the person confirms it first.
+        moves: the step acts on the microscope, so the person confirms it first.
         needs_panel: the person acts at the panel; skipped where there is none.
         contact: the tip is at the sample; it is withdrawn after the step.
-        remembered: a resumed commissioning skips it if it has passed; steps about the tip are always repeated.
-        operations: of the public matrix, that it tests.
+        remembered: a resumed commissioning skips the passed step; steps about the tip are always repeated.
+        operations: operations of the public matrix that the step tests.
     """
 
     explained: str
@@ -66,7 +70,7 @@ class CommissioningProgress:
 
     @classmethod
     def resumed(cls, steps: Sequence[CommissioningStep], before: Mapping[str, CheckResult]) -> CommissioningProgress:
-        """Keep earlier passes of remembered steps; all other steps are repeated."""
+        """Create the progress with earlier passes of remembered steps; all other steps are repeated."""
         kept = {
             step.name: before[step.name]
             for step in steps
@@ -92,12 +96,12 @@ class CommissioningProgress:
 
     @property
     def passed(self) -> bool:
-        """True if no step found an error, and every possible step was done."""
+        """True if no step failed, and every possible step was done."""
         found = [result.outcome for result in self.results.values()]
         return bool(found) and all(one in _GOES_ON for one in found)
 
     def operations(self) -> dict[str, str]:
-        """Return the outcome of each operation of the matrix: the worst of its steps."""
+        """Return the outcome of each operation of the matrix: the worst outcome of its steps."""
         found: dict[str, CheckOutcome] = {}
         for step in self.steps:
             outcome = self._outcome(step.name)

@@ -29,11 +29,11 @@ class InstrumentReport:
     """Test results of the operations of one controller.
 
     Attributes:
-        release: of the controller's program, as reported by it or by the person.
+        release: version of the controller's program, as reported by the program or by the person.
         tried_on: one of `TRIED_ON`.
         evidence: a command, or tests of the repository.
-        operations: the outcome of each.
-        steps: of `afspm commission`: outcome and line of each.
+        operations: the outcome of each operation.
+        steps: outcome and line of each step of `afspm commission`.
         unsupported: actions and parameters that the controller does not have.
         unrestored: settings that could not be restored.
     """
@@ -65,7 +65,11 @@ class InstrumentReport:
 
     @classmethod
     def read(cls, file: Path) -> InstrumentReport:
-        """Read a report. Raises FileError: the file is not one."""
+        """Read a report.
+
+        Raises:
+            FileError: the file is unreadable or no report.
+        """
         try:
             facts: Plain = tomllib.loads(file.read_text(encoding="utf-8"))
             found = cls(**facts)
@@ -82,5 +86,5 @@ class InstrumentReport:
 
 
 def steps_of(progress: CommissioningProgress) -> dict[str, dict[str, str]]:
-    """Return the results in the form of the file."""
+    """Return the results of the steps in the format of the report file."""
     return {name: {"outcome": outcome_word(one.outcome), "line": one.line} for name, one in progress.results.items()}

@@ -1,7 +1,7 @@
-"""Blocking code in simulated time: each has a thread, and only the thread with the baton runs.
+"""Blocking code in simulated time: each has its own thread, and only the thread with the baton runs.
 
-The simulation gives the baton to a thread and waits until the thread returns it, by waiting for an event or by ending.
-So the timeline alone determines the order of events, and blocking code replays as exactly as any other.
+The simulation passes the baton to a thread. The thread returns the baton when it waits for an event or ends. So the
+timeline alone determines the order of events, and blocking code is reproducible.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ class LifeEnded(BaseException):
 
 
 class Baton:
-    """One thread of blocking code.
+    """A thread of blocking code that runs only while it has the baton.
 
     Args:
-        body: the code. Its exception, other than `LifeEnded`, is kept in `error`.
+        body: the code. An exception other than `LifeEnded` is kept in `error`.
     """
 
     def __init__(self, name: str, body: Callable[[], int]) -> None:
@@ -37,7 +37,7 @@ class Baton:
     # --- on the side of the simulation ---
 
     def go_on(self) -> None:
-        """Let the code run until it waits again, or ends."""
+        """Run the code until it waits again or ends."""
         if self.over:
             return
         self._to_thread.release()
@@ -55,7 +55,7 @@ class Baton:
     # --- on the side of the code ---
 
     def wait(self) -> None:
-        """Return the baton, and wait for it."""
+        """Return the baton to the simulation, and wait until it comes back."""
         if self._killed:
             raise LifeEnded
         self._to_simulation.release()
@@ -64,7 +64,7 @@ class Baton:
             raise LifeEnded
 
     def die(self) -> None:
-        """End this process at once, from its own code."""
+        """End the simulated process at once, from its own code."""
         self._killed = True
         raise LifeEnded
 

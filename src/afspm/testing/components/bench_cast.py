@@ -1,4 +1,4 @@
-"""The parts of an experiment on the bench, by default or of an experiment file."""
+"""The parts of an experiment on the bench, either defaults or from an experiment file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class BenchCast:
     """The parts of an experiment on the bench.
 
     Attributes:
-        name: of the component under test.
+        name: name of the component under test.
         components, launches: by name; the launch lines have neither sockets nor folders.
         simulator: class of the microscope; `microscope` are its settings.
     """
@@ -40,7 +40,7 @@ class BenchCast:
 
 
 def cast_of(file: str | Path, *overlays: str | Path, component: str, without: Collection[str]) -> BenchCast:
-    """Return the cast of an experiment file; see `Bench.of`.
+    """Return the parts of an experiment file for the bench; see `Bench.of`.
 
     Raises:
         ConfigError: the file has errors, or a part of it can't run on the bench.

@@ -1,4 +1,4 @@
-"""`Bench`: a component under test, with everything else of an experiment around it, in one process."""
+"""`Bench`: a component under test, with all other parts of an experiment, in one process."""
 
 from __future__ import annotations
 
@@ -65,15 +65,15 @@ class Bench:
         bench.run(until="2 h")
         assert len(bench.scans) == 4
 
-    A component that ends with an error raises that error from `run`.
+    If a component ends with an error, `run` raises that error.
 
     Args:
-        component: under test, as its constructor returns it. Each life runs a copy.
+        component: the component under test. Each life runs a copy.
         others: more components by name, such as one that takes the scans.
         microscope: settings of the simulated microscope, as in the experiment file.
-        problems: problems of your own, names and numbers, as in the experiment file.
-        limits: of the scheduler.
-        folder: for saved state and scans; None: a temporary one.
+        problems: names and numbers of your own problems, as in the experiment file.
+        limits: limits of the scheduler.
+        folder: folder for saved state and scans; None: a temporary one.
         seed: the same seed gives the same run.
         dies_in_call: the chance that the component is killed at a call to the network.
         keeps_requests: keep inputs and requests in `folder`, as `[record] requests = true` does.
@@ -141,8 +141,8 @@ class Bench:
 
         Args:
             overlays: experiment files that override the first.
-            component: under test, by name; by default the only one with a plan of its own.
-            without: names of components to leave out, as pages and programs in other languages must be.
+            component: name of the component under test; by default the only one with a plan of its own.
+            without: names of components to leave out, such as web pages and programs in other languages.
             folder, seed, dies_in_call: as for a bench of one component.
 
         Raises:
@@ -234,7 +234,7 @@ class Bench:
         """Run until an experiment time since the start.
 
         Raises:
-            Exception: the error that a component ended with.
+            Exception: the error of a component.
         """
         until_s = _seconds(until)
         if until_s < self.now_s:
@@ -257,7 +257,6 @@ class Bench:
                 raise error
 
     def _settle(self) -> None:
-        """Let a fault reach the component, unless the fault was planned by `at`."""
         if not self._running:
             self._go_to(self.now_s + _SETTLE_S)
 
@@ -272,7 +271,7 @@ class Bench:
         self._ask(ControlRequest.RMV_EXP_PRBLM, self._problems.number(problem))
 
     def set_mode(self, mode: ControlMode) -> None:
-        """Set the mode, as a person does: MANUAL takes control from the component."""
+        """Set the control mode, as a person does; MANUAL takes control from the component."""
         self._ask(ControlRequest.SET_CONTROL_MODE, int(mode))
 
     def kill(self, name: str = "", *, restarts: bool = True) -> None:
@@ -287,16 +286,16 @@ class Bench:
         self._settle()
 
     def lose_connection(self, for_time: Time = 0.0) -> None:
-        """Break the connections of the component; they are made again after `for_time`."""
+        """Break the connections of the component, and restore them after `for_time`."""
         self._components[self.name].cut(_seconds(for_time))
         self._settle()
 
     def refuse(self, subject: str, *, times: int = 1, reason: str = "refused by the bench") -> None:
-        """Have the microscope refuse the next requests of an action ("start-scan") or of a parameter."""
+        """Let the microscope refuse the next requests for an action ("start-scan") or a parameter."""
         self._translator.refusals[subject] = (times, reason)
 
     def change_tip(self, condition: str) -> None:
-        """Change the tip now, also during a scan: "sharp", "blunt", "double" or "contaminated"."""
+        """Change the tip now, also during a scan, to "sharp", "blunt", "double" or "contaminated"."""
         if not self.now_s:
             self._settle()  # the microscope is not switched on before the first step
         self._simulator.change_tip(condition)
@@ -334,7 +333,6 @@ class Bench:
 
     @property
     def memory(self) -> Plain:
-        """The memory of the component."""
         return dict(self.component.memory)
 
     @property
@@ -344,7 +342,7 @@ class Bench:
 
     @property
     def control_state(self) -> ControlState:
-        """Mode, holder and problems, as the scheduler decides them."""
+        """The control mode, the component in control and the problems, as the scheduler publishes them."""
         return self._scheduler.core.control.published()
 
     @property
@@ -371,7 +369,7 @@ class Bench:
 
 
 class _Life:
-    """The lives of one component: the newest is at hand, and its errors are not turned into exit codes."""
+    """The lives of one component: `component` is the newest, and errors are raised instead of becoming exit codes."""
 
     component: Component | None = None
 
@@ -395,7 +393,7 @@ def _no_port(heard: tuple[str, ...] | None = None) -> Port:
 
 
 class _BenchTranslator(TranslatorProcess):
-    """A translator that refuses on demand. Pending refusals survive a kill."""
+    """A translator that refuses requests on demand. Pending refusals survive a kill."""
 
     def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__(*args, **settings)
@@ -412,7 +410,7 @@ class _BenchTranslator(TranslatorProcess):
 
 
 class _Person(Process):
-    """A person whose requests are sent once each, after a wait for the connection if there is none."""
+    """A simulated person; each request is sent once, as soon as there is a connection."""
 
     def __init__(self, time: SimulatedTime, weather: Weather, scheduler: SchedulerHost) -> None:
         super().__init__(time, "person")

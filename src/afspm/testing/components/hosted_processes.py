@@ -1,7 +1,7 @@
-"""Real components and the real translator as simulated processes: their own code, in-memory ports, a folder for a disk.
+"""Real components and the real translator as simulated processes, with in-memory ports and a folder for a disk.
 
-`ComponentProcess` runs a `Component` as `afspm.supervisor.host` does, `TranslatorProcess` a `Driver` behind the
-real `Translator`. All of it speaks the real wire format.
+`ComponentProcess` runs a `Component` as `afspm.supervisor.host` does; `TranslatorProcess` runs a `Driver` behind the
+real `Translator`. Both use the real wire format.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class BlockingProcess(Process):
     """A process with blocking code.
 
     Args:
-        dies_in_call: the chance that it is killed in a call to its port, before or after the call has its effect.
+        dies_in_call: the chance of a kill in a call to its port, before or after the call has its effect.
 
     Attributes:
         ended_with: the end of its last life: an exit code or an exception; None if it was killed.
@@ -75,7 +75,7 @@ class BlockingProcess(Process):
             baton.kill()
 
     def arrived(self) -> None:
-        """Register a message that the process's code may wait for."""
+        """Wake the process's code if it waits for a message."""
         if self._waits:
             self._go_on()
 
@@ -126,10 +126,10 @@ class BlockingProcess(Process):
 
 
 class ComponentProcess(BlockingProcess):
-    """A `Component`, made for every life, on a `Port` in memory.
+    """A simulated process that runs a `Component` with an in-memory port.
 
     Args:
-        make: makes the component.
+        make: creates the component for each life.
         folder: its state_dir.
         launch: its launch line, without sockets and folders.
 
@@ -202,7 +202,7 @@ class ComponentProcess(BlockingProcess):
         return self._make().run_process(context)
 
     def cut(self, for_s: float = 0.0) -> None:
-        """Break the connections, which are reopened after about `for_s`."""
+        """Break the connections, and restore them after about `for_s`."""
         self._weather.reconnect_s, before_s = max(for_s, self._weather.reconnect_s), self._weather.reconnect_s
         self._line.cut()
         for feed in self._feeds:
@@ -304,14 +304,14 @@ class MemoryPort:
         return -1
 
     def close(self) -> None:
-        """Do nothing: connections belong to the process."""
+        """Do nothing: the process owns the connections."""
 
 
 class TranslatorProcess(BlockingProcess):
-    """A `Driver`, made for every life, behind the real `Translator`.
+    """A simulated process that runs a `Driver` behind the real `Translator`.
 
     Args:
-        make: makes the microscope.
+        make: creates the driver for each life.
         folder: its state_dir and run_dir.
     """
 
@@ -422,4 +422,4 @@ class MemoryServerPort:
         self._host.wake(incoming)
 
     def close(self) -> None:
-        """Do nothing: connections belong to the process."""
+        """Do nothing: the process owns the connections."""

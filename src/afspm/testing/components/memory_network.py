@@ -1,4 +1,4 @@
-"""The in-memory network: lines that keep the order, delay messages, break, and are reopened."""
+"""An in-memory network whose lines keep the message order, delay messages, break and reconnect."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class Weather:
     """The quality of the network; may be changed while it runs.
 
     Attributes:
-        delay_s: the longest delay of a message, mostly much less.
+        delay_s: the longest delay of a message; most delays are much shorter.
         doubles: the chance that a request arrives twice.
-        reconnect_s: time until a broken line is retried.
+        reconnect_s: time between attempts to reconnect a broken line.
     """
 
     delay_s: float = 0.01
@@ -28,16 +28,16 @@ class Weather:
 
 
 class Host(Protocol):
-    """A process as lines see it: whether it is alive, and what it receives."""
+    """The interface of a process for its lines: its connections, and its input."""
 
     @property
     def alive(self) -> bool: ...
     @property
     def sockets(self) -> dict[Any, None]:
-        """The lines that end here; they break when it dies."""
+        """The lines that end at this process; they break when it dies."""
 
     def take(self, do: Callable[..., None], *args: object) -> None:
-        """Call `do(*args)` now, later if the process is frozen, never if this life of it ends first."""
+        """Call `do(*args)` now, after a freeze, or never if this life ends first."""
 
 
 class Pipe:
@@ -67,7 +67,7 @@ class Pipe:
 
 
 class LineServer(Host, Protocol):
-    """The answering end of a line: scheduler or translator."""
+    """The server end of a line: scheduler or translator."""
 
     def peer_connected(self, line: ControlLine) -> None: ...
     def peer_disconnected(self, line: ControlLine) -> None: ...
@@ -75,7 +75,7 @@ class LineServer(Host, Protocol):
 
 
 class LineClient(Host, Protocol):
-    """The requesting end of a line."""
+    """The client end of a line."""
 
     def line_up(self, line: ControlLine) -> None: ...
     def line_down(self, line: ControlLine) -> None: ...
@@ -89,7 +89,7 @@ class ControlLine:
         name: the name that the client uses.
 
     Args:
-        doubling: whether requests may arrive twice, as from a client that repeats them early.
+        doubling: whether requests may arrive twice, as from a client that retries early.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class ControlLine:
             self._back.send(self._client.answered, self, number, response)
 
     def cut(self) -> None:
-        """Break the line: messages on their way are lost, both ends notice it, and it is reopened."""
+        """Break the line: messages in transit are lost, both ends notice, and the line reconnects."""
         if self._there is None or self._back is None:
             return
         there, back = self._there, self._back
@@ -142,12 +142,12 @@ class ControlLine:
         self._retry()
 
     def fall_silent(self, for_s: float) -> None:
-        """Lose all messages, in one direction or both; neither end notices it before `for_s` have passed."""
+        """Lose all messages in one or both directions; both ends notice only after `for_s`."""
         _fall_silent(self._timeline, (self._there, self._back))
         self._timeline.after(for_s, self.cut)
 
     def close(self) -> None:
-        """Close the line of a client that has ended or died."""
+        """Close the line permanently, after its client has ended or died."""
         self._closed = True
         self.cut()
 

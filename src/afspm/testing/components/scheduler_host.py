@@ -1,4 +1,4 @@
-"""The scheduler as a simulated process: the real `SchedulerCore`, with lines for sockets and a dict for a disk."""
+"""The scheduler as a simulated process: the real `SchedulerCore`, with in-memory lines and an in-memory disk."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ class Disk:
     """The data that survives a kill of the scheduler.
 
     Attributes:
-        state: saved last; it is frozen, and converted to plain data only for a restart.
+        state: the last saved state; it is frozen, and converted to plain data only for a restart.
         full: nothing can be written.
-        stale: a write has failed, and none has succeeded since.
+        stale: the last write failed.
     """
 
     state: SavedState | None = None
@@ -102,9 +102,9 @@ class SchedulerHost(Process):
             translator's newest packets, which is harder on the scheduler.
 
     Args:
-        journal_s: how long after a packet the journal is written.
-        dies_in_step: the chance that it is killed between two effects of one step.
-        make_core: makes the core of each life, if it is not a plain one.
+        journal_s: delay between a packet and its write to the journal.
+        dies_in_step: the chance of a kill between two effects of one step.
+        make_core: creates the core of each life; by default a `SchedulerCore`.
 
     Attributes:
         worker: executes jobs of the coordinate frame in this life; None: the observer receives them.
@@ -162,7 +162,7 @@ class SchedulerHost(Process):
         self._carry_out(None, self.core.start(self.timeline.monotonic_s(), self.timeline.now_ns()))
 
     def fall_silent(self, for_s: float) -> None:
-        """Let the connections to the translator lose all messages before they break."""
+        """Lose all messages of the translator's connections, before these break after `for_s`."""
         if self.alive:
             self._link.fall_silent(for_s)
             self._from_translator.fall_silent(for_s)

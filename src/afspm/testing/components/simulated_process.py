@@ -1,4 +1,4 @@
-"""Simulated processes: they can be killed and frozen, and a kill loses their memory."""
+"""Simulated processes that can be killed and frozen; a kill loses their memory."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SAME_S = 1e-6
 
 
 class ProcessTimer:
-    """A call of a process at a time that may be changed often; setting the same time again costs nothing."""
+    """A timer of a process that may be reset often; setting the same time again costs nothing."""
 
     def __init__(self, process: Process, ring: Callable[[], None]) -> None:
         self._process = process
@@ -28,7 +28,7 @@ class ProcessTimer:
         self._at_s = 0.0
 
     def set(self, delay_s: float | None) -> None:
-        """Ring in `delay_s`, if this life lasts that long, and cancel the former time; None: cancel only."""
+        """Restart the timer with this delay; None cancels it. A kill of the process also cancels it."""
         at_s = math.inf if delay_s is None else self._process.timeline.monotonic_s() + delay_s
         if self._timer is not None:
             if abs(at_s - self._at_s) < _SAME_S:
@@ -47,11 +47,11 @@ class Process:
 
     Attributes:
         alive: the process is running or frozen.
-        banned: it can't be started.
-        frozen: it does nothing, and messages wait.
-        sockets: the connections that others have made to it, noticed or not.
-        since_s: since when it has been running: its start, or the end of its last freeze.
-        step_age_s: the age of its current step, as it reports it.
+        banned: the process can't be started.
+        frozen: the process does nothing, and messages wait.
+        sockets: connections from other processes, including broken ones not yet noticed.
+        since_s: the time of its start or of the end of its last freeze.
+        step_age_s: the reported age of its current step.
     """
 
     def __init__(self, timeline: SimulatedTime, name: str) -> None:
@@ -112,7 +112,7 @@ class Process:
     # --- for what happens to it ---
 
     def take(self, do: Callable[..., None], *args: object) -> None:
-        """Call `do(*args)` now, later if frozen, not at all if dead."""
+        """Call `do(*args)` now; after the end of a freeze if frozen; never if dead."""
         if not self.alive:
             return
         if self.frozen:
@@ -121,7 +121,7 @@ class Process:
             do(*args)
 
     def later(self, delay_s: float, do: Callable[..., None], *args: object) -> Timer:
-        """Call `do` in `delay_s`, if this life lasts that long."""
+        """Call `do` after `delay_s`, unless this life ends before."""
         return self.timeline.after(delay_s, self._if_same_life, self.life, do, args)
 
     def _if_same_life(self, life: int, do: Callable[..., None], args: tuple[object, ...]) -> None:
@@ -134,4 +134,4 @@ class Process:
         """Set up a new life."""
 
     def ended(self) -> None:
-        """Close the resources of a life that has ended."""
+        """Close the resources of the life that has ended."""

@@ -1,4 +1,4 @@
-"""Simulated time: the events in their order, and the clock that shows it."""
+"""Simulated time: an ordered queue of events and a clock."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _STUCK = 10_000
 
 
 class GoesInCircles(Exception):
-    """The error that events follow each other without time passing."""
+    """The error that events repeat without time passing."""
 
 
 class Timer:
-    """A future event, unless it is cancelled."""
+    """A future event, which can be cancelled."""
 
     __slots__ = ("args", "cancelled", "do")
 
@@ -33,11 +33,11 @@ class Timer:
 
 
 class SimulatedTime:
-    """All future events in their order. It is a `Clock` as well.
+    """A queue of future events in the order of their times, which is a `Clock` as well.
 
     Args:
-        seed: of all random choices.
-        speed: experiment seconds in a real (simulated) second.
+        seed: seed of all random choices.
+        speed: experiment seconds per real (simulated) second.
     """
 
     def __init__(self, seed: int, speed: float = 1.0) -> None:
@@ -74,7 +74,7 @@ class SimulatedTime:
     # --- what happens ---
 
     def after(self, delay_s: float, do: Callable[..., None], *args: object) -> Timer:
-        """Call `do(*args)` in `delay_s` real seconds; calls at the same time happen in the order of registration."""
+        """Call `do(*args)` after `delay_s` real seconds; calls at the same time run in the order of registration."""
         return self.at(self._time_s + delay_s if delay_s > 0.0 else self._time_s, do, args)
 
     def at(self, time_s: float, do: Callable[..., None], args: tuple[object, ...]) -> Timer:
@@ -85,7 +85,7 @@ class SimulatedTime:
         return timer
 
     def step(self) -> bool:
-        """Let the next event happen; False if there is none."""
+        """Run the next event; return False if there is none."""
         while self._coming:
             time_s, _, timer = heapq.heappop(self._coming)
             if timer.cancelled:
@@ -100,7 +100,7 @@ class SimulatedTime:
         return False
 
     def run_until(self, time_s: float) -> None:
-        """Let all events before `time_s` happen, and advance to this time."""
+        """Run all events up to `time_s`, and advance to this time."""
         while self._coming and self._coming[0][0] <= time_s:
             self.step()
         self._time_s = max(self._time_s, time_s)

@@ -21,10 +21,10 @@ def write(kind: str, name: str, into: Path) -> Path:
 
     Args:
         kind: "driver", "component" or "experiment".
-        name: of its folder; "my-scope" becomes my_scope, with the class MyScope.
+        name: name of its folder; "my-scope" becomes my_scope, with the class MyScope.
 
     Returns:
-        its folder, new in `into`.
+        the new folder in `into`.
 
     Raises:
         ConfigError: the name is invalid.

@@ -1,7 +1,7 @@
-"""Conformance suite for translators: each operation of the wire format, checked from outside.
+"""Conformance suite for translators, which checks each operation of the wire format from outside.
 
 `afspm test-translator experiment.toml` starts translator and scheduler as real processes, or joins running ones, and
-sends every request that a component could send. The same as pytest items, one for each check:
+sends every request that a component could send. The same checks as pytest items:
 `pytest -p afspm.testing.translators.plugin experiment.toml` (the plugin is loaded only on request).
 """
 

@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Observation:
-    """One packet.
+    """A received packet.
 
     Attributes:
         message: its name.
@@ -46,7 +46,7 @@ class Observation:
 
     @property
     def state(self) -> ScopeState | None:
-        """The state in a status message, else None."""
+        """The state in a status message; None in other messages."""
         return self.thing.state if isinstance(self.thing, ScopeStatus) else None
 
     def __str__(self) -> str:
@@ -66,7 +66,7 @@ class Observations:
         self.all: list[Observation] = []
 
     def take(self, packet: Packet, ours: bool) -> None:
-        """Record a packet; a listener of an `ExperimentLink`."""
+        """Record a packet, as a listener of an `ExperimentLink`."""
         message = packet.envelope
         try:
             message = wire.message_of(packet.envelope)
@@ -86,7 +86,7 @@ class Observations:
         return self.all[mark:]
 
     def newest(self, kind: type[T]) -> T | None:
-        """Return the newest content of a kind."""
+        """Return the newest content of a type; None without one."""
         return next((one.thing for one in reversed(self.all) if isinstance(one.thing, kind)), None)
 
     def has_state(self, state: ScopeState, mark: int) -> bool:
@@ -94,7 +94,7 @@ class Observations:
         return any(one.state is state for one in self.all[mark:])
 
     def at_s(self, state: ScopeState, mark: int) -> float | None:
-        """Return the first time of a state after `mark`, experiment time; None if there is none yet."""
+        """Return the first experiment time of a state after `mark`; None if it was not published."""
         times = (one.time_ns for one in self.all[mark:] if one.state is state and one.time_ns is not None)
         return next((time_ns / 1e9 for time_ns in times), None)
 
@@ -116,7 +116,7 @@ def spectra(observed: Iterable[Observation]) -> list[Spectrum]:
 
 
 def states(observed: list[Observation]) -> list[str]:
-    """Return the names of the states, without immediate repetitions."""
+    """Return the names of the states, without consecutive repetitions."""
     found: list[str] = []
     for one in observed:
         if one.state is not None and str(one) not in found[-1:]:
@@ -125,11 +125,11 @@ def states(observed: list[Observation]) -> list[str]:
 
 
 STARTED_S = 30.0
-"""Real seconds until translator and scheduler are up and the microscope has reported that it is free."""
+"""Longest real seconds until translator and scheduler run and the microscope is free."""
 ANSWERED_S = 15.0
-"""Real seconds until an answer: longer than a scheduler waits for the translator's."""
+"""Longest real seconds until an answer: more than the scheduler's wait for the translator."""
 NOTICED_S = 10.0
-"""Real seconds until the effect of a request is published."""
+"""Longest real seconds until the effect of a request is published."""
 QUIET_S = 0.2
 """Real seconds without a packet that count as a pause."""
 MOVED_S = 60.0
@@ -145,9 +145,9 @@ class CheckClient:
     """A component that records every publication.
 
     Args:
-        link: to the scheduler, connected or about to be.
+        link: connection to the scheduler; may still be connecting.
         direct: to the translator, bypassing the scheduler's own refusals; None if there is none.
-        lost: returns which process has ended, after a link reports that the parent is gone.
+        lost: returns the name of the process that has ended, after a link reports the end of the parent.
 
     Attributes:
         observations: all publications.
@@ -168,10 +168,10 @@ class CheckClient:
     # --- beginning and ending ---
 
     def begin(self) -> None:
-        """Wait until the microscope is there, and take control.
+        """Wait for the microscope, and take control.
 
         Raises:
-            Lost: there is no microscope, or control was not granted.
+            Lost: the microscope is missing, or control was not granted.
         """
         try:
             self.wait(lambda: self._link.connected and self._link.is_caught_up(), STARTED_S, _ANSWERS)
@@ -190,10 +190,10 @@ class CheckClient:
         self.at_start = tuple(self.observations.all)
 
     def regain_control(self, within_s: float) -> None:
-        """Ask for control again, after it was taken away while the controller was lost.
+        """Request control again, after it was lost together with the controller.
 
         Raises:
-            Lost: it is not granted within `within_s` real seconds.
+            Lost: control is not granted within `within_s` real seconds.
         """
         until_s = self.clock.monotonic_s() + within_s
         while not (response := self._request_over(self._link, ControlRequest.REQUEST_CTRL, 0)).ok:
@@ -206,9 +206,9 @@ class CheckClient:
         self._link.send_only(ControlRequest.RELEASE_CTRL)
 
     def interrupt(self) -> None:
-        """Raise KeyboardInterrupt (after Ctrl-C) where the checks next wait or send.
+        """Raise KeyboardInterrupt (after Ctrl-C) at the next wait or request of the checks.
 
-        Raised elsewhere, it could leave a half-sent request; requests that restore settings would be read as its rest.
+        An interrupt elsewhere could cut a request in two; later requests, which restore settings, would be misread.
         """
         self._interrupted = True
         self._link.port.wake_up()
@@ -221,7 +221,7 @@ class CheckClient:
     # --- asking ---
 
     def ask(self, kind: ControlRequest, subject: object = None) -> Response:
-        """Send a request, and return the answer, also a refusal.
+        """Send a request; return the answer, even a refusal.
 
         Raises:
             Failed: there is no answer.
@@ -233,7 +233,7 @@ class CheckClient:
         return response
 
     def ask_directly(self, kind: ControlRequest, subject: object) -> Response:
-        """Send a request to the translator, bypassing the scheduler: for the translator's own refusals."""
+        """Send a request to the translator without the scheduler, to test the translator's own refusals."""
         return self._request_over(self._direct, kind, subject)
 
     def _request_over(self, link: ExperimentLink, kind: ControlRequest, subject: object) -> Response:
@@ -257,7 +257,7 @@ class CheckClient:
         return value_in(self.asked(ControlRequest.PARAM, Parameter(name, None, unit), f"getting {name}"), name)
 
     def set(self, name: str, value: str, unit: str | None = None) -> Response:
-        """Request a value; return the answer, also a refusal."""
+        """Request a change of a parameter; return the answer, even a refusal."""
         return self.ask(ControlRequest.PARAM, Parameter(name, value, unit))
 
     # --- hearing ---
@@ -268,7 +268,7 @@ class CheckClient:
         return ScopeState.UNDEFINED if newest is None else newest.state
 
     def wait(self, done: Callable[[], bool], within_s: float, expected: str) -> None:
-        """Wait for a condition on the observations, real seconds.
+        """Wait until a condition on the observations holds, up to `within_s` real seconds.
 
         Raises:
             Failed: a timeout.
@@ -311,11 +311,15 @@ class CheckClient:
                 return
 
     def real_s(self, experiment_s: float) -> float:
-        """Return the longest real time for an experiment time, with an allowance for the notification."""
+        """Return the longest real time for an experiment time, plus a delay for the publication."""
         return self.clock.real_s(experiment_s) + NOTICED_S
 
     def come_to_rest(self) -> None:
-        """Stop any activity, and wait until the microscope is free. Raises Lost."""
+        """Stop any activity, and wait until the microscope is free.
+
+        Raises:
+            Lost: the activity does not stop.
+        """
         if self.state is not ScopeState.FREE:
             mark = self.observations.mark()
             if self.state in _STOPS:
@@ -344,7 +348,7 @@ def _only_asks(kind: ControlRequest, subject: object) -> bool:
 
 
 def answer_in_words(response: Response) -> str:
-    """Describe an answer with its reason."""
+    """Return a response's code and reason as text."""
     known = response.code in ControlResponse._value2member_map_
     code = f"REP_{ControlResponse(response.code).name}" if known else f"response {response.code}"
     return f"{code} ({response.reason})" if response.reason else code
@@ -354,7 +358,7 @@ def value_in(response: Response, name: str) -> Parameter:
     """Return the parameter in a successful answer.
 
     Raises:
-        Failed: none, or another.
+        Failed: no parameter, or another one.
     """
     try:
         found = wire.decode_parameter(response.payload)

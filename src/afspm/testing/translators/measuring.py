@@ -40,7 +40,7 @@ class FrameSetting:
     shape: tuple[int, int]
 
     def request(self, support: Support) -> ScanParameters:
-        """Return the request that sets it; without the angle, where the microscope has none."""
+        """Return the request for this frame; the angle is left out if the microscope has none."""
         (left, low), (width, height) = self.region.top_left_m, self.region.size_m
         angle = self.region.angle_rad if support.has(names.SCAN_ANGLE) else None
         return ScanParameters(RegionChange(left, low, width, height, angle), self.shape)
@@ -48,7 +48,7 @@ class FrameSetting:
 
 @dataclass(frozen=True)
 class FrameSettings:
-    """The frames of one pass. Columns are multiples of 16: some controllers accept no others.
+    """The frames of one pass. Column counts are multiples of 16, as some controllers require.
 
     Attributes:
         whole: the frame at the beginning.
@@ -58,22 +58,22 @@ class FrameSettings:
 
     @property
     def plain(self) -> FrameSetting:
-        """A square, off the centre in both directions."""
+        """A square, off-centre in both directions."""
         return self._part((0.1, -0.15), (0.5, 0.5), (32, 32))
 
     @property
     def other(self) -> FrameSetting:
-        """A smaller square, elsewhere."""
+        """A smaller square at another position."""
         return self._part((-0.2, 0.2), (0.3, 0.3), (32, 32))
 
     @property
     def wide(self) -> FrameSetting:
-        """A frame twice as wide as high, with other pixels."""
+        """A frame twice as wide as high, with another pixel count."""
         return self._part((-0.1, 0.15), (0.6, 0.3), (16, 64))
 
     @property
     def turned(self) -> FrameSetting:
-        """A frame turned counter-clockwise."""
+        """A frame rotated counter-clockwise."""
         return self._part((0.1, 0.05), (0.5, 0.4), (32, 48), TURN_RAD)
 
     def _part(
@@ -128,7 +128,7 @@ class Taken:
     """A finished measurement.
 
     Attributes:
-        frame: the set frame; None for a spectrum.
+        frame: the requested frame; None for a spectrum.
         observed: publications from its start until a pause.
         expected_s: its expected duration, experiment time; None if unknown.
     """
@@ -146,10 +146,10 @@ class Taken:
         return spectra(self.observed)
 
     def time_s(self, state: ScopeState) -> float:
-        """Return the first time of a state, experiment time.
+        """Return the first time of a state in experiment seconds.
 
         Raises:
-            Failed: it was never published.
+            Failed: the state was not published.
         """
         times = [one.time_ns for one in self.observed if one.state is state and one.time_ns is not None]
         expect(times, f"SS_{state.name} with a time", describe_all(self.observed))
@@ -157,11 +157,11 @@ class Taken:
 
 
 class CheckMeasurements:
-    """Measurements for checks. A failed measurement is not repeated: checks that need it are skipped.
+    """Measurements for checks. A failed measurement is not repeated: dependent checks are skipped.
 
     Attributes:
         excused: checks that this controller can't pass, with the reason.
-        complaints: logged warnings and errors; it grows.
+        complaints: logged warnings and errors; the list grows.
         frames: the frames to scan; Skipped where the microscope has not published its frame.
             `frame_m` is the side of the square that contains them, instead of the set frame.
     """
@@ -191,14 +191,22 @@ class CheckMeasurements:
         return self.client.clock
 
     def perform(self, check: Check) -> None:
-        """Run a check. Raises a CheckEnded: Skipped if the microscope does not have what it needs."""
+        """Run a check.
+
+        Raises:
+            CheckEnded: a check that did not pass; Skipped if the microscope does not support it.
+        """
         self._heeded = len(self._complaints)
         if missing := self.support.missing(check.needs):
             raise Skipped(f"not supported: {', '.join(missing)}")
         check.do(self)
 
     def explain(self, check: Check, failure: Failed) -> tuple[str, ...]:
-        """Return the complaints since the check began. Raises Skipped: the controller can't pass it."""
+        """Return the complaints since the check began.
+
+        Raises:
+            Skipped: the controller cannot pass the check.
+        """
         if check.name in self._excused:
             raise Skipped(f"{self._excused[check.name]}: {failure}")
         return tuple(self._complaints[self._heeded :])
@@ -210,17 +218,17 @@ class CheckMeasurements:
         return FrameSettings(self._whole)
 
     def keep(self, what: str, taken: Taken) -> None:
-        """Keep a measurement that was taken in another way."""
+        """Store a measurement for later checks."""
         self._kept[what] = taken
 
     def forget(self) -> None:
-        """Discard all kept measurements, so that they are taken again on request."""
+        """Discard all stored measurements, so that later checks take them again."""
         self._kept.clear()
 
     # --- scans ---
 
     def scan(self, name: str) -> Taken:
-        """Return the scan of the frame of this name, taken now or earlier."""
+        """Return the scan of a named frame; take it on the first call."""
         return self._once(f"scan of the {name} frame", lambda: self.take_scan(getattr(self.frames, name)))
 
     def take_scan(self, frame: FrameSetting) -> Taken:
@@ -255,7 +263,7 @@ class CheckMeasurements:
     # --- spectra ---
 
     def spectrum(self) -> Taken:
-        """Return a spectrum somewhere in the frame, taken now or earlier."""
+        """Return a spectrum inside the frame; take it on the first call."""
         return self._once("spectrum", self._take_spectrum)
 
     def begin_spectrum(self) -> int:
@@ -294,7 +302,11 @@ class CheckMeasurements:
     # --- both ---
 
     def act(self, action: str) -> None:
-        """Run an action. Raises Skipped if it is unsupported, which some microscopes report only on use."""
+        """Run an action.
+
+        Raises:
+            Skipped: an unsupported action, which some microscopes report only on use.
+        """
         response = self.client.ask(ControlRequest.ACTION, action)
         if response.code == ControlResponse.ACTION_NOT_SUPPORTED and self.support.actions.get(action) is None:
             self.support.actions[action] = False
@@ -327,10 +339,10 @@ class CheckMeasurements:
 
 
 def number(parameter: Parameter, unit: str = "") -> float:
-    """Return the value of a parameter in a unit, "" for its own.
+    """Return the value of a parameter in a unit; "" selects the parameter's own unit.
 
     Raises:
-        Failed: it is not a number.
+        Failed: the value is not a number.
     """
     try:
         found = float(str(parameter.value))

@@ -73,7 +73,7 @@ class ExperimentFile(pytest.File):
 
 
 class CheckItem(pytest.Item):
-    """One check."""
+    """A check as a pytest item."""
 
     def __init__(self, *, check: Check, **given: Any) -> None:
         super().__init__(**given)

@@ -21,7 +21,7 @@ class CheckReport(SuiteReport):
 
     Attributes:
         translator: its class or command.
-        unrestored: settings that could not be restored, a line each.
+        unrestored: settings that could not be restored, one per line.
     """
 
     translator: str = ""

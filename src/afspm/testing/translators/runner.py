@@ -1,4 +1,4 @@
-"""Runs all checks in order, then restores every setting."""
+"""Run of all checks in order, followed by the restoration of every setting."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from afspm.testing.translators.support import Support
 from afspm.testing.translators.translator_suite import TRANSLATOR_SUITE
 
 _LAST = (names.SCAN_SPEED, names.MOVE_SPEED)
-"""Restored last, since a change of the frame may change them."""
+"""Settings restored last, since a change of the frame may change them."""
 
 
 @dataclass(frozen=True)
 class SettingsBefore:
-    """The settings in force before the checks."""
+    """The settings before the checks."""
 
     frame: ScanParameters | None
     feedback: Feedback | None
@@ -44,7 +44,7 @@ class SettingsBefore:
         """Stop any activity, and restore all settings.
 
         Returns:
-            the failures, a line each.
+            the failures, one per line.
         """
         wrong: list[str] = []
         try:
@@ -115,7 +115,7 @@ def _same(before: Parameter, now: Parameter) -> bool:
 
 @contextmanager
 def restored(session: CheckSession, report: CheckReport) -> Iterator[CheckMeasurements]:
-    """Restore the settings at the end of the block, however it ends."""
+    """Restore the settings at the end of the `with` block, even after an error."""
     kit = CheckMeasurements(
         session.client, session.support, session.options.frame_m, excused=session.excused, complaints=session.complaints
     )

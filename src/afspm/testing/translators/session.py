@@ -1,4 +1,4 @@
-"""Translator and scheduler of an experiment file, started or joined, and a connection to them."""
+"""Translator and scheduler of an experiment file, started or already running, and a connection to them."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ class CheckOptions:
     Attributes:
         files: the experiment file, and its overlays.
         without: processes that run already, at the addresses in the file, and are joined.
-        runs: the folder of run folders.
-        speed: of the clock of a simulated microscope; experiment seconds in a real second.
+        runs: the parent of the run folders.
+        speed: experiment seconds per real second, for a simulated microscope.
         only: parts of the names of the checks; empty: all.
         frame_m: the side of a square about the centre of the set frame, never left by checks; None: the set frame.
     """
@@ -82,10 +82,10 @@ class CheckSession:
 
     Attributes:
         support: the supported actions and parameters.
-        translator: its class or command; maker: of its controller, if the driver names it.
-        folder: of this run.
+        translator: its class or command; maker: maker of its controller, if the driver names it.
+        folder: the run folder.
         excused: checks that this controller can't pass, with the reason.
-        complaints: the logged warnings and errors; it grows.
+        complaints: the logged warnings and errors; the list grows.
         program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
     """
 
@@ -102,10 +102,10 @@ class CheckSession:
 
 
 def prepare(options: CheckOptions) -> Experiment:
-    """Return the experiment with the tester in it, and with a scheduler if it had none.
+    """Return the experiment with the tester added, and with a scheduler if it had none.
 
     Raises:
-        ConfigError: it can't be run, or is in sample coordinates.
+        ConfigError: the experiment can't be run, or uses sample coordinates.
     """
     own = load(*options.files)
     overlay = _OVERLAY if own.resolved.with_role(Role.SCHEDULER) else _OVERLAY + _SCHEDULER
@@ -126,11 +126,11 @@ def prepare(options: CheckOptions) -> Experiment:
 
 @contextmanager
 def opened(options: CheckOptions) -> Iterator[CheckSession]:
-    """Start, or join, the program under test; hold control of the microscope in the block.
+    """Start or join the program under test; hold control of the microscope within the `with` block.
 
     Raises:
         ConfigError: the experiment file or the options are wrong; nothing was started.
-        Lost: it did not start.
+        Lost: the program did not start.
     """
     experiment = prepare(options)
     resolved = experiment.resolved
@@ -256,7 +256,7 @@ def _link(port: Port, own: Launch, log: logging.Logger) -> ExperimentLink:
 
 
 def is_simulated(experiment: Experiment, options: CheckOptions) -> bool:
-    """Return whether the started microscope is certainly simulated."""
+    """Return whether the microscope is known to be simulated."""
     return experiment.simulated(without=_left_out(experiment, options))
 
 

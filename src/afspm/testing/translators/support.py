@@ -1,4 +1,4 @@
-"""The generic actions and parameters that a microscope supports, requested over the wire."""
+"""The generic actions and parameters that a microscope supports, queried over the wire."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Support:
 
     Attributes:
         actions: whether each is supported; None if the microscope does not report it.
-        parameters: the value at the beginning; None if it is not supported.
+        parameters: the initial value; None if it is not supported.
         errors: errors in the answers.
-        settable: results of the checks; None if not tried.
+        settable: results of the checks; None if not tested.
     """
 
     actions: dict[str, bool | None] = field(default_factory=dict)
@@ -40,7 +40,7 @@ class Support:
         return [name for name in needs if not known.get(name)]
 
     def has(self, *wanted: str) -> bool:
-        """Return whether the microscope supports all of these."""
+        """Return whether the microscope supports all these names."""
         return not self.missing(wanted)
 
     @property
@@ -51,7 +51,7 @@ class Support:
 
 
 def find_out(client: CheckClient, actions: Iterable[str] = (), parameters: Iterable[str] = ()) -> Support:
-    """Query all generic names, and the microscope's own."""
+    """Query the support of all generic names and of the microscope's own names."""
     found = Support()
     for name in dict.fromkeys((*ACTIONS, *actions)):
         found.actions[name] = _has_action(client, name, found.errors)

@@ -19,7 +19,7 @@ TRANSLATOR_SUITE: Final = Suite[Check](
 
 
 def check(name: str, title: str, needs: tuple[str, ...] = ()) -> Callable[[Checking], Checking]:
-    """Add the decorated function to the suite of translators."""
+    """Return a decorator that adds a check to the suite of translators."""
 
     def add(do: Checking) -> Checking:
         TRANSLATOR_SUITE.add(Check(name, title, do, needs))

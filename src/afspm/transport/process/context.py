@@ -32,7 +32,7 @@ class ProcessActivity:
 
     @contextmanager
     def step(self) -> Iterator[None]:
-        """Count the block as one step."""
+        """Count the `with` block as one step."""
         before, self.since_s = self.since_s, self._clock.monotonic_s()
         try:
             yield
@@ -41,7 +41,7 @@ class ProcessActivity:
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
-        """Stop counting within a step while the block waits; afterwards the step's age starts at zero."""
+        """Stop counting the step during the `with` block; afterwards the step's age starts at zero."""
         before, self.since_s = self.since_s, None
         try:
             yield

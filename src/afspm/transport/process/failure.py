@@ -1,4 +1,4 @@
-"""Exceptions as text, with the place in the user's own code; and the file that reports a fault to the supervisor."""
+"""Exceptions as text that points to the user's own code, and the file that reports a fault to the supervisor."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def describe(error: BaseException, name: str = "", package: Path = PACKAGE) -> s
 
 
 def may_pass(error: BaseException) -> bool:
-    """Return whether an error may pass by itself, such as a failure of the controller, unlike a fault of the code."""
+    """Return whether a retry may succeed, as after a controller's failure, unlike after a code fault."""
     if isinstance(error, Refused):
         return error.response not in _REFUSED_AGAIN
     return isinstance(error, (RequestError, FileError, TransportError, OSError, MemoryError))
@@ -95,7 +95,7 @@ def log(logger: logging.Logger, error: BaseException, name: str) -> None:
 
 
 def where_now(thread_id: int, package: Path = PACKAGE) -> str:
-    """Return the lines of code that a thread is running, from the user's own code on."""
+    """Return the lines of code that a thread is running, starting with the user's own code."""
     frame = sys._current_frames().get(thread_id)
     stack = traceback.extract_stack(frame) if frame is not None else []
     return "".join(traceback.format_list(_kept(stack[_BELOW_START:], package, is_foreseen=False))).rstrip("\n")

@@ -19,7 +19,7 @@ class LineFormatter(logging.Formatter):
 
 
 def set_up(name: str, level: str) -> logging.Logger:
-    """Send records from `level` on to standard error, of libraries only warnings; return the component's logger."""
+    """Log to standard error from `level` on (libraries: warnings only); return the component's logger."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(LineFormatter())
     root = logging.getLogger()

@@ -50,14 +50,14 @@ def read_launch_line(pipe: int) -> bytes:
 
 
 class StopRequested(BaseException):
-    """The exception that the parent has ended, or stops the process.
+    """The exception raised when the parent has ended or stops the process.
 
     Like KeyboardInterrupt it is no `Exception`: a script's `except Exception` must not keep a process alive.
     """
 
 
 class ParentWatch:
-    """A watch over the parent, which runs callbacks in another thread once the parent is gone or stops the process.
+    """A watch over the parent, which runs callbacks in another thread when the parent ends or stops the process.
 
     If the process has not ended `END_WITHIN_S` later (a handler that computes, a library that hangs), it exits at once
     with `code_if_late`; if the tip is in danger, `TIP_WITHIN_S` later.
@@ -83,7 +83,7 @@ class ParentWatch:
         return self._gone.is_set()
 
     def when_gone(self, callback: Callable[[], None]) -> None:
-        """Register a callback; if the parent is gone already, call it at once."""
+        """Register a callback; call it at once if the parent is already gone."""
         with self._lock:
             self._callbacks.append(callback)
             gone = self.gone
@@ -118,7 +118,7 @@ class ParentWatch:
 
 
 def end_within(seconds: float, code: int) -> None:
-    """End the process with `code` after `seconds`, in any state."""
+    """End the process with `code` after `seconds`, even if it hangs."""
     # a thread, since Windows has no alarm signal
     timer = threading.Timer(seconds, os._exit, (code,))
     timer.daemon = True

@@ -15,10 +15,10 @@ ENDING = (*CTRL_C, "SIGTERM", "SIGBREAK", "SIGHUP")
 
 @contextmanager
 def caught(tell: Callable[[int], None], wakeup_fd: int, names: Sequence[str] = ENDING) -> Iterator[None]:
-    """Pass signals that end a program to `tell` within this block; each also writes to `wakeup_fd`.
+    """Pass signals that end a program to `tell` during the `with` block; each also writes to `wakeup_fd`.
 
-    A signal that is already ignored (SIGHUP under nohup) stays ignored. Outside the main thread Python delivers no
-    signals, and this does nothing.
+    An ignored signal (SIGHUP under nohup) stays ignored. Outside the main thread this function has no effect, since
+    Python delivers no signals there.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -89,7 +89,7 @@ class AsylumController:
         self.spots_m: list[tuple[float, float]] = [(fast / 2, slow / 2)]
 
     def put(self, names: str, value: float, now_s: float) -> None:
-        """Execute PV. A bias voltage in force for less than a minute counts as a bias pulse."""
+        """Execute PV. A bias voltage that is set for less than a minute counts as a bias pulse."""
         before_v = self.values.get("TipVoltage")
         self.values.put(names, value)
         if self.values.get("TipVoltage") == before_v:
@@ -131,7 +131,7 @@ class AsylumController:
     # --- scans ---
 
     def scan(self, now_s: float, down: bool | None) -> None:
-        """Start a scan, downwards, upwards or in the previous direction (None); a running scan ends."""
+        """Start a scan downwards, upwards or in the previous direction (None); it replaces a running scan."""
         if self.faults.strikes("scan-refused", now_s):
             return
         if self.scanning:
@@ -157,7 +157,7 @@ class AsylumController:
         self.rig.withdraw(now_s)
 
     def engage(self, now_s: float) -> None:
-        """Bring the tip to the sample after a running withdrawal."""
+        """Approach the sample once a running withdrawal has ended."""
         self._engages = True
         self.rig.switch_feedback(now_s, on=True)
 

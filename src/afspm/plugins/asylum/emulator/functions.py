@@ -15,7 +15,7 @@ _NOTHING: Final = math.nan
 
 
 class DialogOpen(Exception):
-    """A modal dialog that blocks Igor; the function returns `result` after OK."""
+    """The exception that a modal dialog blocks Igor; the function returns `result` after OK."""
 
     def __init__(self, text: str, result: float) -> None:
         super().__init__(text)

@@ -1,4 +1,4 @@
-"""Server side of the ZeroMQ-XOP protocol: requests from bytes, replies to bytes. Pure.
+"""Server side of the ZeroMQ-XOP protocol: decoding of requests and encoding of replies. Pure.
 
 After the source and specification of ZeroMQ-XOP, first version of the interface. Independent of the translator's code,
 so that each checks the other.
@@ -45,7 +45,7 @@ Value = float | str | Mapping[str, object] | None
 
 
 class CallFailed(Exception):
-    """A request answered with an error.
+    """The error that is sent in answer to a request.
 
     Attributes:
         number: error number of ZeroMQ-XOP.

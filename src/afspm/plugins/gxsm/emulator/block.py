@@ -1,4 +1,4 @@
-"""Gxsm4's shared memory, from GXSM's side: passes the calls of other programs to the emulator."""
+"""The owner side of Gxsm4's shared memory, which passes calls of other programs to the emulator."""
 
 from __future__ import annotations
 
@@ -66,7 +66,11 @@ class SharedMemoryBlock:
         return self._process.stdout.fileno()
 
     def take(self) -> None:
-        """Post one received call. Raises Crashed: the process was killed."""
+        """Post a received call.
+
+        Raises:
+            Crashed: the process was killed.
+        """
         frame = self._frame()
         if not frame:
             raise Crashed("its process is gone")

@@ -60,7 +60,7 @@ def _fits(signature: inspect.Signature, arguments: tuple[object, ...]) -> bool:
 
 
 class NoAnswer(Exception):
-    """A call that blocks GXSM: neither this call nor a later one is answered until GXSM is restarted."""
+    """The exception that a call blocks GXSM, so that no call is answered until a restart."""
 
 
 class WrongArguments(SystemError):
@@ -95,8 +95,8 @@ class GxsmFunctions:
         """Call a function.
 
         Raises:
-            NoAnswer: GXSM is blocked for good. NameError: no such function.
-            WrongArguments, SystemError: errors that a script sees.
+            NoAnswer: GXSM is blocked permanently. NameError: no such function.
+            WrongArguments, SystemError: errors that a script receives.
         """
         if method not in _FUNCTIONS:
             raise NameError(method)

@@ -1,4 +1,4 @@
-"""GXSM's Python console: runs a user's script in a thread, whose calls of `gxsm` GXSM answers one at a time."""
+"""GXSM's Python console: runs a user's script in a thread; GXSM executes its calls one at a time."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ScriptCall:
 
 
 class GxsmModule:
-    """The module `gxsm` as a script sees it."""
+    """The module `gxsm` for a script in the console."""
 
     def __init__(self, post: Callable[[ScriptCall], None]) -> None:
         self._post = post
@@ -56,7 +56,7 @@ class GxsmModule:
         return call
 
     def end(self) -> None:
-        """End every thread that waits for an answer or makes another call."""
+        """End every thread that waits for an answer or makes another call later."""
         self._gone = True
         for answer in list(self._waiting):
             if not answer.done():
@@ -84,7 +84,11 @@ class ScriptConsole:
         self._thread.start()
 
     def poll(self) -> str | None:
-        """Return the script's address once it listens. Raises the exception that ended the script before."""
+        """Return the address at which the script listens; None before.
+
+        Raises:
+            the exception that ended the script before it listened.
+        """
         return self._address.result() if self._address.done() else None
 
     @property

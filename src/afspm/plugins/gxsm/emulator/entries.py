@@ -1,4 +1,4 @@
-"""Entries of GXSM's panel behind `set` and `get`, with their quirks."""
+"""Entries of GXSM's panel that `set` and `get` use, with their quirks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 USER_UNITS: Final = {"Å": 1.0, "nm": 10.0, "µm": 1e4}
-"""In ångström."""
+"""Units of lengths on the panel, in ångström."""
 _FLOAT: Final = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _ANGSTROM: Final = "Å"
 _PADDING: Final = " " * 4
@@ -22,7 +22,7 @@ _DAC_STEP: Final = 0.422
 
 @dataclass
 class GxsmEntry:
-    """One entry.
+    """An entry of GXSM's panel.
 
     Attributes:
         value: lengths in ångström, independent of the panel's unit.
@@ -78,7 +78,7 @@ class GxsmEntries:
         self._entries[ref].value = value
 
     def set(self, ref: str, text: str) -> int:
-        """Set an entry from text. Returns 0 in any case, as GXSM does."""
+        """Set an entry from text. Return 0 even after a failure, as GXSM does."""
         entry = self._entries.get(ref)
         if entry is None:
             return 0
@@ -98,7 +98,7 @@ class GxsmEntries:
         return 0
 
     def get(self, ref: str) -> float | str:
-        """Return a value in the user's unit; for an unknown name -inf, or in Gxsm3 uninitialised memory."""
+        """Return a value in the user's unit; an unknown name gives -inf, or uninitialised memory in Gxsm3."""
         entry = self._entries.get(ref)
         if entry is not None:
             return entry.value / self._factor(entry)
@@ -107,7 +107,7 @@ class GxsmEntries:
         return -math.inf
 
     def gets(self, ref: str) -> str:
-        """Return the value as text with its unit, of the first entry whose name starts with `ref`."""
+        """Return the first entry whose name starts with `ref`, as text with its unit."""
         found = [entry for name, entry in self._entries.items() if name.startswith(ref)]
         if not found:
             return "ERROR"

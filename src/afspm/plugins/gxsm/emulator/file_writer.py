@@ -51,14 +51,14 @@ class GxsmFileWriter:
         return self.folder / f"scan{counter:03d}-{ending}"
 
     def free(self, ending: str, number: int) -> Path:
-        """Return the path with the first free number from `number` on; each channel counts by itself."""
+        """Return the path with the first free number from `number` on; each channel has separate numbers."""
         counter = number
         while (path := self.named(ending, counter)).exists() or any(write.path == path for write in self._writes):
             counter += 1
         return path
 
     def counted(self, files: list[Path]) -> None:
-        """Set the counter behind the numbers of the saved files."""
+        """Set the counter to the number after the saved files' numbers."""
         numbers = (int(file.name.removeprefix("scan").partition("-")[0]) for file in files)
         self.counter = max(self.counter, *(number + 1 for number in numbers))
 

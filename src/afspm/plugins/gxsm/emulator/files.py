@@ -44,7 +44,7 @@ class GxsmChannel:
         return f"{'M-' if master else ''}{self.direction}-{self.label.replace('-', 'm')}.nc"
 
     def raw(self, values: np.ndarray) -> np.ndarray:
-        """Return the stored values of an image [y, x] with y ascending: rows from the top, NaN where not scanned."""
+        """Return the stored values of an image [y, x] with y ascending: top row first, NaN where not scanned."""
         return (values[::-1] * (self.scale / self.dz)).astype(np.float32)
 
 
@@ -76,7 +76,7 @@ class GxsmScanFile:
     """One channel of a scan.
 
     Attributes:
-        raw: stored values, rows from the top; times `dz` they are in `unit`.
+        raw: stored values, rows from the top; multiplied by `dz`, they are in `unit`.
         unit: unit in the file ("AA" for lengths), and unit on the panel.
         frame: x, y, width, height in ångström, angle clockwise in degrees.
     """
@@ -154,7 +154,7 @@ class GxsmScanFile:
 
 
 def prepare(version: int) -> None:
-    """Import the libraries that write the files, so that the first scan's files are not later than others."""
+    """Import the libraries that write the files, so that the first scan's files are not delayed."""
     import_module("scipy.io" if version == 3 else "h5py")
 
 

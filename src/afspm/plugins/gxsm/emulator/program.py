@@ -1,4 +1,4 @@
-"""GXSM itself: settings and measurements with the simulated instrument behind them, and the saving of files."""
+"""The program GXSM: settings, measurements with the simulated instrument, and saving of files."""
 
 from __future__ import annotations
 
@@ -113,13 +113,13 @@ class GxsmScan:
 
 
 class GxsmProgram:
-    """The program.
+    """The emulated program.
 
     Attributes:
         panel: switches of its panel.
         channels: channels that a scan records.
         dialogs: texts of dialogs on the screen.
-        scan: the last scan that was started.
+        scan: the last started scan.
     """
 
     def __init__(self, rig: Instrument, faults: Faults, clock: Clock, folder: Path, settings: GxsmSettings) -> None:
@@ -234,7 +234,7 @@ class GxsmProgram:
     # --- scans ---
 
     def start_scan(self) -> None:
-        """Start a scan if possible. GXSM reports no failure, and does nothing else while it writes files."""
+        """Start a scan if possible. GXSM reports no failure, and is blocked while it writes files."""
         now_s = self.clock.now_s()
         self.scan.next_follows = now_s < self.saving.done_s
         if self.scan.next_follows:
@@ -271,7 +271,7 @@ class GxsmProgram:
         self.scan.runs, self.scan.saved = True, False
 
     def y_current(self, now_s: float) -> int:
-        """Return the last complete line; before the first one the previous scan's; after a stop the last line."""
+        """Return the last complete line; before the first, the previous scan's; after a stop, the last line."""
         scan = self.scan.activity
         if scan is None:
             return 0
@@ -286,7 +286,7 @@ class GxsmProgram:
         return Region((x, y), (width, height), -math.radians(self.entries["Rotation"]))
 
     def names(self, now_s: float) -> list[Path]:
-        """Return the paths that GXSM reports for its channels' files, existing or not; empty before the first scan."""
+        """Return the reported paths of the channels' files, existing or not; empty before the first scan."""
         if self.scan.activity is None:
             return []
         if self.scan.before is not None and now_s < self.scan.activity.start_s + NAMED_S:
@@ -296,7 +296,7 @@ class GxsmProgram:
         return [self.saving.named(ending, self.scan.number) for ending in self._endings()]
 
     def shown(self, path: Path) -> str:
-        """Return a path as GXSM reports it; in the default folder "./name", relative to GXSM's start folder."""
+        """Return a path as GXSM reports it; relative ("./name") in the default folder."""
         return f"./{path.name}" if path.parent == self.folder else str(path)
 
     def image(self, channel: GxsmChannel) -> np.ndarray:
@@ -363,7 +363,7 @@ class GxsmProgram:
             self.rig.move_probe(self.tip_m(), self.clock.now_s())
 
     def tip_m(self) -> tuple[float, float]:
-        """Return the position where the tip was sent, (x, y) in m."""
+        """Return the target position of the tip, (x, y) in m."""
         angle, (cx, cy) = -math.radians(self.entries["Rotation"]), self.frame().center_m
         u, v = (self.entries[ref] * ANGSTROM_M for ref in ("ScanX", "ScanY"))
         return cx + math.cos(angle) * u - math.sin(angle) * v, cy + math.sin(angle) * u + math.cos(angle) * v

@@ -31,7 +31,7 @@ _STM: Final[PlainMapping] = {"mode": "current", "setpoint": 100e-12, "qplus": Tr
 
 @dataclass(frozen=True)
 class NanonisRequest:
-    """A request.
+    """A request to the emulated controller.
 
     Attributes:
         name: the function's name in the protocol.

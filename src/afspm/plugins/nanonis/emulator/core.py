@@ -24,7 +24,7 @@ _Z_CONTROLLERS: Final = {
 
 @dataclass
 class NanonisCore:
-    """The shared state.
+    """The state shared by all modules.
 
     Attributes:
         range_m: range of the scanner in x, y and z.
@@ -66,7 +66,7 @@ class NanonisCore:
         return math.inf if timeout_ms < 0 else self.now_s + self.experiment_s(timeout_ms / 1000)
 
     def until_free(self, wait: int, timeout_ms: int = -1) -> Answer:
-        """Return a result that is ready at once; if `wait` is set, once the instrument is free."""
+        """Return a result that is ready at once or, if `wait` is set, when the instrument is free."""
         if not wait:
             return ()
         return DeferredResult(lambda now_s: None if self.rig.busy(now_s) else (), self.deadline_s(timeout_ms))

@@ -1,4 +1,4 @@
-"""The TCP Logger: a stream of signals to every client of a port of its own. No sockets here."""
+"""The TCP Logger: a stream of signals to every client of a separate port. No sockets here."""
 
 from __future__ import annotations
 

@@ -54,13 +54,17 @@ _OTHER_NAMES: Final = {"AtomTrack.StatusGet": "AtomTrack.Ctrl"}
 
 
 class Registers:
-    """The registers, by name and by the item that they belong to (number of a modulator, an output …)."""
+    """The registers, by name and by item (number of a modulator, an output …)."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple[str, Values], Values] = {}
 
     def set(self, name: str, arguments: Sequence[object]) -> None:
-        """Store the arguments of a function. Raises ValueError: an argument is none of its choices."""
+        """Store the arguments of a function.
+
+        Raises:
+            ValueError: an argument is not among its choices.
+        """
         register = name.removesuffix("Set")
         fields = wire.functions()[name].arguments
         by, taken = _parts(register, len(arguments))
@@ -72,7 +76,7 @@ class Registers:
         self._kept[key] = tuple(now)
 
     def put(self, register: str, *values: object) -> None:
-        """Store the values of a register that belongs to no item."""
+        """Store the values of a register without an item."""
         self._kept[register, ()] = values
 
     def get(self, register: str, belongs_to: Sequence[object] = ()) -> Values:
@@ -80,7 +84,7 @@ class Registers:
         return self._kept.get((register, tuple(belongs_to)), AT_FIRST.get(register, ()))
 
     def got(self, name: str, arguments: Sequence[object]) -> Values:
-        """Return the results of a function `…Get`: all fields, zero if unknown."""
+        """Return the results of a function `…Get` with all fields, zero if unknown."""
         kept = self.get(_OTHER_NAMES.get(name, name.removesuffix("Get")), arguments)
         codes = [field.code for field in wire.functions()[name].results]
         zeros = tuple(wire.ZEROS[code] for code in codes)

@@ -123,9 +123,10 @@ class ScanModule:
 
     Attributes:
         frame: x, y, width, height in m, angle clockwise in degrees.
-        speed: forward, backward in m/s and in s a line; 1 if the time and not the speed is kept; their ratio.
+        speed: forward and backward speed in m/s; forward and backward time in s per line; 1 if the time is kept
+            instead of the speed; speed ratio.
         running: the running scan.
-        last: the scan started last.
+        last: the last started scan.
         ends: number of ended scans.
     """
 
@@ -267,7 +268,7 @@ class ScanModule:
     def set_frame(self, x: float, y: float, width: float, height: float, angle_deg: float) -> Answer:
         """Set the frame, clipped to the scanner's range like the real controller.
 
-        (!) The real controller's answer to a frame smaller than an atom is unknown: here it is refused.
+        (!) The real controller's answer to a frame smaller than an atom is unknown; the emulator refuses it.
         """
         if not (min(width, height) >= _SMALLEST_M and all(map(math.isfinite, (x, y, width, height, angle_deg)))):
             raise FunctionRefused(

@@ -44,7 +44,7 @@ class Signals:
             self._registers.set("PLL.AmpCtrlSetpntSet", [1, sensor.oscillation_m])
 
     def values(self, indexes: Sequence[int], now_s: float) -> list[float]:
-        """Return the values of signals at one time; unconnected ones are zero."""
+        """Return the values of signals at one time; unused signals are zero."""
         rig = self._core.rig
         shown = rig.signals(now_s)
         values = {CHANNELS[name]: value for name, value in shown.items() if name in CHANNELS}
@@ -199,7 +199,7 @@ class Signals:
 
 
 def spectrum_columns(curve: SpectrumActivity) -> list[str]:
-    """Return the column names as in Nanonis' files, "Current [bwd] (A)", the swept signal first."""
+    """Return the column names as in Nanonis' files ("Current [bwd] (A)"), with the swept signal first."""
     columns: list[str] = []
     for name, unit in zip(curve.names, curve.units, strict=True):
         forward = name.removesuffix(RETRACE)
@@ -215,7 +215,7 @@ def name_and_unit(signal: str) -> tuple[str, str]:
 
 
 def spectrum_signal(column: str) -> int | None:
-    """Return the signal's index of a simulated spectrum's column; None: it has none."""
+    """Return the signal index of a simulated spectrum's column; None without a signal."""
     name = column.removesuffix(RETRACE)
     return CHANNELS.get(name) if name in CHANNELS else _OF_SPECTRA.get(name, (None,))[0]
 

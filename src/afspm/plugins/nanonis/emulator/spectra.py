@@ -28,10 +28,10 @@ class SweepSettings:
 
     Attributes:
         points: number of points; None: as in the simulated spectrum.
-        limits: first and last value of the sweep; None: those of the simulated spectrum, whose last values continue
-            beyond.
+        limits: first and last value of the sweep; None: the limits of the simulated spectrum, whose last values
+            continue beyond.
         sweeps: number of averaged sweeps.
-        channels: indexes of recorded signals; None: all of the simulated spectrum.
+        channels: indexes of recorded signals; None: all signals of the simulated spectrum.
         backward: True if also swept backwards.
         saves: True if a file is written.
         saves_all, dialog: stored without effect.

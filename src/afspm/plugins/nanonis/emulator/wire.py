@@ -1,4 +1,4 @@
-"""Controller's side of the TCP protocol: requests from bytes, replies to bytes.
+"""Controller's side of the TCP protocol: decoding of requests and encoding of replies.
 
 Independent of the translator's code, so that each checks the other.
 """
@@ -47,7 +47,7 @@ _SENSELESS_TEXTS: Final = (
 
 
 class MalformedRequest(Exception):
-    """The bytes of a request do not fit its function."""
+    """The error that the bytes of a request do not fit its function."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def _by_lower_case() -> Mapping[str, str]:
 
 
 def known_as(name: str) -> str | None:
-    """Return the table's spelling of a name, ignoring case; None: unknown."""
+    """Return the spelling of a name in the table, ignoring case; None if unknown."""
     return _by_lower_case().get(name.lower())
 
 
@@ -206,7 +206,7 @@ def body(name: str, results: Sequence[object], release: int, encoding: str = "ut
 
 
 def error_body(name: str, text: str, release: int, *, bare: bool) -> bytes:
-    """Encode the body of a reply with an error, after results of zeros, or without results."""
+    """Encode the body of a reply with an error, after results of zeros or (`bare`) without results."""
     # The specification does not define if results are present after an error: both can be emulated.
     codes = [] if bare or name not in functions() else functions()[name].result_codes(release)
     return b"".join(_packed(code, ZEROS[code], "utf-8") for code in codes) + error_block(text, 1)

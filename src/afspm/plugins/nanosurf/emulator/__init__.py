@@ -1,4 +1,4 @@
-"""Emulated Nanosurf Studio: its socket, its scripts in a real Lua, and its files, with simulated physics."""
+"""Emulated Nanosurf Studio: its socket, its scripts in a real Lua engine, and its files, with simulated physics."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class NanosurfEmulator(ScriptedEmulator):
 
 
 class StudioWire:
-    """Studio's socket: a script and its reply, each after its length in four bytes, least significant first.
+    """Studio's socket: a script and its reply, each preceded by its length in four bytes, little-endian.
 
     See `ScriptWire`.
     """

@@ -1,4 +1,4 @@
-"""Nanosurf Studio: the values of its panels, and its use of the instrument."""
+"""The program Nanosurf Studio: the values of its panels, and its use of the instrument."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _MOST_SHIFT_HZ: Final = 1e3
 
 @dataclass(frozen=True)
 class PanelValue:
-    """One value of a panel.
+    """A value of a panel.
 
     Attributes:
         at_first: initial value; its type is fixed.
@@ -138,7 +138,7 @@ MODES: Final = {
 """The modes of measurement with the commands of each; (!) all measure as the mode of the emulator does."""
 
 CYCLES: Final = ("force_distance_z_z",)
-"""The ids of the cycles of spectroscopy."""
+"""The ids of spectroscopy cycles."""
 
 
 @dataclass
@@ -197,13 +197,13 @@ class StudioProgram(MakerProgram):
 
     @property
     def setpoint_units(self) -> Mapping[str, float]:
-        """Units of the setpoint, each with the value of 1 V in it, or of 1 Hz for a frequency shift."""
+        """Units of the setpoint, each with its factor from 1 V, or from 1 Hz for a frequency shift."""
         if self._holds_frequency:
             return {"Hz": 1.0}
         return {"V": 1.0, "m": float(self.values["probe.current_deflection_sensitivity"])}
 
     def scale(self, path: str) -> float:
-        """Return the factor from an entry of `values` to the result of `get`."""
+        """Return the factor from a value in `values` to the result of `get`."""
         return self.setpoint_units[self.setpoint_unit] if path == SETPOINT else 1.0
 
     def bounds(self, path: str) -> tuple[float, float]:

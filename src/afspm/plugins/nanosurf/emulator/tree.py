@@ -1,4 +1,4 @@
-"""The tree of commands as Lua sees it: `root` of the application, and `root` of a measurement session."""
+"""The tree of commands in Lua: `root` of the application, and `root` of a measurement session."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Nested = Plain
 
 
 class CommandTree:
-    """Both trees in one Lua, and the scripts that run in them.
+    """Both trees in one Lua engine, and the scripts that run in them.
 
     Args:
         release: release of Studio; 19 has no `is_scanning`.

@@ -24,7 +24,7 @@ _UNFIT_FOR_NAMES: Final = frozenset('\\/:*?"<>|') | {chr(number) for number in r
 
 @dataclass
 class WorkspaceItem:
-    """A place to measure: a "frame", a "grid" of curves or a "point" for one.
+    """A place to measure: a "frame", a "grid" of curves or a "point" for a single curve.
 
     Attributes:
         columns, rows: pixels of a frame, curves of a grid.
@@ -46,7 +46,7 @@ class WorkspaceItem:
 
 
 class Workspace:
-    """The items by id. Files are in the gallery: only the name of a path on Studio's computer counts."""
+    """The items by id. Files are in the gallery; folders in paths on Studio's computer are ignored."""
 
     def __init__(self, program: StudioProgram) -> None:
         self._program = program
@@ -106,7 +106,11 @@ class Workspace:
             raise InvalidValue(f"{path!r} can't be written: {error}") from error
 
     def load(self, path: str) -> None:
-        """Replace the items by those of a saved file. Raises InvalidValue: missing or damaged."""
+        """Replace the items by the items of a saved file.
+
+        Raises:
+            InvalidValue: missing or damaged.
+        """
         kinds = {
             field.name: {"str": str, "int": int, "float": float}[str(field.type)] for field in fields(WorkspaceItem)
         }
@@ -173,7 +177,7 @@ class MeasurementQueue:
         self.advance(self._program.now_s)
 
     def abort(self) -> None:
-        """Measure no further item."""
+        """Stop the queue after the present item."""
         self._left = None
 
     def advance(self, now_s: float) -> bool:

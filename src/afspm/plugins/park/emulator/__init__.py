@@ -1,4 +1,4 @@
-"""Emulated SmartScan: its socket, its scripts in a real JavaScript, and its files, with simulated physics."""
+"""Emulated SmartScan: its socket, its scripts in a real JavaScript engine, and its files, with simulated physics."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class ParkEmulator(ScriptedEmulator):
         return _reply(request, result="NaN", value="NaN")
 
     def tick(self, now_s: float) -> float | None:
-        """Also advance the scripts that have been answered already."""
+        """Advance the program and also scripts that are already answered."""
         for script in [one for one, is_answered in self._scripts.items() if is_answered]:
             try:
                 ended = script.step() is not None
@@ -117,7 +117,7 @@ class ParkEmulator(ScriptedEmulator):
         return min((at_s for at_s in times if at_s is not None), default=None)
 
     def abandon(self) -> None:
-        """Also end the scripts."""
+        """Drop the present activity, and end the scripts."""
         super().abandon()
         self._end_scripts()
 

@@ -1,6 +1,6 @@
-"""JavaScript scripts, each in an engine of its own, that wait for the instrument without blocking others.
+"""JavaScript scripts, each in a separate engine, that wait for the instrument without blocking others.
 
-An engine can't be left in the middle of a script, so each engine has a thread. The emulator's own thread executes the
+A script can't be suspended inside an engine, so each engine has a thread. The emulator's own thread executes the
 requests of a script to the instrument, and takes turns with the script's thread.
 """
 
@@ -20,9 +20,9 @@ from afspm.basics.errors import AfspmError
 from afspm.simulation.emulation.scripted import ScriptFailed
 
 LONGEST_S: Final = 5.0
-"""Real seconds of computing before a script is ended. Its thread goes on: the engine can't be interrupted."""
+"""Limit of a script's computing, in real seconds. Its thread continues: the engine can't be interrupted."""
 _AT_ONCE_S: Final = 0.25
-"""Real seconds of waiting for a script before others are served; most scripts end within them."""
+"""Longest wait for a script before others are served, in real seconds; most scripts end earlier."""
 _MEMORY: Final = 64 << 20
 _PRELUDE: Final = Path(__file__).with_name("prelude.js")
 _REFUSALS: Final = (AfspmError, ArithmeticError, TypeError, ValueError)
@@ -85,14 +85,11 @@ class Script:
 
     @property
     def waits(self) -> bool:
-        """Return true while the script waits for the instrument."""
         return self._wait is not None
 
     @property
     def computes_for_s(self) -> float:
-        """Return the real seconds left for computing before the script is ended; infinite during a wait for the
-        instrument.
-        """
+        """Return the real seconds of computing left to the script; infinite while it waits for the instrument."""
         return math.inf if self.waits else self._computes_since_s + LONGEST_S - time.monotonic()
 
     def end(self) -> None:

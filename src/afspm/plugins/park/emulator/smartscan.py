@@ -1,4 +1,4 @@
-"""SmartScan: the values and methods below `spm`, and their use of the instrument."""
+"""The program SmartScan: the values and methods below `spm`, and their use of the instrument."""
 
 from __future__ import annotations
 

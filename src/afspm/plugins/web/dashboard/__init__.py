@@ -1,4 +1,4 @@
-"""The experiment in the browser: shown to every viewer, steered by viewers who have signed in."""
+"""The experiment in the browser: every viewer sees it, and signed-in viewers steer it."""
 
 from __future__ import annotations
 

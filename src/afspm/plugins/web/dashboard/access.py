@@ -19,7 +19,7 @@ class Visitor:
 
     Attributes:
         person: the name; empty: may only look.
-        cookie: of the session; empty for a program that sends its password with each request.
+        cookie: cookie of the session; empty for a program that sends its password with each request.
         recorded: the page shows a recorded night, in which nothing can be steered.
     """
 
@@ -33,15 +33,15 @@ class Visitor:
 
 
 class Access:
-    """The rules for which viewers may look, and which may steer; see `Passwords`.
+    """The rules that decide which viewers may look, and which may steer; see `Passwords`.
 
     Args:
         host: the address to listen at.
-        password_hash: of the common password; the password itself may be in the environment instead
+        password_hash: hash of the common password; the password itself may be in the environment instead
             (AFSPM_DASHBOARD_PASSWORD).
         people: the hash of each person's password.
         now_s: the time in real seconds, for sessions and for the rate limit of password attempts.
-        sessions: of viewers who have signed in.
+        sessions: the sessions of signed-in viewers.
 
     Raises:
         ConfigError: other computers could reach the page without a password; or a malformed hash or name.
@@ -88,11 +88,11 @@ class Access:
         return not visitor.cookie or self._sessions.find(visitor.cookie) is not None
 
     def person_of(self, visitor: Visitor) -> str:
-        """Return the name of a visitor who is signed in; empty for all others."""
+        """Return the name of a signed-in visitor; empty for all others."""
         return check_name(visitor.person) if self.is_signed_in(visitor) else ""
 
     def by_password(self, person: str, password: str, address: str) -> Visitor | None:
-        """Return the visitor with this name and password; None if the password is wrong, or was wrong too often."""
+        """Return the visitor with this name and password; None if it is wrong or checks are suspended."""
         return Visitor(person) if self._passwords.proves(person, password, address) else None
 
     def wait_s(self, person: str, address: str) -> float:
@@ -100,13 +100,13 @@ class Access:
         return self._passwords.wait_s(person, address)
 
     def enter(self, person: str, password: str, address: str) -> str | None:
-        """Sign in; returns the cookie, None if the password is wrong (then `wait_s` may be above zero)."""
+        """Sign in and return the cookie; None if the password was not accepted (see `wait_s`)."""
         if not self._passwords.proves(person, password, address):
             return None
         return self.cookie(person)
 
     def cookie(self, person: str) -> str:
-        """Begin a session; returns its cookie."""
+        """Begin a session and return its cookie."""
         return self._sessions.begin(person, self._passwords.proof_of(person))
 
     def leave(self, cookie: str | None, *, everywhere: bool = False) -> None:

@@ -30,7 +30,7 @@ class ActionResult:
     """The result of an action.
 
     Attributes:
-        text: for the person, with the reason of a refusal.
+        text: message for the person, with the reason of a refusal.
         each: result by parameter name, if the action set or read several parameters.
     """
 
@@ -43,7 +43,7 @@ _NOT_SIGNED_IN = ActionResult("Sign in first: the record keeps the name with eac
 
 
 def not_signed_in() -> Future[ActionResult]:
-    """Return the result for a viewer who has not signed in."""
+    """Return the result for a viewer who is not signed in."""
     done: Future[ActionResult] = Future()
     done.set_result(_NOT_SIGNED_IN)
     return done
@@ -72,7 +72,7 @@ class Actions:
         return _result(self._commands.clear(problem), f"{self._watch.problems.name(problem)} is cleared")
 
     def clear_all(self, problems: Sequence[int]) -> ActionResult:
-        """Clear these problems, up to the first refusal."""
+        """Clear these problems; stop at the first refusal."""
         for problem in problems:
             if not (result := self.clear(problem)).ok:
                 return result
@@ -84,10 +84,10 @@ class Actions:
         return _result(self._commands.request(GRANT_REQUEST, grant), f"The approvals of {grant.agent} {done}")
 
     def approval_facts(self) -> Plain:
-        """Return the facts that an approval given now is valid for.
+        """Return the facts on which an approval given now depends.
 
         Raises:
-            AfspmError: the scheduler does not give them.
+            AfspmError: the scheduler does not provide them.
         """
         response = self._commands.request(CLOCK_REQUEST)
         if not response.ok:
@@ -99,7 +99,7 @@ class Actions:
         return _result(self._commands.restart(process), f"{process} is being restarted")
 
     def note(self, text: str, scan_ns: int | None = None, time_ns: int | None = None) -> ActionResult:
-        """Write a note on a scan or on a time; default: the present."""
+        """Write a note about a scan or a time, by default the present."""
         return _result(self._commands.note(text, scan_ns, time_ns), "Noted")
 
     # --- the microscope, in MANUAL ---
@@ -118,7 +118,7 @@ class Actions:
         return _result(self._commands.stop(), f"The {what} is stopped")
 
     def read(self, parameters: Iterable[str]) -> ActionResult:
-        """Return the values of parameters in force, with their units; refused ones are not `ok`."""
+        """Return the present values of parameters with their units; a refused one is not `ok`."""
         return ActionResult("", each={name: self._read(name) for name in parameters})
 
     def set(self, wanted: Mapping[str, str], shown: Mapping[str, str]) -> ActionResult:
@@ -138,7 +138,7 @@ class Actions:
         return ActionResult(" ".join(refused or [one.text for one in each.values()]), ok=not refused, each=each)
 
     def scan(self, region: Region | None = None, shape: tuple[int, int] | None = None) -> ActionResult:
-        """Begin a scan, and return once it has begun. None as `region` or `shape`: the one in force."""
+        """Begin a scan, and return once it has begun; None keeps the present `region` or `shape`."""
         if (refused := self._commands.prepare_scan(region, shape)) is not None:
             return _result(refused, "")
         where = "" if region is None else f" at {typeset_position(region.center_m)}"
@@ -171,7 +171,7 @@ def _result(response: Response, done: str) -> ActionResult:
 
 
 def refusal(response: Response) -> str:
-    """Return the reason of a refusal, for a person."""
+    """Return the reason of a refusal as text for a person."""
     code = ControlResponse(response.code).name if response.code in ControlResponse._value2member_map_ else response.code
     return f"Refused: {response.reason or 'no reason given'} ({code})"
 
@@ -227,7 +227,7 @@ class Steering:
     """An executor of persons' requests, each under the person's name and in order.
 
     Args:
-        access: knows which viewers have signed in.
+        access: decides which viewers are signed in.
     """
 
     def __init__(self, persons: Persons, watch: Watch, access: Access) -> None:
@@ -237,7 +237,7 @@ class Steering:
         self._log = logging.getLogger("afspm.plugins.web.dashboard")
 
     def do(self, visitor: Visitor, action: Action) -> Future[ActionResult]:
-        """Carry out an action in the name of a visitor who is signed in."""
+        """Carry out an action in the name of a signed-in visitor."""
         person = self._access.person_of(visitor)
         return self._submit(person, action) if person else not_signed_in()
 

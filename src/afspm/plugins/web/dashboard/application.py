@@ -30,10 +30,10 @@ def application(
     page: Callable[[Services, Visitor], object] = Page,
     more: Callable[[FastAPI], None] = lambda _: None,
 ) -> tuple[AsgiApp, Callable[[float], None]]:
-    """Return the application, one per process, and a function that waits until all pages show the end, within seconds.
+    """Return the web application (one per process), and a function that waits until all pages show the end.
 
     Args:
-        page: makes the page of a viewer.
+        page: creates the page of a viewer.
         more: adds further routes.
     """
     bell, access, title = Bell(), services.access, services.title

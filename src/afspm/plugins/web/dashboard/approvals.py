@@ -1,4 +1,4 @@
-"""Plans that agents propose, and approvals in force: a person approves or revokes them here."""
+"""Plans that agents propose, and present approvals, which a person approves or revokes here."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STEPS_SHOWN = 3
 
 
 class ApprovalBar:
-    """A line for each proposal with a preflight, newest last, and for each approval in force."""
+    """A line for each proposal with a preflight, newest last, and for each present approval."""
 
     def __init__(self, session: SteeringSession) -> None:
         self._session = session
@@ -90,7 +90,7 @@ class ApprovalBar:
 
 
 def in_force(approval: Approval) -> tuple[str, str, str]:
-    """Return (agent, what it may do, details) of an approval in force."""
+    """Return (agent, its permissions, details) of a present approval."""
     by, until = approval.by.partition(PERSON)[2] or approval.by, day_and_time(approval.until_ns, seconds=False)
     end = f"approved by {by} until {until}"
     if approval.plan:
@@ -114,7 +114,7 @@ def in_force(approval: Approval) -> tuple[str, str, str]:
 
 
 def waiting(proposal: Proposal) -> tuple[str, str, str]:
-    """Return (agent, its plan in one line, the result of the preflight) of a proposal that waits for a person."""
+    """Return (agent, its plan in one line, the result of the preflight) of a pending proposal."""
     try:
         plan = plan_of(proposal.plan)
     except AfspmError as error:
@@ -135,7 +135,7 @@ def grant_of(table: Mapping[str, object], facts: Plain) -> Grant:
 
 
 def title(proposal: Proposal) -> str:
-    """Return the agent's own words for its plan, escaped."""
+    """Return the plan's title, escaped."""
     try:
         return escaped(str(json.loads(proposal.plan)["title"]))
     except (ValueError, KeyError, TypeError):
@@ -143,7 +143,11 @@ def title(proposal: Proposal) -> str:
 
 
 def reviewed(proposal: Proposal) -> tuple[Grant, list[str]]:
-    """Return the approval of a proposal, and each request in words. Raises AfspmError: it can't be approved."""
+    """Return the approval of a proposal, and each request in words.
+
+    Raises:
+        AfspmError: the proposal can't be approved.
+    """
     # requests have the same bytes in each frame
     grant, plan = of_plan(proposal, Frame.TIP)
     return grant, [escaped(one.text) for one in plan.requests(Frame.TIP)]

@@ -1,4 +1,4 @@
-"""Drift against time, and spectra, as options of ECharts and a line of text."""
+"""Drift against time, and spectra, each as options of ECharts and a line of text."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LEGEND = {"top": 0, "right": 0, "icon": "rect", "itemWidth": 14, "itemHeight": 
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart and the HTML above it; `options` of None: nothing to draw."""
+    """A chart and the HTML above it; without `options` nothing is drawn."""
 
     words: str
     options: Options | None = None

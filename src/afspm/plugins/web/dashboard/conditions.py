@@ -1,4 +1,4 @@
-"""Conditions of scans: parameters that are read when a scan begins, because no message contains them."""
+"""Conditions of scans: parameters read at the start of a scan, because no message contains them."""
 
 from __future__ import annotations
 

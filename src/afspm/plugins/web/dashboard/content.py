@@ -1,4 +1,4 @@
-"""The content of the page, as HTML made once for all viewers."""
+"""The content of the page, as HTML that is generated once for all viewers."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _AS_USUAL = {_STARTING, "alive", "ended"}
 
 @dataclass(frozen=True)
 class SlowContent:
-    """The parts that take longer to make.
+    """The parts of the page that take longer to generate.
 
     Attributes:
         sample_map_near: only the area of measurements.
@@ -49,7 +49,7 @@ class SlowContent:
 
 @dataclass(frozen=True)
 class Content:
-    """The page at one moment.
+    """The content of the page at one time.
 
     Attributes:
         trouble: why the page may be out of date; empty: it is current.
@@ -73,13 +73,13 @@ class Content:
 
 
 class Contents:
-    """The maker of the content, for use in the page's thread.
+    """The generator of the page's content, in the page's thread.
 
     Args:
         limits: the allowed region of scans, in tip coordinates; None if it is not known.
         adjustable: parameters that a person may set in AUTOMATED, too.
         pictures: the address of small pictures of scans.
-        bands: the values of other instruments that measuring needs.
+        bands: required value ranges of other instruments.
         agents: names under which agents may act.
     """
 
@@ -189,7 +189,7 @@ def _now_ns(watch: Watch, overview: Overview) -> int:
 
 
 def unheard(watch: Watch, overview: Overview) -> dict[str, int]:
-    """Return ns since the last report of each process silent while others report: its computer is unreachable."""
+    """Return the silence in ns of each process that is silent while others report: its computer is unreachable."""
     if watch.ended:
         return {}
     speed = 1.0 / watch.clock.real_s(1.0)
@@ -208,7 +208,7 @@ def processes_of(watch: Watch, overview: Overview) -> Iterator[ProcessState]:
 
 
 def trouble(watch: Watch) -> str:
-    """Return why the page may be out of date; empty if it is up to date."""
+    """Return the reason why the page may be out of date; empty if it is current."""
     if watch.ended:
         return "The experiment has ended. This page shows its final state."
     if not watch.connected:

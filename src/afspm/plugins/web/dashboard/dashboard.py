@@ -1,4 +1,4 @@
-"""`Dashboard`: the component that shows an experiment in the browser, and steers it."""
+"""`Dashboard`: the component that shows an experiment in the browser and lets persons steer it."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ _OTHER = "solve the problem, then clear it."
 
 @dataclass(frozen=True)
 class Flag:
-    """A flagged problem: its number and name, its flagger and time, and the advice."""
+    """A flagged problem: its number and name, the component that flagged it, the time, and advice."""
 
     number: int
     name: str

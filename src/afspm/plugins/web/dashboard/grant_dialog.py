@@ -1,4 +1,4 @@
-"""The dialog in which a person gives an agent a grant: a box of place, ranges, numbers and time.
+"""The dialog in which a person gives an agent a grant: limits of place, values, counts and time.
 
 Its fields are those of `afspm approve --grant`, and the same function reads them. The scheduler decides; its refusal is
 shown in the dialog, which stays open.
@@ -20,7 +20,7 @@ from afspm.plugins.web.dashboard.approvals import grant_of
 from afspm.plugins.web.dashboard.steering_session import SteeringSession
 
 MEASURED = {names.START_SCAN: 10, names.START_SPEC: 0}
-"""The actions that are offered first, with the numbers that the dialog begins with."""
+"""The first offered actions, with their initial numbers."""
 TREATMENTS = (names.PULSE, names.CRASH)
 LASTS = "1 h"
 Pair = tuple[str, str]
@@ -68,8 +68,8 @@ class GrantDialog:
     """The dialog of one viewer; it closes when the scheduler has accepted the grant, or at Cancel.
 
     Args:
-        agents: names that are suggested; the first is filled in.
-        region: fills in the place; None: the agent may set no place.
+        agents: suggested names; the first is filled in.
+        region: the initial place; None: the agent may set no place.
     """
 
     def __init__(self, session: SteeringSession, agents: Sequence[str], region: Region | None) -> None:

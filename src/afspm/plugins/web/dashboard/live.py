@@ -1,7 +1,7 @@
-"""Requests of the browser's scripts: live pictures, values, profiles.
+"""Handling of requests from the browser's scripts: live pictures, values, profiles.
 
-The browser asks for the next picture when it has drawn the last, and gets the newest. A slow browser skips pictures,
-and nothing waits for it here.
+The browser requests the next picture when it has drawn the last, and gets the newest. A slow browser skips pictures,
+and does not delay this process.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class PictureRequest:
     """The requested picture.
 
     Attributes:
-        time: of a finished scan, ns; 0: the newest.
+        time: time of a finished scan, ns; 0: the newest.
         beside: time of another scan for comparison, ns: both get the same range of values; 0: none.
     """
 
@@ -53,7 +53,7 @@ class Live:
     """The handler of requests from the browser's scripts.
 
     Args:
-        archive: of scans that are no longer in memory.
+        archive: source of scans that are no longer in memory.
         conditions: parameters at the start of each scan.
     """
 
@@ -68,7 +68,7 @@ class Live:
         self._closing = False
 
     def close(self) -> None:
-        """Answer all requests that wait for a picture, and let no later request wait. Thread-safe."""
+        """Answer all pending requests for pictures, and make later requests return at once. Thread-safe."""
         self._closing = True
         self._bell.ring()
 

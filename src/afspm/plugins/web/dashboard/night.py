@@ -1,4 +1,4 @@
-"""A recorded night at any moment, in the form of a running experiment's page."""
+"""A recorded night at a selected time, in the form of a running experiment's page."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from afspm.record.run import Run, open_run
 _log = logging.getLogger("afspm.plugins.web.dashboard")
 
 SPECTRA = 8
-"""Spectra read before a moment."""
+"""Limit of spectra read before the displayed time."""
 
 
 @dataclass(frozen=True, slots=True)
 class NightEvent:
-    """A published message; a note counts at the moment that it describes."""
+    """A published message; a note has the time that it describes."""
 
     time_ns: int
     message: str
@@ -39,7 +39,7 @@ class NightEvent:
 
 @dataclass(frozen=True, slots=True)
 class DriftedScan:
-    """The centre of a scan in tip coordinates, and in sample coordinates as drift correction found it."""
+    """The centre of a scan in tip coordinates, and its drift-corrected centre in sample coordinates."""
 
     tip_m: XY
     sample_m: XY
@@ -49,7 +49,7 @@ class Night:
     """The record of a run: all published messages, without the values of scans.
 
     Args:
-        folder: of the run.
+        folder: the run folder.
 
     Raises:
         FileError: there is no record, or it is damaged.
@@ -95,7 +95,7 @@ class Night:
         return store
 
     def drifted(self) -> dict[int, DriftedScan]:
-        """Return by number the scans whose place drift correction determined; empty without drift correction."""
+        """Return the drift-corrected scans by number; empty without drift correction."""
         by_time = {row.time_ns: row for row in self.scans}
         found: dict[int, DriftedScan] = {}
         mapping: Any = None
@@ -111,7 +111,7 @@ class Night:
 
 
 class NightWatch(Watch):
-    """A night at one moment, for one viewer."""
+    """The state of a night at one time, for one viewer."""
 
     def __init__(self, night: Night) -> None:
         self.moment = StoppedClock(night.end_ns, night.speed)
@@ -182,7 +182,7 @@ class ChannelNames(FrameStore):
 
 
 class StoppedClock:
-    """A clock that shows one moment."""
+    """A clock that shows a fixed time."""
 
     def __init__(self, time_ns: int, speed: float) -> None:
         self.time_ns = time_ns

@@ -1,4 +1,4 @@
-"""The page of a recorded night: a running experiment's page at one moment, with a slider through the night.
+"""The page of a recorded night: a running experiment's page at one time, with a slider through the night.
 
 The module also answers its scripts (scans, difference of two scans, report), and has its one action, a note.
 """
@@ -46,7 +46,7 @@ _HEAD = """<link rel="stylesheet" href="/assets/night.css"><script type="module"
 
 
 class NightPage(Page):
-    """The page of one viewer, at a moment of its own."""
+    """The page of one viewer, at a time that the viewer selects."""
 
     tabs: ClassVar = {**TABS, "two": "Compare"}
 
@@ -178,7 +178,7 @@ class NightActions(Actions):
 
 
 class NightSteering(Steering):
-    """A writer of notes, one after the other."""
+    """An executor of night-page actions, one after the other."""
 
     def __init__(self, night: Night, access: Access, name: str) -> None:
         self._night = night

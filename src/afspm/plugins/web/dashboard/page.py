@@ -153,7 +153,7 @@ class Page:
 
 
 class Theme:
-    """Light, dark, or as the viewer's system has it; the browser keeps the choice."""
+    """The light or dark theme, or the viewer's system theme; the browser stores the choice."""
 
     def __init__(self) -> None:
         self._dark = ui.dark_mode(None)
@@ -165,7 +165,7 @@ class Theme:
         ui.run_javascript(f"window.afspm?.keepTheme({json.dumps(self._name)})")
 
     def remember(self, name: object) -> None:
-        """Take the choice that the browser kept."""
+        """Apply the choice stored in the browser."""
         if isinstance(name, str) and name != self._name and name in THEMES:
             self._set(name)
 
@@ -175,7 +175,7 @@ class Theme:
 
 
 class Sections:
-    """The sections below the header: the first rows fill a screen, the rest is further down. A phone has tabs."""
+    """The sections below the header: the first rows fill a screen, and further rows follow. A phone has tabs."""
 
     def __init__(self, services: Services, session: SteeringSession, visitor: Visitor) -> None:
         self._content = Content()

@@ -1,4 +1,4 @@
-"""Parts of the page with state for one viewer: the log's filter, rows of processes, spectra, a note being written."""
+"""Parts of the page with state for one viewer: the log's filter, rows of processes, spectra, and notes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _BAD = {ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.G
 
 
 class ChartPanel:
-    """A line of text and a chart below it, which is sent again only when it has changed."""
+    """A line of text and a chart below it; the browser receives the chart only after a change."""
 
     def __init__(self) -> None:
         self._words = ui.html("", sanitize=False)
@@ -116,7 +116,7 @@ def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: 
     """Return log lines, newest first.
 
     Args:
-        names: of components; empty: all.
+        names: names of components; empty: all.
         level: the lowest level shown.
         text: filter for lines, in any case.
     """
@@ -145,7 +145,7 @@ def _level_html(level: str) -> str:
 
 
 class HealthPanel:
-    """A row for each process. Rows keep their place when their text changes, so that no button moves before a click."""
+    """A row for each process. Rows keep their place when their text changes, so that buttons do not move."""
 
     def __init__(self, session: SteeringSession) -> None:
         self._session = session

@@ -1,4 +1,4 @@
-"""The parameters of the microscope with their values: edited ones are set together."""
+"""A form with the parameters of the microscope; all edited values are set together."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ParameterForm:
         self._box.set_visibility(False)
 
     async def show(self) -> None:
-        """Show the parameters that may be set now."""
+        """Show the parameters that may be set at present."""
         content = self._session.content
         offered = () if content.ended else PARAMETERS if content.is_manual else content.adjustable
         if offered == self._offered:

@@ -1,4 +1,4 @@
-"""Frames as pictures for the browser, each made once for all viewers; small ones for the map and the time line."""
+"""Frames as pictures for the browser, each rendered once for all viewers; small ones for map and time line."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class RenderedFrame:
-    """A frame as a viewer sees it.
+    """A frame with a viewer's levelling, contrast and colours.
 
     Attributes:
         values: levelled, [y, x].
@@ -54,7 +54,7 @@ class RenderedFrame:
     png: bytes
 
     def head(self, facts: Facts) -> str:
-        """Return the data for drawing it with axes, and facts to show beside it, as ASCII JSON in SI."""
+        """Return the data for drawing the frame with axes, and facts about it, as ASCII JSON in SI."""
         frame, region = self.frame, self.frame.region
         return json.dumps(
             {
@@ -86,7 +86,7 @@ class PictureCache:
         self._drawn = lru_cache(KEPT)(_draw)
 
     def draw(self, frame: ChannelFrame, look: Look, beside: ChannelFrame | None = None) -> RenderedFrame:
-        """Return the picture of a frame, with the range of values of a frame beside it, if there is one."""
+        """Return the picture of a frame; with `beside`, both frames share one range of values."""
         with self._lock:  # requests for the same picture wait for one drawing; others would share a core anyway
             return self._drawn(frame, look, beside)
 
@@ -111,7 +111,7 @@ class Thumbnails:
         self._kept = lru_cache(THUMBNAILS_KEPT)(self._draw)
 
     def png(self, time_ns: int, channel: str) -> bytes | None:
-        """Return the picture of a scan, flattened; None if its values are not kept."""
+        """Return a small, flattened picture of a scan as PNG; None if its values are not stored."""
         with self._lock:
             try:
                 return self._kept(time_ns, channel)

@@ -31,8 +31,8 @@ class RecordedSettings:
     """The settings of the page of a recorded night; see `Dashboard`.
 
     Attributes:
-        folder: of the run.
-        name: of the dashboard's component, whose port and sessions it takes over.
+        folder: the run folder.
+        name: name of the dashboard's component, whose port and sessions it takes over.
     """
 
     folder: str

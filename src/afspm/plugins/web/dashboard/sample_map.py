@@ -29,7 +29,7 @@ class MapContent:
     """The content of the map, in the coordinates of components (sample coordinates where drift is corrected).
 
     Attributes:
-        current: the region in force.
+        current: the present scan region.
         limits: the allowed region of scans, in tip coordinates.
         tip_to_sample: 2 x 3; None if both coordinates are equal.
         probe_m: the probe's position.

@@ -1,4 +1,4 @@
-"""The dialog of *Scan here*: size, pixels and angle of a scan can be edited before it is taken."""
+"""The dialog of *Scan here*, with editable size, pixels and angle of the scan."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ScanChoice:
     shape: Shape
 
     def squared(self) -> ScanChoice:
-        """Return the square of the longer side, with the larger number of pixels along both."""
+        """Return a square choice with the longer side and the larger number of pixels."""
         side_m, pixels = max(self.region.size_m), max(self.shape)
         return ScanChoice(replace(self.region, size_m=(side_m, side_m)), (pixels, pixels))
 

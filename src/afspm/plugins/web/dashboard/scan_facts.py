@@ -54,7 +54,7 @@ def _recorded(frame: ChannelFrame, overview: Overview) -> Mapping[str, str]:
 
 
 def began_ns(frame: ChannelFrame, overview: Overview) -> int | None:
-    """Return the start of a frame's scan; None if it was not seen."""
+    """Return the start of a frame's scan; None if unknown."""
     if frame.time_ns is not None:
         summary = summary_of(frame.time_ns, overview)
     elif overview.running is not None:
@@ -81,7 +81,7 @@ def _growing(frame: ChannelFrame, overview: Overview, now_ns: int) -> Facts:
 
 
 def ends_text(left_ns: int, now_ns: int) -> str:
-    """Return the time of an end, and the time left: "22:14 (in 12 min)"."""
+    """Return the end time with the time left: "22:14 (in 12 min)"."""
     return f"{time_of_day(now_ns + left_ns, seconds=left_ns < 600 * NS_PER_S)} (in {duration_text(left_ns / NS_PER_S)})"
 
 

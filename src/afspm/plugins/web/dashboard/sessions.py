@@ -1,4 +1,4 @@
-"""Sessions: signed cookies, and a list of sessions that were ended early."""
+"""Sessions of signed-in viewers: signed cookies, and a list of sessions that were ended early."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 COOKIE = "afspm_dashboard"
 REMEMBERED_S = 30 * 24 * 3600
 MOST_ENDED = 1000
-"""Ended sessions that are remembered; with one more all sessions end."""
+"""Limit of remembered ended sessions; beyond it all sessions end."""
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class Session:
     """The content of a cookie.
 
     Attributes:
-        person: empty for a viewer who only looks.
-        proof: derived from the password at its beginning.
-        generation: counts how often the person signed out everywhere.
-        since_s: its beginning, real time.
+        person: empty for a viewer who may only look.
+        proof: derived from the password at the beginning of the session.
+        generation: how often the person signed out everywhere.
+        since_s: beginning of the session, real time.
     """
 
     person: str
@@ -64,14 +64,14 @@ class Sessions:
         self._save()
 
     def begin(self, person: str, proof: str) -> str:
-        """Begin a session; return its cookie."""
+        """Begin a session and return its cookie."""
         with self._lock:
             generation = self._kept.generations.get(person, 0)
             session = Session(person, proof, secrets.token_hex(8), generation, self._now_s())
             return str(self._signer().dumps(list(asdict(session).values())))
 
     def find(self, cookie: str) -> Session | None:
-        """Return the session of a cookie; None if it was not signed here, or has ended."""
+        """Return the session of a cookie; None if its signature is invalid or the session has ended."""
         with self._lock:
             is_signed, content = self._signer().loads_unsafe(cookie)
             if not is_signed or not cookie.isascii():  # base64 skips unknown letters

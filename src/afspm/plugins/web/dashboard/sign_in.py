@@ -1,4 +1,4 @@
-"""The sign-in page, and the guard before everything: without access a viewer sees only the sign-in page."""
+"""The sign-in page, and the guard that shows only this page to viewers without access."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ _ADJUST = "Changes hold from the next line on. In MANUAL you can set all paramet
 
 
 class ModeButtons:
-    """Take over and hand back, always visible."""
+    """The buttons to take over and to hand back, which are always visible."""
 
     def __init__(self, session: SteeringSession) -> None:
         self._session = session
@@ -91,7 +91,7 @@ def _flag_html(flag: Flag) -> str:
 
 
 class SteeringPanel:
-    """The buttons for a viewer who has signed in."""
+    """The buttons for a signed-in viewer."""
 
     def __init__(self, session: SteeringSession) -> None:
         self._session = session
@@ -119,7 +119,7 @@ class SteeringPanel:
         ui.on("grant_here", self._ask_grant)
 
     async def show(self, content: Content) -> None:
-        """Show the buttons and parameters that apply now."""
+        """Show the buttons and parameters that are usable at present."""
         for one in self._by_hand:
             one.set_visibility(content.is_manual)
         self._hint.set_text(_MANUAL if content.is_manual else _ADJUST if content.adjustable else _TAKE_OVER)
@@ -163,7 +163,7 @@ class SteeringPanel:
 
 
 def drawn_box(place: PlainMapping) -> Region:
-    """Return the box along x and y around a rectangle from the picture's script: a grant has no angle."""
+    """Return the box along x and y around a rectangle from the picture's script, since a grant has no angle."""
     x, y, width, height, angle = (float(place[name]) for name in ("x", "y", "width", "height", "angle"))
     cos, sin = abs(math.cos(angle)), abs(math.sin(angle))
     return Region((x, y), (width * cos + height * sin, width * sin + height * cos))

@@ -1,4 +1,4 @@
-"""The actions that one viewer may do now; all panels of the page share them."""
+"""The actions that one viewer may do at present, shared by all panels of the page."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _CLOSE = [{"label": "Close", "color": "white"}]
 
 
 class SteeringSession:
-    """The actions of one viewer, and the display of each result, with the reason of a refusal."""
+    """The actions of one viewer, and the display of their results."""
 
     def __init__(self, watch: Watch, steering: Steering, visitor: Visitor) -> None:
         self.watch = watch
@@ -34,7 +34,7 @@ class SteeringSession:
 
     @property
     def may_steer(self) -> bool:
-        """True if the viewer has signed in, and the experiment goes on."""
+        """True if the viewer is signed in and the experiment is running."""
         return self.signed_in and not self.content.ended
 
     @property
@@ -43,11 +43,11 @@ class SteeringSession:
         return self.may_steer and self.content.is_manual
 
     def results(self) -> None:
-        """Make the element that shows the last result."""
+        """Create the element that shows the last result."""
         self._results = ui.html("", sanitize=False).classes("outcomes").props('role="status" aria-live="polite"')
 
     def do(self, action: Action) -> None:
-        """Carry out an action and show its result; the page goes on meanwhile."""
+        """Carry out an action in the background and show its result."""
 
         async def doing() -> None:
             result = await self.carry_out(action)
@@ -75,14 +75,14 @@ class SteeringSession:
 
 
 def button(text: str, on_click: Callable[..., object], colour: str | None = None) -> ui.button:
-    """Return a button; `colour` "primary" makes it a filled one."""
+    """Return a button; with `colour` "primary" it is filled."""
     return ui.button(text, on_click=on_click, color=colour).props(
         f"no-caps {'unelevated' if colour == 'primary' else 'outline'}"
     )
 
 
 async def asked(title: str, text: str, yes: str) -> bool:
-    """Ask the viewer, in a dialog that Escape leaves; False also if the browser is closed."""
+    """Ask a yes-or-no question in a dialog; return False if the viewer cancels or closes the browser."""
 
     def body() -> None:
         ui.label(text)
@@ -93,7 +93,7 @@ async def asked(title: str, text: str, yes: str) -> bool:
 async def ask_in_dialog(
     title: str, body: Callable[[], object], yes: str, may: Callable[[], bool] = lambda: True
 ) -> bool:
-    """Ask the viewer in a dialog with a body of its own; the answer yes is enabled while `may()` is true."""
+    """Ask the viewer in a dialog with its own body; the button `yes` is enabled while `may()` is true."""
 
     def agree() -> None:
         if may():

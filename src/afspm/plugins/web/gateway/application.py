@@ -1,4 +1,4 @@
-"""The web application: routes by subject, and one model for every refusal."""
+"""The web application of the gateway: routes by subject, and one model for every refusal."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _REFUSED: dict[int | str, dict[str, object]] = {
 def application(
     services: GatewayServices, passwords: Passwords, *, host: str, origins: Collection[str] = ()
 ) -> AsgiApp:
-    """Return the application, with the guard before it."""
+    """Return the application, protected by the guard."""
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:

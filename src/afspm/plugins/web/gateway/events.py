@@ -1,4 +1,4 @@
-"""The events of an experiment, numbered by their times, so that a client continues after a lost connection."""
+"""The events of an experiment, numbered by their times, so that a reconnected client can continue."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ MOST_EVENTS, MOST_BYTES = 20_000, 16 << 20
 
 
 class Event(NamedTuple):
-    """An event in the form in which it is sent; `time_ns` is its id."""
+    """An event in its transmitted form; `time_ns` is its id."""
 
     time_ns: int
     kind: str
@@ -50,10 +50,10 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True)
 class EventBatch:
-    """Events to send.
+    """A batch of events to send.
 
     Attributes:
-        newest_ns: continue after this.
+        newest_ns: the time after which to continue.
         missed_until_ns: events up to this time are no longer stored; None: nothing was missed.
     """
 
@@ -84,7 +84,7 @@ class EventHistory:
             return self._events[-1].time_ns if self._events else None
 
     def incomplete_before(self, time_ns: int) -> None:
-        """Note that events before this time may be incomplete."""
+        """Record that events before this time may be incomplete."""
         with self._lock:
             self._complete_since_ns = max(self._complete_since_ns, time_ns)
 
@@ -105,7 +105,7 @@ class EventHistory:
                 self._drop_oldest()
 
     def after(self, time_ns: int, kinds: Collection[str], most: int) -> EventBatch:
-        """Return the stored events after a time, of some kinds."""
+        """Return the stored events of the given kinds after a time, at most `most`."""
         with self._lock:
             start = bisect_right(self._events, time_ns, key=lambda event: event.time_ns)
             found = self._events[start : start + most]

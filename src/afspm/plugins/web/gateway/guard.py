@@ -1,4 +1,4 @@
-"""The guard before everything: origin, name and size of a request."""
+"""The guard of the gateway, which checks origin, name and size of each request."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ MOST_BODY_BYTES = 64 << 10
 
 
 class GatewayGuard:
-    """ASGI middleware: checks each request, and sets scope["state"][PERSON] to the name; empty: may only look.
+    """ASGI middleware that checks each request, and stores the name in scope["state"][PERSON]; empty: may only look.
 
     Args:
-        origins: of pages elsewhere that may send requests.
+        origins: origins of other pages that may send requests.
     """
 
     def __init__(self, app: AsgiApp, passwords: Passwords, host: str, origins: Collection[str]) -> None:
@@ -80,7 +80,7 @@ def answer(refused: RefusedRequest) -> JSONResponse:
 
 
 class _Body:
-    """The body of a request, limited in size also without a declared length."""
+    """The body of a request, limited in size even without a declared length."""
 
     def __init__(self, receive: Receive) -> None:
         self._receive = receive

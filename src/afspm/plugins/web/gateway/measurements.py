@@ -1,6 +1,6 @@
-"""Scans and spectra requested by clients: each is begun once for its key, and followed to its end.
+"""Scans and spectra requested by clients: each is begun once for its key, and tracked to its end.
 
-They are on disk before they are begun: a restarted gateway continues with them, using the scheduler's replay.
+They are saved before they begin: a restarted gateway continues with them, using the scheduler's replay.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _WHY = {
 
 @dataclass
 class Measurement:
-    """A scan or spectrum requested by a client, as it is kept on disk.
+    """A scan or spectrum requested by a client, as saved on disk.
 
     Attributes:
         who: the client's name, as the scheduler knows it.
         plan: the target in JSON's types.
-        attempt: number of the last; the same id is executed once.
+        attempt: number of the last attempt; requests with the same id are executed once.
         since_ns: older results belong to earlier measurements.
         refusal: as a `RefusalModel`, of a failed measurement.
     """
@@ -92,7 +92,7 @@ class Measurements:
     """The measurements of all clients. Thread-safe.
 
     Args:
-        file: keeps them over a restart; None: they end with this process.
+        file: file that keeps the measurements over a restart; None: measurements end with this process.
         now_s: real and monotonic.
     """
 
@@ -110,7 +110,7 @@ class Measurements:
                 self._follow(one, resumed=True)
 
     def find(self, who: str, key: str) -> Measurement | None:
-        """Return a measurement of a client by its key; None: the client has none with this key."""
+        """Return a client's measurement by its key; None without one."""
         with self._lock:
             if (one := self._followed.get((who, key))) is not None:
                 self._settle_if_never_begun(one)

@@ -58,7 +58,7 @@ _STATUS = {
     _C.EXPERIMENT_ENDED: _S.GONE,
     _C.FAILED: _S.INTERNAL_SERVER_ERROR,
 }
-"""All others: 409. The request is well-formed, and refused by the experiment."""
+"""HTTP status by code. Other codes give 409: a well-formed request that the experiment refuses."""
 _ADVICE = {
     _C.INVALID: "Correct the request; /openapi.json describes it.",
     _C.TOO_LARGE: "Send less: no request needs more than 64 KiB.",
@@ -139,7 +139,7 @@ class RefusedRequest(Exception):
 
 
 def refused(response: Response) -> RefusedRequest:
-    """Return an unsuccessful response as a refusal."""
+    """Convert an unsuccessful response to a refusal."""
     if response.detail is ResponseDetail.EXPERIMENT_ENDED:
         return RefusedRequest(_C.EXPERIMENT_ENDED, response.reason)
     is_known = response.code in ControlResponse._value2member_map_
@@ -149,7 +149,7 @@ def refused(response: Response) -> RefusedRequest:
 
 
 def of_error(error: BaseException) -> RefusedRequest:
-    """Return an error as a refusal."""
+    """Convert an error to a refusal."""
     match error:
         case RefusedRequest():
             return error

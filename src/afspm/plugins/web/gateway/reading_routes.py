@@ -1,4 +1,4 @@
-"""Routes for every client that may look: state, parameters, scans, spectra, events."""
+"""Routes for all clients, including those without a name: state, parameters, scans, spectra, events."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ READER = ".reader"
 
 @dataclass
 class GatewayServices:
-    """The shared parts of the routes, and their ways to send requests."""
+    """The shared services of the routes, including connections for requests."""
 
     watch: Watch
     bell: Bell

@@ -56,7 +56,7 @@ class StreamCount:
         return self._open >= MOST_STREAMS
 
     async def counted(self, stream: AsyncIterator[str]) -> AsyncIterator[str]:
-        """Yield from a stream, which counts as open meanwhile."""
+        """Yield from a stream, and count it as open meanwhile."""
         self._open += 1
         try:
             async for one in stream:

@@ -1,4 +1,4 @@
-"""Converts published data to the documents of the gateway."""
+"""Conversion of published data to the documents of the gateway."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CHUNK_BYTES = 3 << 16  # a multiple of three, so that pieces of base64 fit toget
 
 
 def region_model(region: Region) -> RegionModel:
-    """Return a region without validation: it comes from the microscope."""
+    """Convert a region without validation, since it comes from the microscope."""
     return RegionModel.model_construct(
         center_m=list(region.center_m), size_m=list(region.size_m), angle_rad=region.angle_rad
     )
@@ -56,7 +56,7 @@ def microscope(overview: Overview) -> MicroscopeModel:
 
 
 def scans(overview: Overview) -> list[list[ScanSummary]]:
-    """Return the scans in the order of their arrival, each as its channels."""
+    """Return the scans in the order of arrival, each as a list of its channels."""
     return [list(channels) for _, channels in groupby(overview.scans, lambda scan: scan.number)]
 
 
@@ -66,7 +66,7 @@ def scan_id(channels: Sequence[ScanSummary]) -> str:
 
 
 def scan_model(channels: Sequence[ScanSummary]) -> ScanModel:
-    """Return a scan from its channels."""
+    """Return the document of a scan from its channels."""
     first = channels[0]
     return ScanModel.model_construct(
         id=scan_id(channels),
@@ -83,7 +83,7 @@ def scan_model(channels: Sequence[ScanSummary]) -> ScanModel:
 
 
 def spectrum_model(spectrum: SpectrumSummary) -> SpectrumModel:
-    """Return a spectrum without its values."""
+    """Return the document of a spectrum without its values."""
     return SpectrumModel.model_construct(
         id=str(spectrum.time_ns),
         finished=iso_utc(spectrum.time_ns),
@@ -111,7 +111,7 @@ def parameter_model(name: str, response: Response, asked: Any = None) -> Paramet
 
 
 def as_npy(values: NDArray[np.float64]) -> Iterator[bytes]:
-    """Yield an array as a .npy file, piece by piece: it may be large, with many clients at once."""
+    """Yield an array as a .npy file in pieces, to limit memory with many clients."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": values.shape})
     yield header.getvalue()
@@ -119,7 +119,7 @@ def as_npy(values: NDArray[np.float64]) -> Iterator[bytes]:
 
 
 def as_base64(values: NDArray[np.float64], units: Sequence[str]) -> Iterator[bytes]:
-    """Yield an array as an `ArrayModel`, piece by piece."""
+    """Yield an array as an `ArrayModel` in pieces."""
     model = ArrayModel.model_construct(shape=list(values.shape), units=list(units), base64="")
     head, tail = model.model_dump_json().rsplit('""', 1)
     yield f'{head}"'.encode()

@@ -1,4 +1,4 @@
-"""Loss of control to a person or a problem, and processes killed meanwhile."""
+"""Checks of the loss of control to a person or a problem, and of killed processes meanwhile."""
 
 from __future__ import annotations
 

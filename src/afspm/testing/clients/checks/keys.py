@@ -1,4 +1,4 @@
-"""Encryption: a peer without the right key gets no answer and no access."""
+"""Checks of encryption: a peer without the right key gets no answer and no access."""
 
 from __future__ import annotations
 

@@ -15,11 +15,11 @@ ENDED_S = 4.0
 """Twice the documented limit, for a busy computer."""
 _WATCHED_S = 5.0
 _MOST_BEATS_APART = 4.0
-"""In periods: three missed beats count as dead; one more for a busy computer."""
+"""Longest pause in heartbeat periods: three missed beats count as dead; one more for a busy computer."""
 
 
 def await_beat(beats: BeatRecorder, pump: Pump) -> None:
-    """Wait for the first heartbeat: after it the subscription works, so the closing heartbeat will arrive."""
+    """Wait for the first heartbeat, which shows that the subscription works."""
     pump(lambda: bool(beats.beats), _MOST_BEATS_APART * BEAT_S)
 
 
@@ -37,7 +37,7 @@ def require_exit(program: ClientProgram, codes: tuple[int, ...]) -> None:
 
 
 def require_end(program: ClientProgram, beats: BeatRecorder, pump: Pump, codes: tuple[int, ...]) -> None:
-    """Raise Failed unless the program ends in time, with one of these exit codes and after a closing beat."""
+    """Raise Failed unless the program ends in time, with an allowed exit code and a closing heartbeat."""
     require_exit(program, codes)
     pump(lambda: any(beat.closing for beat in beats.beats), 1.0)
     came = f"{len(beats.beats)} that do not" if beats.beats else "no heartbeat at all"

@@ -1,4 +1,4 @@
-"""Measurements and settings through a real scheduler and the simulated microscope."""
+"""Checks of measurements and settings through a real scheduler and the simulated microscope."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Late joining: earlier packets are requested and arrive once."""
+"""Checks of late joining: earlier packets are requested and arrive once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Requests: ids, repetition, lost answers, and refusals."""
+"""Checks of requests: ids, repetition, lost answers, and refusals."""
 
 from __future__ import annotations
 

@@ -27,7 +27,11 @@ def in_base64(data: bytes) -> str:
 
 
 def bytes_in(answer: Answer, name: str) -> bytes:
-    """Return the bytes in an answer. Raises Failed: there are none."""
+    """Return the decoded bytes in a field of an answer.
+
+    Raises:
+        Failed: no valid base64 in the field.
+    """
     try:
         return base64.b64decode(answer.get(name) or "", validate=True)
     except (binascii.Error, TypeError, ValueError) as error:
@@ -142,7 +146,7 @@ def _answered(run: ScriptedRun, code: int, payload: bytes, reason: str, detail: 
 
 
 def response_name(code: int) -> str | int:
-    """Return the name of a response code as in the client's answers, or an unknown code itself."""
+    """Return the name of a response code, as in the client's answers; an unknown code is returned unchanged."""
     known = code in ControlResponse._value2member_map_
     return f"REP_{ControlResponse(code).name}" if known else code
 

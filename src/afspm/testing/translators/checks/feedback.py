@@ -1,4 +1,4 @@
-"""The z feedback: gains, setpoint, on and off."""
+"""Checks of the z feedback: gains, setpoint, on and off."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _STEP = 1.02
 
 
 def in_force(kit: CheckMeasurements) -> Feedback:
-    """Return the newest feedback."""
+    """Return the last published feedback."""
     feedback = kit.client.observations.newest(Feedback)
     if feedback is None and not any(map(kit.support.has, _NUMBERS.values())):
         raise Skipped("the microscope reports no feedback")
@@ -31,7 +31,7 @@ def in_force(kit: CheckMeasurements) -> Feedback:
 
 
 def set_and_require(kit: CheckMeasurements, wanted: Feedback) -> None:
-    """Set the given fields; all others must keep their values."""
+    """Set the given fields, and raise Failed if any other field changes."""
     kit.client.come_to_rest()
     before, mark = in_force(kit), kit.client.observations.mark()
     given = {name: value for name, value in vars(wanted).items() if value is not None}

@@ -1,4 +1,4 @@
-"""The scan frame: its publication at the start, changes of it, and moves of the probe."""
+"""Checks of the scan frame: its publication at the start, changes of it, and moves of the probe."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def current_frame(kit: CheckMeasurements) -> FrameSetting:
 
 
 def require_in_force(kit: CheckMeasurements, frame: FrameSetting) -> None:
-    """Raise Failed unless this is the last published frame."""
+    """Raise Failed unless `frame` is the last published frame."""
     published = current_frame(kit)
     wrong = difference(frame.region, published.region)
     if wrong:

@@ -1,4 +1,4 @@
-"""Each base parameter: read, set, set in another unit; and refusals of impossible values."""
+"""Checks of each base parameter: reading, setting, setting in another unit, and refusals of impossible values."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _BAD_UNIT = "kg"
 
 @dataclass(frozen=True)
 class ParameterStep:
-    """The change of a parameter in a check: a factor, an amount where the value is 0, or always an amount."""
+    """The change of a parameter in a check: by a factor, by an amount from 0, or by a fixed amount."""
 
     factor: float = 1.02
     from_zero: float = 0.0
     by: float = 0.0
 
     def from_(self, value: float, sign: int) -> float:
-        """Return a changed value."""
+        """Return `value` changed up (`sign` 1) or down (`sign` -1)."""
         if self.by:
             return value + sign * self.by
         return value * self.factor**sign if value else sign * self.from_zero
@@ -133,7 +133,7 @@ def _require_refused(kit: CheckMeasurements, name: str) -> None:
 
 
 def require_param_error(kit: CheckMeasurements, name: str, value: str, unit: str | None, before: Parameter) -> None:
-    """Raise Failed unless setting is refused with REP_PARAM_ERROR and changes nothing."""
+    """Raise Failed unless the request is refused with REP_PARAM_ERROR and changes nothing."""
     asked = f"{name} = {value!r} {unit or ''}".rstrip()
     response = kit.client.ask_directly(ControlRequest.PARAM, Parameter(name, value, unit))
     expect(response.code == ControlResponse.PARAM_ERROR, f"REP_PARAM_ERROR to {asked}", answer_in_words(response))

@@ -1,7 +1,7 @@
 """Geometry of scans: details must fit into a larger scan at their reported regions, if the sample shows structure.
 
-A larger scan is compared with details of it. A wrong idea of the axes affects both alike, so each idea is tried on
-both.
+A larger scan is compared with details of it. A wrong assumption about the axes affects both alike, so each assumption
+("idea") is applied to both.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Idea = Callable[[ScanPicture], ScanPicture]
 
 
 def ideas(angle_rad: float) -> dict[str, Idea]:
-    """Return possible errors in the axes of a translator, by description; `angle_rad` is the larger scan's."""
+    """Return possible errors in a translator's axes, by description; `angle_rad` is the larger scan's."""
 
     def turned_back(picture: ScanPicture) -> ScanPicture:
         return replace(picture, region=replace(picture.region, angle_rad=2 * angle_rad - picture.region.angle_rad))
@@ -72,7 +72,7 @@ def _moved(across: float, up: float) -> Idea:
 
 
 def likenesses(larger: ScanPicture, details: Sequence[ScanPicture]) -> dict[str, float]:
-    """Return for each idea the mean correlation (-1 to 1) of the details with the larger scan."""
+    """Return the mean correlation (-1 to 1) of the details with the larger scan, for each idea."""
     return {
         name: float(np.mean([_best(idea(larger), idea(detail)) for detail in details]))
         for name, idea in ideas(larger.region.angle_rad).items()
@@ -80,9 +80,9 @@ def likenesses(larger: ScanPicture, details: Sequence[ScanPicture]) -> dict[str,
 
 
 def best_of(found: dict[str, float]) -> tuple[str, float]:
-    """Return the idea that explains the scans best, with its likeness; of equal ones the first and simplest.
+    """Return the idea with the highest likeness, and the likeness; among equal ones the first and simplest.
 
-    With few details two may be equal: a square detail fits swapped as well as shifted by half a frame.
+    With few details two ideas may be equal: a square detail fits swapped as well as shifted by half a frame.
     """
     most = max(found.values())
     return next((name, likeness) for name, likeness in found.items() if likeness >= most - _EQUAL)

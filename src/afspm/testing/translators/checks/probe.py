@@ -1,4 +1,4 @@
-"""Moves of the probe, after all scans: some controllers move it within the scan frame only."""
+"""Checks of probe moves, after all scans: some controllers move the probe within the scan frame only."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NEEDS = (names.PROBE_POS_X, names.PROBE_POS_Y)
 
 
 def require_place(kit: CheckMeasurements, xy_m: tuple[float, float]) -> None:
-    """Raise Failed unless the probe's position is reported there, as published and by its parameters."""
+    """Raise Failed unless `xy_m` is the probe's position, as published and by its parameters."""
     newest = kit.client.observations.newest(ProbePosition)
     if newest is None:
         raise Failed("a ProbePosition", "none")

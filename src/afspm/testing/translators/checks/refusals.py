@@ -1,4 +1,4 @@
-"""Refusals: unknown names, impossible values, positions out of reach, and requests that would disturb a scan."""
+"""Checks of refusals: unknown names, impossible values, unreachable positions, and requests during a scan."""
 
 from __future__ import annotations
 

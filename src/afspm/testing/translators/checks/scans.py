@@ -1,4 +1,4 @@
-"""Scans: interrupted, and complete."""
+"""Checks of interrupted and complete scans."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from afspm.testing.translators.translator_suite import check
 
 
 def broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> list[Observation]:
-    """Stop the activity; return its publications, after a check of its states."""
+    """Stop the activity, check its states, and return its publications."""
     stop_by_request(kit, mark, stop, begun)
     return require_broken_off(kit, mark, stop, begun)
 
 
 def stop_by_request(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> float:
-    """Stop the activity; return the time of the answer, experiment time in s."""
+    """Stop the activity; return the time of the answer in experiment seconds."""
     client = kit.client
     expect(client.state is begun, f"SS_{begun.name} until it is stopped", describe_all(client.observations.since(mark)))
     kit.act(stop)
@@ -26,7 +26,7 @@ def stop_by_request(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeSt
 
 
 def require_broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> list[Observation]:
-    """Return all publications of the stopped activity, after a check of its states."""
+    """Wait for the stop of the activity, check its states, and return all its publications."""
     client = kit.client
     client.wait_state(ScopeState.INTERRUPTED, mark)
     client.wait_state(ScopeState.FREE, mark, client.real_s(60.0))
@@ -71,7 +71,7 @@ def order(kit: CheckMeasurements) -> None:
 
 
 def require_order(observed: list, begun: ScopeState, kind: type) -> None:  # type: ignore[type-arg]
-    """Raise Failed unless the order is SS_<begun>, results of a kind, SS_FREE, and nothing else."""
+    """Raise Failed unless the publications are SS_<begun>, results of a kind, SS_FREE, in this order."""
     results = [i for i, one in enumerate(observed) if isinstance(one.thing, kind)]
     named = "Scan2d" if kind is Scan else "Spec1d"
     right = f"SS_{begun.name}, {named} …, SS_FREE"
@@ -100,7 +100,7 @@ def frame(kit: CheckMeasurements) -> None:
 
 
 def require_frame(taken: Taken) -> None:
-    """Raise Failed unless the scans are of the set frame."""
+    """Raise Failed unless the scans have the requested frame."""
     assert taken.frame is not None
     for scan in taken.scans:
         wrong = difference(taken.frame.region, scan.region)
@@ -131,7 +131,7 @@ def time(kit: CheckMeasurements) -> None:
 
 
 def require_time(time_ns: int | None, taken: Taken, begun: ScopeState, what: str) -> None:
-    """Raise Failed unless the time is the scan's end: not its start, an earlier scan, or another clock."""
+    """Raise Failed unless a measurement's time is its end: not its start, and not from another scan or clock."""
     if time_ns is None:
         raise Skipped(f"the {what} has no time")
     begin_s, free_s = taken.time_s(begun), taken.time_s(ScopeState.FREE)

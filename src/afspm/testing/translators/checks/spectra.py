@@ -1,4 +1,4 @@
-"""Spectra: interrupted, and complete."""
+"""Checks of interrupted and complete spectra."""
 
 from __future__ import annotations
 

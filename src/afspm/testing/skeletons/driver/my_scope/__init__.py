@@ -21,7 +21,7 @@ class MyScope(Driver):
     """The driver of the microscope.
 
     Args:
-        address: of the controller.
+        address: address of the controller.
         settings: common to all drivers.
     """
 
@@ -74,7 +74,7 @@ class MyScope(Driver):
 
 
 class PretendController:
-    """Stands for your controller: it stores values, scans at its speed, and saves a file."""
+    """A stand-in for your controller: it stores values, scans at its speed, and saves a file."""
 
     def __init__(self, clock: Clock, folder: Path) -> None:
         self.folder = folder
