@@ -19,10 +19,13 @@ BRIGHT_ROW = """row => {
   const at = geometry.toScreen(geometry.fromPixel([0, row]))[1], { box } = geometry;
   const scale = canvas.width / canvas.getBoundingClientRect().width;
   const beyond = 220 * scale; // right of the words
+  const width = Math.floor(0.9 * (box.width * scale - beyond)), height = 5; // the line may lie between two pixels
   const { data } = canvas.getContext("2d").getImageData(
-    box.x * scale + beyond, Math.round(at * scale), box.width * scale - beyond - 4, 1);
-  const white = [];
-  for (let i = 0; i < data.length; i += 4) white.push(Math.min(data[i], data[i + 1], data[i + 2]) > 240);
+    Math.round(box.x * scale + beyond), Math.floor(at * scale) - 2, width, height);
+  const white = Array(width).fill(false);
+  for (let i = 0; i < data.length; i += 4) {
+    white[(i / 4) % width] ||= Math.min(data[i], data[i + 1], data[i + 2]) > 180;
+  }
   return white;
 }"""
 
@@ -62,11 +65,11 @@ def test_changed_row_is_a_dashed_line_while_the_scan_runs_and_afterwards(
     stage.publish(line_verdict_message(verdict), f"{OF_LINES}_line_watch")
     page.wait_for_function(f"window.afspm.image.head?.changed_row === {CHANGED}")
     page.wait_for_function("document.querySelector('.picture').dataset.number")
+    keep(page, "tip-change")
     share, pieces = dashes(page, CHANGED)
     assert 0.3 < share < 0.8
     assert pieces > 5
     assert dashes(page, CHANGED - 10) == (0.0, 0)
-    keep(page, "tip-change")
     time_ns = stage.clock.now_ns()
     stage.publish(Scan(REGION, "Height", "m", values, time_ns), "Scan2d_Height")
     page.wait_for_function(f"document.querySelector('.picture').dataset.time === '{time_ns}'")
