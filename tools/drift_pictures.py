@@ -27,6 +27,7 @@ from afspm.plugins.drift.figures.style import (
     WIDTH_IN,
     figure,
     letter,
+    shared_span,
     show_scan,
     styled,
     time_axis,
@@ -71,7 +72,7 @@ def registration() -> Figure:
         made = figure(WIDTH_IN, 4.9)
         axes = made.subplots(2, 3).ravel()
         for ax, scan, title in ((axes[0], first, "a scan"), (axes[1], second, "two hours later")):
-            show_scan(ax, scan)
+            show_scan(ax, scan, shared_span((first, second)))
             ax.set(xlabel="x / µm", ylabel="y / µm", title=title)
         arrow = {"arrowstyle": "-|>", "color": ORANGE, "linewidth": 1.8, "shrinkA": 0, "shrinkB": 0}
         axes[1].annotate("", 1e6 * found[0].displacement_m, (0.0, 0.0), arrowprops=arrow)
@@ -154,7 +155,7 @@ def shear() -> Figure:
         axes = made.subplots(1, 4)
         both = (("scanned upwards", up), ("then downwards", down))
         for ax, (title, scan) in zip(axes[:2], both, strict=True):
-            show_scan(ax, scan)
+            show_scan(ax, scan, shared_span((up, down)))
             ax.set(xlabel="x / µm", title=title)
         mended = [
             undistorted(levelled(scan), scan.region, v, scan.duration_s, upwards=bool(scan.upwards)) for _, scan in both
@@ -172,7 +173,7 @@ def shear() -> Figure:
         nm_min = np.array((*v, *velocity)) * 60e9
         made.suptitle(
             f"velocity from both frames ({nm_min[0]:.1f}, {nm_min[1]:.1f}) nm/min; "
-            f"true ({nm_min[2]:.1f}, {nm_min[3]:.1f}) nm/min",
+            f"true ({nm_min[2]:.1f}, {nm_min[3]:.1f}) nm/min".replace("-", "−"),
             size=7,
         )
     return made

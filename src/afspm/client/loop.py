@@ -162,7 +162,7 @@ class ComponentLoop:
             with self._handler():
                 self._component.on_end()
         except (ExperimentEnded, StopRequested):
-            self._context.log.debug("on_end sent a request after the end")
+            self._context.log.warning("on_end sent a request after the end, and did nothing after it")
         except Exception as error:  # the component's code may raise anything
             self._context.log.error("on_end failed: %s", failure.describe(error, self._context.name))
 

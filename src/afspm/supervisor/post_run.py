@@ -82,6 +82,8 @@ def summary(outcome: RunOutcome, folder: Path) -> list[str]:
             lines.append(f"{report.name} was restarted {_times(restarts)}")
         if report.ordered:
             lines.append(f"{report.name} was restarted {_times(report.ordered)}, as ordered")
+        if report.unfinished:
+            lines.append(f"{report.name} was {report.unfinished}")
         if report.given_up:
             lines.append(f"{report.name} was GIVEN UP: {report.last_exit or 'it never started'}")
     try:

@@ -146,6 +146,28 @@ def test_comparisons_before_a_restart_are_repeated_before_the_end(
 
 
 @pytest.mark.timeout(60)
+def test_figures_without_comparisons_are_drawn_when_time_is_short(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    lab = night(tmp_path)
+    lab.at(850.0, lab.parent_goes)
+    quick = {"estimator": "correlation", "features": "correlation"}
+    DriftPictures(**quick).run_process(context_of(lab, tmp_path / "state", run_dir=str(tmp_path)))
+    for path in tmp_path.glob("*.png"):
+        path.unlink()
+    lab.restart_component()
+    monkeypatch.setattr("afspm.plugins.drift.drift_pictures._COMPARED_WITHIN_S", 0.0)
+    monkeypatch.setattr(DriftPictures, "on_tick", lambda self: None)
+    lab.at(1500.0, lab.kill)
+    run(DriftPictures(**quick), lab, tmp_path / "state", run_dir=str(tmp_path))
+    assert (tmp_path / "drift_pairs.png").exists()
+    assert not (tmp_path / "drift_estimates_off.png").exists()
+    (line,) = [record for record in caplog.records if "drift_estimates_off.png" in record.message]
+    assert line.levelname == "WARNING"
+    assert "3 of 3 comparisons" in line.message
+
+
+@pytest.mark.timeout(60)
 def test_scans_of_a_night_are_never_all_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = night(tmp_path)
     drawn = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ from afspm.plugins.drift.figures.drawings import (
     draw_offsets,
     draw_pairs,
 )
-from afspm.plugins.drift.registration import Matches
+from afspm.plugins.drift.registration import DriftScan, Matches
 from afspm.record import night_figure
 
 SHOWN_PX = 800.0  # the width of a column of text in the report and the README
@@ -55,11 +56,15 @@ def saved(made: Figure, path: Path) -> None:
     made.savefig(path)
 
 
+def in_m(number: int) -> DriftScan:
+    return replace(scan(number), unit="m")
+
+
 PICTURES: dict[str, Callable[[Path], None]] = {
     "night": drawn_night,
     "survey": drawn_survey,
     "offset": lambda path: saved(draw_offsets(record(), truth_m=record().drift_m), path),
-    "pairs": lambda path: saved(draw_pairs([ScanPair(scan(0), scan(8), np.array([3e-9, 4e-9]), "on")]), path),
+    "pairs": lambda path: saved(draw_pairs([ScanPair(in_m(0), in_m(8), np.array([3e-9, 4e-9]), "on")]), path),
     "histogram": lambda path: saved(draw_histogram(record(), title="off"), path),
     "estimates": lambda path: saved(draw_estimates(record(), title="off", truth_m=record().misplacement_m), path),
     "features": lambda path: saved(draw_features(scan(0), scan(1), MATCHES), path),
@@ -99,7 +104,17 @@ def test_displacement_of_ten_nanometres_is_magnified_with_a_key() -> None:
     assert any("×" in label and "nm" in label for label in labels), labels
 
 
+def test_compared_scans_have_a_colour_bar_with_their_unit() -> None:
+    made = draw_pairs([ScanPair(in_m(0), in_m(8), np.array([6e-9, 8e-9]))])
+    made.canvas.draw()
+    (bar,) = made.axes[1].child_axes
+    assert bar.get_ylabel().endswith("m")
+    assert not any("e" in label.get_text() for label in bar.get_yticklabels())
+
+
 def test_bias_of_the_estimate_is_in_the_figure() -> None:
     run = record()
     truth_m = run.drift_m - np.array([2e-9, -3e-9]) * (np.arange(len(run.drift_m)) > 0)[:, None]
-    assert "bias (2, −3) nm" in draw_errors(run, truth_m).axes[1].get_title(loc="right")
+    above, below = draw_errors(run, truth_m).axes
+    assert "bias (2, −3) nm" in below.get_title(loc="right")
+    assert above.get_title(loc="right") == "SIMULATED"

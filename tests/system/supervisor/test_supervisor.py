@@ -162,6 +162,16 @@ def test_busy_process_may_finish_after_the_end_of_the_experiment(
     running.terminal.wait_for("waiting for busy to finish", "Ctrl-C")
 
 
+def test_component_that_works_too_long_after_the_end_is_reported_as_unfinished(
+    run_tasks: RunTasks, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("afspm.supervisor.supervision.run_end.FAREWELL_S", 4.0)
+    busy = peer("busy", first="busy", busy_s=600.0, longest_step_s=900.0)
+    running = run_tasks(busy, peer("ends", first="exit", code=80))
+    assert "before it had finished" in running.outcome().reports[0].unfinished
+    running.terminal.wait_for(" busy ", "WARNING", "files that it writes at the end may be missing")
+
+
 def test_a_scheduler_that_is_done_ends_the_experiment(run_tasks: RunTasks) -> None:
     outcome = run_tasks(peer("scheduler", Role.SCHEDULER, first="exit", code=0), peer("waits")).outcome()
     assert outcome.why is EndReason.EXPERIMENT_ENDED

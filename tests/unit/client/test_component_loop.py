@@ -324,7 +324,7 @@ def test_error_in_on_end_does_not_hide_why_the_process_ended(caplog: pytest.LogC
     assert "on_end failed" in caplog.text
 
 
-def test_request_in_on_end_does_no_harm() -> None:
+def test_request_in_on_end_does_no_harm_and_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     class Asks(Component):
         def on_end(self) -> None:
             self.scope.flag(TIP)
@@ -332,6 +332,7 @@ def test_request_in_on_end_does_no_harm() -> None:
     lab = Lab()
     lab.at(1.0, lab.kill)
     assert run(Asks(), lab) == ExitCode.ENDED
+    assert [record.levelname for record in caplog.records if "on_end sent a request" in record.message] == ["WARNING"]
 
 
 def test_attribute_used_too_early_is_refused_with_a_reason() -> None:

@@ -17,8 +17,9 @@ from tests.unit.record.record_lab import REGION, Night
 
 import afspm
 from afspm.basics.errors import FileError, InvalidValue
-from afspm.model import ScopeState, Spectrum
-from afspm.record.export import chosen, export
+from afspm.model import Scan, ScopeState, Spectrum
+from afspm.model.line_levelling import flattened
+from afspm.record.export import chosen, export, png
 from afspm.record.run import Run
 from afspm.record.store import RecordStore
 
@@ -250,6 +251,19 @@ def test_pictures_are_there_for_every_channel(run: Run, tmp_path: Path) -> None:
     assert names[:2] == ["0001_Height.png", "0001_Height_Retrace.png"]
     assert len(names) == 2 + 2 + 1 + 1
     assert all((tmp_path / "out" / name).read_bytes().startswith(b"\x89PNG") for name in names)
+
+
+def test_pictures_of_heights_have_levelled_lines_and_say_so(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib")
+    drawn: list[tuple[Scan, str]] = []
+    draw = png.scan_figure
+    monkeypatch.setattr(png, "scan_figure", lambda scan, title: drawn.append((scan, title)) or draw(scan, title))
+    assert len(list(export(run, "png", tmp_path / "out", "1"))) == 2
+    scan, title = drawn[0]
+    assert "Height, lines levelled, " in title
+    np.testing.assert_array_equal(scan.values, flattened(run.scan(0)["Height"].values))
 
 
 def test_tables_have_their_columns_even_if_they_are_empty(run: Run, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from afspm.model import ControlMode, ControlState, ProcessCondition, Registratio
 from afspm.record.bad_scans import BAD, VERDICT_MESSAGE
 from afspm.record.report import REPORT_FILE, page, pictures, story, write
 from afspm.record.run import open_run
-from afspm.record.run_json import EXPERIMENT_FILE
+from afspm.record.run_json import EXPERIMENT_FILE, UNFINISHED
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.record.timeline import Span
 
@@ -147,6 +147,15 @@ def with_spectra(into: Path, positions: Sequence[tuple[float, float]]) -> str:
 def told(run: Path) -> story.RunStory:
     with open_run(run) as opened:
         return story.read(opened)
+
+
+def test_component_that_had_not_finished_is_named_beside_the_figures(run: Path) -> None:
+    facts = json.loads((run / "run.json").read_text(encoding="utf-8"))
+    facts[UNFINISHED] = {"drawing": "stopped 1 min 00 s after the end of the experiment, before it had finished"}
+    (run / "run.json").write_text(json.dumps(facts), encoding="utf-8")
+    text = write(run).read_text(encoding="utf-8")
+    assert "drawing was stopped 1 min 00 s after the end of the experiment, before it had finished" in text
+    assert "drawing not finished" in text
 
 
 class Page(HTMLParser):

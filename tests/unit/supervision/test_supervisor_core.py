@@ -173,6 +173,42 @@ def test_a_component_that_works_on_a_step_is_waited_for_at_the_end() -> None:
     assert run.lines[-1].text == "waiting for series to finish; Ctrl-C ends it now"
 
 
+def test_component_stopped_in_a_step_after_the_end_is_logged_and_reported() -> None:
+    run = Run()
+    run.beat()
+    run.step(Beaten("series", Beat(step_age_s=1.0, longest_step_s=100.0)))
+    run.exits("scope", ExitCode.ENDED)
+    run.exits("scheduler", ExitCode.ENDED)
+    while (CLOSE, "series") not in run.commands:
+        run.step(TimePassed(), 0.25)
+        run.step(Beaten("series", Beat(step_age_s=run.now_s - 100.0, longest_step_s=100.0)))
+    run.exits("series", ExitCode.ORPHAN)
+    how = "stopped 1 min 00 s after the end of the experiment, before it had finished"
+    assert (run.lines[-1].name, run.lines[-1].level) == ("series", "WARNING")
+    assert run.lines[-1].text.startswith(f"{how} (ended as it was asked to)")
+    assert [report.unfinished for report in run.core.reports()] == ["", "", how]
+
+
+def test_component_that_dies_twice_at_the_end_is_reported_as_unfinished() -> None:
+    run = Run()
+    run.beat()
+    run.exits("scheduler", ExitCode.ENDED)
+    run.exits("series", -9)
+    run.exits("series", -9)
+    assert run.lines[-1].level == "WARNING"
+    assert "before it had finished (killed by SIGKILL)" in run.lines[-1].text
+
+
+def test_component_that_ends_in_time_is_finished() -> None:
+    run = Run()
+    run.beat()
+    run.exits("scope", ExitCode.ENDED)
+    run.step(TimePassed(), OWN_PACE_S)
+    run.exits("series", ExitCode.ORPHAN)
+    assert run.lines[-1].level == "DEBUG"
+    assert not any(report.unfinished for report in run.core.reports())
+
+
 def test_components_wait_for_the_scheduler_s_answer_within_a_limit() -> None:
     run = Run(awaits_scheduler=True)
     run.beat("scheduler")

@@ -33,6 +33,12 @@ def test_summary_lists_processes_restarts_and_processes_given_up(tmp_path: Path)
     ]
 
 
+def test_summary_names_a_component_that_had_not_finished(tmp_path: Path) -> None:
+    how = "stopped 1 min 00 s after the end of the experiment, before it had finished"
+    reports = (ProcessReport("drawing", starts=1, given_up=False, last_exit="", unfinished=how),)
+    assert f"drawing was {how}" in summary(RunOutcome(EndReason.EXPERIMENT_ENDED, "", reports, 1.0), tmp_path)
+
+
 def test_a_scan_of_two_channels_is_one_scan(tmp_path: Path) -> None:
     rows = ["time,measurement,channel", "t1,scan,Height", "t1,scan,Phase", "t2,scan,Height", "t3,spectrum,IV"]
     (tmp_path / "metadata.csv").write_text("\n".join(rows), encoding="utf-8")

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 COLUMNS = ("datetime", "filename", "offset_x", "offset_y", "rate_x", "rate_y", "units", *RECORD, "lost", "correcting")
 _ALBUM = "afspm.plugins.drift.figures.album"
+_COMPARED_WITHIN_S = (
+    15.0  # at the end: the supervisor waits for a minute, and drawing takes most of it on a busy computer
+)
 
 
 class DriftTable(Component):
@@ -213,21 +216,36 @@ class DriftPictures(DriftTable):
             parts=self._parts(tabled, record, frames),
             matched=self._matched(tabled, scans),
             truth_m=true_drift(folder, frames) if self.simulated else None,
+            simulated=self.simulated,
         )
-        title = f"{self.title} (simulated)".strip() if self.simulated else self.title
-        for path in album.write(run, folder, title=title):
+        for path in album.write(run, folder, title=self.title):
             self.log.info("drawn: %s", path)
 
     def _parts(self, tabled: list[TabledScan], record: DriftRecord, frames: list[DriftScan]) -> list[RunPart]:
         from afspm.plugins.drift.figures.album import RunPart
         from afspm.plugins.drift.offline import against_first
 
-        made = []
+        made, until_s = [], self.clock.monotonic_s() + _COMPARED_WITHIN_S
         for name, start, stop in parts(tabled):
-            pairs = [self._compared(tabled[start], one) for one in tabled[start + 1 : stop]]
-            estimates = against_first(record[start:stop], frames[start:stop], pairs)
+            pairs = self._compared_until(until_s, tabled[start], tabled[start + 1 : stop])
+            complete = len(pairs) == stop - start - 1
+            estimates = against_first(record[start:stop], frames[start:stop], pairs) if complete else None
+            if not complete:
+                self.log.warning(
+                    "drift_estimates_%s.png and drift_histogram_%s.png are not drawn: after a restart %d of %d "
+                    "comparisons were left at the end; `afspm drift %s` compares all",
+                    name, name, stop - start - 1 - len(pairs), stop - start - 1, self.run_dir,
+                )  # fmt: skip
             made.append(RunPart(name, f"correction {name}", start, stop, estimates))
         return made
+
+    def _compared_until(self, until_s: float, first: TabledScan, others: Sequence[TabledScan]) -> list[Registration]:
+        pairs = []
+        for other in others:
+            if (first.file, other.file) not in self._pairs and self.clock.monotonic_s() >= until_s:
+                break
+            pairs.append(self._compared(first, other))
+        return pairs
 
     def _matched(self, tabled: list[TabledScan], scans: Sequence[DriftScan]) -> tuple[int, int, Registration] | None:
         # drift shows best between the first scan and the last one without correction that shares features with it

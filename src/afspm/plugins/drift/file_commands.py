@@ -178,7 +178,9 @@ def written(found: Series, analysis: Analysis, truth: Array | None, folder: Path
 
     part = album.RunPart("", found.channel, 0, len(found.scans), analysis.estimates)
     matched = next(((0, k, one) for k, one in enumerate(analysis.pairs, 1) if one.accepted and one.matches), None)
-    yield from album.write(album.DriftRun(found.scans, analysis.record, [part], matched, truth), folder)
+    yield from album.write(
+        album.DriftRun(found.scans, analysis.record, [part], matched, truth, truth is not None), folder
+    )
 
 
 def _stack(found: Series, record: DriftRecord) -> Stack:

@@ -25,6 +25,7 @@ class DriftScan:
         start_s, end_s: experiment time of the first and last row.
         upwards: whether the scan began at small y; None if unknown.
         key: name of the scan, chosen by the caller.
+        unit: unit of the values; empty if unknown.
     """
 
     values: Array
@@ -33,6 +34,7 @@ class DriftScan:
     end_s: float
     upwards: bool | None = None
     key: str = ""
+    unit: str = ""
 
     def __post_init__(self) -> None:
         if self.values.ndim != 2 or min(self.values.shape) < 2:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from afspm.basics.clock import iso_utc
 from afspm.model import Scan, Spectrum
+from afspm.model.line_levelling import flattened
 from afspm.record.export import file_word
+from afspm.record.report.pictures import is_topography
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 
@@ -25,15 +28,17 @@ def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
     time = f"{iso_utc(row.time_ns)[:19].replace('T', ' ')} UTC"
     if isinstance(row, ScanRow):
         for channel, scan in run.scan(row).items():
-            title = _title(run, f"{channel}, {time}", row.interrupted)
-            yield f"_{file_word(channel)}.png", _image(scan_figure(scan, title))
+            is_levelled = is_topography(channel)
+            shown = replace(scan, values=flattened(scan.values)) if is_levelled else scan
+            title = _title(run, f"{channel}{', lines levelled' if is_levelled else ''}, {time}", row.interrupted)
+            yield f"_{file_word(channel)}.png", _image(scan_figure(shown, title))
     else:
         title = _title(run, f"{row.kind}, {time}", interrupted=False)
         yield ".png", _image(spectrum_figure(run.spectrum(row), title))
 
 
 def scan_figure(scan: Scan, title: str) -> Figure:
-    """Return a figure of the raw values, not levelled, with colour bar and scale bar."""
+    """Return a figure of a scan with colour bar and scale bar."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5.2, 4.6), layout="constrained")

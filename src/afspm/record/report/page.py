@@ -44,7 +44,7 @@ def html(
         section("On the sample", sample.sample_map(shown, places, story.frame)),
         section("Scans", sample.sheet(story, shown, clock)),
         section("Spectra", curves.html(spectra, clock)),
-        section("Figures", _figures(figures)),
+        section("Figures", _unfinished(story) + _figures(figures)),
         section("What the time went into", _shares(story)),
         section("Refusals", _refusals(story, clock)),
         section("Restarts", _restarts(story, clock)),
@@ -80,6 +80,11 @@ def _duration_line(story: RunStory, clock: PageTimes) -> str:
         reason = f": {end.reason}" if end.reason else ""
         ended = f"{end.who} ended the experiment at {clock.whole(end.time_ns)}{reason}"
     return f"<p>{escape(period)}; {escape(ended)}</p>"
+
+
+def _unfinished(story: RunStory) -> str:
+    lines = [f"{name} was {how}: its pictures and tables may be missing." for name, how in story.unfinished.items()]
+    return "".join(f'<p class="note">{escape(line)}</p>' for line in lines)
 
 
 def _figures(figures: Sequence[FigurePicture]) -> str:

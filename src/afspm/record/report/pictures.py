@@ -113,6 +113,11 @@ def _read(run: Run, row: ScanRow) -> tuple[TopographyPicture, Array | None]:
     return TopographyPicture(row, scan.channel, scan.unit, thumbnail=thumbnail(scan)), values
 
 
+def is_topography(channel: str) -> bool:
+    """Return whether the name of a channel is one of heights."""
+    return channel.lower().startswith(_TOPOGRAPHY)
+
+
 def topography(scans: ScanSet) -> str:
     """Return the displayed channel of a scan: the first with a name like a height, else the first of all."""
     return next((c for name in _TOPOGRAPHY for c in scans if c.lower().startswith(name)), scans.first.channel)

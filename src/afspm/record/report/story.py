@@ -25,7 +25,7 @@ from afspm.record.overview import Overview, ProcessRestart
 from afspm.record.report import agents
 from afspm.record.report.work_comparison import WorkComparison, compare
 from afspm.record.run import Run
-from afspm.record.run_json import REAL_S
+from afspm.record.run_json import REAL_S, UNFINISHED
 from afspm.record.run_lock import describe_state
 from afspm.record.tables import NoteRow, ScanRow
 from afspm.record.timeline import Span, Timeline
@@ -64,6 +64,7 @@ class RunStory:
         comparisons: planned and measured work of each component with a plan.
         agents: the work of each agent.
         bands: the values of other instruments that the conditions allowed.
+        unfinished: the stop of each unfinished component as text, by name.
     """
 
     name: str
@@ -85,6 +86,7 @@ class RunStory:
     comparisons: Sequence[WorkComparison] = ()
     agents: Sequence[agents.AgentWork] = ()
     bands: AllowedBands = field(default_factory=dict)
+    unfinished: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def end_ns(self) -> int:
@@ -180,6 +182,7 @@ def read(run: Run) -> RunStory:
         comparisons=compare(plans_of(run.facts), scans, run.spectra),
         agents=agents.read(run),
         bands=allowed_bands(run.folder),
+        unfinished=run.facts.get(UNFINISHED) or {},
     )
 
 
@@ -217,6 +220,7 @@ def sentence(story: RunStory) -> str:
     if story.restarts:
         parts.append(counted(len(story.restarts), "restart"))
     parts += [f"{name} given up" for name in story.given_up]
+    parts += [f"{name} not finished" for name in story.unfinished]
     return ", ".join(parts)
 
 

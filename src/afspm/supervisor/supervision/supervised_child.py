@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from afspm.basics.exit_codes import ExitCode
 from afspm.model import Role
 from afspm.supervisor.supervision.child import ChildWatch, HeartbeatReport
 from afspm.supervisor.supervision.liveness import LivenessPolicy
@@ -92,6 +93,11 @@ class ChildLife:
             return False
         return self.processor_s - self.asked_processor_s < CLOSES_WITHIN_S
 
+    def is_cut_short(self, code: int) -> bool:
+        """Return whether the exit after a request to end interrupted a step."""
+        beat = self.beat
+        return code == ExitCode.ORPHAN and beat is not None and not beat.closing and bool(beat.step_age_s)
+
     def is_silent(self, now_s: float, liveness: LivenessPolicy) -> bool:
         """Return whether the heartbeat is long overdue, and the process is not at work."""
         beating = self.beat is not None and not self.beat.closing
@@ -106,6 +112,7 @@ class SupervisedChild:
         starts, ordered: number of starts, and number of restarts ordered by a person.
         rescued: whether it was started once more after the end of the experiment.
         last_exit: description of its last exit.
+        unfinished: the stop before it had finished as text; empty if it had finished.
     """
 
     spec: ChildSpec
@@ -116,6 +123,7 @@ class SupervisedChild:
     rescued: bool = False
     given_up: bool = False
     last_exit: str = ""
+    unfinished: str = ""
 
     @property
     def is_over(self) -> bool:
@@ -148,3 +156,4 @@ class ProcessReport:
     given_up: bool
     last_exit: str
     ordered: int = 0
+    unfinished: str = ""

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from afspm.basics.exit_codes import ExitCode
+from afspm.basics.formatting import duration_text
 from afspm.model import Role
 from afspm.model.events import LOGGED_AS
 from afspm.supervisor.supervision.child import (
@@ -166,7 +167,7 @@ class SupervisorCore:
 
     def reports(self) -> tuple[ProcessReport, ...]:
         return tuple(
-            ProcessReport(name, child.starts, child.given_up, child.last_exit, child.ordered)
+            ProcessReport(name, child.starts, child.given_up, child.last_exit, child.ordered, child.unfinished)
             for name, child in self.children.items()
         )
 
@@ -203,6 +204,11 @@ class SupervisorCore:
             if child.watch.died(code) and self._may_be_rescued(child):
                 self._log(child.spec.name, "WARNING", f"{how}; restarting it, to finish")
                 self._rescue(child)
+            elif self._is_unfinished(child, life, code):
+                after = duration_text(self._now_s - self.ending.began_s)
+                child.unfinished = f"stopped {after} after the end of the experiment, before it had finished"
+                what = f"{child.unfinished} ({child.last_exit}): files that it writes at the end may be missing"
+                self._log(child.spec.name, "WARNING", what)
             else:
                 self._log(child.spec.name, "DEBUG", child.last_exit)
         elif code == ExitCode.DONE and child.spec.role is Role.TRANSLATOR and not life.is_closing:
@@ -333,6 +339,11 @@ class SupervisorCore:
     def _may_be_rescued(self, child: SupervisedChild) -> bool:
         # a component that dies after the end of the experiment had not finished: it gets one more start to do so
         return self._has_just_ended and child.spec.beats and child.spec.role is Role.COMPONENT and not child.rescued
+
+    def _is_unfinished(self, child: SupervisedChild, life: ChildLife, code: int) -> bool:
+        # after an announced end a component finishes by itself, unless that takes too long or fails
+        announced = self.ending is not None and self.ending.why.is_announced
+        return announced and child.spec.role is Role.COMPONENT and (child.watch.died(code) or life.is_cut_short(code))
 
     @property
     def _has_just_ended(self) -> bool:

@@ -58,6 +58,7 @@ class DriftRun:
         parts: parts of the run in order of time.
         matched: indices of two scans, and their registration with matched features; None without one.
         truth_m: (n, 2) true drift, if known.
+        simulated: whether the microscope was simulated.
     """
 
     scans: Sequence[DriftScan]
@@ -65,11 +66,16 @@ class DriftRun:
     parts: Sequence[RunPart]
     matched: tuple[int, int, Registration] | None = None
     truth_m: Array | None = None
+    simulated: bool = False
 
     @property
     def switched_on_s(self) -> float | None:
-        """Time at which correction was switched on: the start of the second part; None without one."""
-        return float(self.record.time_s[self.parts[1].start]) if len(self.parts) > 1 else None
+        """Time at which correction was switched on: of the first scan after the first part; None without another."""
+        return float(self.record.time_s[self.parts[0].stop]) if len(self.parts) > 1 else None
+
+    def marked(self, title: str) -> str:
+        """Return a title, marked if the microscope was simulated."""
+        return f"{title}   {style.SIMULATED}".strip() if self.simulated else title
 
 
 def write(run: DriftRun, folder: Path, *, title: str = "") -> list[Path]:
@@ -84,13 +90,13 @@ def write(run: DriftRun, folder: Path, *, title: str = "") -> list[Path]:
 
 def _figures(run: DriftRun, title: str) -> Iterator[tuple[str, Figure]]:
     record, switched = run.record, run.switched_on_s
-    yield "offset", draw_offsets(record, truth_m=run.truth_m, switched_on_s=switched, title=title)
+    yield "offset", draw_offsets(record, truth_m=run.truth_m, switched_on_s=switched, title=run.marked(title))
     if chosen := [pair for part in run.parts for pair in _pairs(run, part)]:
         yield "pairs", draw_pairs(chosen)
     for part in run.parts:
         if part.estimates is None or len(part.estimates) < 2:
             continue
-        caption = f"{part.title}: first scan against each later one"
+        caption = run.marked(f"{part.title}: first scan against each later one")
         yield _named("estimates", part), draw_estimates(part.estimates, title=caption, truth_m=_left_over(run, part))
         yield _named("histogram", part), draw_histogram(part.estimates, title=caption)
     if run.matched is not None and run.matched[2].matches is not None:
@@ -116,6 +122,6 @@ def _pairs(run: DriftRun, part: RunPart) -> list[ScanPair]:
     record, scans = run.record[part.start : part.stop], run.scans[part.start : part.stop]
     moved = record.misplacement_m
     return [
-        ScanPair(scans[first], scans[second], moved[second] - moved[first], part.title)
+        ScanPair(scans[first], scans[second], moved[second] - moved[first], run.marked(part.title))
         for first, second in spread_pairs(record, PAIRS_APART_S, _PAIRS)
     ]

@@ -22,14 +22,17 @@ from afspm.plugins.drift.figures.style import (
     HOUR_S,
     MAGENTA,
     ORANGE,
+    SIMULATED,
     TIME_COLOURS,
     WIDTH_IN,
     Array,
+    colour_bar,
     figure,
     letter,
     shared_span,
     show_scan,
     styled,
+    three_digits,
     time_axis,
     unit_of,
 )
@@ -106,12 +109,14 @@ def draw_pairs(pairs: Sequence[ScanPair]) -> Figure:
     Scans are shown in their own frames.
     """
     with styled():
-        made = figure(2 * _PAIR_INCHES, (_PAIR_INCHES + 0.15) * len(pairs))
+        made = figure(2 * _PAIR_INCHES, 0.9 * _PAIR_INCHES * len(pairs))
         for row, pair in zip(made.subplots(len(pairs), 2, squeeze=False), pairs, strict=True):
             span = shared_span((pair.first, pair.second))
+            row[0].set_ylabel("y / µm")
             for ax, scan in zip(row, (pair.first, pair.second), strict=True):
-                show_scan(ax, scan, span)
-                ax.set(xlabel="x / µm", ylabel="y / µm")
+                image = show_scan(ax, scan, span)
+                ax.set_xlabel("x / µm")
+            colour_bar(row[1], image, pair.first.unit)
             hours = (pair.second.mid_s - pair.first.mid_s) / HOUR_S
             unit, factor = unit_of(pair.moved_m)
             row[0].set_title(pair.title, loc="left")
@@ -240,8 +245,8 @@ def _histogram(ax: Axes, values: Array, colour: str, unit: str) -> None:
     ax.hist(values, round_bins(values).tolist(), color=colour, edgecolor="white", linewidth=0.5)
     ax.axvline(float(np.median(values)), color="black", linewidth=0.8)
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
-    median, rms = np.median(values), np.sqrt(np.mean(values**2))
-    ax.set_title(f"median {median:.3g} {unit}, rms {rms:.3g} {unit}, n = {len(values)}", size=6.5)
+    median, rms = (three_digits(float(value)) for value in (np.median(values), np.sqrt(np.mean(values**2))))
+    ax.set_title(f"median {median} {unit}, rms {rms} {unit}, n = {len(values)}", size=6.5)
 
 
 _MOST_LINES = 60
@@ -325,6 +330,7 @@ def draw_errors(record: DriftRecord, truth_m: Array, *, switched_on_s: float | N
             for ax in (above, below):
                 ax.axvline((switched_on_s - record.time_s[0]) / HOUR_S, color=BLUE, linestyle="--", linewidth=0.8)
             above.set_title("correction: off ¦ on", color=BLUE)
+        above.set_title(SIMULATED, loc="right")  # the truth of another night is not known
         letter(above, "a")
         letter(below, "b")
         time_axis(below)
@@ -349,6 +355,6 @@ def _known(ax: Axes, record: DriftRecord, truth_m: Array, hours: Array) -> None:
     ax.set_ylabel(f"error of the estimate / {unit}")
     if len(error_m) > 1:
         mean, rms = error_m[1:].mean(axis=0) * factor, np.sqrt((error_m[1:] ** 2).mean(axis=0)) * factor
-        both = [f"{name} ({x:.3g}, {y:.3g}) {unit}" for name, (x, y) in (("bias", mean), ("rms", rms))]
-        ax.set_title(", ".join(both).replace("-", "−"), loc="right")
+        both = (f"{name} ({', '.join(map(three_digits, xy))}) {unit}" for name, xy in (("bias", mean), ("rms", rms)))
+        ax.set_title(", ".join(both), loc="right")
     ax.legend(ncols=2, loc="best")

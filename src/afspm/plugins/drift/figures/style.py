@@ -11,8 +11,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
+from afspm.basics.formatting import scale
 from afspm.basics.plain_data import Plain
 from afspm.model.line_levelling import flattened
 from afspm.plugins.drift.registration import DriftScan
@@ -27,6 +30,7 @@ TIME_COLOURS = "viridis"  # of even lightness: distinct in grey, too
 DPI = 200
 LAYOUT: Literal["constrained"] | None = "constrained"
 HOUR_S = 3600.0
+SIMULATED = "SIMULATED"
 _UNITS = ((1e-9, "pm", 1e12), (1e-6, "nm", 1e9), (np.inf, "µm", 1e6))
 _STYLE: Plain = {
     "font.size": 7,
@@ -76,7 +80,7 @@ def shared_span(scans: Sequence[DriftScan]) -> ValueRange:
     return shared_range(flattened(scan.values) for scan in scans)
 
 
-def show_scan(ax: Axes, scan: DriftScan, span: ValueRange) -> None:
+def show_scan(ax: Axes, scan: DriftScan, span: ValueRange) -> AxesImage:
     """Show a scan in grey, levelled line by line, with a scale bar; axes in µm of its own frame (before rotation)."""
     left, low = (1e6 * edge for edge in scan.region.top_left_m)
     width, height = (1e6 * size for size in scan.region.size_m)
@@ -86,9 +90,31 @@ def show_scan(ax: Axes, scan: DriftScan, span: ValueRange) -> None:
         size / (count - 1) / 2 for size, count in zip((width, height), scan.values.shape[::-1], strict=True)
     )
     extent = (left - half_x, left + width + half_x, low - half_y, low + height + half_y)
-    ax.imshow(level, cmap="gray", vmin=span.low, vmax=span.high, extent=extent, origin="lower", interpolation="nearest")
+    image = ax.imshow(
+        level, cmap="gray", vmin=span.low, vmax=span.high, extent=extent, origin="lower", interpolation="nearest"
+    )
     ax.set_aspect("equal")
     draw_scale_bar(ax, scan.region.size_m, (left, low), 1e6, font=6.5)
+    return image
+
+
+def colour_bar(ax: Axes, image: AxesImage, unit: str) -> None:
+    """Draw a colour bar with the unit of the values, as high as the image; none without a unit."""
+    if not unit:
+        return
+    factor, label = scale(max(abs(end) for end in image.get_clim()), unit)
+    bar = ax.figure.colorbar(image, cax=ax.inset_axes((1.04, 0.0, 0.05, 1.0)), label=label)
+    bar.formatter = FuncFormatter(lambda value, _: f"{value * factor:.6g}".replace("-", "−"))
+    bar.update_ticks()
+
+
+def three_digits(value: float) -> str:
+    """Return a number with three significant digits, without an exponent.
+
+    >>> [three_digits(value) for value in (-1112.3, 74.52, 0.12345)]
+    ['−1110', '74.5', '0.123']
+    """
+    return f"{float(f'{value:.3g}'):.12g}".replace("-", "−")
 
 
 def letter(ax: Axes, text: str) -> None:

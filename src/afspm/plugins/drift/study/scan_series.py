@@ -73,7 +73,8 @@ def drift_scan(scan: Scan, content: FileContent) -> DriftScan:
     start_ns = content.start_ns if content.start_ns is not None else end_ns
     if start_ns is None or end_ns is None:
         raise InvalidValue("it does not say when it was taken", where=scan.filename)
-    return DriftScan(scan.values, scan.region, start_ns / NS_PER_S, end_ns / NS_PER_S, content.upwards, scan.filename)
+    start_s, end_s = start_ns / NS_PER_S, end_ns / NS_PER_S
+    return DriftScan(scan.values, scan.region, start_s, end_s, content.upwards, scan.filename, scan.unit)
 
 
 def _unfit(scan: Scan, content: FileContent) -> str:
