@@ -31,7 +31,7 @@ from afspm.components.tip_experience import CURED, UNCHANGED, WORSENED, TipExper
 from afspm.components.tip_experience_file import read_experience, write_experience
 from afspm.components.tip_treatments import Pulse, Treatment, treatments
 from afspm.model.snapshot import from_plain, to_plain
-from afspm.simulation.instrument import Instrument
+from afspm.simulation.instrument import SimulatedInstrument
 from afspm.simulation.tip import FLAWS
 from afspm.simulation.tip_answers import KEY_FILE, TipAnswers
 
@@ -64,7 +64,7 @@ class SimulatedNight:
         random = np.random.default_rng((seed, 7))
         schedule = [[(n + 1) * REPAIR_S, str(random.choice(FLAWS))] for n in range(repairs)]
         changes = {"schedule": schedule, "answers": answers, "answers_turn_s": turn * REPAIR_S}
-        self.rig = Instrument({"tip_changes": changes}, seed, 0.0)
+        self.rig = SimulatedInstrument({"tip_changes": changes}, seed, 0.0)
         self.now_s = 0.0
 
     def begin(self, repair: int) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.model import Feedback, Region
-from afspm.plugins.line_watch.line_judge import AlarmLevel, Kind, LineJudge, RunningScan
+from afspm.plugins.line_watch.line_judge import AlarmLevel, Kind, LineJudge, ScanJudge
 from afspm.plugins.line_watch.registration import levelled
 from afspm.simulation.measuring import Adjustment
 from afspm.simulation.world import World
@@ -129,7 +129,7 @@ class Night:
         found.alarm_row = None if judged is None else _watch(judged, last.picture, ROWS)[0]
         return found
 
-    def _begin(self, judge: LineJudge, kind: Kind, at_s: float) -> RunningScan | None:
+    def _begin(self, judge: LineJudge, kind: Kind, at_s: float) -> ScanJudge | None:
         return judge.begin(self.region, kind, at_s, channels=2)
 
     def _changed(self, world: World, at_s: float, more: Mapping[str, object]) -> World:
@@ -210,7 +210,7 @@ class Night:
         return values[int(self.random.integers(len(values)))]
 
 
-def _watch(judged: RunningScan, picture: list[Array], until: int) -> tuple[int | None, float]:
+def _watch(judged: ScanJudge, picture: list[Array], until: int) -> tuple[int | None, float]:
     strongest = 0.0
     for row in range(until):
         alarm = judged.add(row, [values[row] for values in picture])

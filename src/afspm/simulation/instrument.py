@@ -1,4 +1,4 @@
-"""`Instrument`: the simulated instrument that the Simulator's driver and all emulated controllers use.
+"""`SimulatedInstrument`: the simulated instrument that the Simulator's driver and all emulated controllers use.
 
 **Theory of operation.** A driver or a maker's protocol changes the settings (`setup`), starts one activity after the
 other, and polls its progress. The instrument has no clock and no threads: every call passes the time (experiment
@@ -91,7 +91,7 @@ class InstrumentState:
     scanned: list[ScannedPlace]
 
 
-class Instrument:
+class SimulatedInstrument:
     """A simulated instrument with one activity at a time. Not thread-safe.
 
     Args:

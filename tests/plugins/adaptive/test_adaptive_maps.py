@@ -11,7 +11,7 @@ from benchmarks.adaptive import GOAL, Case, course
 from afspm.basics.errors import InvalidValue
 from afspm.model import Region
 from afspm.plugins.adaptive.gaussian_process import GaussianProcess, Parameters, fitted
-from afspm.plugins.adaptive.refinement import AdaptiveMap, Lattice, LatticeMap, NestedGrid, Optimizer
+from afspm.plugins.adaptive.refinement import AdaptiveMap, LatticeMap, NestedGrid, NestedLattices, Optimizer
 from afspm.plugins.adaptive.tours import learnt_cost, short_tour, snake, way_m
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))
@@ -139,7 +139,7 @@ def test_tour_is_shorter_than_rows_where_positions_lie_in_groups() -> None:
 
 
 def test_each_cell_is_new_in_one_level_and_its_parents_are_in_a_coarser_one() -> None:
-    lattice = Lattice(Region((0.0, 0.0), (2e-6, 1e-6), 0.3), coarsest=5, levels=3)
+    lattice = NestedLattices(Region((0.0, 0.0), (2e-6, 1e-6), 0.3), coarsest=5, levels=3)
     cells = [cell for level in range(4) for cell in lattice.new(level)]
     assert sorted(cells) == sorted(lattice.cells(3))
     for level in (1, 2, 3):

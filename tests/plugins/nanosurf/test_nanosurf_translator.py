@@ -21,7 +21,7 @@ from afspm.model import Region, Scan, ScanLines, ScopeState, Spectrum, names
 from afspm.plugins.nanosurf.emulator import NanosurfEmulator
 from afspm.plugins.nanosurf.emulator.studio import SETPOINT, StudioProgram
 from afspm.simulation.faults import Faults
-from afspm.simulation.instrument import Instrument
+from afspm.simulation.instrument import SimulatedInstrument
 
 Make = Callable[..., Bench]
 Settings = dict[str, Any]
@@ -54,7 +54,7 @@ def test_scan_shows_the_sample_in_place(bench: Make, release: int, direction: st
 
 
 def test_the_setpoint_of_a_frequency_shift_is_in_hertz(tmp_path: Path) -> None:
-    rig = Instrument({"feedback": {"mode": "frequency-shift", "setpoint": -20.0}}, 3, 1000.0)
+    rig = SimulatedInstrument({"feedback": {"mode": "frequency-shift", "setpoint": -20.0}}, 3, 1000.0)
     faults, log = Faults([], NanosurfEmulator.all_faults(), 0.0), logging.getLogger("test")
     studio = StudioProgram(rig, faults, FakeClock(), tmp_path, log, start_s=0.1, file_s=0.1)
     assert (studio.setpoint_unit, list(studio.setpoint_units), studio.get(SETPOINT)) == ("Hz", ["Hz"], -20.0)

@@ -18,7 +18,7 @@ from afspm.plugins.park.emulator.engine import LONGEST_S, Script, Wait
 from afspm.plugins.park.emulator.smartscan import SmartScanProgram
 from afspm.simulation.emulation.scripted import ScriptFailed
 from afspm.simulation.faults import Faults
-from afspm.simulation.instrument import Instrument, InstrumentBusy
+from afspm.simulation.instrument import InstrumentBusy, SimulatedInstrument
 
 
 class SmartScan(SmartScanProgram):
@@ -26,7 +26,7 @@ class SmartScan(SmartScanProgram):
 
     def __init__(self, folder: Path) -> None:
         self.fake_clock = FakeClock()
-        rig = Instrument({"surface": "particles"}, seed=3, start_s=self.fake_clock.t_s)
+        rig = SimulatedInstrument({"surface": "particles"}, seed=3, start_s=self.fake_clock.t_s)
         rig.setup.shape = (8, 16)
         log = logging.getLogger("test")
         faults = Faults([], ParkEmulator.fault_kinds, 0.0)

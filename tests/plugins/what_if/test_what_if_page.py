@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from afspm.wire.generated import analysis_pb2
 from tests.plugins.what_if import what_if_lab as lab
 from typer.testing import CliRunner
 
@@ -20,12 +21,11 @@ from afspm.model import Region
 from afspm.plugins.what_if.alignment import Difference, Output, PacketName
 from afspm.plugins.what_if.commands import DIFFERS, app
 from afspm.plugins.what_if.component_replay import ComponentReplay
-from afspm.plugins.what_if.page import Page
+from afspm.plugins.what_if.page import DifferencePage
 from afspm.plugins.what_if.side_by_side import ChangedField, changed_fields
 from afspm.plugins.what_if.what_if import WhatIf
 from afspm.record.run import open_run
 from afspm.storage.memory import Memory
-from afspm.wire.generated import analysis_pb2
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def test_page_marks_counterfactual_differences_and_escapes_texts() -> None:
         ["<i>reads"],
     )
     same = WhatIf(Path("same"))
-    page = Page({"<i>judge": {"<i>factor": "<i>1"}})
+    page = DifferencePage({"<i>judge": {"<i>factor": "<i>1"}})
     page.add(result)
     page.add(same)
     read = _Read(page.html())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from fake_clock import FakeClock
 
-from afspm.simulation.instrument import Instrument
+from afspm.simulation.instrument import SimulatedInstrument
 
 
 @pytest.fixture
@@ -14,8 +14,8 @@ def clock() -> FakeClock:
 
 
 @pytest.fixture
-def rig(clock: FakeClock) -> Instrument:
-    rig = Instrument({}, seed=3, start_s=clock.t_s)
+def rig(clock: FakeClock) -> SimulatedInstrument:
+    rig = SimulatedInstrument({}, seed=3, start_s=clock.t_s)
     rig.setup.shape = (8, 16)
     rig.setup.line_s = 0.5
     return rig

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from afspm.model import Region
-from afspm.simulation.instrument import Instrument
+from afspm.simulation.instrument import SimulatedInstrument
 from afspm.simulation.ledger import PRESSED_FROM_M, DamageLedger, distance_m
 
 START_S = 1000.0
@@ -21,7 +21,7 @@ class Bench:
 
     def __init__(self, **world: object) -> None:
         self.lines: list[dict[str, Any]] = []
-        self.rig = Instrument(world, seed=3, start_s=START_S, note=self._note)
+        self.rig = SimulatedInstrument(world, seed=3, start_s=START_S, note=self._note)
         self.rig.setup.shape, self.rig.setup.line_s = (8, 16), 0.5
 
     def _note(self, time_s: float, event: str, facts: Mapping[str, object]) -> None:

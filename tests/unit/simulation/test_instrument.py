@@ -15,11 +15,11 @@ from afspm.basics.errors import InvalidValue
 from afspm.model import Region
 from afspm.simulation import World
 from afspm.simulation.background import in_background
-from afspm.simulation.instrument import Instrument, InstrumentBusy
+from afspm.simulation.instrument import InstrumentBusy, SimulatedInstrument
 from afspm.simulation.scan_drawing import run_at_once
 
 
-def test_scan_takes_its_time_and_its_lines_appear_one_by_one(rig: Instrument, clock: Any) -> None:
+def test_scan_takes_its_time_and_its_lines_appear_one_by_one(rig: SimulatedInstrument, clock: Any) -> None:
     scan = rig.start_scan(clock.t_s)
     assert scan.end_s == 1004.0
     told = []
@@ -30,7 +30,7 @@ def test_scan_takes_its_time_and_its_lines_appear_one_by_one(rig: Instrument, cl
     assert rig.scan is scan
 
 
-def test_lines_not_yet_scanned_are_missing(rig: Instrument) -> None:
+def test_lines_not_yet_scanned_are_missing(rig: SimulatedInstrument) -> None:
     rig.setup.upwards = False
     scan = rig.start_scan(1000.0)
     unit, height = scan.channels(1001.0)["Height"]
@@ -40,20 +40,20 @@ def test_lines_not_yet_scanned_are_missing(rig: Instrument) -> None:
     assert np.array_equal(scan.channels()["Height"][1][6:], height[6:])
 
 
-def test_instrument_has_the_world_of_the_simulator(rig: Instrument) -> None:
+def test_instrument_has_the_world_of_the_simulator(rig: SimulatedInstrument) -> None:
     theirs = World.from_settings({}, 3, 1000.0).scan(rig.setup.region, (8, 16), 0.5, 1000.0, rig.setup.feedback, 0.1)
     ours = rig.start_scan(1000.0)
     assert np.array_equal(ours.channels()["Height"][1], theirs.channels()["Height"][1])
 
 
-def test_changes_during_a_scan_hold_for_the_next(rig: Instrument) -> None:
+def test_changes_during_a_scan_hold_for_the_next(rig: SimulatedInstrument) -> None:
     scan = rig.start_scan(1000.0)
     rig.setup.region, rig.setup.shape = Region((1e-6, 0.0), (2e-6, 1e-6)), (4, 4)
     assert scan.region == Region((0.0, 0.0), (1e-6, 1e-6))
     assert scan.channels()["Height"][1].shape == (8, 16)
 
 
-def test_stopped_scan_keeps_its_lines(rig: Instrument, clock: Any) -> None:
+def test_stopped_scan_keeps_its_lines(rig: SimulatedInstrument, clock: Any) -> None:
     scan = rig.start_scan(clock.t_s)
     clock.t_s = 1001.2
     rig.stop_scan(clock.t_s)
@@ -62,14 +62,14 @@ def test_stopped_scan_keeps_its_lines(rig: Instrument, clock: Any) -> None:
     assert np.isnan(scan.channels(1100.0)["Height"][1]).all(axis=1).tolist() == [False] * 2 + [True] * 6
 
 
-def test_stopping_a_scan_that_is_over_changes_nothing(rig: Instrument, clock: Any) -> None:
+def test_stopping_a_scan_that_is_over_changes_nothing(rig: SimulatedInstrument, clock: Any) -> None:
     scan = rig.start_scan(clock.t_s)
     clock.t_s = 1010.0
     rig.stop_scan(clock.t_s)
     assert (scan.stopped_s, scan.end_s, scan.lines_done(1010.0)) == (None, 1004.0, 8)
 
 
-def test_pause_postpones_the_end(rig: Instrument) -> None:
+def test_pause_postpones_the_end(rig: SimulatedInstrument) -> None:
     scan = rig.start_scan(1000.0)
     scan.pause(1001.0)
     assert scan.running(1500.0)
@@ -80,14 +80,14 @@ def test_pause_postpones_the_end(rig: Instrument) -> None:
     assert np.isfinite(scan.channels(1501.5)["Height"][1]).all(axis=1).sum() == 3
 
 
-def test_impossible_scan_is_refused_at_once(rig: Instrument) -> None:
+def test_impossible_scan_is_refused_at_once(rig: SimulatedInstrument) -> None:
     rig.setup.line_s = 0.0
     with pytest.raises(InvalidValue, match="line"):
         rig.start_scan(1000.0)
     assert not rig.busy(1000.0)
 
 
-def test_second_activity_is_refused(rig: Instrument) -> None:
+def test_second_activity_is_refused(rig: SimulatedInstrument) -> None:
     rig.start_scan(1000.0)
     now_s = 1000.0
     for other in (
@@ -100,7 +100,7 @@ def test_second_activity_is_refused(rig: Instrument) -> None:
             other()
 
 
-def test_duration_of_a_move_is_proportional_to_its_length(rig: Instrument, clock: Any) -> None:
+def test_duration_of_a_move_is_proportional_to_its_length(rig: SimulatedInstrument, clock: Any) -> None:
     rig.setup.move_speed_m_s = 1e-6
     rig.move_probe((3e-6, 4e-6), clock.t_s)
     clock.t_s = 1002.5
@@ -111,7 +111,7 @@ def test_duration_of_a_move_is_proportional_to_its_length(rig: Instrument, clock
     assert not rig.busy(1005.0)
 
 
-def test_move_can_be_stopped_on_the_way(rig: Instrument, clock: Any) -> None:
+def test_move_can_be_stopped_on_the_way(rig: SimulatedInstrument, clock: Any) -> None:
     rig.setup.move_speed_m_s = 1e-6
     rig.move_probe((4e-6, 0.0), clock.t_s)
     clock.t_s = 1001.0
@@ -120,7 +120,7 @@ def test_move_can_be_stopped_on_the_way(rig: Instrument, clock: Any) -> None:
     assert not rig.busy(1001.0)
 
 
-def test_spectrum_is_taken_where_the_probe_is(rig: Instrument, clock: Any) -> None:
+def test_spectrum_is_taken_where_the_probe_is(rig: SimulatedInstrument, clock: Any) -> None:
     rig.move_probe((1e-7, 0.0), clock.t_s)
     clock.t_s += 1.0
     spectrum = rig.start_spectrum("IV", clock.t_s)
@@ -131,7 +131,7 @@ def test_spectrum_is_taken_where_the_probe_is(rig: Instrument, clock: Any) -> No
     assert spectrum.end_s == 1003.0
 
 
-def test_in_air_every_measurement_is_noise(rig: Instrument, clock: Any) -> None:
+def test_in_air_every_measurement_is_noise(rig: SimulatedInstrument, clock: Any) -> None:
     rig.withdraw(clock.t_s)
     assert rig.doing(1000.5) == "approach"
     clock.t_s = 1001.0
@@ -149,7 +149,7 @@ def test_in_air_every_measurement_is_noise(rig: Instrument, clock: Any) -> None:
     assert np.ptp(rig.start_scan(clock.t_s).channels()["Height"][1]) > 1e-10
 
 
-def test_withdrawing_ends_any_activity(rig: Instrument, clock: Any) -> None:
+def test_withdrawing_ends_any_activity(rig: SimulatedInstrument, clock: Any) -> None:
     scan = rig.start_scan(clock.t_s)
     clock.t_s = 1001.0
     rig.withdraw(clock.t_s)
@@ -157,7 +157,7 @@ def test_withdrawing_ends_any_activity(rig: Instrument, clock: Any) -> None:
     assert rig.doing(1001.5) == "approach"
 
 
-def test_tip_moves_forward_and_back_along_a_turned_line(rig: Instrument) -> None:
+def test_tip_moves_forward_and_back_along_a_turned_line(rig: SimulatedInstrument) -> None:
     rig.setup.region = Region((1e-6, 2e-6), (2e-6, 1e-6), math.pi / 2)
     rig.start_scan(1000.0)
     # turned by 90 degrees the fast axis runs along +y, the slow one along -x
@@ -166,13 +166,13 @@ def test_tip_moves_forward_and_back_along_a_turned_line(rig: Instrument) -> None
     assert rig.probe_at(1003.75) == pytest.approx((0.5e-6, 3e-6))
 
 
-def last_mark(rig: Instrument, t_s: float) -> dict[str, Any]:
+def last_mark(rig: SimulatedInstrument, t_s: float) -> dict[str, Any]:
     truth: dict[str, Any] = rig.world.truth(t_s)
     mark: dict[str, Any] = truth["marks"][-1]
     return mark
 
 
-def test_pulses_and_crashes_change_the_world(rig: Instrument, clock: Any) -> None:
+def test_pulses_and_crashes_change_the_world(rig: SimulatedInstrument, clock: Any) -> None:
     assert rig.pulse(8.0, 0.1, clock.t_s) in ("cured", "worsened", "unchanged")
     clock.t_s = 1001.0
     rig.crash(depth_m=1e-7, speed_m_s=1e-6, now_s=clock.t_s)
@@ -187,7 +187,7 @@ def test_pulses_and_crashes_change_the_world(rig: Instrument, clock: Any) -> Non
 
 def test_scan_computed_in_the_background_is_the_same_and_wakes_the_emulator(clock: Any) -> None:
     woken = []
-    at_once, meanwhile = (Instrument({}, 3, clock.t_s, run=run) for run in (run_at_once, in_background))
+    at_once, meanwhile = (SimulatedInstrument({}, 3, clock.t_s, run=run) for run in (run_at_once, in_background))
     meanwhile.drawing.wake = lambda: woken.append(True)
     heights = []
     for rig in (at_once, meanwhile):
@@ -199,7 +199,7 @@ def test_scan_computed_in_the_background_is_the_same_and_wakes_the_emulator(cloc
     assert woken
 
 
-def test_scanner_follows_the_sample_at_the_set_velocity(rig: Instrument, clock: Any) -> None:
+def test_scanner_follows_the_sample_at_the_set_velocity(rig: SimulatedInstrument, clock: Any) -> None:
     rig.start_scan(clock.t_s)
     rig.follow((2e-9, -1e-9), clock.t_s)
     clock.t_s = 1100.0
@@ -214,7 +214,7 @@ def test_scanner_follows_the_sample_at_the_set_velocity(rig: Instrument, clock: 
     assert np.corrcoef(ours.ravel(), elsewhere.ravel())[0, 1] < 0.999
 
 
-def test_tip_at_rest_shows_the_value_of_a_scan_without_changing_the_world(rig: Instrument, clock: Any) -> None:
+def test_tip_at_rest_shows_the_value_of_a_scan_without_changing_the_world(rig: SimulatedInstrument, clock: Any) -> None:
     rig.setup.region, rig.setup.shape = Region((30e-9, -20e-9), (10e-9, 10e-9)), (9, 9)
     rig.move_probe((30e-9, -20e-9), clock.t_s)
     clock.t_s += 10.0
@@ -231,7 +231,9 @@ def test_tip_at_rest_shows_the_value_of_a_scan_without_changing_the_world(rig: I
     assert rig.world.state() == unseen.state()
 
 
-def test_signals_follow_the_lines_of_a_scan_and_are_noise_without_a_sample(rig: Instrument, clock: Any) -> None:
+def test_signals_follow_the_lines_of_a_scan_and_are_noise_without_a_sample(
+    rig: SimulatedInstrument, clock: Any
+) -> None:
     scan = rig.start_scan(clock.t_s)
     picture = scan.channels()
     clock.t_s = scan.start_s + 2 * rig.setup.line_s + rig.setup.line_s * 0.25 * 1.01
@@ -246,7 +248,7 @@ def test_signals_follow_the_lines_of_a_scan_and_are_noise_without_a_sample(rig: 
 
 
 def test_with_the_feedback_off_the_current_follows_where_z_is_held(clock: Any) -> None:
-    rig = Instrument({"feedback": {"mode": "current", "setpoint": 1e-10}}, 3, clock.t_s)
+    rig = SimulatedInstrument({"feedback": {"mode": "current", "setpoint": 1e-10}}, 3, clock.t_s)
     z_m = np.mean([rig.signals(clock.t_s)["Height"] for _ in range(50)])
     rig.setup.feedback = replace(rig.setup.feedback, on=False)
     rig.hold(float(z_m))
@@ -258,22 +260,22 @@ def test_with_the_feedback_off_the_current_follows_where_z_is_held(clock: Any) -
 
 
 @pytest.fixture
-def sensor(clock: Any) -> Instrument:
+def sensor(clock: Any) -> SimulatedInstrument:
     """An instrument with an oscillating sensor, on flat ground."""
     settings = {"feedback": {"mode": "frequency-shift", "setpoint": -20.0}, "noise": {"scar_probability": 0.0}}
-    rig = Instrument(settings, 3, clock.t_s)
+    rig = SimulatedInstrument(settings, 3, clock.t_s)
     rig.setup.region, rig.setup.shape = Region((30e-9, -20e-9), (10e-9, 10e-9)), (9, 9)
     rig.move_probe((30e-9, -20e-9), clock.t_s)
     clock.t_s += 10.0
     return rig
 
 
-def _shift_hz(rig: Instrument, clock: Any) -> float:
+def _shift_hz(rig: SimulatedInstrument, clock: Any) -> float:
     return float(np.mean([rig.signals(clock.t_s)["Frequency Shift"] for _ in range(100)]))
 
 
 def test_sensor_at_rest_shows_the_frequency_shift_of_the_picture_and_of_the_setpoint(
-    sensor: Instrument, clock: Any
+    sensor: SimulatedInstrument, clock: Any
 ) -> None:
     for setpoint_hz in (-20.0, -5.0):
         sensor.setup.feedback = replace(sensor.setup.feedback, setpoint=setpoint_hz)
@@ -284,7 +286,7 @@ def test_sensor_at_rest_shows_the_frequency_shift_of_the_picture_and_of_the_setp
         assert np.median(picture_hz) == pytest.approx(setpoint_hz, abs=0.2)
 
 
-def test_lifted_sensor_shows_the_remaining_attraction(sensor: Instrument, clock: Any) -> None:
+def test_lifted_sensor_shows_the_remaining_attraction(sensor: SimulatedInstrument, clock: Any) -> None:
     z_m = float(np.mean([sensor.signals(clock.t_s)["Height"] for _ in range(400)]))
     sensor.setup.feedback = replace(sensor.setup.feedback, on=False)
     shifts_hz = []
@@ -299,9 +301,9 @@ def test_lifted_sensor_shows_the_remaining_attraction(sensor: Instrument, clock:
 
 
 def test_scan_that_can_not_be_simulated_is_interrupted(
-    rig: Instrument, clock: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    rig: SimulatedInstrument, clock: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    rig = Instrument({}, 3, clock.t_s)
+    rig = SimulatedInstrument({}, 3, clock.t_s)
     rig.setup.shape = (16, 16)
 
     def fails(*_: Any, **__: Any) -> None:
@@ -316,7 +318,7 @@ def test_scan_that_can_not_be_simulated_is_interrupted(
     assert "was stopped" in caplog.text
 
 
-def test_invalid_setup_is_refused_before_any_activity(rig: Instrument, clock: Any) -> None:
+def test_invalid_setup_is_refused_before_any_activity(rig: SimulatedInstrument, clock: Any) -> None:
     for change in (
         {"feedback": replace(rig.setup.feedback, setpoint=-1.0)},
         {"feedback": replace(rig.setup.feedback, integral_gain=-1.0)},
@@ -349,18 +351,18 @@ def test_invalid_setup_is_refused_before_any_activity(rig: Instrument, clock: An
     assert rig.scan is None
 
 
-def _kept(rig: Instrument) -> Any:
+def _kept(rig: SimulatedInstrument) -> Any:
     return json.loads(json.dumps(rig.state()))
 
 
-def _killed(rig: Instrument) -> Instrument:
-    again = Instrument({}, 3, 1000.0)
+def _killed(rig: SimulatedInstrument) -> SimulatedInstrument:
+    again = SimulatedInstrument({}, 3, 1000.0)
     again.setup = rig.setup
     again.restore(_kept(rig))
     return again
 
 
-def test_killed_instrument_continues_its_scan_identically(rig: Instrument) -> None:
+def test_killed_instrument_continues_its_scan_identically(rig: SimulatedInstrument) -> None:
     rig.pulse(8.0, 0.1, 1000.0)
     rig.start_scan(1001.0)
     again = _killed(rig)
@@ -379,7 +381,7 @@ def test_killed_instrument_continues_its_scan_identically(rig: Instrument) -> No
     assert _kept(rig) == _kept(again)
 
 
-def test_killed_instrument_continues_its_activity(rig: Instrument) -> None:
+def test_killed_instrument_continues_its_activity(rig: SimulatedInstrument) -> None:
     for now_s, begin, what in (
         (1000.0, lambda at_s: rig.move_probe((3e-6, 0.0), at_s), "move"),
         (1010.0, lambda at_s: rig.start_spectrum("force", at_s), "spectrum"),
@@ -393,7 +395,7 @@ def test_killed_instrument_continues_its_activity(rig: Instrument) -> None:
             assert np.array_equal(rig.spectrum.values, again.spectrum.values)  # type: ignore[union-attr]
 
 
-def test_velocity_set_during_a_scan_affects_the_rest_and_survives_a_kill(rig: Instrument) -> None:
+def test_velocity_set_during_a_scan_affects_the_rest_and_survives_a_kill(rig: SimulatedInstrument) -> None:
     rig.setup.upwards = True
     before = rig.start_scan(1000.0).channels()["Height"][1]
     rig.follow((1e-7, 0.0), 1002.0)  # after four of eight lines
@@ -406,7 +408,7 @@ def test_velocity_set_during_a_scan_affects_the_rest_and_survives_a_kill(rig: In
     assert rig.world.sample.compensation.at(1100.0)[0] == pytest.approx(again.world.sample.compensation.at(1100.0)[0])
 
 
-def test_feedback_set_during_a_scan_is_in_force_from_the_next_line_on(rig: Instrument) -> None:
+def test_feedback_set_during_a_scan_is_in_force_from_the_next_line_on(rig: SimulatedInstrument) -> None:
     before = rig.start_scan(1000.0).channels()["Amplitude"][1]
     rig.setup.feedback = replace(rig.setup.feedback, setpoint=0.3)
     rig.adjust(1002.0)
@@ -424,7 +426,7 @@ def test_events_are_noted_with_the_truth(clock: Any) -> None:
         if event != "ledger":
             noted.append((time_s, event, "drift_m" in facts["truth"]))
 
-    rig = Instrument({}, 3, clock.t_s, note=note)
+    rig = SimulatedInstrument({}, 3, clock.t_s, note=note)
     rig.setup.shape, rig.setup.line_s = (4, 4), 0.5
     rig.start_scan(1000.0)
     rig.stop_scan(1001.0)

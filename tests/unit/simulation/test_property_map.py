@@ -9,7 +9,7 @@ import pytest
 
 from afspm.basics.errors import ConfigError
 from afspm.simulation import World
-from afspm.simulation.instrument import Instrument
+from afspm.simulation.instrument import SimulatedInstrument
 from afspm.simulation.property_map import QUANTITIES, PropertyMap, PropertyMapSettings
 
 QUIET = {
@@ -101,7 +101,7 @@ def test_the_map_moves_with_the_sample() -> None:
 def test_every_spectrum_has_its_true_value_in_the_truth() -> None:
     noted: list[tuple[str, Any]] = []
     settings = {"surface": "steps", "property_map": {"kind": "spotty", "quantity": "modulus"}}
-    rig = Instrument(settings, 5, 0.0, note=lambda _, event, facts: noted.append((event, facts)))
+    rig = SimulatedInstrument(settings, 5, 0.0, note=lambda _, event, facts: noted.append((event, facts)))
     rig.start_spectrum("force", 10.0)
     ((event, facts),) = noted
     assert event == "spectrum starts"

@@ -13,7 +13,7 @@ from afspm.basics.errors import FileError
 from afspm.model import Region
 from afspm.plugins.nanosurf.emulator import files
 from afspm.simulation.activities import SpectrumActivity
-from afspm.simulation.instrument import Instrument
+from afspm.simulation.instrument import SimulatedInstrument
 
 pytest.importorskip("h5py")
 NSFOPEN = importlib.util.find_spec("NSFopen")
@@ -30,9 +30,9 @@ def example(name: str) -> Path:
 START_S = 1.7e9
 
 
-def scanned(folder: Path, *, upwards: bool = True) -> tuple[Path, Instrument]:
+def scanned(folder: Path, *, upwards: bool = True) -> tuple[Path, SimulatedInstrument]:
     """Return a file of the emulator, and the simulated instrument."""
-    rig = Instrument({"surface": "steps"}, 3, START_S)
+    rig = SimulatedInstrument({"surface": "steps"}, 3, START_S)
     rig.setup.region, rig.setup.shape = Region((40e-9, -25e-9), (300e-9, 100e-9), np.deg2rad(30)), (6, 10)
     rig.setup.upwards = upwards
     path = folder / "scan.nhf"
@@ -64,7 +64,7 @@ def test_nsfopen_reads_the_same_heights_and_curves(tmp_path: Path) -> None:
     for way, suffix in (("Forward", ""), ("Backward", " Retrace")):
         heights = rig.scan.channels()[f"Height{suffix}"][1]
         np.testing.assert_allclose(np.asarray(data[way]["Height"], float), heights, atol=1e-9 * np.ptp(heights))
-    taken = Instrument({"surface": "steps"}, 3, START_S).start_spectrum("force", START_S)
+    taken = SimulatedInstrument({"surface": "steps"}, 3, START_S).start_spectrum("force", START_S)
     path = tmp_path / "curve.nhf"
     path.write_bytes(files.curves([taken], (1, 1), 1.7e9, "dynamic_mode"))
     data = reading.read(str(path)).data["Image"]
@@ -74,7 +74,7 @@ def test_nsfopen_reads_the_same_heights_and_curves(tmp_path: Path) -> None:
 
 
 def test_lines_that_were_not_scanned_are_missing(tmp_path: Path) -> None:
-    rig = Instrument({"surface": "steps"}, 3, START_S)
+    rig = SimulatedInstrument({"surface": "steps"}, 3, START_S)
     rig.setup.shape = (6, 10)
     scan = rig.start_scan(START_S)
     scan.stopped_s = scan.start_s + 2.5 * scan.line_s
@@ -84,7 +84,7 @@ def test_lines_that_were_not_scanned_are_missing(tmp_path: Path) -> None:
 
 
 def test_a_curve_goes_there_and_back(tmp_path: Path) -> None:
-    rig = Instrument({"surface": "steps"}, 3, START_S)
+    rig = SimulatedInstrument({"surface": "steps"}, 3, START_S)
     taken: SpectrumActivity = rig.start_spectrum("force", START_S)
     path = tmp_path / "curve.nhf"
     path.write_bytes(files.curves([taken], (1, 1), 1.7e9, "dynamic_mode"))

@@ -17,7 +17,7 @@ from afspm.model.planned_work import PlannedWork
 from afspm.plugins.adaptive.mapping import (
     MOST_SPECTRA,
     MapProgress,
-    Measured,
+    MeasuredPoint,
     Until,
     optimizer_of,
     rows,
@@ -98,7 +98,7 @@ class Adaptive(Component):
     def run(self) -> None:
         found = MapProgress(self._optimizer, self._region, self._evaluation, self._until, self.clock.late)
         self._progress = found
-        kept = [Measured(**row) for row in self.memory.setdefault("measured", [])]
+        kept = [MeasuredPoint(**row) for row in self.memory.setdefault("measured", [])]
         failed = self.memory.setdefault("failed", [])
         found.restore(kept, failed)
         if kept:

@@ -64,7 +64,7 @@ class Until:
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredPoint:
     """One measurement of a map: `name` of the optimiser's suggestion, position, value, end and duration."""
 
     name: Any
@@ -103,14 +103,14 @@ class MapProgress:
         self.optimizer, self.evaluation, self.until = optimizer, evaluation, until
         # the optimiser of another package has no map: the values are mapped as ours are
         self.map = optimizer if isinstance(optimizer, LatticeMap) else NestedGrid(region, evaluation.name)
-        self.measured: list[Measured] = []
+        self.measured: list[MeasuredPoint] = []
         self.failures = 0
         self.error: float | None = None
         self._planning = planning
         self._in_a_row = 0
         self._looked = 0
 
-    def restore(self, measured: list[Measured], failures: list[Any]) -> None:
+    def restore(self, measured: list[MeasuredPoint], failures: list[Any]) -> None:
         """Take the measurements of an earlier life of the component, and the names of failed suggestions."""
         with self._planning():
             for one in measured:
@@ -148,7 +148,7 @@ class MapProgress:
             raise InvalidValue(f"the optimiser suggests no {' and '.join(missing)}: {point}")
         return {ID: point.get(ID), "x": float(point["x"]), "y": float(point["y"])}
 
-    def measure(self, scope: Scope, point: Plain, key: str | None = None) -> Measured | None:
+    def measure(self, scope: Scope, point: Plain, key: str | None = None) -> MeasuredPoint | None:
         """Take a spectrum at a suggested position; None if it could not be measured or evaluated: that is logged.
 
         Raises:
@@ -172,7 +172,7 @@ class MapProgress:
         before_s = self.measured[-1].time_s if self.measured else end_s
         if end_s is None or before_s is None:
             raise InvalidValue("the controller gives spectra no time", hint="drift and cost follow from times")
-        one = Measured(point[ID], float(x_m), float(y_m), value, end_s, end_s - before_s)
+        one = MeasuredPoint(point[ID], float(x_m), float(y_m), value, end_s, end_s - before_s)
         self._take(one, is_suggested=True)
         if len(self.measured) >= _LOOKS * self._looked:
             self._look()
@@ -183,7 +183,7 @@ class MapProgress:
         if register is not None and points:
             register(points)
 
-    def _take(self, one: Measured, *, is_suggested: bool) -> None:
+    def _take(self, one: MeasuredPoint, *, is_suggested: bool) -> None:
         point: Plain = {"x": one.x_m, "y": one.y_m, self.evaluation.name: one.value}
         named: Plain = {ID: one.name, **point} if is_suggested else point
         with_times = {"time_s": one.time_s, **({"seconds": one.seconds} if self.measured else {})}
@@ -254,6 +254,6 @@ def measure_map(
         yield progress
 
 
-def rows(measured: list[Measured]) -> list[Plain]:
+def rows(measured: list[MeasuredPoint]) -> list[Plain]:
     """Return measurements in JSON's types."""
     return [asdict(one) for one in measured]

@@ -50,7 +50,7 @@ class Optimizer(Protocol):
         ...
 
 
-class Lattice:
+class NestedLattices:
     """Nested lattices over a region. Cells are (column, row) of the finest one."""
 
     def __init__(self, region: Region, coarsest: int = COARSEST, levels: int = LEVELS) -> None:
@@ -123,7 +123,7 @@ class LatticeMap:
         coarsest: int = COARSEST,
         levels: int = LEVELS,
     ) -> None:
-        self.lattice, self.quantity = Lattice(region, coarsest, levels), quantity
+        self.lattice, self.quantity = NestedLattices(region, coarsest, levels), quantity
         self.parameters = Parameters(0.5 * self.lattice.spacing_m(0), 0.01, velocity_m_s or (0.0, 0.0))
         self.cost = MeasurementCost()
         self._follows_drift = velocity_m_s is None

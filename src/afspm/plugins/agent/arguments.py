@@ -53,7 +53,7 @@ class Picture(OfScan):
     px: Annotated[int, Field(ge=16, le=LARGEST_PX)] = 256
 
 
-class ScanStep(Arguments):
+class ScanArguments(Arguments):
     """Step of a plan: take a scan."""
 
     do: Literal["scan"]
@@ -63,14 +63,14 @@ class ScanStep(Arguments):
     angle: Quantity = "0 deg"
 
 
-class SpectrumStep(Arguments):
+class SpectrumArguments(Arguments):
     """Step of a plan: take a spectrum at a place."""
 
     do: Literal["spectrum"]
     at: Place
 
 
-class SetStep(Arguments):
+class SetArguments(Arguments):
     """Step of a plan: set a parameter."""
 
     do: Literal["set"]
@@ -78,14 +78,14 @@ class SetStep(Arguments):
     value: Annotated[str, Field(min_length=1, max_length=100, description='with its unit: "2 um/s"')]
 
 
-class MoveStep(Arguments):
+class MoveArguments(Arguments):
     """Step of a plan: move the probe."""
 
     do: Literal["move"]
     to: Place
 
 
-Step = Annotated[ScanStep | SpectrumStep | SetStep | MoveStep, Field(discriminator="do")]
+Step = Annotated[ScanArguments | SpectrumArguments | SetArguments | MoveArguments, Field(discriminator="do")]
 
 
 class PlanArguments(Arguments):

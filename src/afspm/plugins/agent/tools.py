@@ -26,7 +26,7 @@ from afspm.plugins.agent import arguments
 from afspm.plugins.agent.plan import Plan, PlannedRequest, read_plan, read_step
 from afspm.plugins.agent.preflight import Preflight
 from afspm.plugins.agent.untrusted import untrusted
-from afspm.plugins.agent.workplace import Run, Workplace, with_preflight
+from afspm.plugins.agent.workplace import PlanRun, Workplace, with_preflight
 from afspm.plugins.web.gateway import views
 from afspm.plugins.web.gateway.guard import PERSON
 from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest, of_error
@@ -347,7 +347,7 @@ def _texts(requests: list[PlannedRequest]) -> list[str]:
     return [one.text for one in requests]
 
 
-def _run(run: Run) -> dict[str, object]:
+def _run(run: PlanRun) -> dict[str, object]:
     refusal = dict(run.refusal) if run.refusal else {}
     reason = str(refusal.get("reason", ""))
     return {

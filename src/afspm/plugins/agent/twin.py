@@ -28,7 +28,7 @@ from afspm.scheduler.safety.limit_checker import LimitChecker
 from afspm.scheduler.safety.limits import ExperimentLimits
 from afspm.scheduler.safety.parameter_values import number_of
 from afspm.simulation.activities import ScanActivity
-from afspm.simulation.instrument import Instrument
+from afspm.simulation.instrument import SimulatedInstrument
 
 LONGEST_S = 60.0
 """Real: after this time the process is ended."""
@@ -71,7 +71,7 @@ def simulate(plan: Plan, sample: Plain, speed_m_s: float, pictures: Path) -> Pla
     """Simulate a plan on a sample: return its duration and damage, and write pictures of its first scans."""
     surface = sample.get("surface") or {"kind": "steps"}
     noise = {**_QUIET, "white_m": sample["noise_m"]} if sample.get("noise_m") else _QUIET
-    instrument = Instrument({"surface": surface, "noise": noise}, 1, 0.0)
+    instrument = SimulatedInstrument({"surface": surface, "noise": noise}, 1, 0.0)
     origin = sample.get("center_m") or [0.0, 0.0]
     now_s, at_m, drawn, pressed_m = 0.0, (0.0, 0.0), 0, 0.0
     for step in plan.steps:
@@ -110,7 +110,7 @@ def simulate(plan: Plan, sample: Plain, speed_m_s: float, pictures: Path) -> Pla
 
 
 def _scan(
-    instrument: Instrument, step: ScanStep, speed_m_s: float, origin: list[float], now_s: float
+    instrument: SimulatedInstrument, step: ScanStep, speed_m_s: float, origin: list[float], now_s: float
 ) -> tuple[ScanActivity, float]:
     rows, columns = step.shape
     line_s = 2.0 * step.size_m[0] / max(speed_m_s, 1e-12)

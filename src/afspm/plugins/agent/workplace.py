@@ -59,7 +59,7 @@ class Requests(Protocol):
 
 
 @dataclass
-class Run:
+class PlanRun:
     """A plan or single measurement in progress or finished.
 
     Attributes:
@@ -111,10 +111,10 @@ class Workplace:
         self.proposals: dict[str, Proposal] = {}
         # on the event loop, where `stop` must not wait for a hanging disk
         self._memory = Memory(file, synced=False)
-        self.runs: dict[str, Run] = {}
+        self.runs: dict[str, PlanRun] = {}
         self._saved: dict[str, dict[str, object]] = {}
         for facts in self._memory.get("runs", ()):
-            run = Run(**facts)
+            run = PlanRun(**facts)
             # control has been lost with the process, and an approved plan is for one run
             run.state = "interrupted" if run.state == "running" else run.state
             self.runs[run.id], self._saved[run.id] = run, asdict(run)
@@ -181,13 +181,13 @@ class Workplace:
 
     # --- runs ---
 
-    def begin(self, person: str, plan: Plan, *, proposal: str) -> Run:
+    def begin(self, person: str, plan: Plan, *, proposal: str) -> PlanRun:
         """Start to carry out a plan, and return at once. Raises RefusedRequest if this agent has a run in progress."""
         who = self.requests.name_of(person)
         if any(one.who == who and one.state == "running" for one in self.runs.values()):
             raise RefusedRequest(RefusalCode.NOT_FREE, "a run of yours goes on; wait for its end, or stop")
         number = max((int(one) for one in self.runs), default=0) + 1
-        run = Run(str(number), who, proposal, len(plan.steps))
+        run = PlanRun(str(number), who, proposal, len(plan.steps))
         self.runs[run.id] = run
         self._save(run)
         self._tasks[run.id] = asyncio.ensure_future(self._carry_out(person, run, plan))
@@ -220,7 +220,7 @@ class Workplace:
             _log.warning("stop of %s is tried again: %s", person, why)
             await asyncio.sleep(STOP_AGAIN_S)
 
-    async def _carry_out(self, person: str, run: Run, plan: Plan) -> None:
+    async def _carry_out(self, person: str, run: PlanRun, plan: Plan) -> None:
         try:
             await self.ask(person, lambda commands: commands.request_control())
             await self._renew(person)
@@ -243,7 +243,7 @@ class Workplace:
         except RefusedRequest as error:  # the lease ends it
             _log.info("%s could not release control: %s", run.who, error.model.reason)
 
-    async def _step(self, person: str, run: Run, step: Step) -> None:
+    async def _step(self, person: str, run: PlanRun, step: Step) -> None:
         match step:
             case SetStep():
                 await self.ask(person, lambda commands: commands.set(step.parameter, step.value))
@@ -254,7 +254,7 @@ class Workplace:
             case ScanStep() | SpectrumStep():
                 await self._measure(person, run, step.target(self.frame))
 
-    async def _measure(self, person: str, run: Run, target: Target) -> None:
+    async def _measure(self, person: str, run: PlanRun, target: Target) -> None:
         key = f"{run.id}-{run.step}"
         one: Measurement = await self.do(person, self.measurements.take(run.who, key, target))
         loop = asyncio.get_running_loop()
@@ -275,7 +275,7 @@ class Workplace:
         if not response.ok and response.code != ControlResponse.NO_RESPONSE:
             raise refused(response)
 
-    def _save(self, changed: Run) -> None:
+    def _save(self, changed: PlanRun) -> None:
         # only the changed run is turned into plain data: up to MOST_RUNS are kept, and each step of a run saves
         self._saved[changed.id] = asdict(changed)
         while len(self.runs) > MOST_RUNS:

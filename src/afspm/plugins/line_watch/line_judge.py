@@ -265,7 +265,7 @@ class _Comparer:
         return found
 
 
-class RunningScan:
+class ScanJudge:
     """Judge of the lines of one scan, in order of arrival; see `LineJudge.begin`.
 
     Attributes:
@@ -402,7 +402,7 @@ class LineJudge:
         known = self._known(kind)
         return 0 if known is None else len(known.pairs)
 
-    def begin(self, region: Region, kind: Kind, at_s: float, *, channels: int) -> RunningScan | None:
+    def begin(self, region: Region, kind: Kind, at_s: float, *, channels: int) -> ScanJudge | None:
         """Return the judge of a scan that begins at `at_s`, or None if the scan can't be judged (see `lacking`).
 
         Args:
@@ -415,7 +415,7 @@ class LineJudge:
         if place is not None and len(place.templates) == channels and len(known.pairs) >= FEWEST_PAIRS:
             registration = RowRegistration(place.templates[0], known.shift(place, region, at_s), REACH)
             what = "lines differ from the earlier scan of this place"
-            return RunningScan(_Comparer(place, registration), LineStatistic(known.pairs), what)
+            return ScanJudge(_Comparer(place, registration), LineStatistic(known.pairs), what)
         return None
 
     def lacking(self, region: Region, kind: Kind) -> str:
@@ -516,7 +516,7 @@ def _statistics(
 ) -> PairStatistics | None:
     if before:
         # as a running scan: a sample that jumps is registered again
-        running = RunningScan(comparer, LineStatistic(before), "")
+        running = ScanJudge(comparer, LineStatistic(before), "")
         for row, line in lines:
             running.add(row, line)
         fitted = [(row, fits) for row, fits in running.fitted.items() if fits]

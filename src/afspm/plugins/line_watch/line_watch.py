@@ -14,7 +14,7 @@ from afspm.client.component import Component
 from afspm.components import tip_verdict
 from afspm.components.channel_pairs import ChannelPairing, HeightPair, MissingChannels
 from afspm.model import ControlState, Feedback, Scan, ScanLines, ScopeState
-from afspm.plugins.line_watch.line_judge import Alarm, AlarmLevel, Kind, LineJudge, RunningScan, confidence
+from afspm.plugins.line_watch.line_judge import Alarm, AlarmLevel, Kind, LineJudge, ScanJudge, confidence
 from afspm.plugins.line_watch.registration import Array
 
 KEPT_TIMES = 16  # of scans learnt from, which a restarted process may receive again
@@ -33,7 +33,7 @@ class _Lines:
     """
 
     began_ns: int | None
-    judge: RunningScan | None
+    judge: ScanJudge | None
     pictures: dict[str, Array] = field(default_factory=dict)
     taken: list[int] = field(default_factory=list)
     is_disturbed: bool = False

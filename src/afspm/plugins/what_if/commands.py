@@ -109,10 +109,10 @@ def _require_page(page: Path, *, closed: bool) -> None:
 
 
 def _replay(folders: list[Path], changes: Any, only: tuple[str, ...], target: Path | None, *, as_json: bool) -> bool:
-    from afspm.plugins.what_if.page import Page
+    from afspm.plugins.what_if.page import DifferencePage
     from afspm.plugins.what_if.what_if import what_if
 
-    page, differs = Page(changes), False
+    page, differs = DifferencePage(changes), False
     for folder in folders:
         result = what_if(folder, changes, only=only)
         differs |= result.differs

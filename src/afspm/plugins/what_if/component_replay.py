@@ -18,7 +18,7 @@ from afspm.basics.clock import ExperimentClock
 from afspm.basics.launch import Launch
 from afspm.model import ProblemNames
 from afspm.plugins.what_if.alignment import Difference, Output, aligned, first_difference
-from afspm.plugins.what_if.hazards import Guard
+from afspm.plugins.what_if.hazards import HazardGuard
 from afspm.plugins.what_if.outputs import OutputReader
 from afspm.plugins.what_if.port_replay import Life, LifeOver, PacketOf, ReplayPort, recorded_outputs
 from afspm.record.run_json import EXPERIMENT_FILE, RUN_FILE
@@ -124,7 +124,7 @@ def _replay(
     recorded, now, stopped = list[Output](), list[Output](), ""
     began_s = time.perf_counter()
     with TemporaryDirectory(prefix="afspm-what-if-") as folder:
-        guard = Guard(Path(folder), (run_dir,))
+        guard = HazardGuard(Path(folder), (run_dir,))
         home = _Home(Path(folder), run_dir, name)
         for number, life in enumerate(lives, 1):
             launch = _launch(life, home.folder, settings)

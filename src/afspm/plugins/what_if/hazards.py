@@ -27,7 +27,7 @@ _NETWORK = {"socket.connect", "socket.bind", "socket.sendto", "socket.getaddrinf
 _CHANGES = {"os.remove", "os.rename", "os.rmdir", "os.mkdir", "os.truncate", "os.link", "os.symlink", "shutil.move"}
 _AFSPM = Path(__file__).resolve().parents[2]
 _INFRASTRUCTURE = tuple(str(_AFSPM / room) for room in ("basics", "client", "storage", "transport", "wire", "model"))
-_guards: dict[int, Guard] = {}
+_guards: dict[int, HazardGuard] = {}
 _is_hooked = False
 
 
@@ -35,7 +35,7 @@ class ReplayForbids(PermissionError):
     """Error: a replayed component tries to change files, start a program or make a connection."""
 
 
-class Guard:
+class HazardGuard:
     """Guard that confines one replayed process to its folder.
 
     Args:

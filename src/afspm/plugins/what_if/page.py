@@ -24,7 +24,7 @@ article{margin-top:3rem}article>h2{font-size:1.4rem}article:only-of-type>h2{disp
 """
 
 
-class Page:
+class DifferencePage:
     """The page of one night, or of several with the same change.
 
     Nights are drawn one by one: their outputs together may fill the memory.

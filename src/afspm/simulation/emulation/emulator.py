@@ -25,7 +25,7 @@ from afspm.basics.plain_data import PlainMapping
 from afspm.basics.requirements import require
 from afspm.simulation.background import in_background
 from afspm.simulation.faults import Fault, Faults
-from afspm.simulation.instrument import Instrument
+from afspm.simulation.instrument import SimulatedInstrument
 from afspm.simulation.truth import Truth
 from afspm.translator.emulated_controller import AddressNotice, notice_file
 from afspm.transport.polling import WakeUp
@@ -111,7 +111,7 @@ class Emulator(ABC):
     clock: Clock
     log: logging.Logger
     folder: Path
-    rig: Instrument
+    rig: SimulatedInstrument
     faults: Faults
     woken: WakeUp[None]
     listening: Callable[[str], None]
@@ -231,7 +231,9 @@ class Emulator(ABC):
         """
         self.clock, self.folder, self.log, self.listening = clock, folder, log, listening
         truth = Truth(folder / "truth.jsonl")
-        self.rig = Instrument(self._world_settings, self.seed, clock.now_s(), run=in_background, note=truth.note)
+        self.rig = SimulatedInstrument(
+            self._world_settings, self.seed, clock.now_s(), run=in_background, note=truth.note
+        )
         self.faults = Faults(self._faults, self.all_faults(), clock.now_s())
         folder.mkdir(parents=True, exist_ok=True)
         self.woken = WakeUp()

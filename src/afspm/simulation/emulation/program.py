@@ -13,7 +13,7 @@ from afspm.basics.errors import AfspmError
 from afspm.simulation.activities import ScanActivity, SpectrumActivity
 from afspm.simulation.emulation.pending_writes import PendingWrites
 from afspm.simulation.faults import Faults
-from afspm.simulation.instrument import Instrument, InstrumentBusy
+from afspm.simulation.instrument import InstrumentBusy, SimulatedInstrument
 
 NamedFile = tuple[str, bytes]
 """The name of a file and its content."""
@@ -35,7 +35,7 @@ class MakerProgram(ABC):
 
     def __init__(
         self,
-        rig: Instrument,
+        rig: SimulatedInstrument,
         faults: Faults,
         clock: Clock,
         folder: Path,

@@ -20,7 +20,7 @@ from afspm.simulation import World
 from afspm.simulation.background import in_background
 from afspm.simulation.faults import INSTRUMENT_FAULTS, Fault, Faults
 from afspm.simulation.feedback import FeedbackSettings
-from afspm.simulation.instrument import Instrument
+from afspm.simulation.instrument import SimulatedInstrument
 from afspm.simulation.settings import build
 from afspm.simulation.simulator.controller import PanelEvent, SimulatedController
 from afspm.simulation.truth import Truth
@@ -244,7 +244,9 @@ class Simulator(Driver):
         start_s = kept["start_s"]
         self.faults = Faults(self._faults_settings, FAULT_KINDS, start_s, kept["faults"])
         truth = Truth(self.run_dir / "truth.jsonl", kept)
-        instrument = Instrument(self._world_settings, self._seed, start_s, run=self.run_drawing, note=truth.note)
+        instrument = SimulatedInstrument(
+            self._world_settings, self._seed, start_s, run=self.run_drawing, note=truth.note
+        )
         instrument.setup.approach_s = self._approach_s
         instrument.drawing.wake, instrument.drawing.log = self.wake, self.log
         if "instrument" not in kept:

@@ -20,7 +20,7 @@ from afspm.basics.errors import AfspmError, FileError, InvalidValue, Refused
 from afspm.model import ControlResponse, ScanLines, ScopeState, Spectrum, names
 from afspm.simulation.activities import ScanActivity, SpectrumActivity
 from afspm.simulation.faults import Faults
-from afspm.simulation.instrument import Instrument, InstrumentBusy
+from afspm.simulation.instrument import InstrumentBusy, SimulatedInstrument
 from afspm.storage.atomic import write_atomic
 from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 from afspm.translator.parameters import ParameterTable, Value
@@ -69,7 +69,7 @@ class SimulatedController:
 
     def __init__(
         self,
-        instrument: Instrument,
+        instrument: SimulatedInstrument,
         table: ParameterTable,
         kept: Kept,
         folder: Path,

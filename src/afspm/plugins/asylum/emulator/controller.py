@@ -15,7 +15,7 @@ from afspm.plugins.asylum.emulator import files
 from afspm.plugins.asylum.emulator.values import IgorValues
 from afspm.simulation.emulation.pending_writes import PendingWrites
 from afspm.simulation.faults import Faults
-from afspm.simulation.instrument import Instrument
+from afspm.simulation.instrument import SimulatedInstrument
 
 FAULT_KINDS: Final = {
     "scan-refused": "DoScan does nothing",
@@ -66,7 +66,7 @@ class AsylumController:
 
     def __init__(
         self,
-        rig: Instrument,
+        rig: SimulatedInstrument,
         faults: Faults,
         values: IgorValues,
         folder: Path,

@@ -20,7 +20,7 @@ from afspm.plugins.gxsm.emulator.file_writer import GxsmFileWriter
 from afspm.plugins.gxsm.emulator.files import CHANNELS, SIMULATED_3, GxsmChannel
 from afspm.simulation.activities import ScanActivity, SpectrumActivity
 from afspm.simulation.faults import Faults
-from afspm.simulation.instrument import Instrument
+from afspm.simulation.instrument import SimulatedInstrument
 
 CARDS: Final = {"SRanger": "SRangerMK2:SPM", "RPSPMC": "RPSPMC:SPM", "simulator": "SPM-SIM:SPM"}
 FAULT_KINDS: Final[Mapping[str, str]] = {
@@ -122,7 +122,9 @@ class GxsmProgram:
         scan: the last started scan.
     """
 
-    def __init__(self, rig: Instrument, faults: Faults, clock: Clock, folder: Path, settings: GxsmSettings) -> None:
+    def __init__(
+        self, rig: SimulatedInstrument, faults: Faults, clock: Clock, folder: Path, settings: GxsmSettings
+    ) -> None:
         self.rig, self.faults, self.clock, self.folder = rig, faults, clock, folder
         self.version, self.card = version, card = settings.version, settings.card
         self.dialogs: list[str] = []

@@ -12,7 +12,7 @@ from afspm.plugins.nanonis.emulator.dispatch import Answer, DeferredResult
 from afspm.plugins.nanonis.emulator.registers import Registers
 from afspm.plugins.nanonis.emulator.session import SessionFolder
 from afspm.simulation.faults import Faults
-from afspm.simulation.instrument import Instrument
+from afspm.simulation.instrument import SimulatedInstrument
 
 _Z_CONTROLLERS: Final = {
     "current": ("log Current", "A"),
@@ -33,7 +33,7 @@ class NanonisCore:
         opened: modules opened by clients.
     """
 
-    rig: Instrument
+    rig: SimulatedInstrument
     faults: Faults
     clock: Clock
     session: SessionFolder

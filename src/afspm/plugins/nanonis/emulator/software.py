@@ -18,7 +18,7 @@ from afspm.plugins.nanonis.emulator.signals import Signals
 from afspm.plugins.nanonis.emulator.spectra import SpectroscopyModules
 from afspm.plugins.nanonis.emulator.tip import TipModules, ZController
 from afspm.simulation.faults import Faults
-from afspm.simulation.instrument import Instrument
+from afspm.simulation.instrument import SimulatedInstrument
 
 _RANGE_Z_M: Final = 2e-6
 _EXPERIMENTS: Final = {"Bias Spectroscopy": "IV", "Z Spectroscopy": "force"}
@@ -37,7 +37,7 @@ class NanonisSoftware:
 
     def __init__(
         self,
-        rig: Instrument,
+        rig: SimulatedInstrument,
         faults: Faults,
         clock: Clock,
         folder: Path,
