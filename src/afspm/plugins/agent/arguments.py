@@ -53,7 +53,7 @@ class Picture(OfScan):
     px: Annotated[int, Field(ge=16, le=LARGEST_PX)] = 256
 
 
-class ScanArguments(Arguments):
+class DoScan(Arguments):
     """Step of a plan: take a scan."""
 
     do: Literal["scan"]
@@ -63,14 +63,14 @@ class ScanArguments(Arguments):
     angle: Quantity = "0 deg"
 
 
-class SpectrumArguments(Arguments):
+class DoSpectrum(Arguments):
     """Step of a plan: take a spectrum at a place."""
 
     do: Literal["spectrum"]
     at: Place
 
 
-class SetArguments(Arguments):
+class DoSet(Arguments):
     """Step of a plan: set a parameter."""
 
     do: Literal["set"]
@@ -78,14 +78,14 @@ class SetArguments(Arguments):
     value: Annotated[str, Field(min_length=1, max_length=100, description='with its unit: "2 um/s"')]
 
 
-class MoveArguments(Arguments):
+class DoMove(Arguments):
     """Step of a plan: move the probe."""
 
     do: Literal["move"]
     to: Place
 
 
-Step = Annotated[ScanArguments | SpectrumArguments | SetArguments | MoveArguments, Field(discriminator="do")]
+Step = Annotated[DoScan | DoSpectrum | DoSet | DoMove, Field(discriminator="do")]
 
 
 class PlanArguments(Arguments):
