@@ -1,6 +1,6 @@
 /** The conformance program of this client: `afspm test-client -- node dist/conformance/conformance.js`. */
 
-import { createRegistry, fromBinary, fromJson, type JsonValue, toBinary, toJson } from "@bufbuild/protobuf";
+import { createRegistry, type DescFile, fromBinary, fromJson, type JsonValue, toBinary, toJson } from "@bufbuild/protobuf";
 import { decode, type Experiment, messageOf, type Packet, RequestError, responseName, runComponent, type Scan, type Shape, type Spectrum, wire, type XY } from "../src/index.js";
 
 interface Step {
@@ -11,10 +11,7 @@ interface Step {
 type Answer = Record<string, unknown>;
 
 const DEGREE = Math.PI / 180;
-const REGISTRY = createRegistry(
-  wire.file_analysis, wire.file_control, wire.file_drift, wire.file_feedback, wire.file_geometry, wire.file_journal, wire.file_lines,
-  wire.file_scan, wire.file_spectroscopy,
-);
+const REGISTRY = createRegistry(...Object.values(wire).filter((found): found is DescFile => (found as { kind?: unknown }).kind === "file"));
 
 runComponent(async (experiment) => {
   const packets: Packet[] = [];
