@@ -120,8 +120,33 @@ def test_scan_with_a_jump_is_a_measure_of_the_next_one() -> None:
     judge.learn(heights(pictures[LEARNT]), HOME, KIND, LEARNT * PERIOD_S)
     running = judge.begin(HOME, KIND, (LEARNT + 1) * PERIOD_S, channels=2)
     assert running is not None
-    assert running.threshold == FLOOR
+    assert running.threshold < 2.0 * FLOOR
     assert stopped(judge, heights(pictures[-1]), (LEARNT + 1) * PERIOD_S) is None
+
+
+def test_scan_after_a_jump_is_compared_with_the_scan_before_it() -> None:
+    # the two halves of a scan with a jump don't fit together
+    judge, whole = taught(), heights(night()[LEARNT])
+    slipped = [np.roll(values, (-3, 4), axis=(0, 1)) for values in whole]
+    jumped = [np.concatenate([before[:30], after[30:]]) for before, after in zip(whole, slipped, strict=True)]
+    assert stopped(judge, jumped) is None
+    judge.learn(jumped, HOME, KIND, LEARNT * PERIOD_S)
+    running = judge.begin(HOME, KIND, (LEARNT + 1) * PERIOD_S, channels=2)
+    assert running is not None
+    evidence = 0.0
+    for row in range(ROWS - 4):
+        assert running.add(row, [values[row] for values in slipped]) is None
+        evidence = max(evidence, running.evidence)
+    assert evidence < 0.3
+
+
+def test_tip_that_spoils_some_lines_is_no_jump() -> None:
+    spoilt = heights(night()[LEARNT])
+    for values in spoilt:
+        values[30:60:3] += 20e-9 * np.random.default_rng(1).standard_normal(values[30:60:3].shape)
+    alarm = stopped(taught(), spoilt)
+    assert alarm is not None
+    assert alarm.row <= 60
 
 
 def test_rows_from_the_last_to_the_first_are_judged_alike() -> None:

@@ -13,7 +13,7 @@ search for the shift shows whether the sample has jumped: then the template expl
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
@@ -54,6 +54,7 @@ FEWEST_STOP = 10  # the same before a scan is stopped, after a second search for
 LOOK = 0.6  # share of the threshold
 GOOD_DECAY = 5.0  # assumed, not fitted: of the share of good scans that reach some evidence
 FEWEST_PAIRS = 2  # of good scans, before such scans are judged
+ENOUGH_PAIRS = 4  # for medians
 KEPT_PAIRS, KEPT_SPEEDS = 16, 3
 MOST_KINDS, MOST_PLACES = 4, 8
 SAME_SIZE = 0.02  # relative difference within which sizes count as equal
@@ -138,11 +139,13 @@ class Place:
     Attributes:
         at_s: end of the scan.
         templates: trace and, if recorded, retrace.
+        slipped: how far the sample has jumped since the scan, besides its drift, in pixels.
     """
 
     region: Region
     at_s: float
     templates: tuple[RowTemplate, ...]
+    slipped: Shift = (0.0, 0.0)
 
 
 @dataclass
@@ -169,19 +172,26 @@ class KindReference:
 
     def shift(self, place: Place, region: Region, at_s: float) -> Shift:
         """Return the predicted shift, in pixels, between an earlier scan and a scan of a region."""
-        (along, down), (ny, nx) = self._away(place, region), self.kind.shape
-        passed_s = at_s - place.at_s
+        passed_s, (down, along) = at_s - place.at_s, self._undrifted(place, region)
         # the median: a sample that has jumped once does not drift
         rows_per_s, columns_per_s = np.median(self.speeds, axis=0) if self.speeds else (0.0, 0.0)
-        return down * (ny - 1) + passed_s * float(rows_per_s), along * (nx - 1) + passed_s * float(columns_per_s)
+        return down + passed_s * float(rows_per_s), along + passed_s * float(columns_per_s)
 
     def note_shift(self, place: Place, region: Region, at_s: float, found: Shift) -> None:
         """Learn the drift from the shift found at the end of a scan."""
-        passed_s = at_s - place.at_s
+        passed_s, (down, along) = at_s - place.at_s, self._undrifted(place, region)
         if passed_s > 0.0:
-            (along, down), (ny, nx) = self._away(place, region), self.kind.shape
-            self.speeds.append(((found[0] - down * (ny - 1)) / passed_s, (found[1] - along * (nx - 1)) / passed_s))
+            self.speeds.append(((found[0] - down) / passed_s, (found[1] - along) / passed_s))
             del self.speeds[:-KEPT_SPEEDS]
+
+    def note_jump(self, place: Place, region: Region, at_s: float, found: Shift) -> None:
+        """Move an earlier scan to the shift found at the end of a scan during which the sample has jumped."""
+        (down, along), (rows, columns) = self.shift(place, region, at_s), place.slipped
+        place.slipped = (rows + found[0] - down, columns + found[1] - along)
+
+    def _undrifted(self, place: Place, region: Region) -> Shift:
+        (along, down), (ny, nx), (rows, columns) = self._away(place, region), self.kind.shape, place.slipped
+        return rows + down * (ny - 1), columns + along * (nx - 1)
 
     def _away(self, place: Place, region: Region) -> tuple[float, float]:
         x, y = (a - b for a, b in zip(region.center_m, place.region.center_m, strict=True))
@@ -223,8 +233,10 @@ class LineStatistic:
     """
 
     def __init__(self, pairs: Sequence[PairStatistics]) -> None:
+        # of few pairs the least alike: their median may lie well below what the next pair shows
+        middle = np.median if len(pairs) >= ENOUGH_PAIRS else np.max
         self.flat_m, self.per_slope, self._usual, self._spread = (
-            float(np.median([getattr(pair, name) for pair in pairs]))
+            float(middle([getattr(pair, name) for pair in pairs]))
             for name in ("flat_m", "per_slope", "usual", "spread")
         )
         self.pairs = len(pairs)
@@ -252,6 +264,7 @@ def line_statistic(fits: Sequence[RowFit], flat_m: float, per_slope: float) -> f
 class _Comparer:
     place: Place
     registration: RowRegistration
+    jumps: int = 0  # of the sample, in this scan
 
     def follow(self, row: int, line: Sequence[Array]) -> None:
         self.registration.follow(row, line[0])
@@ -281,7 +294,6 @@ class ScanJudge:
         self._home = comparer.registration.shift
         self._followed = 0
         self._recent: list[tuple[int, list[Array]]] = []
-        self._jumps = 0
 
     @property
     def threshold(self) -> float:
@@ -330,13 +342,15 @@ class ScanJudge:
         return AlarmLevel.LOOK if self.evidence >= LOOK and suspects >= FEWEST_SUSPECT else None
 
     def _has_jumped(self) -> bool:
-        if self._jumps >= MOST_JUMPS:
+        if self._comparer.jumps >= MOST_JUMPS:
             return False
         # since the change, for a sample that has jumped; all lines, for a lattice that was matched one period away
         suspects = [(row, line) for row, line in self._recent if self._is_suspect(row)]
         # the older half may lie before the jump
         newest = suspects[-max(NEWEST, (len(suspects) + 1) // 2) :]
         template, statistic = self._comparer.place.templates[0], self._statistic
+        # a contaminated tip spoils some lines at any shift, and leaves the others as they were
+        odd = {row for row, _ in newest if (fits := self.fitted.get(row)) and statistic.sigmas(fits) > EXPLAINED}
         found: list[tuple[float, RowRegistration]] = []
         for lines in (newest, self._recent):
             traces = [(row, line[0]) for row, line in lines]
@@ -347,13 +361,14 @@ class ScanJudge:
                 again = _Comparer(self._comparer.place, RowRegistration(template, shift, NEAR, steady=1.0))
                 for row, line in lines:
                     again.follow(row, line)
-                sigmas = [statistic.sigmas(fits) for row, line in newest if (fits := again.fits(row, line))]
-                if 2 * len(sigmas) > len(newest) and (off := float(np.median(sigmas))) < EXPLAINED:
+                sigmas = {row: statistic.sigmas(fits) for row, line in newest if (fits := again.fits(row, line))}
+                off = max(_median(sigmas.values()), _median([of for row, of in sigmas.items() if row in odd]))
+                if 2 * len(sigmas) > len(newest) and off < EXPLAINED:
                     far = math.dist(again.registration.shift, self._home)
                     found.append((max(0.0, off) + PER_PIXEL * far, again.registration))
         if not found:
             return False
-        self._jumps += 1
+        self._comparer.jumps += 1
         shift = min(found, key=lambda one: one[0])[1].shift
         self._comparer.registration = RowRegistration(template, shift, REACH)
         for row, line in newest:
@@ -365,6 +380,10 @@ class ScanJudge:
         numbers = [number for number, _ in self._recent]
         since = self._cusum.since
         return since is None or since not in numbers or numbers.index(row) >= numbers.index(since)
+
+
+def _median(values: Collection[float]) -> float:
+    return float(np.median(list(values))) if values else 0.0
 
 
 @dataclass
@@ -450,6 +469,8 @@ class LineJudge:
         self._kinds.append(known)
         place = known.place(region)
         odd = _OddRows() if again else self._compare(known, place, picture, region, at_s, downwards=downwards)
+        if odd is None:
+            return
         templates = tuple(RowTemplate.of(odd.cleaned(values, n), odd.doubtful) for n, values in enumerate(picture))
         known.places = [one for one in known.places if one is not place]
         known.places.append(Place(region, at_s, templates))
@@ -464,7 +485,8 @@ class LineJudge:
         at_s: float,
         *,
         downwards: bool,
-    ) -> _OddRows:
+    ) -> _OddRows | None:
+        # None: the sample has jumped during the scan, whose two halves don't fit together: no reference for later ones
         odd = _OddRows()
         lines = [(row, [levelled(values[row])[0] for values in picture]) for row in range(len(picture[0]))]
         lines = [(row, line) for row, line in lines if all(np.isfinite(values).all() for values in line)]
@@ -475,6 +497,9 @@ class LineJudge:
         if place is not None and len(place.templates) == len(picture):
             comparer = _Comparer(place, RowRegistration(place.templates[0], known.shift(place, region, at_s), REACH))
             _append(known.pairs, _statistics(comparer, lines, known.pairs, odd))
+            if comparer.jumps:
+                known.note_jump(place, region, at_s, comparer.registration.shift)
+                return None
             known.note_shift(place, region, at_s, comparer.registration.shift)
         return odd
 

@@ -63,14 +63,16 @@ class RowTemplate:
         """
         level = levelled(heights)
         rows = np.arange(len(level))
-        there = np.isfinite(level).all(axis=1)
-        if not there.all() and there.any():
-            nearest = rows[there][np.abs(rows[:, None] - rows[there][None, :]).argmin(axis=1)]
-            level = level[nearest]
+        trusted = np.isfinite(level).all(axis=1) & ~np.isin(rows, list(doubtful))
+        if not trusted.all() and trusted.any():
+            # the spline of the rows beside a hole reaches into it: a copied row would bend them
+            after = np.searchsorted(rows[trusted], rows).clip(max=trusted.sum() - 1)
+            low, high = rows[trusted][np.maximum(after - 1, 0)], rows[trusted][after]
+            share = ((rows - low) / np.maximum(high - low, 1)).clip(0.0, 1.0)[:, None]
+            level = np.where(trusted[:, None], level, (1.0 - share) * level[low] + share * level[high])
         slopes = np.diff(level, axis=1)
         row_slopes, column_slopes = (np.asarray(np.gradient(level, axis=axis)) for axis in (0, 1))
         spline = np.asarray(ndimage.spline_filter(level, order=3))
-        trusted = there & ~np.isin(rows, list(doubtful))
         # the spread is not robust: on particles most of the ground is flat, and only flanks show a shift
         return cls(level, slopes, row_slopes, column_slopes, spline, float(np.std(slopes)) or 1e-15, trusted)
 
