@@ -8,7 +8,7 @@ One line declares one class::
 
 | comes in | the metadata of all installed packages, read once per process, since reading takes milliseconds |
 | goes out | names, paths of classes, loaded objects, and for `afspm doctor` an inventory |
-| always holds | nothing is imported until its name is used; a name that two packages declare is refused |
+| always holds | nothing is imported until its name is used; a name declared for different objects is refused |
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def find(name: str, *groups: str) -> EntryPoint | None:
     """Return the entry point with this name in one of the groups; None if no package declares the name.
 
     Raises:
-        ConfigError: two packages declare the name.
+        ConfigError: the name is declared for different objects.
     """
     # by value: two packages may declare the same object
     found = {point.value: point for point in _points(groups) if point.name == name}
@@ -134,7 +134,9 @@ def folder(group: str, name: str) -> Path | None:
 
 
 def inventory(taken_commands: Collection[str] = ()) -> tuple[DeclaredName, ...]:
-    """Load every declared object, and return all declared names with the reasons why some can't be used.
+    """Load the declared objects; return all declared names, each with the reason if it can't be used.
+
+    Names in unknown groups and names of afspm's own commands are not loaded.
 
     Args:
         taken_commands: afspm's own commands, which no package can replace.

@@ -1,7 +1,7 @@
 """The launch line: one JSON line on standard input that gives a process its part in an experiment.
 
 The same line goes to Python components (`python -m afspm.supervisor.host`) and to commands in any other
-language. Standard input then stays open: its end means that the parent is gone or stops the process.
+language. Standard input then stays open: its end means that the parent is gone, or stops the process.
 
 On the heartbeat socket a process sends `[beat, age, longest, token]`: the byte 0 (alive) or 1 (closing on purpose),
 the age of the current step in s (ASCII; 0 when idle), the longest duration of a step in s (ASCII), and
@@ -76,7 +76,7 @@ class Launch:
     sample_coordinates: bool = False
     """Positions are sample coordinates, which the scheduler maps to tip coordinates."""
     retracts: bool = False
-    """For a translator: retract the tip if standard input ends while the run has the feedback switched off."""
+    """For a translator: retract the tip if standard input ends while a request of the run keeps the feedback off."""
     adjustable: tuple[str, ...] = ()
     """For a translator: parameters that may be set during a scan."""
     solved: tuple[str, ...] = ()
@@ -95,7 +95,8 @@ class Launch:
         """Parse a launch line.
 
         Raises:
-            ConfigError: the line is not JSON, or an entry is unknown or of the wrong type.
+            ConfigError: the line is no JSON object, the name is missing, or an entry is unknown, negative or of the
+                wrong type.
         """
         try:
             plain = json.loads(line)
