@@ -1,7 +1,7 @@
-"""The fence of a translator, which obeys only the newest life of its own run's scheduler.
+"""Fencing: a translator obeys only the scheduler of its own run, and of this scheduler only the newest life.
 
-A scheduler puts its epoch before each request. Without it, two experiments at the same addresses would command one
-microscope unnoticed.
+A life lasts from a start of the process to its end. A scheduler sends its epoch before each request. Without epochs two
+experiments at the same addresses would command one microscope unnoticed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _EPOCH = re.compile(rb"([\w-]{1,40}):(\d{1,20}):([01])")
 
 @dataclass(frozen=True)
 class Epoch:
-    """One life of the scheduler of one run.
+    """The identity of one life of a run's scheduler.
 
     Attributes:
         run: the identity of the run.

@@ -37,7 +37,7 @@ class MicroscopeStatus:
     """The known activity of the microscope.
 
     Attributes:
-        dangerous: names of ScopeState, and "feedback-off".
+        dangerous: states that endanger the tip: names of ScopeState, and "feedback-off".
         patience_s: real time after which the loss of the controller becomes a problem. If the controller returns
             before, its scan continues.
         state: the last published state; UNDEFINED for a lost controller or invalid answers.
@@ -60,7 +60,7 @@ class MicroscopeStatus:
 
     @property
     def is_free(self) -> bool:
-        """Return whether the microscope is free; true before its first state."""
+        """Return whether the microscope is free; True before its first published state."""
         return self.state is ScopeState.FREE or not self.states_seen
 
     @property
@@ -76,7 +76,7 @@ class MicroscopeStatus:
         return replace(changed, lost_since_s=None)._with_risk(replace(self.risk, state=state))
 
     def with_feedback(self, feedback: Feedback) -> MicroscopeStatus:
-        """Return the status with the present feedback."""
+        """Return the status with a published feedback; unchanged if `feedback.on` is unknown."""
         if feedback.on is None:
             return self
         certain = replace(self, in_doubt=False)
@@ -114,7 +114,7 @@ class MicroscopeStatus:
 
     @property
     def danger(self) -> str | None:
-        """Return the danger to the tip, in words; None if there is none, or it is averted."""
+        """Return the danger to the tip, in words; None without a danger, or with the tip withdrawn."""
         if self.risk.tip_away:
             return None
         if self.endangered_by_feedback:
@@ -123,7 +123,7 @@ class MicroscopeStatus:
         return f"the microscope is in {name}" if name in self.dangerous else None
 
     def telling(self) -> tuple[MicroscopeStatus, str | None]:
-        """Return the danger if it was not logged yet, so that each danger is logged once."""
+        """Return the next status, and the danger in words if it was not logged yet, else None."""
         danger = self.danger
         return replace(self, logged=danger), None if danger == self.logged else danger
 

@@ -32,7 +32,10 @@ class ControlRequest(IntEnum):
 CLOCK_REQUEST = 101
 """Request for the experiment time; an extension of afspm."""
 RELAY_REQUEST = 102
-"""Request to publish a message of the sender; the answer to a supervisor holds orders. An extension of afspm."""
+"""Request to publish a message of the sender; an extension of afspm.
+
+The answer to a supervisor or an instrument holds its orders.
+"""
 RESTART_REQUEST = 103
 """Request to restart the process named by its subject; an extension of afspm."""
 LEASE_REQUEST = 104
@@ -90,7 +93,7 @@ WAIT_FOR_CONTROL = frozenset(
 
 
 class RescanKind(IntEnum):
-    """Requests to a Rescanner, a message that only afspm has."""
+    """The kinds of a request to the component Rescanner, in a message that only afspm has."""
 
     AGAIN = 1
     """Scan the same region again."""
