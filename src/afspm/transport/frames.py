@@ -34,7 +34,7 @@ def contents(frames: Sequence[zmq.Frame]) -> list[Buffer]:
 
 
 def send_frames(socket: Socket, frames: Sequence[bytes]) -> bool:
-    """Send a whole message; return False if no peer can take it. Never blocks.
+    """Send a whole message; return False if no peer can take the message. Never blocks.
 
     Raises:
         zmq.ZMQError: the addressed peer is gone, on sockets that report it.
@@ -52,8 +52,8 @@ def send_packet(socket: Socket, packet: Packet, stamp: bytes | None, *, topic: b
     """Publish a packet; a received payload is sent from its own buffer.
 
     Args:
-        stamp: the third frame; None: the packet has two.
-        topic: frame before the envelope.
+        stamp: the third frame, a serialised time; None: the packet has two frames.
+        topic: frame before the envelope, for a replay to one subscriber; None: no such frame.
     """
     payload: Buffer | zmq.Frame = packet.payload
     if isinstance(payload, memoryview):
