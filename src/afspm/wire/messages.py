@@ -342,7 +342,7 @@ def known_messages() -> tuple[str, ...]:
 
 
 def messages_of_the_experiment() -> tuple[str, ...]:
-    """Return the names of messages about sample, microscope and control; others concern processes and logs."""
+    """Return the names of all messages except those about processes, requests, logs, progress, sweeps and notes."""
     beside = journal_pb2.DESCRIPTOR.name
     return tuple(name for name, one in _declared.items() if one.type.DESCRIPTOR.file.name != beside)
 
