@@ -374,7 +374,9 @@ class Scope(ExperimentView):
         return self._control.held
 
     def flag(self, problem: int | str) -> None:
-        """Flag a problem, by name or number: until the flag is cleared, only a solver of the problem has control.
+        """Flag a problem, by name or number.
+
+        Until the flag is cleared, only components that solve a flagged problem get control.
 
         Raises:
             ExperimentEnded: the experiment has ended; the flag is sent all the same, for the record.
