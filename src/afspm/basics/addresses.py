@@ -56,7 +56,7 @@ def connectable(bind: str) -> str:
 class Listens:
     """Annotation of a setting that holds a listening address, or a port (0: any free port).
 
-    `afspm check` uses the annotation to find two components that listen at one address.
+    `afspm check` uses the annotation to find two components that listen at the same address.
 
     Attributes:
         host: for a port, the setting that names the host; empty: this computer only.

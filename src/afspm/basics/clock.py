@@ -80,9 +80,9 @@ _BOOT = Path("/proc/sys/kernel/random/boot_id")
 def monotonic_id() -> str:
     """Return an id for the origin of `time.monotonic()`: this computer, its boot, and the clock that Python reads.
 
-    In one boot all processes share one origin: the function is "system-wide" by Python's documentation (since 3.5;
-    on macOS since 3.10), but which of Windows' clocks it reads depends on the version of Python. Only Linux gives a
-    boot an identity. Elsewhere the computer's name is enough, as no run passes such times to the next one.
+    All processes of one boot share the origin: Python's documentation calls the function system-wide (since 3.5; on
+    macOS since 3.10). On Windows the clock that Python reads depends on the version of Python. Only Linux gives a boot
+    an identity. Elsewhere the computer's name is enough, since no run passes times of this clock to another run.
     """
     boot = ""
     if sys.platform == "linux":  # Wine shows the file only to processes on its drive Z:
@@ -104,7 +104,7 @@ _CHECKSUM = struct.Struct("<I")
 
 
 class SharedSimulationTime:
-    """Simulated time that the processes of a run share in a small file, and that slows down for late processes.
+    """Simulated time, shared by the processes of a run in a small file; it slows down for late processes.
 
     While a process is late, experiment time passes as fast as real time; otherwise at the speed of the run. A late
     process writes the start of the slow period and its latest end into the file.

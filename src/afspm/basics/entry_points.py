@@ -87,7 +87,7 @@ def class_path(name: str) -> str | None:
     """Return the full path of a declared class, "package.module.Name"; None if no package declares the name.
 
     Raises:
-        ConfigError: two packages declare the name.
+        ConfigError: the name is declared for different classes.
     """
     point = find(name, *CLASSES)
     return None if point is None else f"{point.module}.{point.attr}"
@@ -108,7 +108,7 @@ def load(group: str, name: str) -> Any:
     """Import and return the object declared under a name; None if no package declares the name.
 
     Raises:
-        ConfigError: the module can't be imported, or two packages declare the name.
+        ConfigError: the module can't be imported, or the name is declared for different objects.
     """
     point = find(name, group)
     return None if point is None else _loaded(point)
@@ -118,7 +118,8 @@ def required(group: str, name: str) -> Any:
     """Import and return an object that afspm itself declares.
 
     Raises:
-        ConfigError: no package declares the name, its module can't be imported, or two packages declare it.
+        ConfigError: no package declares the name, the module can't be imported, or the name is declared for different
+            objects.
     """
     found = load(group, name)
     if found is None:
@@ -127,7 +128,11 @@ def required(group: str, name: str) -> Any:
 
 
 def folder(group: str, name: str) -> Path | None:
-    """Return the folder of the module of a declared object, without importing the module; None if not found."""
+    """Return the folder of the module of a declared object, without importing the module; None if not found.
+
+    Raises:
+        ConfigError: the name is declared for different objects.
+    """
     point = find(name, group)
     spec = None if point is None else find_spec(point.module)
     return None if spec is None or spec.origin is None else Path(spec.origin).parent

@@ -10,6 +10,7 @@ from afspm.basics.clock import utc_time
 
 _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"),
              (1e-12, "p"), (1e-15, "f"))  # fmt: skip
+# all other units (px, deg, min, %) are shown without a prefix
 PREFIXABLE = frozenset(
     {"m", "V", "A", "s", "N", "Hz", "W", "F", "m/s", "m/V", "V/m", "C", "S", "Pa", "Ohm", "Ω", "T", "g"}
 )
@@ -37,7 +38,7 @@ def duration_text(seconds: float) -> str:
 
 
 def lengths_text(values_m: Sequence[float], joined: str = ", ") -> str:
-    """Return lengths as text, in the unit that suits the largest, in the notation of experiment files.
+    """Return lengths as text in the unit that suits the largest length, in the notation of experiment files.
 
     >>> lengths_text([5e-7, 2.5e-7], " x ")
     '500 x 250 nm'

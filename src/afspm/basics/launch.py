@@ -5,8 +5,9 @@ language. Standard input then stays open: its end means that the parent is gone,
 
 On the heartbeat socket a process sends `[beat, age, longest, token]`: the byte 0 (alive) or 1 (closing on purpose),
 the age of the current step in s (ASCII; 0 when idle), the longest duration of a step in s (ASCII), and
-`beat_token`. All but the first are optional. The second and third distinguish a busy process from a frozen one. After
-the first beat with a token, beats without the token are ignored, so that no other process can beat in its place.
+`beat_token`. All frames but the first are optional. The second and third distinguish a busy process from a frozen
+process. After the first beat with the token, beats without the token are ignored, so that no other process can beat in
+its place; for a process of a Python class the first beat already needs the token.
 """
 
 from __future__ import annotations

@@ -151,7 +151,7 @@ def convert(value: Number, unit_from: str, unit_to: str) -> Number:
     """Convert `value` (a float or an array) from one unit to another.
 
     Raises:
-        UnitError: a unit is unknown, or the two are of different kinds.
+        UnitError: a unit is unknown, or the units are of different kinds.
     """
     if unit_from == unit_to:
         return value

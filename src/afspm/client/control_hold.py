@@ -115,7 +115,7 @@ class ControlHold:
             link.log.info("in control")
 
     def release_inherited(self) -> None:
-        """Release control that the component held before its restart, unless it needs control now."""
+        """Release control held since before a restart of the component, unless the component needs control now."""
         state = self._link.view.control
         if state is not None and state.holder == self._link.name and not self._wanted and not self.held:
             self._link.send_only(ControlRequest.RELEASE_CTRL)

@@ -1,4 +1,4 @@
-"""One scan or spectrum, followed through the published packets. Pure: packets in, an outcome out."""
+"""One scan or spectrum, followed through the published packets to its outcome, without input or output."""
 
 from __future__ import annotations
 

@@ -242,8 +242,8 @@ class Scope(ExperimentView):
 
         Args:
             value: a number in `unit` (default: SI), a quantity as text ("0.5 V"), True, "on" …
-            wait: for a parameter of another instrument, such as a temperature: wait until it has arrived at `value`,
-                and return the measured value. The wait needs no control.
+            wait: whether to wait until a parameter of another instrument, such as a temperature, has arrived at
+                `value`. The call then returns the measured value. The wait needs no control.
 
         Raises:
             NoResponse: with `wait`, the target was changed meanwhile, or was not reached within the timeout.
@@ -404,7 +404,7 @@ class Scope(ExperimentView):
         self._ask_scheduler(ControlRequest.SET_CONTROL_MODE, int(mode))
 
     def restart(self, process: str) -> None:
-        """Restart a process of the experiment, even one that was given up."""
+        """Restart a process of the experiment, even a process that was given up."""
         self._ask_scheduler(RESTART_REQUEST, process)
 
     def approval_facts(self) -> Plain:

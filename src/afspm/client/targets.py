@@ -1,4 +1,4 @@
-"""Targets: a scan or spectrum to take, and the check of published results against it. Pure."""
+"""Targets: a scan or spectrum to take, and the check of published results against the target."""
 
 from __future__ import annotations
 

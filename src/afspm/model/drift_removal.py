@@ -45,7 +45,7 @@ def _per_scan_m(region: Region, velocity_m_s: XY, duration_s: float, *, upwards:
 
 
 def _interpolated(values: Array, row: Array, column: Array) -> Array:
-    # NaN outside, and wherever a neighbour is NaN
+    # NaN outside, and wherever a neighbour is NaN; with a tolerance, so that rounding makes no border pixel NaN
     from scipy.ndimage import distance_transform_edt, map_coordinates
 
     ny, nx = values.shape

@@ -13,11 +13,11 @@ from afspm.model.requests import WAIT_FOR_CONTROL, ControlRequest, ControlRespon
 from afspm.model.state import ControlMode
 
 SUPERVISOR = "supervisor"
-"""Owner of the key that allows reports on processes; each supervisor adds ":" and its own suffix."""
+"""Owner of the key that allows reports on processes. A supervisor's own name is "supervisor:" and a suffix."""
 LOGGED_AS = "afspm"
 """Name of the supervisor's own log lines."""
 LONGEST_ANNOUNCEMENT = 256 * 1024
-"""Most bytes of log lines that a supervisor sends in one message."""
+"""Largest size, in bytes, of a message that the scheduler publishes for another process."""
 PERSON = ":"
 """The separator between a component and the person for whom the component acts: "dashboard:Ada"."""
 LONGEST_PROCESS_NAME = 100
@@ -156,7 +156,7 @@ class ProcessState:
 
 @dataclass(frozen=True, slots=True)
 class ProcessStates:
-    """The states of all processes of one supervisor; each computer of a run has one supervisor."""
+    """The states of all processes of one supervisor. A run has one supervisor for each `afspm run` that takes part."""
 
     time_ns: int
     supervisor: str

@@ -44,7 +44,7 @@ class Epoch:
 
 
 class SchedulerFence:
-    """The decision whether a translator obeys a sender.
+    """A guard that decides which senders a translator obeys.
 
     Args:
         run: the identity of the translator's run; empty: the first scheduler is obeyed while it stays connected.
@@ -60,7 +60,7 @@ class SchedulerFence:
         """Return the reason for refusing a sender; empty if the translator obeys it.
 
         Args:
-            epoch: epoch in the request; None without one.
+            epoch: epoch of the request; None for a request without an epoch.
             run: identity of the run in the id of a component's own request; empty: unknown.
             is_connected: returns whether the scheduler that was obeyed last is still connected.
         """

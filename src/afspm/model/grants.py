@@ -1,4 +1,4 @@
-"""Approvals of persons for agents: of one plan, or a grant within whose bounds an agent measures by itself."""
+"""Approvals of persons for agents: of one plan, or grants, which are bounds for measurements without a plan."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class GrantedRange:
 
 @dataclass(frozen=True, slots=True)
 class GrantedCount:
-    """An action, and how often it may be used."""
+    """An action, and the largest number of its uses."""
 
     action: str
     count: int
@@ -145,7 +145,7 @@ class Approvals:
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """A plan that an agent proposes, frozen.
+    """A plan that an agent proposes; after the proposal the plan no longer changes.
 
     Attributes:
         who: "component:name".

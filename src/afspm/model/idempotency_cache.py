@@ -32,7 +32,7 @@ class RequestStatus(Enum):
     UNKNOWN = auto()
     """Sent, with an unknown outcome."""
     FORGOTTEN = auto()
-    """At or below the floor of its session: it may have been carried out."""
+    """The number is at or below the floor of its session: the request may have been carried out."""
 
 
 _Outcomes = Mapping[str, tuple[int, RequestStatus | Response]]
@@ -47,7 +47,7 @@ _Shelf = tuple[str, bool]
 
 @dataclass(frozen=True)
 class Floors:
-    """The highest forgotten number of each session: ids at or below it are never new.
+    """The highest forgotten number of each session: ids at or below this number are never new.
 
     Attributes:
         most: maximum number of sessions.

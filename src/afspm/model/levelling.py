@@ -1,4 +1,4 @@
-"""Levelling of scans: subtract a polynomial surface fitted to the heights. Pure.
+"""Levelling of scans: pure functions that subtract a polynomial surface fitted to the heights.
 
 Heights are fitted over x and y from -1 to 1, so that the result does not depend on the scan's size. NaN (not measured)
 is left out of the fit.

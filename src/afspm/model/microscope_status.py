@@ -9,20 +9,20 @@ from afspm.basics.frozen import replace
 from afspm.model import Feedback, Parameter, Request, ScopeState, names
 
 FEEDBACK_OFF = "feedback-off"
-"""Name, among the dangerous states, of a feedback that is known to be off."""
+"""The name in `dangerous` for a feedback that is known to be off."""
 STOPS = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
 """Actions that stop a running scan or spectrum."""
 STARTS = {names.START_SCAN: names.STOP_SCAN, names.START_SPEC: names.STOP_SPEC}
-"""Actions that start a scan or spectrum, with the actions that stop it."""
+"""Actions that start a scan or spectrum, each with the action that stops it."""
 _OFF = names.OFF_WORDS | {"0.0"}  # translators of other makes may take a number
 
 
 @dataclass(frozen=True)
 class TipRisk:
-    """The part of the status that endangers the tip; it survives a restart.
+    """The part of the status that shows a danger to the tip; kept over a restart.
 
     Attributes:
-        state: the last known state; a microscope continues in it after the loss of its controller.
+        state: the last known state, which lasts even after the loss of the controller.
         feedback_on: None if unknown.
         tip_away: whether the tip is withdrawn, so that neither the coarse motor nor a switched-off feedback does harm.
     """

@@ -118,7 +118,7 @@ def changes_by(values: Iterable[tuple[str, float]]) -> list[PositionChange | Sca
     """Return the changes of probe and scan by single parameters that are set together.
 
     Raises:
-        InvalidValue: a number of pixels that is not a whole number.
+        InvalidValue: a number of pixels is not a whole number, or below 1.
     """
     given: dict[type, Plain] = {}
     for name, value in values:

@@ -202,7 +202,9 @@ class Scan:
         vmin: float | None = None,
         vmax: float | None = None,
     ) -> Axes:
-        """Draw the scan with matplotlib: with a scale bar, and a colour bar with units.
+        """Draw the scan with matplotlib; an image or contours get a scale bar, and a colour bar with units.
+
+        Only the first scan drawn into the axes gets these bars.
 
         Args:
             kind: "image", "contour" or "surface" (in three dimensions).
@@ -217,7 +219,7 @@ class Scan:
             `axes.plot(*spectrum.position_m, "o")`, appears at its measured position.
 
         Raises:
-            InvalidValue: there is no such kind, or nothing was measured.
+            InvalidValue: there is no such kind, nothing was measured, or `vmin` is above `vmax`.
         """
         drawn: Axes = required(DISPLAYS, "plot")(self, kind, axes, colorbar=colorbar, vmin=vmin, vmax=vmax)
         return drawn
@@ -235,7 +237,8 @@ class Scan:
         """Return a two-dimensional `sidpy.Dataset` as a scan; axes in any unit of length.
 
         Raises:
-            InvalidValue: the data are not an image, or the axes are not lengths.
+            InvalidValue: the data are not an image, or an axis has only one value.
+            UnitError: an axis is not a length.
         """
         scan: Scan = required(DISPLAYS, "from_sidpy")(dataset)
         return scan

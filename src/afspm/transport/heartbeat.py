@@ -24,8 +24,8 @@ class Heartbeat(NamedTuple):
     Attributes:
         name: name of the process.
         closing: whether the process ends on purpose, so that no more heartbeats follow.
-        step_age_s: age of the current step; 0 when idle. None if the process does not send it.
-        longest_step_s: longest allowed step; None if the process does not send it.
+        step_age_s: age of the current step in real time; 0 when idle, None if missing.
+        longest_step_s: longest allowed duration of a step; None if missing.
     """
 
     name: str

@@ -337,7 +337,7 @@ class Authenticator:
         self._names, self._read_ns = {**found, **self._names}, changed_ns
 
     def close(self) -> None:
-        """Stop the thread; the context must be closed after it."""
+        """Stop the thread. Close the context only afterwards."""
         self._stop.post()
         self._thread.join()
         self._stop.close()

@@ -28,7 +28,7 @@ MAX_REQUEST_BYTES = 1024 * 1024
 HAS_PRIVATE_SOCKETS = sys.platform != "win32" and zmq.has("ipc")
 """Whether the system has unix sockets, and modes of folders to protect them."""
 QUEUE_LENGTH = 4000
-"""Limit of waiting messages for one peer; a publisher drops further ones."""
+"""Limit of waiting messages for one peer; a publisher drops further messages."""
 
 _LINGER_MS = 200
 # ZMTP heartbeats: a peer that is frozen or cut off is noticed within seconds, not after hours as by TCP.
@@ -147,7 +147,7 @@ class Network:
         """Bind a socket, and return its address, with the chosen port if `address` has port 0.
 
         Args:
-            requests: peers send requests to this socket, so that they must prove their names.
+            requests: whether peers send requests to this socket, and so must prove their names.
 
         Raises:
             TransportError: the address is taken, malformed, or not of this computer.

@@ -68,7 +68,7 @@ class MessageDeclaration:
         type: the generated class.
         kind: see `MessageKind`.
         source: role of the process that publishes the message; None: only published on behalf of another process.
-        always: whether every process of this role can be expected to publish the message.
+        always: whether `afspm check` assumes that every process of this role publishes the message.
         named: whether an envelope continues after the message's name with size and channel, kind or owner.
         history: number of packets for each envelope that the scheduler keeps for late joiners.
         handler: method of a `Component` and of an `Overview` for this message.
