@@ -85,7 +85,7 @@ class RecordedPort:
 
     Args:
         wants: returns whether the component has a handler for a packet.
-        handled: returns the packet that is being handled.
+        handled: returns the packet of the running handler; None outside of handlers.
     """
 
     def __init__(

@@ -73,7 +73,8 @@ class Scope(ExperimentView):
         ExperimentEnded: the experiment has ended.
 
     Args:
-        link: link to the experiment.
+        link: connection to the experiment.
+        problems: the problems of the experiment by name; None: only those of every experiment.
         state_dir: folder for keyed measurements; None: only in memory.
         between: called after each outermost call, outside any measurement.
         frame: coordinate system of all places.

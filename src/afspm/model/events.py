@@ -96,7 +96,7 @@ class JournalEntry:
         request: the number of the ControlRequest; None without a request, or for an unreadable one.
         problem: the number of the flagged or cleared problem; for a CONTROL_GAINED, of the problem to solve.
         mode: the new mode, for a MODE_CHANGED.
-        late: the answer came after the client had received a NO_RESPONSE.
+        late: whether the answer came after the client had received a NO_RESPONSE.
         sent_ns: time of forwarding to the translator; None for requests that the scheduler answers.
         key: key of the measurement that the request starts; empty without a key.
         subject: the action, or the parameter to set; empty for other requests.
@@ -125,7 +125,7 @@ class JournalEntry:
     def refused(self) -> bool:
         """Return whether a request was refused.
 
-        A wait for control or for a busy microscope and a missing answer are not refusals.
+        A request that has to wait, for control or for a busy microscope, and a request without an answer are not.
         """
         waits = self.request == ControlRequest.REQUEST_CTRL and self.response in WAIT_FOR_CONTROL
         return not waits and self.response not in _NOT_REFUSED
@@ -208,7 +208,7 @@ class Progress:
 
 
 class HasTime(Protocol):
-    """A measurement with the time of its end; None if unknown."""
+    """A measurement with the time of its end, ns since the Unix epoch; None if unknown."""
 
     @property
     def time_ns(self) -> int | None: ...
@@ -249,8 +249,8 @@ class MeasurementSettings:
 
     Attributes:
         who: the component.
-        parameters: empty if its next measurements are not part of a sweep.
-        key: the key of the measurement, if it is taken exactly once.
+        parameters: empty if the component's next measurements are not part of a sweep.
+        key: key of the measurement; empty without a key.
     """
 
     time_ns: int

@@ -28,7 +28,7 @@ class RequestStatus(Enum):
     """The state of a request without an answer to repeat."""
 
     PENDING = auto()
-    """Waiting, or sent to the translator: a repetition gets the same answer."""
+    """Waiting, or sent to the translator: a repetition gets the answer to the first request."""
     UNKNOWN = auto()
     """Sent, with an unknown outcome."""
     FORGOTTEN = auto()

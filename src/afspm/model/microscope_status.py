@@ -93,7 +93,7 @@ class MicroscopeStatus:
         return replace(changed, feedback_before=self.risk.feedback_on, in_doubt=True)
 
     def feedback_was_left(self) -> MicroscopeStatus:
-        """Return the status before `feedback_may_be_off`, after a refusal of the request."""
+        """Return the status with the feedback from before `feedback_may_be_off`, after a refusal of the request."""
         if not self.in_doubt:
             return self
         return replace(self, in_doubt=False)._with_risk(replace(self.risk, feedback_on=self.feedback_before))

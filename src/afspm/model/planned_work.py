@@ -118,7 +118,8 @@ def planned_rounds(
 def planned_end_s(works: Iterable[PlannedWork | None]) -> float | None:
     """Return the experiment time until the experiment ends; None if unknown.
 
-    The first work that ends the experiment counts, otherwise the longest; None stands for work without an estimate.
+    The earliest work that ends the experiment decides; without such work, the longest. If the end of a deciding work is
+    unknown, the result is None; a None in `works` is work without an estimate.
     """
     all_works = list(works)
     ending = [work.end_s for work in all_works if work is not None and work.ends_experiment]

@@ -71,7 +71,7 @@ def send_packet(socket: Socket, packet: Packet, stamp: bytes | None, *, topic: b
 def descriptor_of(frame: zmq.Frame) -> int:
     """Return the file descriptor of a message's connection; -1 for peers older than ZMTP 3.
 
-    Only for REQ sockets and plain subscribers, see `router` and `publisher`: the library calls this option obsolete.
+    Only for REQ sockets, see `router`: the library calls this option obsolete.
     """
     try:
         return int(frame.get(zmq.SRCFD))

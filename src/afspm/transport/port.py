@@ -89,7 +89,7 @@ class Port(Protocol):
         """
 
     def publish(self, envelope: str, payload: bytes) -> None:
-        """Publish on the component's own publisher; the packet's experiment time is later than all earlier packets'.
+        """Publish on the component's own publisher, at a later experiment time than each earlier packet.
 
         Raises:
             ConfigError: the component has no address to publish on.
@@ -158,7 +158,7 @@ class ServerPort(Protocol):
         """Return whether the connection of a scheduler with an epoch still exists."""
 
     def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:
-        """Publish a packet; its experiment time is later than the times of all earlier packets.
+        """Publish a packet, at a later experiment time than each earlier packet.
 
         Args:
             time_ns: time of the packet. After a kill, a restarted translator publishes possibly lost packets again,

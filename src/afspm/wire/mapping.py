@@ -319,7 +319,7 @@ MAPPINGS: tuple[MessageMapping[Any], ...] = (
 
 
 def encode_orders(restart: Iterable[str]) -> bytes:
-    """Return the answer to RELAY_REQUEST in bytes: the names of the processes to restart."""
+    """Return the answer to a supervisor's RELAY_REQUEST in bytes: the names of the processes to restart."""
     return journal_pb2.Orders(restart=restart).SerializeToString()
 
 
