@@ -31,7 +31,10 @@ def _has_port(match: re.Match[str]) -> bool:
 
 
 def reaches(connect: str, bind: str) -> bool:
-    """Return whether connecting to `connect` reaches a socket bound to `bind`; a wildcard host matches any."""
+    """Return whether a connection to `connect` reaches a socket bound to `bind`; a wildcard in `bind` matches any host.
+
+    The hosts 127.0.0.1, localhost and [::1] count as equal; other host names are compared as text.
+    """
     if connect == bind:
         return True
     a, b = _ADDRESS.fullmatch(connect), _ADDRESS.fullmatch(bind)
@@ -42,7 +45,10 @@ def reaches(connect: str, bind: str) -> bool:
 
 
 def connectable(bind: str) -> str:
-    """Return the address at which processes on this computer reach a bound socket: a wildcard becomes loopback."""
+    """Return the address at which processes on this computer reach a socket bound to `bind`.
+
+    The wildcard hosts `*` and 0.0.0.0 become loopback.
+    """
     return re.sub(r"^tcp://(\*|0\.0\.0\.0)(?=:)", f"tcp://{LOOPBACK}", bind)
 
 
@@ -50,7 +56,7 @@ def connectable(bind: str) -> str:
 class Listens:
     """Annotation of a setting that holds a listening address, or a port (0: any free port).
 
-    `afspm check` uses the annotation to find two components that listen at one address.
+    `afspm check` uses the annotation to find two components that listen at the same address.
 
     Attributes:
         host: for a port, the setting that names the host; empty: this computer only.

@@ -80,9 +80,9 @@ _BOOT = Path("/proc/sys/kernel/random/boot_id")
 def monotonic_id() -> str:
     """Return an id for the origin of `time.monotonic()`: this computer, its boot, and the clock that Python reads.
 
-    In one boot all processes share one origin: the function is "system-wide" by Python's documentation (since 3.5;
-    on macOS since 3.10), but which of Windows' clocks it reads depends on the version of Python. Only Linux gives a
-    boot an identity. Elsewhere the computer's name is enough, as no run passes such times to the next one.
+    All processes of one boot share the origin: Python's documentation calls the function system-wide (since 3.5; on
+    macOS since 3.10). On Windows the clock that Python reads depends on the version of Python. Only Linux gives a boot
+    an identity. Elsewhere the computer's name is enough, since no run passes times of this clock to another run.
     """
     boot = ""
     if sys.platform == "linux":  # Wine shows the file only to processes on its drive Z:
@@ -96,18 +96,18 @@ def monotonic_id() -> str:
 
 
 LONGEST_LATE_S = 10.0  # real time: a process that is killed while it is late must not slow the rest of the night
-_LOOKS = 1000  # at a file that is being written; after them its writer was killed, and the time before it counts
+_LOOKS = 1000  # reads while another process writes; if none is valid, the writer was killed: the last valid one counts
 _MOST_LATE = 16  # late processes at a time; further ones get no time
-# in ns: real time, experiment time at that moment, until which real time each late process slows the experiment
+# in ns: real time, experiment time at that moment, and for each late process the real time when its slow period ends
 _SHARED = struct.Struct(f"<{2 + _MOST_LATE}q")
 _CHECKSUM = struct.Struct("<I")
 
 
 class SharedSimulationTime:
-    """Simulated time that the processes of a run share in a small file, and that slows down for late processes.
+    """Simulated time, shared by the processes of a run in a small file; it slows down for late processes.
 
     While a process is late, experiment time passes as fast as real time; otherwise at the speed of the run. A late
-    process writes the begin of the slow period and its latest end into the file.
+    process writes the start of the slow period and its latest end into the file.
 
     Args:
         path: an existing file.
@@ -122,7 +122,7 @@ class SharedSimulationTime:
         self._last: tuple[int, ...] = (0,) * (2 + _MOST_LATE)
 
     def now_ns(self, real_ns: int, speed: float) -> int:
-        """Return the experiment time at a moment of `time.monotonic_ns`."""
+        """Return the experiment time, ns since the Unix epoch, at the moment `real_ns` of `time.monotonic_ns`."""
         return _shown_ns(self._read(), real_ns, speed)
 
     @contextmanager
@@ -135,7 +135,7 @@ class SharedSimulationTime:
             self._change(mine_ns, 0, speed)
 
     def _change(self, before_ns: int, after_ns: int, speed: float) -> None:
-        # one of the moments until which time is slow replaces another, and the moment of writing becomes the new origin
+        # the end of one slow period is replaced, and the moment of writing becomes the new origin
         with self._turn, locked(self._file):
             real_ns, (since_ns, shown_ns, *until_ns) = time.monotonic_ns(), self._read()
             shown_ns = _shown_ns((since_ns, shown_ns, *until_ns), real_ns, speed)
@@ -178,13 +178,14 @@ def _waiting_in(path: str | None) -> SharedSimulationTime | None:
 class ExperimentClock:
     """Clock of a run: experiment time = start + (real time - origin) · speed.
 
-    All processes of a run get the same origin, start and speed, and on one computer the same anchor of real time. So
-    their clocks agree, whenever a process starts, and after any change of the system clock.
+    All processes of a run get the same origin, start and speed, and on one computer the same anchor of real time. So on
+    one computer their clocks agree, whenever a process starts, and after any change of the system clock. A clock that
+    waits for late processes (`waiting_in`) reads the experiment time from a shared file instead.
 
     Attributes:
         origin_s: real time, s since the Unix epoch, at which the run began.
         start_s: experiment time at that moment, s since the Unix epoch.
-        speed: experiment seconds in a real second; 1 on a real microscope.
+        speed: experiment seconds per real second; 1 on a real microscope.
     """
 
     origin_s: float = 0.0
@@ -206,7 +207,11 @@ class ExperimentClock:
 
     @classmethod
     def from_dict(cls, values: PlainMapping) -> ExperimentClock:
-        """Return the clock that an `as_dict` table describes; the real-time clock for an empty table."""
+        """Return the clock that an `as_dict` table describes; the real-time clock for an empty table.
+
+        Raises:
+            ConfigError: the clock waits for late processes, and the table is from another computer.
+        """
         if not values:
             return cls.real()
         times = (float(values["origin_s"]), float(values["start_s"]), float(values["speed"]))
@@ -233,7 +238,7 @@ class ExperimentClock:
         }
 
     def waiting_in(self, path: Path) -> ExperimentClock:
-        """Return a clock that waits for late processes through a shared file; unchanged at real speed.
+        """Return a clock that waits for late processes through a shared file; unchanged at speed 1 or below.
 
         Args:
             path: file that the processes of the run share.
@@ -247,7 +252,7 @@ class ExperimentClock:
         """Slow the experiment's time down to real time while the block runs, for at most `LONGEST_LATE_S`.
 
         Use it around work that takes computing time but no experiment time: starting a scan that is due, or
-        registering a finished scan. Without effect at speed 1.
+        registering a finished scan. Without effect unless the clock is from `waiting_in`.
         """
         return nullcontext() if self._waiting is None else self._waiting.late(self.speed)
 

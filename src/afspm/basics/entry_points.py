@@ -8,7 +8,7 @@ One line declares one class::
 
 | comes in | the metadata of all installed packages, read once per process, since reading takes milliseconds |
 | goes out | names, paths of classes, loaded objects, and for `afspm doctor` an inventory |
-| always holds | nothing is imported until its name is used; a name that two packages declare is refused |
+| always holds | nothing is imported until its name is used; a name declared for different objects is refused |
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def find(name: str, *groups: str) -> EntryPoint | None:
     """Return the entry point with this name in one of the groups; None if no package declares the name.
 
     Raises:
-        ConfigError: two packages declare the name.
+        ConfigError: the name is declared for different objects.
     """
     # by value: two packages may declare the same object
     found = {point.value: point for point in _points(groups) if point.name == name}
@@ -87,7 +87,7 @@ def class_path(name: str) -> str | None:
     """Return the full path of a declared class, "package.module.Name"; None if no package declares the name.
 
     Raises:
-        ConfigError: two packages declare the name.
+        ConfigError: the name is declared for different classes.
     """
     point = find(name, *CLASSES)
     return None if point is None else f"{point.module}.{point.attr}"
@@ -108,7 +108,7 @@ def load(group: str, name: str) -> Any:
     """Import and return the object declared under a name; None if no package declares the name.
 
     Raises:
-        ConfigError: the module can't be imported, or two packages declare the name.
+        ConfigError: the module can't be imported, or the name is declared for different objects.
     """
     point = find(name, group)
     return None if point is None else _loaded(point)
@@ -118,7 +118,8 @@ def required(group: str, name: str) -> Any:
     """Import and return an object that afspm itself declares.
 
     Raises:
-        ConfigError: no package declares the name, its module can't be imported, or two packages declare it.
+        ConfigError: no package declares the name, the module can't be imported, or the name is declared for different
+            objects.
     """
     found = load(group, name)
     if found is None:
@@ -127,14 +128,20 @@ def required(group: str, name: str) -> Any:
 
 
 def folder(group: str, name: str) -> Path | None:
-    """Return the folder of the module of a declared object, without importing the module; None if not found."""
+    """Return the folder of the module of a declared object, without importing the module; None if not found.
+
+    Raises:
+        ConfigError: the name is declared for different objects.
+    """
     point = find(name, group)
     spec = None if point is None else find_spec(point.module)
     return None if spec is None or spec.origin is None else Path(spec.origin).parent
 
 
 def inventory(taken_commands: Collection[str] = ()) -> tuple[DeclaredName, ...]:
-    """Load every declared object, and return all declared names with the reasons why some can't be used.
+    """Load the declared objects; return all declared names, each with the reason if it can't be used.
+
+    Names in unknown groups and names of afspm's own commands are not loaded.
 
     Args:
         taken_commands: afspm's own commands, which no package can replace.

@@ -86,7 +86,7 @@ class ErrorCollector:
                 check(name)
         errors.raise_all()
 
-    An AfspmError ends its block, and the code after the block goes on.
+    An AfspmError ends its block, and the code after the block still runs. Other exceptions pass.
     """
 
     def __init__(self) -> None:
@@ -194,7 +194,7 @@ class MeasurementFailed(NoResponse):
 
 
 class ControlLost(RequestError):
-    """Loss of control, raised for a caller that does not wait to regain control."""
+    """Missing control: not given in time, lost in an unbroken block, or without the problem to solve."""
 
     code = "control-lost"
 

@@ -16,7 +16,7 @@ def lock(file: IO[bytes], *, shared: bool = False, wait: bool = False) -> None:
         wait: wait until another process releases the lock, on Windows for at most ten seconds.
 
     Raises:
-        OSError: another process holds the lock.
+        OSError: another process holds the lock, with `wait` on Windows even after ten seconds.
     """
     if sys.platform == "win32":
         import msvcrt

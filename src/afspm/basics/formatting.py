@@ -10,6 +10,7 @@ from afspm.basics.clock import utc_time
 
 _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"),
              (1e-12, "p"), (1e-15, "f"))  # fmt: skip
+# all other units (px, deg, min, %) are shown without a prefix
 PREFIXABLE = frozenset(
     {"m", "V", "A", "s", "N", "Hz", "W", "F", "m/s", "m/V", "V/m", "C", "S", "Pa", "Ohm", "Ω", "T", "g"}
 )
@@ -37,7 +38,7 @@ def duration_text(seconds: float) -> str:
 
 
 def lengths_text(values_m: Sequence[float], joined: str = ", ") -> str:
-    """Return lengths as text, in the unit that suits the largest, in the notation of experiment files.
+    """Return lengths as text in the unit that suits the largest length, in the notation of experiment files.
 
     >>> lengths_text([5e-7, 2.5e-7], " x ")
     '500 x 250 nm'
@@ -76,7 +77,7 @@ def typeset(text: str) -> str:
 
 
 def time_of_day(time_ns: int, zone: tzinfo | None = None, *, seconds: bool = True) -> str:
-    """Return a time of day, "22:04:31"; without a zone in the zone of this computer."""
+    """Return a time (ns since the Unix epoch) as a time of day, "22:04:31"; without `zone` in this computer's zone."""
     return f"{_moment(time_ns, zone):{'%H:%M:%S' if seconds else '%H:%M'}}"
 
 
@@ -112,7 +113,10 @@ def _moment(time_ns: int, zone: tzinfo | None) -> datetime:
 
 
 def scale(largest: float, unit: str) -> tuple[float, str]:
-    """Return (factor, unit with prefix) that suit numbers up to `largest`: shown = value * factor."""
+    """Return (factor, prefixed unit) to show numbers up to `largest`, a number in `unit`: shown = value * factor.
+
+    The factor is 1 for a unit that takes no prefix, and for a `largest` of zero, NaN or infinity.
+    """
     if unit not in PREFIXABLE or not math.isfinite(largest) or largest == 0.0:
         return 1.0, unit
     # a number that rounds up to a thousand, as 999.6 nm in three digits, belongs to the next prefix
@@ -122,7 +126,7 @@ def scale(largest: float, unit: str) -> tuple[float, str]:
 
 
 def quantity(value: float | None, unit: str, digits: int = 4) -> str:
-    """Return a number with its unit, "12.34 nm"; "–" if there is no number."""
+    """Return a number with its unit, "12.34 nm"; "–" for None, NaN and infinity."""
     if value is None or not math.isfinite(value):
         return "–"
     factor, shown = scale(value, unit)

@@ -12,7 +12,10 @@ if TYPE_CHECKING:
 else:
 
     def replace(part: T, /, **changes: object) -> T:
-        """Return a copy of a dataclass with some fields changed, without a call of `__post_init__`."""
+        """Return a copy of a dataclass with some fields changed, without a call of `__post_init__`.
+
+        A class with slots is copied by `dataclasses.replace`, which calls `__post_init__`.
+        """
         if not hasattr(part, "__dict__"):
             return dataclasses.replace(part, **changes)
         copy = object.__new__(type(part))

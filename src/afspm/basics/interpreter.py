@@ -18,7 +18,8 @@ def python_environment() -> Mapping[str, str]:
     """Return the environment variables to add for `python_command`.
 
     In a virtual environment of Windows `sys.executable` is only a launcher with another process number, which starts
-    the real Python. afspm starts the real Python directly; this variable names its virtual environment.
+    the real Python. afspm starts the real Python directly; the variable `__PYVENV_LAUNCHER__` names the virtual
+    environment.
     """
     return {} if _executable() == sys.executable else {"__PYVENV_LAUNCHER__": sys.executable}
 

@@ -1,12 +1,13 @@
 """The launch line: one JSON line on standard input that gives a process its part in an experiment.
 
 The same line goes to Python components (`python -m afspm.supervisor.host`) and to commands in any other
-language. Standard input then stays open: its end means that the parent is gone or stops the process.
+language. Standard input then stays open: its end means that the parent is gone, or stops the process.
 
 On the heartbeat socket a process sends `[beat, age, longest, token]`: the byte 0 (alive) or 1 (closing on purpose),
 the age of the current step in s (ASCII; 0 when idle), the longest duration of a step in s (ASCII), and
-`beat_token`. All but the first are optional. The second and third distinguish a busy process from a frozen one. After
-the first beat with a token, beats without the token are ignored, so that no other process can beat in its place.
+`beat_token`. All frames but the first are optional. The second and third distinguish a busy process from a frozen
+process. After the first beat with the token, beats without the token are ignored, so that no other process can beat in
+its place; for a process of a Python class the first beat already needs the token.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ class Launch:
     sample_coordinates: bool = False
     """Positions are sample coordinates, which the scheduler maps to tip coordinates."""
     retracts: bool = False
-    """For a translator: retract the tip if standard input ends while the run has the feedback switched off."""
+    """For a translator: retract the tip if standard input ends while a request of the run keeps the feedback off."""
     adjustable: tuple[str, ...] = ()
     """For a translator: parameters that may be set during a scan."""
     solved: tuple[str, ...] = ()
@@ -95,7 +96,8 @@ class Launch:
         """Parse a launch line.
 
         Raises:
-            ConfigError: the line is not JSON, or an entry is unknown or of the wrong type.
+            ConfigError: the line is no JSON object, the name is missing, or an entry is unknown, negative or of the
+                wrong type.
         """
         try:
             plain = json.loads(line)

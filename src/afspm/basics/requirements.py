@@ -1,4 +1,4 @@
-"""Check of the packages that a class lists in its attribute `requires`, beyond a plain install of afspm.
+"""Check of the packages that a class needs beyond a plain install of afspm: its attribute `requires`.
 
     class Ridges(Component):
         requires = ("afspm[features]", "torch>=2.4")
@@ -20,7 +20,8 @@ def require(class_: object) -> None:
     """Check that the packages a class requires are installed.
 
     Raises:
-        ConfigError: a package is missing, or has another version; the hint is the command that installs it.
+        ConfigError: a package is missing or has another version, with the command that installs it as the hint; or a
+            requirement is malformed.
     """
     wanted = getattr(class_, ATTRIBUTE, ())
     require_installed(getattr(class_, "__name__", str(class_)), *((wanted,) if isinstance(wanted, str) else wanted))

@@ -86,7 +86,7 @@ DIMENSIONS: Final[Mapping[str, Dimension]] = {
     "s": Dimension("a time", "15 min"),
     "Hz": Dimension("a frequency", "2 kHz"),
 }
-"""Dimensions by SI unit. A number without a unit is in SI: the bounds refuse 400 as a length, since it means 400 m."""
+"""Dimensions by SI unit. A number without a unit is in SI, so 400 as a length means 400 m; the bounds refuse it."""
 
 
 @dataclass(frozen=True)
@@ -94,10 +94,11 @@ class Unit:
     """Annotation of a float setting that the experiment file may give as text with a unit.
 
     Attributes:
-        si: the SI unit that the component gets, e.g. "m".
-        is_written: the file must give a unit, since a plain number is ambiguous (seconds or minutes).
+        si: the SI unit of the component's value, e.g. "m".
+        is_written: whether the file must give a unit, since a plain number is ambiguous (seconds or minutes). Zero
+            needs no unit.
         least: the smallest value, in the SI unit.
-        above: exclusive lower bound of the values.
+        above: exclusive lower bound of the values, in the SI unit.
     """
 
     si: str
@@ -115,7 +116,8 @@ class Unit:
         """Convert a value of the experiment file to the SI unit; a number without a unit is in SI.
 
         Raises:
-            UnitError: not a finite number, an unknown unit, a unit of another kind, or a required unit is missing.
+            UnitError: not a finite number, an unknown unit, a unit of another kind, a required unit is missing, or a
+                value out of range.
         """
         if isinstance(value, bool) or not isinstance(value, str | float | int):
             raise UnitError(f"{value!r} is not a quantity", hint=_hint(self.si))
@@ -149,7 +151,7 @@ def convert(value: Number, unit_from: str, unit_to: str) -> Number:
     """Convert `value` (a float or an array) from one unit to another.
 
     Raises:
-        UnitError: a unit is unknown, or the two are of different kinds.
+        UnitError: a unit is unknown, or the units are of different kinds.
     """
     if unit_from == unit_to:
         return value
@@ -181,7 +183,8 @@ def si(value: str | float, unit: str) -> float:
     """Convert a quantity as text ("2.5 um"), or a number in SI, to a float in the SI unit `unit`.
 
     Raises:
-        UnitError: not a number, an unknown unit, a unit of another kind than `unit`, or a required unit is missing.
+        UnitError: not a number, an unknown unit, a unit of another kind than `unit`, or a number without a unit that is
+            implausibly large (`Dimension.largest_plain`).
     """
     if isinstance(value, bool):
         raise UnitError(f"{value} is not a number in {unit}")
@@ -199,7 +202,7 @@ def si_or_text(value: float | str, unit: str) -> float:
     """Convert a number in the SI unit `unit`, or a text with a unit, to a float in `unit`.
 
     Raises:
-        UnitError: text without a unit, or with an unknown unit.
+        UnitError: text without a number or a unit, or with a unit that is unknown or of another kind.
         TypeError, ValueError: neither a number nor text.
     """
     if not isinstance(value, str):
@@ -213,7 +216,7 @@ def require_unit(number: float, unit: str) -> None:
     """Refuse a number without a unit that is implausibly large in `unit`.
 
     Raises:
-        UnitError: the number is above `Dimension.largest_plain`.
+        UnitError: the amount of the number is above `Dimension.largest_plain`.
     """
     dimension = DIMENSIONS.get(unit)
     if dimension is not None and dimension.largest_plain < abs(number) < math.inf:

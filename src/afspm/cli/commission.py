@@ -71,13 +71,13 @@ def _before(file: Path) -> InstrumentReport | None:
 
 
 class Terminal:
-    """A dialogue with the user at this terminal. No answer means no confirmation."""
+    """A dialogue with the user at this terminal. An empty answer is no confirmation."""
 
     def __init__(self) -> None:
         self._console = plain_console()
 
     def show(self, text: str) -> None:
-        """Print a text; if it begins with an empty line, its first line is printed as a title."""
+        """Print a text; after an empty line at its beginning, the next line is printed as a title."""
         title, _, rest = text.removeprefix("\n").partition("\n") if text.startswith("\n") else ("", "", text)
         if title:
             self._console.print(f"\n{title}", style="bold")
@@ -94,7 +94,7 @@ class Terminal:
         """Ask for one of the options, by number or word; an empty answer means the default, if there is one.
 
         Raises:
-            KeyboardInterrupt: no valid answer after several attempts.
+            KeyboardInterrupt: no valid answer after several attempts, or the end of the input.
         """
         numbered = ", ".join(f"{number} {option}" for number, option in enumerate(options, 1))
         if default:

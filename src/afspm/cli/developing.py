@@ -177,8 +177,8 @@ def emulate(
 ) -> None:
     """Emulate a vendor's controller: its own protocol, simulated physics behind it.
 
-    Runs until Ctrl-C. Listens on this computer only, and at a free port unless you give one: a client that connects to
-    the vendor's usual port may expect a real controller there. A replay ends with 1 if a request differs from the
+    Runs until Ctrl-C. Listens on this computer only, and at a free port unless you name a port: a client that connects
+    to the vendor's usual port may expect a real controller there. A replay ends with 1 if a request differs from the
     recorded one.
     """
     from afspm.simulation.emulation.emulator import emulator_names, find_emulator
@@ -282,7 +282,7 @@ def component(name: Name, into: Into = Path()) -> None:
 def driver(name: Name, into: Into = Path()) -> None:
     """Make a package with a driver for a new controller.
 
-    At first the driver works with a pretended controller, and passes the checks of its operations.
+    At first the driver works with a simulated controller in the package, and passes the checks of its operations.
     """
     what = "replace its PretendController, and look how far it is with"
     _write("driver", name, into, what, "afspm test-translator experiment.toml")

@@ -41,7 +41,7 @@ _ILL = (ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.G
 
 @dataclass
 class Examination:
-    """Findings, rates of packets by envelope, and ids of the experiment's processes on this computer."""
+    """Findings, rates of packets by envelope, and pids of the experiment's processes on this computer."""
 
     found: list[Diagnosis] = field(default_factory=list)
     heard: list[Heard] = field(default_factory=list)
@@ -55,7 +55,7 @@ class Examination:
 def examine(experiment: Experiment | None, runs: Path, listen_s: float, commands: Collection[str] = ()) -> Examination:
     """Examine an experiment from this computer, and count its scheduler's packets for `listen_s` of real time.
 
-    Without an experiment only this computer is examined.
+    Without an experiment, or with errors in its file, only this computer is examined.
 
     Args:
         commands: names of afspm's own commands, which no package can replace.

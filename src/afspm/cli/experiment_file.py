@@ -150,7 +150,7 @@ def keys(
 def notify(
     files: Files, test: Annotated[bool, typer.Option("--test", help="Send a test message by each of them.")] = False
 ) -> None:
-    """List the notifications of [notify] in an experiment file, and test them.
+    """List the notifications of [notify] in an experiment file; with --test, send a test message by each.
 
     Ends with 1 if there are none, or if a test message does not arrive.
     """
@@ -197,10 +197,10 @@ COMPUTING_S = 0.1
 
 
 def estimate_lines(works: Mapping[str, PlannedWork | None], speed: float, now: datetime) -> Iterator[str]:
-    """Yield a line about the planned work of each component, then a line about the expected end.
+    """Yield a line about the planned work of each component, then a line about the expected end if it is known.
 
     Args:
-        speed: experiment seconds in a real second.
+        speed: experiment seconds per real second.
         now: start of the experiment, real time.
     """
     from afspm.model.planned_work import planned_end_s
@@ -256,7 +256,7 @@ def doctor(
 
     Checks names, ports, keys, clocks, versions, disk and memory, and the packets of the scheduler. Works before the
     experiment runs, while it runs, and when a part of it does not. Lists the drivers, components, readers … of all
-    installed packages, with the reason where one can't be loaded. Without a file it checks this computer alone. Ends
+    installed packages, and the reasons why some can't be loaded. Without a file only this computer is checked. Ends
     with 1 if something keeps the experiment from working.
     """
     from afspm.cli.examination import examine

@@ -27,10 +27,11 @@ class Follower:
     Args:
         folder: folder of the run.
         name: name (and owner of the key) of the follower.
-        envelopes: prefixes of the envelopes to subscribe to; None: all messages but values of scans and spectra.
+        envelopes: prefixes of the envelopes to subscribe to; None: all messages of translator and scheduler except
+            scans, spectra and lines of running scans.
 
     Attributes:
-        ended: the experiment has ended.
+        ended: whether the experiment has ended.
         heard_s: real monotonic time of the last packet; None before the first.
 
     Raises:
@@ -62,10 +63,12 @@ class Follower:
             self.ended = True
 
     def catch_up(self, within_s: float = HEARD_WITHIN_S) -> None:
-        """Wait for all packets of the scheduler's cache, and process them.
+        """Wait for the packets of the scheduler's cache for up to `within_s` real seconds, and process them.
+
+        After that time, with some packets missing, the method returns all the same.
 
         Raises:
-            NoResponse: no packet arrived.
+            NoResponse: not one packet arrived.
         """
         until_s = self.clock.monotonic_s() + within_s
         while not (self.ended or self._link.is_caught_up()):
@@ -78,7 +81,7 @@ class Follower:
             raise NoResponse("the scheduler does not answer", where=str(self.folder), hint=hint)
 
     def silent_s(self) -> float:
-        """Return the real seconds since the last packet."""
+        """Return the real seconds since the last packet; 0 before the first."""
         return 0.0 if self.heard_s is None else self.clock.monotonic_s() - self.heard_s
 
     def cut_off(self) -> str:

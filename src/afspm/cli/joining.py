@@ -37,9 +37,10 @@ def person() -> str:
 
 @contextmanager
 def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
-    """Open a follower of the run at `where`; end the command if no run goes on there.
+    """Open a follower of the run at `where`; if no run goes on there, end the command with `NOT_RUNNING`.
 
     Args:
+        where: the folder of a run, a folder of runs (its newest) or an experiment file (its newest run).
         lines: whether to follow lines of unfinished scans, too.
     """
     from afspm import wire
@@ -58,7 +59,7 @@ def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
 
 @contextmanager
 def acting(where: Path) -> Iterator[Scope]:
-    """Connect to the run at `where` in the user's name; end the command if no run goes on there."""
+    """Connect to the run at `where`, as for `looking`, in the user's name; end the command if no run goes on there."""
     from afspm.client.connect import connect
 
     folder = _running(where)
@@ -146,7 +147,7 @@ def _only_if_running(folder: Path) -> Iterator[None]:
 
 
 def plain_table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> Table:
-    """Return a table with a line below its heads and no other."""
+    """Return a table whose only line is below its heads."""
     from rich import box
     from rich.table import Table
 

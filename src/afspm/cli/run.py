@@ -80,9 +80,9 @@ def run(
     """Run an experiment.
 
     Everything is checked before anything starts. Processes that crash or freeze are restarted. Ctrl-C ends the
-    experiment cleanly, a second one at once. Ends with 0 when the experiment has ended by itself, with 1 when the
+    experiment cleanly, a second Ctrl-C at once. Ends with 0 when the experiment has ended by itself, with 1 when the
     experiment file is wrong or something essential was given up, with 3 when all plans were done and nothing ended the
-    experiment, with 4 when the last component with a plan was given up.
+    experiment, with 4 when the last component with a plan was given up, with 130 when the run was stopped.
     """
     import logging
     import sys
@@ -205,7 +205,7 @@ def trace(
     """Run an experiment, and record all traffic with the controller.
 
     The trace is one file in the run's folder; it includes the files that the controller saved, and no secrets. Attach
-    it to a bug report: `afspm emulate --replay` plays it back. The same as `afspm run` with `trace = true` in the
+    it to a bug report: `afspm emulate --replay` plays it back. `afspm run` does the same with `trace = true` in the
     translator's section.
     """
     import sys

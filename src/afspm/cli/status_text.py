@@ -33,7 +33,7 @@ class RunDescription:
         replay_of: folder of the replayed run; empty if this is no replay.
         began_ns: experiment time at its start; None if unknown.
         plans: planned work of each component; None: no estimate.
-        speed: experiment seconds in a real second.
+        speed: experiment seconds per real second.
         fancy: whether the terminal can show block characters.
     """
 
@@ -53,7 +53,7 @@ def bar(part: float, *, fancy: bool = True, width: int = BAR) -> str:
 
 
 def flagged(seen: Overview) -> Iterator[tuple[int, str, Span | None]]:
-    """Yield each flagged problem: its number, its name, and the span with the flag's start and source."""
+    """Yield each flagged problem: its number, its name, and the span with start and source of the flag, if known."""
     for number in seen.control.problems if seen.control else ():
         yield number, seen.problems.name(number), seen.timelines.problems[number].now
 
@@ -226,7 +226,10 @@ class StatusText:
             yield _label("note").append(f"{time_of_day(note.time_ns)} {note.who}{on}: {note.text}")
 
     def as_json(self) -> dict[str, object]:
-        """Return the status for programs. Times are ISO 8601 in UTC, durations are in experiment seconds."""
+        """Return the status for programs.
+
+        Times are ISO 8601 in UTC. Durations are in experiment seconds, except the real seconds of `step_age_s`.
+        """
         seen, run = self._seen, self._run
         control, running, end_ns = seen.control, seen.scan_progress(self._now_ns), self._end_ns()
         return {

@@ -39,7 +39,7 @@ def end(
     where: Where = RUNS,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Don't ask.")] = False,
 ) -> None:
-    """End a running experiment, for all its components, after a question."""
+    """End a running experiment for all its components, once you have confirmed."""
     with acting(where) as scope:
         if not yes:
             typer.confirm("End the experiment?", abort=True)
@@ -51,7 +51,7 @@ def restart(
     process: Annotated[str, typer.Argument(help="The name of the process, such as `series`.", show_default=False)],
     where: Where = RUNS,
 ) -> None:
-    """Restart a process of a running experiment, also one that was given up; its saved memory is kept."""
+    """Restart a process of a running experiment, even a process that was given up; its saved memory is kept."""
     with acting(where) as scope:
         scope.restart(process)
     typer.echo(f"{process} is restarted")
@@ -67,9 +67,9 @@ def problems(
     ] = None,
     clear_all: Annotated[bool, typer.Option("--clear-all", help="Remove the flags of all problems.")] = False,
 ) -> None:
-    """List the flagged problems, with the sources and times of their flags; or flag and clear them.
+    """List the flagged problems, with the sources and times of their flags; or flag and clear problems.
 
-    A flagged problem takes control from its holder until a component that solves the problem has cleared the flag.
+    While a problem is flagged, only components that solve a flagged problem get control.
     """
     if flag or clear or clear_all:
         with acting(where) as scope:

@@ -6,7 +6,6 @@ and handles packets while a call waits.
 
     comes in      packets of the scheduler, answers to requests
     state         the newest state of the experiment; a memory on disk; intent and result of each keyed measurement
-
     goes out      calls of `on_scan`, `on_problem` … (`dispatch`); requests, repeated with one id until they are
                   answered (`command_retry`)
     always holds  a handler is never interrupted; a keyed measurement is taken exactly once, over any number of kills

@@ -1,4 +1,4 @@
-"""Queue of the packets that wait for their handler: in order, without loss, in bounded memory."""
+"""Queue of the packets that wait for their handlers: in order, without loss, in bounded memory."""
 
 from __future__ import annotations
 

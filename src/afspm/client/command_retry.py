@@ -51,23 +51,22 @@ NOT_IN_CONTROL = {ControlResponse.NOT_IN_CONTROL, ControlResponse.WRONG_CONTROL_
 
 
 class CommandRetry:
-    """A sender of commands, through the scheduler, while the component is in control."""
+    """A sender of commands to the microscope, through the scheduler, for a component in control."""
 
     def __init__(self, link: ExperimentLink, control: ControlHold) -> None:
         self._link = link
         self._control = control
 
     def ask(self, kind: ControlRequest, subject: object = None, *, until_s: float | None = None) -> Response:
-        """Send a command until it succeeds, inside a block with control; if control is lost, wait for it.
+        """Send a command until it succeeds, inside a block with control; after a loss of control, wait to regain it.
 
-        In an unbroken block, lost control is an error: other components may have changed the microscope meanwhile.
+        In an unbroken block a loss of control is an error: other components may have changed the microscope meanwhile.
 
         Raises:
             Refused: the microscope or a limit refuses.
-            NoResponse: the microscope stays silent, or is not free until `until_s`; or, in an unbroken block, control
-                was lost before an action was answered.
-            ControlLost: control was not regained by `until_s`; or, in an unbroken block, was lost before any action
-                was carried out.
+            NoResponse: the microscope stays silent, or is not free by `until_s`; or, in an unbroken block, control was
+                lost before an action was answered.
+            ControlLost: control was not regained by `until_s`, or was lost in an unbroken block.
         """
         request_id = self._link.next_id()
         while True:
@@ -95,12 +94,12 @@ class CommandRetry:
                 )
 
     def in_control(self, kind: ControlRequest, subject: object, until_s: float | None) -> Response:
-        """Take control, and send a command until it succeeds."""
+        """Take control for one command, and send the command until it succeeds. Raises as `ask`."""
         with self._control.hold(until_s=until_s):
             return self.ask(kind, subject, until_s=until_s)
 
     def read(self, kind: ControlRequest, subject: object, until_s: float | None) -> Response:
-        """Send a request that only reads; take control for it if the scheduler demands that."""
+        """Send a read-only request, and return the answer; take control first if the scheduler demands control."""
         response = self.send(kind, subject, until_s=until_s)
         if response.code != ControlResponse.NOT_IN_CONTROL:
             return response
@@ -108,9 +107,9 @@ class CommandRetry:
             return self.send(kind, subject, until_s=until_s)
 
     def set(self, kind: ControlRequest, wanted: object, message: str, until_s: float | None) -> None:
-        """Send a setting; wait until its `message` is published and the tip has stopped moving.
+        """Send a setting; wait until its `message` is published and the tip has stopped moving. Raises as `ask`.
 
-        If nothing is published, since nothing changed, the wait ends after SETTLED_WITHIN_S.
+        If nothing is published, since nothing changed, the wait ends after `SETTLED_WITHIN_S`.
         """
         link, view = self._link, self._link.view
         count = view.count(message)
@@ -140,7 +139,7 @@ class CommandRetry:
         until_s: float | None = None,
         is_seen: Callable[[], bool] = lambda: False,
     ) -> Response:
-        """Send a request; repeat it while the microscope is silent, with the same id, so that it is executed once.
+        """Send a request, and repeat it while the microscope is silent: with the same id, so that it is executed once.
 
         Args:
             is_seen: returns whether the effect of the request has been observed, which counts as an answer.
@@ -183,10 +182,14 @@ class CommandRetry:
             self._wait_for_news(link.earlier(RETRY_S, give_up_s))
 
     def get_over(self, kind: ControlRequest, response: Response, states: int, until_s: float | None) -> None:
-        """Wait until the cause of a failed response is gone; raise Refused if no wait can help.
+        """Handle a failed response: wait until the microscope is free, or record a loss of control.
 
         Args:
             states: number of states published before the request.
+
+        Raises:
+            Refused: the response has another cause, which no wait can remove.
+            NoResponse: the microscope was not free by `until_s`.
         """
         if response.code == ControlResponse.NO_RESPONSE:
             return  # control was lost: the caller regains it before the next attempt

@@ -59,28 +59,29 @@ class Component:
         memory: a dict on disk, saved after each handler (in `run`: by its `save`) and restored after a restart.
         run_dir: folder of this run.
         simulated: whether the microscope is simulated; state it in your output.
-        packet: the packet being handled, with envelope and time; None between handlers.
-        longest_step_s: longest allowed handler in real seconds; after it the process counts as frozen and is killed.
-            Waiting inside `scope` does not count.
-        period_s: period of `on_tick`; None: no ticks.
+        packet: the packet of the running handler, with envelope and time; None without a packet.
+        longest_step_s: longest allowed duration of a handler in real seconds; after this time the process counts as
+            frozen and is killed. Waiting inside `scope` does not count.
+        period_s: period of `on_tick` in s; None: no ticks.
         period_time: whether `period_s` is in experiment time or real time.
     """
 
     solves: ClassVar[tuple[str, ...]] = ()
     """Problems that the component solves."""
     flags: ClassVar[tuple[str, ...]] = ()
-    """Problems that the component may flag; the experiment file must have a component that solves each."""
+    """Problems that the component may flag. Each needs a component that solves it, or an entry in the experiment file:
+    `solved_by_hand` or `end_on` in [control]."""
     publishes: ClassVar[tuple[str, ...]] = ()
     """Envelopes that the component publishes itself; if there are any, the component gets an address to publish on."""
     listens: ClassVar[tuple[str, ...] | None] = None
     """Prefixes of the envelopes to subscribe to, unless the experiment file gives them. None: all except messages about
-    processes, requests and logs; `("",)`: really all."""
+    processes, requests, logs, progress, sweeps and notes; `("",)`: all without exception."""
     operates: ClassVar[bool] = False
-    """In MANUAL mode a person uses the microscope through this component, unless the experiment file names another."""
+    """Whether a person in MANUAL mode uses the microscope through this component. [control] roles may name others."""
     has_people: ClassVar[bool] = False
-    """The component acts for people, whose passwords are in its setting `people`."""
+    """Whether the component acts for people, whose passwords are in its setting `people`."""
     needs_approval: ClassVar[bool] = False
-    """The component acts for agents: its commands need the approval of a person."""
+    """Whether the component acts for agents: their commands need the approval of a person."""
     requires: ClassVar[tuple[str, ...]] = ()
     """Packages needed beyond a plain install of afspm, in the notation of `pip install`: `("scikit-learn>=1.4",)`."""
     needs_actions: tuple[str, ...] = ()
@@ -105,7 +106,8 @@ class Component:
     def planned_work(self, speed_m_s: float | None) -> PlannedWork | None:
         """Return the work that the component plans, for `afspm check` and the report; None: no estimate.
 
-        Called after `__init__`, without `on_start`, and only for classes that a package declares as entry points.
+        Called after `__init__`, without `on_start`, and only for classes that a package declares as entry points and
+        for classes derived from them.
 
         Args:
             speed_m_s: scan speed at the start, if the experiment file gives it.
@@ -131,7 +133,7 @@ class Component:
         """Handle a change of mode, holder or problems."""
 
     def on_problem(self, problem: str, flagged: bool) -> None:
-        """Handle a problem that is flagged (True) or cleared (False); at the start, each problem already flagged.
+        """Handle a problem that was flagged (`flagged`) or cleared; at the start, each problem already flagged.
 
         `problem` is a standard name, such as "tip-shape-changed", or a name from the experiment file.
         """
@@ -164,7 +166,10 @@ class Component:
             envelope: topic for subscribers; the name of the message by default.
 
         Raises:
-            ConfigError: the component has no address to publish on.
+            ConfigError: the component has no address to publish on, or the envelope does not begin with the message's
+                name.
+            WireError: the envelope begins with no known message's name.
+            InvalidValue: `message` is neither a model object nor a message.
         """
         self._publish(message, envelope)
 

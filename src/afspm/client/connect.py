@@ -24,7 +24,7 @@ from afspm.wire.message_types import register_all
 
 GUEST = "guest"
 GUEST_KEYS = "guest.keys"
-"""The file with the keys of guests, beside the state folder of the run; see `supervisor.key_ring`."""
+"""The file with the keys of guests, in the state folder of the run; see `supervisor.key_handout`."""
 JOINED_WITHIN_S = 5.0
 HEARD_WITHIN_S = 30.0  # the cache may hold many large scans
 
@@ -44,8 +44,8 @@ def connect(where: str | Path = "runs", name: str = "notebook", *, messages: Seq
 
     Raises:
         FileError: there is no such run.
-        ConfigError: the run has no scheduler to connect to; or `messages` can't be imported.
-        NoResponse: the scheduler is not running, or its packets do not arrive.
+        ConfigError: the run has no scheduler to connect to, or `messages` can't be imported.
+        NoResponse: the scheduler does not answer within 5 s, or its cached packets do not arrive within 30 s.
         ExperimentEnded: the experiment has just ended.
     """
     folder = find_run(Path(where))
@@ -86,6 +86,7 @@ def _log_of(name: str) -> logging.Logger:
 
 def guest_facts(launch: Launch) -> Plain:
     """Return the entry for guests in run.json: a component's launch line without class, settings and envelopes."""
+    # the scheduler's publisher is the first, and the only one whose address a guest needs
     sockets = Sockets(subscribe=launch.sockets.subscribe[:1], control=launch.sockets.control)
     guest = dataclasses.replace(launch, name=GUEST, class_="", settings={}, sockets=sockets, envelopes=None)
     facts: Plain = json.loads(guest.to_json())
@@ -96,8 +97,8 @@ def guest_of(folder: Path, name: str) -> Launch:
     """Return the launch line of a guest that joins the run in `folder`.
 
     Raises:
-        FileError: run.json can't be read.
-        ConfigError: there is no scheduler to connect to.
+        FileError: run.json, or the key of the run, can't be read.
+        ConfigError: there is no scheduler to connect to, or other users may read the key.
     """
     if not (folder / RUN_FILE).exists():
         raise FileError("there is no run in this folder", where=str(folder), hint="name a folder with a run.json")
@@ -132,7 +133,7 @@ def _keys_in(folder: Path) -> Plain:
 
 
 def find_run(where: Path) -> Path:
-    """Return a run's folder, from the folder itself, a folder of runs (its newest) or an experiment file (its newest).
+    """Return the folder of a run: `where` itself, or the newest run of a folder of runs or an experiment file.
 
     Raises:
         FileError: there is no such run.

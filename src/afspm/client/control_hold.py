@@ -51,8 +51,9 @@ class ControlHold:
         """Hold control in the block; an inner block shares the control of the outer one.
 
         Raises:
-            ControlLost: control was not given by `until_s`; or, if `unbroken`, was lost in the block.
-            Refused: the problem to solve is not flagged.
+            ControlLost: control was not given by `until_s`; the problem to solve is not flagged; an outer block solves
+                another problem; or, in an unbroken block, control was lost.
+            Refused: the scheduler refuses control for another reason.
         """
         if self._wanted and solving not in (Problem.NONE, self._wanted[0]):
             raise ControlLost(
@@ -81,10 +82,15 @@ class ControlHold:
             self.is_unbroken = was_unbroken
 
     def regain(self, until_s: float | None = None) -> None:
-        """Wait until control is held; request control after each change of the control state.
+        """Wait until control is held.
+
+        Control is requested at once, after each change of the control state that may allow it, after a reconnection,
+        and every `ASK_AGAIN_S`.
 
         Raises:
-            ControlLost: control was not given by `until_s`, the problem has been solved, or the block is unbroken.
+            ControlLost: control was not given by `until_s`, the problem to solve is not flagged, or control was lost in
+                an unbroken block.
+            Refused: the scheduler refuses control for another reason.
         """
         link, solving = self._link, self._solving
         if self.is_unbroken and not self.held:
@@ -109,7 +115,7 @@ class ControlHold:
             link.log.info("in control")
 
     def release_inherited(self) -> None:
-        """Release control that the component held before its restart, unless it needs control now."""
+        """Release control held since before a restart of the component, unless the component needs control now."""
         state = self._link.view.control
         if state is not None and state.holder == self._link.name and not self._wanted and not self.held:
             self._link.send_only(ControlRequest.RELEASE_CTRL)
@@ -126,7 +132,7 @@ class ControlHold:
         self.why_lost = why
 
     def obstacle(self, solving: int = Problem.NONE) -> str:
-        """Return why control can't be had now, as text for people; empty if it can."""
+        """Return the obstacle to control now, as text for people; empty without an obstacle, or if unknown."""
         state = self._link.view.control
         if state is None:
             return ""

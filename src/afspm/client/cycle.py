@@ -1,4 +1,4 @@
-"""One scan or spectrum, followed through the published packets. Pure: packets in, an outcome out."""
+"""One scan or spectrum, followed through the published packets to its outcome, without input or output."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class CycleOutcome(Enum):
     VANISHED = auto()
     """The microscope is free again without a result, e.g. after a restart of its controller."""
     ANOTHER = auto()
-    """The results can't be the requested ones, e.g. since a person at the panel has moved the frame."""
+    """The results do not fit the request, e.g. since a person at the panel has moved the frame."""
 
 
 class Cycle:
@@ -28,13 +28,14 @@ class Cycle:
 
     Args:
         busy: the state during the measurement, SCANNING or SPEC.
-        fits: returns whether a result can be the requested one. Only such results count, even while this component
-            is in control: a person, or another program, can always use the controller itself.
+        fits: returns whether a result fits the request. Only such results count, even while this component is in
+            control: a person, or another program, can always use the controller itself.
         since_ns: packets up to this time belong to an earlier measurement; None: nothing was published before.
-        resumed: whether it was requested before a restart of the component; others may have measured since.
+        resumed: whether the measurement was requested before a restart of the component, so that other components may
+            have measured since.
 
     Attributes:
-        begun: whether its start was observed.
+        begun: whether the state `busy`, or a fitting result, was published.
         results: the results that fit.
         other: the first result since `busy` that does not fit.
     """

@@ -60,7 +60,7 @@ class MessageDispatcher:
         self._wanted: dict[str, bool] = {}
 
     def wants(self, packet: Packet) -> bool:
-        """Return whether the component has a handler for a packet; only such packets need to be kept."""
+        """Return whether the component subscribed to a packet and has a handler for it; only such packets are kept."""
         try:
             message = wire.message_of(packet.envelope)
         except WireError:

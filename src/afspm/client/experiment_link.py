@@ -1,4 +1,4 @@
-"""A component's connection to its experiment, the only place where it waits: events come in, requests go out."""
+"""A component's connection to its experiment, and the only place where a component waits for events and answers."""
 
 from __future__ import annotations
 
@@ -89,14 +89,14 @@ Listener = Callable[[Packet, bool], None]
 
 
 class RequestTracker:
-    """Ids of a component's requests, and their answers. Only one request at a time is waited for.
+    """Ids of a component's requests, and the answers. The component waits for one answer at a time.
 
     Args:
         session: text that differs after each restart of a component of the same name.
 
     Attributes:
         connections: number of connections to the scheduler so far.
-        answer: answer to the request that is waited for; None until it arrives.
+        answer: answer to the request chosen by `expect`; None until the answer arrives.
     """
 
     def __init__(self, send: Send, name: str, session: str) -> None:
@@ -117,7 +117,7 @@ class RequestTracker:
         return f"{self._name}/{self._session}/{self._requests}"
 
     def expect(self, request_id: str) -> None:
-        """Select the request whose answer is waited for; an empty id selects none."""
+        """Choose the request whose answer `answer` will hold; an empty id chooses none."""
         self._asked, self.answer = request_id, None
 
     def send_only(self, kind: int, subject: object = None) -> str:
@@ -215,6 +215,7 @@ class ExperimentLink:
             ExperimentEnded: the experiment has ended.
             StopRequested: the process is being stopped.
             NoResponse: the link was closed.
+            ConfigError: the scheduler belongs to another run.
             KeyboardInterrupt: the user interrupts.
         """
         with self.activity.waiting(), self.interrupts.heeded():
@@ -226,7 +227,10 @@ class ExperimentLink:
         return True
 
     def wait_connected(self, done: Callable[[], bool], within_s: float, until_s: float | None = None) -> bool:
-        """Wait until `done()`: without limit while the scheduler is away, else for at most `within_s`."""
+        """Wait until `done()`, for at most `within_s` of uninterrupted connection; return False after that.
+
+        While the scheduler is away, only `until_s` (monotonic) limits the wait.
+        """
         while not done():
             if not self.wait(lambda: self.connected or done(), until_s):
                 return False
@@ -236,7 +240,7 @@ class ExperimentLink:
         return True
 
     def pump(self, timeout_s: float | None) -> None:
-        """Wait for events once, and pass them to their handlers."""
+        """Wait for events once, and pass them to their listeners. Raises as `wait`."""
         self.check()
         for incoming in self.port.poll(timeout_s):
             self._take(incoming)
@@ -244,7 +248,7 @@ class ExperimentLink:
         self.check()
 
     def check(self) -> None:
-        """Raise an error if waiting is useless.
+        """Raise an error if no more events can arrive.
 
         Raises:
             ExperimentEnded, StopRequested: the experiment has ended, or the process is being stopped.
@@ -265,7 +269,7 @@ class ExperimentLink:
     def wait_caught_up(self, until_s: float | None = None) -> None:
         """Wait until all packets of the scheduler's cache have arrived; later calls return at once.
 
-        The wait lasts while the scheduler is away or its packets do not arrive: its cache may show that the measurement
+        The wait goes on while the scheduler is away or its packets do not arrive: its cache may show that a measurement
         is already done.
 
         Raises:
@@ -326,11 +330,11 @@ class ExperimentLink:
     ) -> Response:
         """Send a request to the scheduler, and return the answer, even a refusal.
 
-        A request without an answer is repeated with its id, so that it is executed once. The wait lasts while the
-        scheduler is away.
+        A request without an answer is repeated with its id, so that it is executed once. While the scheduler is away,
+        the wait goes on.
 
         Raises:
-            ExperimentEnded: the answer is that the experiment has ended.
+            ExperimentEnded: the experiment has ended.
             NoResponse: no repetition was answered, or none by `until_s` (monotonic).
         """
         request = Request(kind, subject, id=request_id or self.next_id())
@@ -361,7 +365,7 @@ class ExperimentLink:
         )
 
     def send_only(self, kind: ControlRequest, subject: object = None) -> None:
-        """Send a request without waiting for the answer, for the last steps before an end."""
+        """Send a request without waiting for the answer; without a connection the request is lost."""
         self.requests.send_only(kind, subject)
 
     def relay(self, thing: object) -> None:

@@ -44,7 +44,7 @@ class ExperimentView:
 
     @property
     def state(self) -> ScopeState:
-        """Return the state of the microscope."""
+        """Return the state of the microscope; UNDEFINED if the microscope has published none."""
         self._catch_up()
         return self._link.view.state
 
@@ -56,7 +56,7 @@ class ExperimentView:
 
     @property
     def mode(self) -> ControlMode:
-        """Return MANUAL or AUTOMATED."""
+        """Return MANUAL or AUTOMATED; UNDEFINED if the scheduler has published no mode."""
         return self.control_state.mode
 
     @property
@@ -82,18 +82,21 @@ class ExperimentView:
 
         Args:
             envelopes: prefixes of the wanted envelopes; none: all.
-            timeout_s: end the iteration after this time without a message.
+            timeout_s: end the iteration after this real time without a message; None: only with the experiment.
         """
         return Events(self._link, envelopes, timeout_s)
 
     def wait_until(self, condition: Callable[[], bool], *, timeout_s: float | None = None) -> bool:
-        """Wait until `condition()`, tested after each published message; return False after `timeout_s`."""
+        """Wait until `condition()`, tested after each event; return False after `timeout_s` of real time."""
         with self._call():
             return self._link.wait(condition, self._link.until(timeout_s))
 
     def sleep(self, experiment_s: float) -> None:
-        """Wait for some experiment time. Unlike `time.sleep` this follows the experiment's clock, and ends with the
-        experiment.
+        """Wait for some experiment time; unlike `time.sleep`, the wait follows the experiment's clock.
+
+        Raises:
+            InvalidValue: the time is not a number, or below zero.
+            ExperimentEnded: the experiment has ended.
         """
         if not (isinstance(experiment_s, Real) and experiment_s >= 0.0):
             raise InvalidValue(f"can't wait for {experiment_s!r}", hint="a number of seconds, zero or more")

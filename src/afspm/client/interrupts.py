@@ -14,8 +14,8 @@ from afspm.transport.process import signals
 class Interrupts:
     """A handler of interrupts (Ctrl-C, the stop button of a notebook) during calls over one port.
 
-    An interrupt is raised where a call waits, so that no request or answer is left half done. A program that handles or
-    ignores SIGINT itself, as components do, is not affected.
+    An interrupt is raised where a call waits, so that no request or answer is left half done. In a program that handles
+    or ignores SIGINT itself, as components do, Ctrl-C has no effect here.
     """
 
     def __init__(self, port: Port) -> None:
@@ -44,13 +44,13 @@ class Interrupts:
             self._is_deferred = self._has_come = False
 
     def heed(self) -> None:
-        """Raise KeyboardInterrupt if an interrupt has come since the last call."""
+        """Raise Interrupted, a KeyboardInterrupt, if an interrupt has come and is not deferred."""
         if self._has_come and not self._is_deferred:
             self._has_come = False
             raise Interrupted
 
     def interrupt(self) -> None:
-        """Interrupt the present or next call, as Ctrl-C does. From any thread."""
+        """Interrupt the present call, as Ctrl-C does. Thread-safe."""
         self._has_come = True
         self._port.wake_up()
 

@@ -64,13 +64,16 @@ class KeyedResults:
 
     @property
     def pending(self) -> Plain | None:
-        """Return the intended measurement without a result: key, plan, attempt, since_ns, interruptions; else None."""
+        """Return the intended measurement that has no result yet; None if there is none.
+
+        It has the entries key, plan, attempt, since_ns and interruptions.
+        """
         intent: Plain | None = self._memory.get("pending")
         path = None if intent is None else self._path(intent["key"])
         return None if path is not None and path.exists() else intent
 
     def intend(self, intent: Plain) -> None:
-        """Save the intent of a measurement, before its request."""
+        """Save the intent of a measurement, before the measurement is requested."""
         self._memory["pending"] = intent
         self._memory.save(synced=False)  # a power cut may have it measured again, which costs a scan and no harm
 
@@ -89,11 +92,11 @@ class KeyedResults:
         self._memory.save()
 
     def find(self, key: str, plan: Plain) -> MeasurementResult | None:
-        """Return the saved result of a key, from an earlier call or before a restart; None without a result.
+        """Return the saved result of a key, from an earlier call or before a restart; None without a readable result.
 
         Raises:
             InvalidValue: the key was used for another measurement.
-            FileError: the result can't be read.
+            FileError: the file of the result can't be opened or read; a damaged result counts as none.
         """
         path = self._path(key)
         if path is None or not path.exists():
@@ -123,7 +126,7 @@ class KeyedResults:
                 write_atomic(path, parts, synced=False, soon=True)
                 is_kept = True
         self._memory.pop("pending", None)
-        if not is_kept:  # else the file shows that it is fulfilled
+        if not is_kept:  # otherwise the file shows that the intent is fulfilled
             self._memory.save(synced=False)
 
     def forget(self, key: str) -> None:

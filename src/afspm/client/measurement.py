@@ -116,8 +116,9 @@ class MeasurementRunner:
         Raises:
             Refused: the microscope or a limit refuses.
             NoResponse: there is no result by `until_s`.
-            MeasurementFailed: the microscope fails repeatedly.
+            MeasurementFailed: five attempts in a row failed for no known reason (`MOST_FAILURES`).
             ControlLost: control was not given by `until_s`; or, without `repeat`, was lost during the measurement.
+            InvalidValue: the key is not valid, or was used for another measurement.
         """
         if key is not None and (found := self._results.find(check_key(key), target.facts())) is not None:
             return found

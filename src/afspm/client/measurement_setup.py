@@ -11,7 +11,8 @@ from afspm.model import ControlRequest, Feedback, Frame, Parameter, ProbePositio
 class MeasurementSetup:
     """A setter of the microscope's settings for a measurement. Control must be held during each call.
 
-    Settings already in force are not sent again.
+    A region, a shape or a probe position already in force is not sent again. A region in sample coordinates is sent
+    each time, since the sample drifts.
 
     Args:
         view: the published settings in force.
@@ -23,7 +24,7 @@ class MeasurementSetup:
         self._rounded: tuple[ScanParameters, ScanParameters | None] | None = None
 
     def prepare(self, target: Target, key: str, until_s: float | None) -> None:
-        """Set all that a target needs, and publish its sweep parameters as the microscope reports them."""
+        """Set all settings of a target, and publish its sweep parameters with the values in force."""
         if isinstance(target, ScanTarget):
             self.set_scan(target.parameters, until_s)
         else:
@@ -42,7 +43,7 @@ class MeasurementSetup:
             self._commands.set(ControlRequest.SET_PROBE_POS, ProbePosition(xy_m), "ProbePosition", until_s)
 
     def set_scan(self, wanted: ScanParameters, until_s: float | None) -> None:
-        """Set region and shape together, unless they are in force."""
+        """Set region and shape together, unless both are in force."""
         if wanted.region is None and wanted.shape is None:
             return
         # in sample coordinates a region drifts: a while later the same region is elsewhere for the tip
@@ -56,7 +57,7 @@ class MeasurementSetup:
         self._rounded = (wanted, now) if is_set(wanted, now, FITS) else None
 
     def set_feedback(self, wanted: Feedback, until_s: float | None) -> None:
-        """Set the given fields of the feedback; wait until they are published, if any changes."""
+        """Set the given fields of the feedback; if one of them changes, wait until the feedback is published."""
         now = self._view.feedback
         if now and all(value in (None, getattr(now, name)) for name, value in vars(wanted).items()):
             self._commands.ask(ControlRequest.SET_ZCTRL_PARAMS, wanted, until_s=until_s)

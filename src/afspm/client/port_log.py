@@ -11,7 +11,7 @@ A line of the file is a list; its first item is its kind:
 - ["end", how]: the process ends by itself; after a kill this line is missing.
 
 `readings` are the readings of the clock since the previous line; `handled` is the packet whose handler sent a message.
-Values of scans and spectra are in the run's record; here their packets have only time and envelope.
+Packets of scans and spectra above `INLINE_BYTES` have only time and envelope here: the run's record has their values.
 """
 
 from __future__ import annotations
@@ -81,11 +81,11 @@ class RecordedClock:
 
 
 class RecordedPort:
-    """A port that writes the port log. See `afspm.transport.port.Port`.
+    """A port (`afspm.transport.port.Port`) that passes all calls on to another port, and writes the port log.
 
     Args:
         wants: returns whether the component has a handler for a packet.
-        handled: returns the packet that is being handled.
+        handled: returns the packet of the running handler; None outside of handlers.
     """
 
     def __init__(

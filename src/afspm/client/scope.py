@@ -61,7 +61,7 @@ ANSWER_S = 60.0  # default of readings; calls that wait for control or a measure
 
 
 class Scope(ExperimentView):
-    """The handle for scans, spectra, settings and actions; each call returns when it is done.
+    """The handle for scans, spectra, settings and actions; each call returns when its work is done.
 
     A call requests control and releases it afterwards; `with scope.control():` keeps control over several calls.
     Without control, calls wait until control is given. Timeouts are in real seconds; None waits for ever.
@@ -73,7 +73,8 @@ class Scope(ExperimentView):
         ExperimentEnded: the experiment has ended.
 
     Args:
-        link: link to the experiment.
+        link: connection to the experiment.
+        problems: the problems of the experiment by name; None: only those of every experiment.
         state_dir: folder for keyed measurements; None: only in memory.
         between: called after each outermost call, outside any measurement.
         frame: coordinate system of all places.
@@ -115,9 +116,10 @@ class Scope(ExperimentView):
         Args:
             region: region to scan; None: the present region.
             shape: (rows, columns); None: the present shape.
-            key: take this scan only once in this run: after a restart the component gets the saved scan. Each
-                measurement of a component needs its own key. A saved scan takes space on disk until `forget`.
-            repeat: False: if control is lost during the scan, raise ControlLost instead of taking the scan again.
+            key: name of the scan, which is then taken only once in this run: after a restart of the component the call
+                returns the saved scan. Each measurement of a component needs its own key. A saved scan takes space on
+                disk until `forget`.
+            repeat: whether to take the scan again if control is lost during the scan; False: raise ControlLost.
         """
         with self._call():
             target = ScanTarget.of(region, shape, self._frame)
@@ -131,7 +133,7 @@ class Scope(ExperimentView):
         key: str | None = None,
         timeout_s: float | None = None,
     ) -> Spectrum:
-        """Take a spectrum; interruptions and `key` as with `scan`.
+        """Take a spectrum; interruptions and `key` as for `scan`.
 
         Args:
             at: (x, y) in m or as text, ("1 um", "0 nm"), to move the probe to; None: the present position.
@@ -163,9 +165,10 @@ class Scope(ExperimentView):
                 for point in points:
                     print(point.values, point.scans["Height"].values.std())
 
-        Control is kept over all points. If control is lost, to a tip repair for instance, the point's parameters are
-        set and measured again. When the block ends, even by an error, the parameters are set back to their earlier
-        values. In the record the parameters are columns of `run.scans` and `run.spectra`.
+        Control is kept over all points. If control is lost, to a tip repair for instance, the parameters of the present
+        point are set again, and the point is measured again. When the block ends, even by an error, the parameters are
+        set back to their earlier values; not after the end of the experiment or a stop of the process. In the record
+        the parameters are columns of `run.scans` and `run.spectra`.
 
         Args:
             parameters: values of each parameter: a list, or a range such as {"from": "0.5 um/s", "to": "4 um/s",
@@ -176,7 +179,8 @@ class Scope(ExperimentView):
             order: "snake": from point to point one parameter changes, to a neighbouring value; "listed": nested loops;
                 "random".
             seed: seed of the random order.
-            key: take each measurement only once in this run, under the keys "<key>-1", "<key>-2" …
+            key: name of the sweep, whose measurements are then taken only once in this run, under the keys "<key>-1",
+                "<key>-2" …
             done: number of points to skip at the beginning.
         """
         plan = SweepPlan.of(parameters, order, seed)
@@ -239,11 +243,11 @@ class Scope(ExperimentView):
 
         Args:
             value: a number in `unit` (default: SI), a quantity as text ("0.5 V"), True, "on" …
-            wait: for a parameter of another instrument, such as a temperature: wait until it has arrived at `value`,
-                and return the measured value. The wait needs no control.
+            wait: whether to wait until a parameter of another instrument, such as a temperature, has arrived at
+                `value`. The call then returns the measured value. The wait needs no control.
 
         Raises:
-            NoResponse: with `wait`: the target was changed meanwhile, or was not reached within the timeout.
+            NoResponse: with `wait`, the target was changed meanwhile, or was not reached within the timeout.
         """
         with self._call():
             asked, until_s = to_parameter(parameter, value, unit), self._link.until(timeout_s)
@@ -292,7 +296,7 @@ class Scope(ExperimentView):
         setpoint: float | None = None,
         timeout_s: float | None = None,
     ) -> None:
-        """Set the given fields of the z feedback, and return when `feedback` shows them; other fields stay unchanged.
+        """Set the given fields of the z feedback, and return once they are published; other fields stay unchanged.
 
         Args:
             on: whether the feedback regulates; if False, the tip is held at its height.
@@ -317,7 +321,7 @@ class Scope(ExperimentView):
     ) -> None:
         """Set the region of the next scan, and with `shape` (rows, columns) its pixels; return when they are in force.
 
-        Both are sent in one request: set one after the other, they could form a frame in between that is refused.
+        Both are sent in one request: after two requests, the frame between them might be refused.
         """
         with self._call():
             until_s = self._link.until(timeout_s)
@@ -348,17 +352,17 @@ class Scope(ExperimentView):
     def control(
         self, *, solving: int | str | None = None, timeout_s: float | None = None, unbroken: bool = False
     ) -> Iterator[None]:
-        """Keep control over all calls in the block, after waiting for it.
+        """Wait for control, and keep control over all calls in the block.
 
         Within the block control may still be lost: to a problem, or to MANUAL. The next call then waits until control
-        is back. If the problem to solve has been cleared meanwhile, the call raises ControlLost.
+        is back. If the problem to solve has been cleared meanwhile, this call raises ControlLost.
 
         Args:
             solving: the flagged problem to solve, by name or number.
-            unbroken: all calls in the block belong together, such as a move of the probe and a pulse there. After a
-                loss of control the next call raises ControlLost, and nothing more is done: begin the block again, since
-                others may have changed anything. `action` raises NoResponse if control was lost before the answer: its
-                outcome is unknown. Inside another block, an unbroken block first waits for control.
+            unbroken: whether all calls in the block belong together, such as a move of the probe and a pulse there.
+                After a loss of control the next call then raises ControlLost, and does nothing: begin the block again,
+                since others may have changed anything. `action` raises NoResponse if control was lost before the
+                answer: its outcome is unknown. Inside another block, an unbroken block first waits for control.
         """
         number = Problem.NONE if solving is None else self.problems.number(solving)
         with self._control.hold(solving=number, until_s=self._link.until(timeout_s), unbroken=unbroken):
@@ -371,10 +375,12 @@ class Scope(ExperimentView):
         return self._control.held
 
     def flag(self, problem: int | str) -> None:
-        """Flag a problem, by name or number: control is taken from its holder until the problem is cleared.
+        """Flag a problem, by name or number.
+
+        Until the flag is cleared, only components that solve a flagged problem get control.
 
         Raises:
-            ExperimentEnded: the experiment has ended; the record still notes the problem.
+            ExperimentEnded: the experiment has ended; the flag is sent all the same, for the record.
         """
         number = self.problems.number(problem)
         try:
@@ -399,7 +405,7 @@ class Scope(ExperimentView):
         self._ask_scheduler(ControlRequest.SET_CONTROL_MODE, int(mode))
 
     def restart(self, process: str) -> None:
-        """Restart a process of the experiment, even one that was given up."""
+        """Restart a process of the experiment, even a process that was given up."""
         self._ask_scheduler(RESTART_REQUEST, process)
 
     def approval_facts(self) -> Plain:
@@ -445,7 +451,7 @@ class Scope(ExperimentView):
             time_ns: moment of the note, experiment time; None: the end of the scan, or now.
 
         Raises:
-            InvalidValue: the text is empty or too long, or the end of the scan is unknown.
+            InvalidValue: the text is empty, is too long or has control characters; or the end of the scan is unknown.
         """
         if scan is not None and scan.time_ns is None:
             raise InvalidValue("the scan has no time of its end", hint="give time_ns instead")
@@ -458,7 +464,7 @@ class Scope(ExperimentView):
         """Report the values of this component's instrument, and return the orders for it.
 
         Raises:
-            Refused: this component is no instrument of the experiment, or the report is not about its own parameters.
+            Refused: this component is no instrument of the experiment, or the report has parameters of others.
         """
         with self._call():
             response = self._link.request(RELAY_REQUEST, RelayedMessage(*wire.encode(report)))
@@ -469,7 +475,7 @@ class Scope(ExperimentView):
     # --- leaving ---
 
     def interrupt(self) -> None:
-        """Interrupt the call that waits in another thread, as Ctrl-C does: its measurement is stopped."""
+        """Interrupt the call that waits in another thread, as Ctrl-C does; a measurement of the call is stopped."""
         self._link.interrupts.interrupt()
 
     def close(self) -> None:

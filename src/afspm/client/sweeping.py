@@ -1,4 +1,4 @@
-"""A sweep of parameters: at each point they are set and a scan or spectrum is taken; at the end they are set back."""
+"""A sweep of parameters: set them at each point, take a scan or spectrum, and set them back at the end."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class SweepPoint:
         number: number of the point, from 1, in the order of measurement.
         of: the number of points.
         key: key of the measurement; empty if the sweep has no key.
-        values: value of each parameter; a number is in SI, or in the unit given.
+        values: value of each parameter; a number is in SI, or in the microscope's own unit (`SweepAxis.unit`).
     """
 
     number: int
@@ -36,12 +36,12 @@ class SweepPoint:
 
     @property
     def scans(self) -> ScanSet:
-        """All channels of the scan taken at this point."""
+        """Return all channels of the scan taken at this point."""
         return self._result.scans
 
     @property
     def spectrum(self) -> Spectrum:
-        """The spectrum taken at this point."""
+        """Return the spectrum taken at this point."""
         return self._result.spectrum
 
 
@@ -89,7 +89,8 @@ class ParameterSweep:
         """Set the parameters to their values before the sweep; a value that the microscope refuses is logged.
 
         Raises:
-            ControlLost, NoResponse: not done by `until_s`; a later call can still set them back, even after a restart.
+            ControlLost, NoResponse: the parameters are not set back by `until_s`. A later call can still do so, with a
+                key even after a restart.
         """
         if self._before is None:
             return
@@ -104,7 +105,7 @@ class ParameterSweep:
 
     @property
     def left_behind(self) -> str:
-        """Parameter values from before the sweep that are not in force again, as text; empty if all are."""
+        """Return the parameter values from before the sweep that are not in force again, as text; empty if all are."""
         return ", ".join(map(_text, self._before or ()))
 
     def _read(self, until_s: float | None) -> list[Parameter]:

@@ -1,4 +1,4 @@
-"""Targets: a scan or spectrum to take, and the check of published results against it. Pure."""
+"""Targets: a scan or spectrum to take, and the check of published results against the target."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class ScanTarget:
         return _facts(self)
 
     def fits(self, scan: Scan) -> bool:
-        """Return whether shape and region of a scan match this target."""
+        """Return whether shape and region of a scan match this target, within the tolerances of a controller."""
         wanted = self.region
         if self.shape is not None and scan.shape != self.shape:
             return False
@@ -102,7 +102,10 @@ class SpectrumTarget:
         return _facts(self)
 
     def fits(self, spectrum: Spectrum) -> bool:
-        """Return whether the kind and position of a spectrum match this target."""
+        """Return whether the kind and position of a spectrum match this target.
+
+        A position in sample coordinates, and an unknown position, count as a match.
+        """
         if self.kind is not None and spectrum.kind != self.kind:
             return False
         if self.at_m is None or spectrum.position_m is None or self.frame is Frame.SAMPLE:
@@ -153,7 +156,7 @@ def xy_of(xy_m: Any) -> XY:
 
 
 def is_set(wanted: ScanParameters, now: ScanParameters | None, tolerance: float) -> bool:
-    """Return whether the wanted parameters are in force, within `tolerance` of the size."""
+    """Return whether region and shape of the wanted parameters are in force: the region as in `is_near`."""
     if now is None or (wanted.shape is not None and wanted.shape != now.shape):
         return False
     if not isinstance(wanted.region, Region):
@@ -162,7 +165,7 @@ def is_set(wanted: ScanParameters, now: ScanParameters | None, tolerance: float)
 
 
 def is_near(a: Region, b: Region, tolerance: float) -> bool:
-    """Return whether two regions differ by less than `tolerance` of their size everywhere."""
+    """Return whether two regions agree: centres and sizes to `tolerance` times the diagonal of `a`, angles in rad."""
     size_m = math.hypot(*a.size_m)
     turned = math.remainder(a.angle_rad - b.angle_rad, math.tau)
     return (

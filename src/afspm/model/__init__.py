@@ -1,13 +1,13 @@
-"""Scans, spectra, regions, states and requests: frozen values in SI units that need only numpy.
+"""Scans, spectra, regions, states and requests: values in SI units that need only numpy.
 
-**Theory of operation.** A value of the model never changes after its construction. Arrays are [y, x] with ascending
+**Theory of operation.** No code changes a value of the model after its construction. Arrays are [y, x] with ascending
 coordinates; lengths are in m, angles in rad and counter-clockwise, times in ns since the Unix epoch. A name with a
 unit (`center_m`, `time_ns`) is in that unit; a value whose unit varies carries it (`Scan.unit`).
 
     comes in      decoded messages (`wire`), files of controllers (`storage.formats`), values of scripts
     state         none
     goes out      the same values to handlers, drivers, the record
-    always holds  every value is valid: constructors refuse invalid ones with InvalidValue
+    always holds  regions, scans, spectra, sweeps, notes and grants are valid: their constructors raise InvalidValue
 
 The model also holds the small pure decisions that scheduler and translator share: which connection may speak for
 a name (`sessions`), which scheduler a translator obeys (`fencing`), and that a request is not executed twice

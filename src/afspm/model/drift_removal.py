@@ -16,10 +16,10 @@ Array = NDArray[np.float64]
 def undistorted(values: Array, region: Region, velocity_m_s: XY, duration_s: float, *, upwards: bool = True) -> Array:
     """Return a scan's values without drift, on the same grid, as at the middle of the scan.
 
-    Rows are taken one after the other. A point at the offset S from the centre c at half time is found at the offset q
-    with S = (1 - v a') q, where v is the velocity and a the vector along the slow axis of length duration / height,
-    negative when scanning down. Cubic splines between pixels; NaN where nothing was measured. The arguments are those
-    of `Scan.undistorted`.
+    Rows are scanned one after the other. A sample point at the offset S from the region's centre at half time was
+    recorded at the offset q, with S = (1 - v a') q. Here v is the velocity, and a is the vector along the slow axis of
+    length duration / height, negative when scanning down. Values between pixels are from cubic splines; NaN where
+    nothing was measured. Arguments and errors as for `Scan.undistorted`.
     """
     ny, nx = values.shape
     along_m, across_m = _per_scan_m(region, velocity_m_s, duration_s, upwards=upwards)
@@ -45,7 +45,7 @@ def _per_scan_m(region: Region, velocity_m_s: XY, duration_s: float, *, upwards:
 
 
 def _interpolated(values: Array, row: Array, column: Array) -> Array:
-    # NaN outside, and wherever a neighbour is NaN
+    # NaN outside, and wherever a neighbour is NaN; with a tolerance, so that rounding makes no border pixel NaN
     from scipy.ndimage import distance_transform_edt, map_coordinates
 
     ny, nx = values.shape

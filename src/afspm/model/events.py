@@ -13,13 +13,13 @@ from afspm.model.requests import WAIT_FOR_CONTROL, ControlRequest, ControlRespon
 from afspm.model.state import ControlMode
 
 SUPERVISOR = "supervisor"
-"""Owner of the key that allows reports on processes; each supervisor adds ":" and its own suffix."""
+"""Owner of the key that allows reports on processes. A supervisor's own name is "supervisor:" and a suffix."""
 LOGGED_AS = "afspm"
 """Name of the supervisor's own log lines."""
 LONGEST_ANNOUNCEMENT = 256 * 1024
-"""Most bytes of log lines that a supervisor sends in one message."""
+"""Largest size, in bytes, of a message that the scheduler publishes for another process."""
 PERSON = ":"
-"""The separator of a component and the person it acts for: "dashboard:Ada"."""
+"""The separator between a component and the person for whom the component acts: "dashboard:Ada"."""
 LONGEST_PROCESS_NAME = 100
 """In bytes: files are named after processes, on every system."""
 LONGEST_NOTE = 1000
@@ -29,7 +29,11 @@ _PROCESS_NAME = re.compile(r"\w([\w .+-]*[\w+-])?")
 
 
 def is_process_name(name: str) -> bool:
-    """Return whether a name is valid for a process: letters, digits, _, -, +, with dots and spaces between them."""
+    """Return whether a name is valid for a process, as a part of file names on every system.
+
+    It has letters, digits, `_`, `-`, `+`, and between them dots and spaces; it begins with a letter, a digit or `_`,
+    and has at most `LONGEST_PROCESS_NAME` bytes.
+    """
     return _PROCESS_NAME.fullmatch(name) is not None and len(name.encode()) <= LONGEST_PROCESS_NAME
 
 
@@ -81,8 +85,8 @@ class JournalEntry:
 
     Attributes:
         time_ns: experiment time, ns since the Unix epoch.
-        kind: "request", "control" (holder, mode or problems changed) or "order" (of a person, e.g. to restart a
-            process).
+        kind: "request", "control" (holder, mode or problems changed), "order" (of a person, e.g. to restart a process)
+            or, only in the record, "note".
         who: the component; "component:person" if it acts for a person.
         what: the event as text, with units.
         response: the number of a ControlResponse; None for an event without a request.
@@ -90,11 +94,11 @@ class JournalEntry:
         took_s: real time from request to answer; None for an event without a request.
         event: the change, for entries of the kind "control".
         request: the number of the ControlRequest; None without a request, or for an unreadable one.
-        problem: the number of the flagged or cleared problem, or of the problem that the request is to solve.
+        problem: the number of the flagged or cleared problem; for a CONTROL_GAINED, of the problem to solve.
         mode: the new mode, for a MODE_CHANGED.
-        late: the answer came after the client had received a NO_RESPONSE.
+        late: whether the answer came after the client had received a NO_RESPONSE.
         sent_ns: time of forwarding to the translator; None for requests that the scheduler answers.
-        key: key of a measurement that is taken exactly once.
+        key: key of the measurement that the request starts; empty without a key.
         subject: the action, or the parameter to set; empty for other requests.
         value, unit: value and unit of that parameter, as requested.
     """
@@ -121,7 +125,7 @@ class JournalEntry:
     def refused(self) -> bool:
         """Return whether a request was refused.
 
-        A wait for control or for a busy microscope and a missing answer are not refusals.
+        A request that has to wait, for control or for a busy microscope, and a request without an answer are not.
         """
         waits = self.request == ControlRequest.REQUEST_CTRL and self.response in WAIT_FOR_CONTROL
         return not waits and self.response not in _NOT_REFUSED
@@ -152,7 +156,7 @@ class ProcessState:
 
 @dataclass(frozen=True, slots=True)
 class ProcessStates:
-    """All processes of one supervisor; each computer has one supervisor."""
+    """The states of all processes of one supervisor. A run has one supervisor for each `afspm run` that takes part."""
 
     time_ns: int
     supervisor: str
@@ -199,12 +203,12 @@ class Progress:
     left_s: float | None = None
 
     def remaining_ns(self, now_ns: int) -> int | None:
-        """Return the remaining time at the moment `now_ns`; None if unknown."""
+        """Return the remaining experiment time in ns at the moment `now_ns`; 0 once overdue, None if unknown."""
         return None if self.left_s is None else max(0, round(self.left_s * 1e9) - max(0, now_ns - self.time_ns))
 
 
 class HasTime(Protocol):
-    """A measurement with the time of its end; None if unknown."""
+    """A measurement with the time of its end, ns since the Unix epoch; None if unknown."""
 
     @property
     def time_ns(self) -> int | None: ...
@@ -245,8 +249,8 @@ class MeasurementSettings:
 
     Attributes:
         who: the component.
-        parameters: empty if its next measurements are not part of a sweep.
-        key: the key of the measurement, if it is taken exactly once.
+        parameters: empty if the component's next measurements are not part of a sweep.
+        key: key of the measurement; empty without a key.
     """
 
     time_ns: int
@@ -257,10 +261,11 @@ class MeasurementSettings:
 
 @dataclass(frozen=True, slots=True)
 class RelayedMessage:
-    """A message that the scheduler publishes for another process: ProcessStates, LogLines, Progress,
-    MeasurementSettings or Note.
+    """A serialised message that the scheduler publishes for another process.
 
-    Its envelope is the name of the message; for ProcessStates and Progress "_" and the sender's name follow.
+    The message is a ProcessStates, LogLines, Progress, MeasurementSettings, Note, Proposal or InstrumentReadings. Its
+    envelope is the name of the message. For ProcessStates, Progress and InstrumentReadings "_" follows, and the name of
+    the supervisor, component or instrument.
     """
 
     message: str

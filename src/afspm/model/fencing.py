@@ -1,7 +1,7 @@
-"""The fence of a translator, which obeys only the newest life of its own run's scheduler.
+"""Fencing: a translator obeys only the scheduler of its own run, and of this scheduler only the newest life.
 
-A scheduler puts its epoch before each request. Without it, two experiments at the same addresses would command one
-microscope unnoticed.
+A life lasts from a start of the process to its end. A scheduler sends its epoch before each request. Without epochs two
+experiments at the same addresses would command one microscope unnoticed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _EPOCH = re.compile(rb"([\w-]{1,40}):(\d{1,20}):([01])")
 
 @dataclass(frozen=True)
 class Epoch:
-    """One life of the scheduler of one run.
+    """The identity of one life of a run's scheduler.
 
     Attributes:
         run: the identity of the run.
@@ -44,7 +44,7 @@ class Epoch:
 
 
 class SchedulerFence:
-    """The decision whether a translator obeys a sender.
+    """A guard that decides which senders a translator obeys.
 
     Args:
         run: the identity of the translator's run; empty: the first scheduler is obeyed while it stays connected.
@@ -60,7 +60,7 @@ class SchedulerFence:
         """Return the reason for refusing a sender; empty if the translator obeys it.
 
         Args:
-            epoch: epoch in the request; None without one.
+            epoch: epoch of the request; None for a request without an epoch.
             run: identity of the run in the id of a component's own request; empty: unknown.
             is_connected: returns whether the scheduler that was obeyed last is still connected.
         """

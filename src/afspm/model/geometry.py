@@ -79,18 +79,19 @@ class Region:
 
     @classmethod
     def from_top_left(cls, top_left_m: XY, size_m: XY, angle_rad: float = 0.0, frame: Frame = Frame.TIP) -> Region:
-        """Return a region from the corner of smallest x and y of the unrotated rectangle, as on the wire."""
+        """Return a region from the corner of smallest x and y before the rotation, called "top left" on the wire."""
         center_m = (top_left_m[0] + size_m[0] / 2, top_left_m[1] + size_m[1] / 2)
         return cls(center_m, size_m, angle_rad, frame)
 
     @property
     def top_left_m(self) -> XY:
-        """Return (x, y) of the corner of smallest x and y of the unrotated rectangle."""
+        """Return (x, y) in m of the corner of smallest x and y before the rotation."""
         return (self.center_m[0] - self.size_m[0] / 2, self.center_m[1] - self.size_m[1] / 2)
 
     def corners_m(self) -> NDArray[np.float64]:
-        """Return the four corners after the rotation, shape (4, 2), counter-clockwise from the corner of smallest x and
-        y.
+        """Return the four rotated corners in m, shape (4, 2), counter-clockwise.
+
+        The first is the corner of smallest x and y before the rotation.
         """
         # imported late, as in all of model: processes without values start in half the time without numpy
         import numpy as np
@@ -122,7 +123,7 @@ class Region:
         return (across + 0.5) * (shape[0] - 1), (along + 0.5) * (shape[1] - 1)
 
     def has_size_of(self, other: Region, tolerance: float) -> bool:
-        """Return whether both sizes agree with those of `other` within a relative tolerance."""
+        """Return whether width and height agree with `other` within a relative tolerance."""
         return all(math.isclose(a, b, rel_tol=tolerance) for a, b in zip(self.size_m, other.size_m, strict=True))
 
     def moved_to(self, center_m: XY) -> Region:
@@ -137,7 +138,10 @@ class Region:
 
 @dataclass(frozen=True)
 class RegionChange:
-    """A request to change some fields of a region, in m and rad before the rotation; None stays unchanged."""
+    """A request to change some fields of a region; None stays unchanged.
+
+    Corner and size are in m and before the rotation, the angle is in rad.
+    """
 
     left_m: float | None = None
     low_m: float | None = None

@@ -1,4 +1,4 @@
-"""Approvals of persons for agents: of one plan, or a grant within whose bounds an agent measures by itself."""
+"""Approvals of persons for agents: of one plan, or grants, which are bounds for measurements without a plan."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class GrantedRange:
 
 @dataclass(frozen=True, slots=True)
 class GrantedCount:
-    """An action, and how often it may be used."""
+    """An action, and the largest number of its uses."""
 
     action: str
     count: int
@@ -54,12 +54,14 @@ class Grant:
         steps: all requests of the plan, in order.
         region_m: the region of a grant: x and y of the centre, width, height; empty: no place may be set.
         ranges, counts: the parameters and actions that a grant allows; all others are refused.
-        lasts_s: experiment time; 0: all approvals of the agent end.
+        lasts_s: duration of the approval in experiment time; 0: all approvals of the agent end.
         run: the run for which the approval is valid.
         limits: digest of the limits that the plan was checked against.
-        since_ns: the time of that check. A flagged problem, or MANUAL, since then makes the approval stale.
-        offset_m: the origin of component coordinates in microscope coordinates at that check.
-        drift_m: largest change of the offset; empty offset: not checked.
+        since_ns: the time of that check. The scheduler refuses an approval as stale if a problem was flagged or the
+            mode changed since then, or after an hour.
+        offset_m: the origin of component coordinates in microscope coordinates at that check; empty: the scheduler maps
+            no coordinates.
+        drift_m: largest change of the offset; beyond it the approval is refused, too.
 
     Raises:
         InvalidValue: a number out of range.
@@ -115,7 +117,7 @@ class Approval:
     Attributes:
         plan: the id of the approved plan; empty: a grant.
         by: the person who approved.
-        left: the actions that a grant still allows.
+        left: the actions that a grant still allows, with the remaining counts.
         region_m, ranges, counts: the bounds of a grant, as in `Grant`.
     """
 
@@ -143,7 +145,7 @@ class Approvals:
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """A plan that an agent proposes, frozen.
+    """A plan that an agent proposes; after the proposal the plan no longer changes.
 
     Attributes:
         who: "component:name".

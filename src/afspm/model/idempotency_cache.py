@@ -28,11 +28,11 @@ class RequestStatus(Enum):
     """The state of a request without an answer to repeat."""
 
     PENDING = auto()
-    """Waiting, or sent to the translator: a repetition gets the same answer."""
+    """Waiting, or sent to the translator: a repetition gets the answer to the first request."""
     UNKNOWN = auto()
     """Sent, with an unknown outcome."""
     FORGOTTEN = auto()
-    """At or below the floor of its session: it may have been carried out."""
+    """The number is at or below the floor of its session: the request may have been carried out."""
 
 
 _Outcomes = Mapping[str, tuple[int, RequestStatus | Response]]
@@ -47,7 +47,7 @@ _Shelf = tuple[str, bool]
 
 @dataclass(frozen=True)
 class Floors:
-    """The highest forgotten number of each session: ids at or below it are never new.
+    """The highest forgotten number of each session: ids at or below this number are never new.
 
     Attributes:
         most: maximum number of sessions.
@@ -58,7 +58,7 @@ class Floors:
     numbers: Mapping[str, int] = field(default_factory=dict)
 
     def forgetting(self, client: str, request_ids: Iterable[str]) -> Floors:
-        """Raise the floors to the numbers of forgotten ids."""
+        """Return the floors, raised to the numbers of forgotten ids."""
         raised = dict(self.numbers)
         for request_id in request_ids:
             if (numbered := number_of(request_id)) is not None:
@@ -77,10 +77,11 @@ class IdempotencyCache:
     """The status or answer of the latest request ids of each client.
 
     Attributes:
-        per_client: maximum number of ids for each client, separately for ids with and without numbers.
-        clients: maximum number of clients.
-        sent_actions: actions sent to the translator, kept over a restart. The translator would not repeat such an
-            action, but the scheduler must not move the microscope in preparation for it again.
+        per_client: number of ids kept for each client, up to an eighth more between two merges, separately for ids with
+            and without numbers.
+        clients: maximum number of clients; a client with both kinds of ids counts twice.
+        sent_actions: latest actions sent to the translator, kept over a restart. The translator would not repeat such
+            an action, but the scheduler must not move the microscope in preparation for it again.
         floors: the highest forgotten numbers, kept over a restart.
         table: the outcomes of the older and the latest ids of each client.
     """
@@ -92,7 +93,10 @@ class IdempotencyCache:
     table: Mapping[_Shelf, tuple[_Outcomes, _Outcomes]] = field(default_factory=dict)
 
     def look_up(self, client: str, request: Request) -> RequestStatus | Response | None:
-        """Return the status or answer of an id; None for a new or empty id."""
+        """Return the status or answer of an id; None for a new or empty id.
+
+        The answer is a FAILURE if the id was used for another request before.
+        """
         older, latest = self.table.get(_shelf(client, request.id), _NONE)
         entry = latest.get(request.id) or older.get(request.id) if request.id else None
         # an id at or below its floor may have been executed, so it is not new
@@ -114,7 +118,7 @@ class IdempotencyCache:
         return replace(self, table={**self.table, shelf: (older, latest)})
 
     def sent(self, client: str, request: Request) -> IdempotencyCache:
-        """Remember a sent action over a restart."""
+        """Remember a sent action over a restart; the oldest beyond a hundred are forgotten and raise the floors."""
         others = (one for one in self.sent_actions if one[:2] != (client, request.id))
         actions = (*others, (client, request.id, fingerprint(request)))
         floors = self.floors

@@ -64,7 +64,7 @@ class InstrumentReadings:
     """A report of an instrument: all of its values, and the outcomes of orders since the last report.
 
     Attributes:
-        token: the token of the scheduler's last answer, which precedes the report.
+        token: the token of the scheduler's last answer before the report.
     """
 
     time_ns: int
@@ -80,7 +80,7 @@ class InstrumentOrder:
 
     Attributes:
         number: identifies the order in its outcome.
-        id: the id of the client's request, which is carried out once.
+        id: the id of the client's request; a repeated request has the same id, so that it is carried out once.
         rate_per_s: the fastest change allowed, in `rate_unit` per real second; None: no limit.
     """
 

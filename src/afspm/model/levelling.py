@@ -1,4 +1,4 @@
-"""Levelling of scans: subtract a polynomial surface fitted to the heights. Pure.
+"""Levelling of scans: pure functions that subtract a polynomial surface fitted to the heights.
 
 Heights are fitted over x and y from -1 to 1, so that the result does not depend on the scan's size. NaN (not measured)
 is left out of the fit.
@@ -31,7 +31,10 @@ _MAD: Final = 1.4826
 def levelled(
     values: Floats, order: int = 1, fit: str = "least-squares", quantile: float = 0.5, rows: str | None = None
 ) -> Floats:
-    """Return values [y, x] without a polynomial surface, NaN where nothing was measured; see `Scan.levelled`."""
+    """Return values [y, x] without a polynomial surface, NaN where nothing was measured.
+
+    Arguments and errors as for `Scan.levelled`.
+    """
     if fit not in FITS:
         raise InvalidValue(f"there is no fit {fit!r}", hint=f"one of {', '.join(sorted(FITS))}")
     if order not in range(4) or not 0.0 < quantile < 1.0:

@@ -24,7 +24,7 @@ class Levelling(Enum):
     MEDIANS = "medians"
     """The median of each row."""
     DIFFERENCES = "differences"
-    """The summed median difference of each row from the row before: features longer than half a row do no harm."""
+    """The sum of the median differences between neighbouring rows: features longer than half a row do no harm."""
 
 
 def levelled(values: Array, how: Levelling) -> Array:
@@ -38,9 +38,9 @@ def levelled(values: Array, how: Levelling) -> Array:
 
 
 def flattened(values: Array) -> Array:
-    """Return values with all lines at one height and without a plane, for small pictures.
+    """Return values [y, x] with rows aligned in height and a plane subtracted, for small pictures.
 
-    Outliers are masked: neither a scar nor a high particle tilts its neighbours.
+    The plane is fitted without outliers: neither a scar nor a high particle tilts its neighbours.
     """
     flat = levelled(levelled(values, Levelling.DIFFERENCES), Levelling.PLANE)
     finite = np.isfinite(flat)

@@ -9,20 +9,20 @@ from afspm.basics.frozen import replace
 from afspm.model import Feedback, Parameter, Request, ScopeState, names
 
 FEEDBACK_OFF = "feedback-off"
-"""Name, among the dangerous states, of a feedback that is known to be off."""
+"""The name in `dangerous` for a feedback that is known to be off."""
 STOPS = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
 """Actions that stop a running scan or spectrum."""
 STARTS = {names.START_SCAN: names.STOP_SCAN, names.START_SPEC: names.STOP_SPEC}
-"""Actions that start a scan or spectrum, with the actions that stop it."""
+"""Actions that start a scan or spectrum, each with the action that stops it."""
 _OFF = names.OFF_WORDS | {"0.0"}  # translators of other makes may take a number
 
 
 @dataclass(frozen=True)
 class TipRisk:
-    """The part of the status that endangers the tip; it survives a restart.
+    """The part of the status that shows a danger to the tip; kept over a restart.
 
     Attributes:
-        state: the last known state; a microscope continues in it after the loss of its controller.
+        state: the last known state, which lasts even after the loss of the controller.
         feedback_on: None if unknown.
         tip_away: whether the tip is withdrawn, so that neither the coarse motor nor a switched-off feedback does harm.
     """
@@ -37,7 +37,7 @@ class MicroscopeStatus:
     """The known activity of the microscope.
 
     Attributes:
-        dangerous: names of ScopeState, and "feedback-off".
+        dangerous: states that endanger the tip: names of ScopeState, and "feedback-off".
         patience_s: real time after which the loss of the controller becomes a problem. If the controller returns
             before, its scan continues.
         state: the last published state; UNDEFINED for a lost controller or invalid answers.
@@ -60,7 +60,7 @@ class MicroscopeStatus:
 
     @property
     def is_free(self) -> bool:
-        """Return whether the microscope is free; true before its first state."""
+        """Return whether the microscope is free; True before its first published state."""
         return self.state is ScopeState.FREE or not self.states_seen
 
     @property
@@ -76,7 +76,7 @@ class MicroscopeStatus:
         return replace(changed, lost_since_s=None)._with_risk(replace(self.risk, state=state))
 
     def with_feedback(self, feedback: Feedback) -> MicroscopeStatus:
-        """Return the status with the present feedback."""
+        """Return the status with a published feedback; unchanged if `feedback.on` is unknown."""
         if feedback.on is None:
             return self
         certain = replace(self, in_doubt=False)
@@ -93,7 +93,7 @@ class MicroscopeStatus:
         return replace(changed, feedback_before=self.risk.feedback_on, in_doubt=True)
 
     def feedback_was_left(self) -> MicroscopeStatus:
-        """Return the status before `feedback_may_be_off`, after a refusal of the request."""
+        """Return the status with the feedback from before `feedback_may_be_off`, after a refusal of the request."""
         if not self.in_doubt:
             return self
         return replace(self, in_doubt=False)._with_risk(replace(self.risk, feedback_on=self.feedback_before))
@@ -114,7 +114,7 @@ class MicroscopeStatus:
 
     @property
     def danger(self) -> str | None:
-        """Return the danger to the tip, in words; None if there is none, or it is averted."""
+        """Return the danger to the tip, in words; None without a danger, or with the tip withdrawn."""
         if self.risk.tip_away:
             return None
         if self.endangered_by_feedback:
@@ -123,7 +123,7 @@ class MicroscopeStatus:
         return f"the microscope is in {name}" if name in self.dangerous else None
 
     def telling(self) -> tuple[MicroscopeStatus, str | None]:
-        """Return the danger if it was not logged yet, so that each danger is logged once."""
+        """Return the next status, and the danger in words if it was not logged yet, else None."""
         danger = self.danger
         return replace(self, logged=danger), None if danger == self.logged else danger
 

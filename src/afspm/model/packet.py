@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 
+# not frozen, as the events of `transport.port`: frozen dataclasses take twice as long to make
 @dataclass(slots=True)
 class Packet:
     """A published message.
@@ -41,7 +42,7 @@ class PacketHeader:
     Attributes:
         message: the name of the message, e.g. "Scan2d".
         channel: channel of a scan or a list of places.
-        size_m: (x, y) of a scan's region.
+        size_m: (width, height) of a scan's region in m.
         kind: kind of a spectrum, e.g. "IV".
         time_ns: time of measurement, ns since the Unix epoch; None if the message has none.
     """

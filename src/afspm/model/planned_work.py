@@ -24,7 +24,8 @@ class PlannedWork:
         scans, spectra: number of measurements; scans is None without an end.
         path_m: path of the tip over the surface, trace and retrace; None without an end.
         pixels: the number of pixels of all scans, in one channel; None without an end.
-        duration_s: time from the first scan to the end of the last, with pauses, without spectra; None if unknown.
+        duration_s: experiment time from the start of the first scan to the end of the last, with pauses, without
+            spectra; None if unknown.
         at_most: whether the numbers are upper bounds.
         ends_experiment: whether the experiment ends when the work is done.
         why: the reason for an unknown or bounded number.
@@ -46,11 +47,11 @@ class PlannedWork:
 
     @property
     def end_s(self) -> float | None:
-        """Return the experiment time until the work is done; None if unknown."""
+        """Return the experiment time until the work is done; None if unknown, as for work with spectra."""
         return None if self.spectra else self.duration_s
 
     def __add__(self, other: PlannedWork) -> PlannedWork:
-        """Return the sum of two works that follow each other."""
+        """Return the sum of two parts of work, the second after the first."""
         return PlannedWork(
             _sum(self.scans, other.scans),
             self.spectra + other.spectra,
@@ -117,7 +118,8 @@ def planned_rounds(
 def planned_end_s(works: Iterable[PlannedWork | None]) -> float | None:
     """Return the experiment time until the experiment ends; None if unknown.
 
-    The first work that ends the experiment counts, otherwise the longest; None stands for work without an estimate.
+    The earliest work that ends the experiment decides; without such work, the longest. If the end of a deciding work is
+    unknown, the result is None; a None in `works` is work without an estimate.
     """
     all_works = list(works)
     ending = [work.end_s for work in all_works if work is not None and work.ends_experiment]

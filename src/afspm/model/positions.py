@@ -46,7 +46,10 @@ class KnownPosition:
     probe_m: XY | None = None
 
     def learn(self, subject: object) -> KnownPosition:
-        """Return the positions after a position, complete or in part, was set or published."""
+        """Return the positions after a setting or publication, complete or in part.
+
+        A part of an unknown region, and an invalid value, change nothing.
+        """
         with suppress(InvalidValue):  # a part of an unknown region
             return self.onto(subject)
         return self
@@ -81,7 +84,7 @@ class KnownPosition:
         On a microscope without an angle parameter a frame counts as unrotated.
 
         Args:
-            values: None for a parameter without a number in the answer.
+            values: values in SI by the parameter's name; None for an answer without a number.
         """
         wrong = [name for name, value in values.items() if value is None]
         known = self.without(wrong)
@@ -103,7 +106,7 @@ class KnownPosition:
         return known
 
     def without(self, names_: Collection[str]) -> KnownPosition:
-        """Forget the positions that depend on the named parameters."""
+        """Return the positions, with region, shape or probe forgotten if a named parameter is a part of it."""
         return KnownPosition(
             None if REGION_CHANGES.keys() & names_ else self.region,
             None if SHAPE_CHANGES.keys() & names_ else self.shape,
@@ -115,7 +118,7 @@ def changes_by(values: Iterable[tuple[str, float]]) -> list[PositionChange | Sca
     """Return the changes of probe and scan by single parameters that are set together.
 
     Raises:
-        InvalidValue: a number of pixels that is not a whole number.
+        InvalidValue: a number of pixels is not a whole number, or below 1.
     """
     given: dict[type, Plain] = {}
     for name, value in values:

@@ -10,7 +10,7 @@ from afspm.basics.errors import InvalidValue
 
 HIGHEST_PROBLEM = 255  # one byte on the wire
 STOPPED_BY_AGENT = "stopped-by-agent"
-"""The problem flagged by an agent's tool `stop`; an experiment with an agent has it, with the highest number."""
+"""The problem flagged by an agent's tool `stop`. Every experiment with an agent has it, by default as number 255."""
 STOPPER = " stop"
 """Suffix of the name under which an agent stops, over a second connection: the first may wait for the microscope."""
 

@@ -30,9 +30,12 @@ class ControlRequest(IntEnum):
 
 # numbers from 100 on are extensions of afspm, unknown to the published implementation
 CLOCK_REQUEST = 101
-"""Request for the experiment time; an extension of afspm."""
+"""Request for the experiment time and other facts of the run, such as its clock and versions; an extension of afspm."""
 RELAY_REQUEST = 102
-"""Request to publish a message of the sender; the answer to a supervisor holds orders. An extension of afspm."""
+"""Request to publish a message of the sender; an extension of afspm.
+
+The answer to a supervisor or an instrument holds its orders.
+"""
 RESTART_REQUEST = 103
 """Request to restart the process named by its subject; an extension of afspm."""
 LEASE_REQUEST = 104
@@ -48,7 +51,7 @@ The subject is a Grant.
 """
 
 OTHER_RUN_RESPONSE = 100
-"""Response to a component that named another run than the scheduler's; an extension of afspm."""
+"""Response to a component of another run than the scheduler's run; an extension of afspm."""
 
 _OURS = {
     CLOCK_REQUEST: "CLOCK",
@@ -90,7 +93,7 @@ WAIT_FOR_CONTROL = frozenset(
 
 
 class RescanKind(IntEnum):
-    """Requests to a Rescanner, a message that only afspm has."""
+    """The kinds of a request to the component Rescanner, in a message that only afspm has."""
 
     AGAIN = 1
     """Scan the same region again."""
@@ -106,7 +109,7 @@ class Parameter:
 
     Attributes:
         value: as text, in `unit`; None to read it.
-        unit: unit of `value`; None for SI.
+        unit: unit of `value`; None for the wire's own unit: SI, but degrees for angles.
     """
 
     name: str
@@ -120,8 +123,8 @@ class Request:
 
     Attributes:
         kind: the number of a ControlRequest.
-        subject: a ScanParameters, Feedback, ProbePosition or Parameter, the name of an action, or the number of a
-            problem or control mode; None for requests without a subject.
+        subject: a model object, such as a ScanParameters, Parameter or Grant; the name of an action or process; the
+            number of a problem or control mode; or the seconds of a lease. None for requests without a subject.
         payload: the subject in bytes, as received.
         id: equal for all repetitions of one request; empty if the request may not be repeated.
     """

@@ -99,7 +99,7 @@ class Scan:
         channel: e.g. "Height Retrace".
         unit: unit of the values.
         values: [y, x], both ascending, float64; empty if only the parameters arrived.
-        time_ns: time of its end, ns since the Unix epoch; None if unknown.
+        time_ns: end of the scan, ns since the Unix epoch; None if unknown.
         filename: the controller's own file; empty without a file.
         pixels: (rows, columns) of a scan without values; None if unknown.
     """
@@ -135,7 +135,7 @@ class Scan:
 
     @property
     def time(self) -> datetime | None:
-        """Return the end of the scan, UTC."""
+        """Return the end of the scan, UTC; None if unknown."""
         return None if self.time_ns is None else utc_time(self.time_ns)
 
     @property
@@ -165,7 +165,8 @@ class Scan:
             The same region and pixels; NaN where nothing was measured.
 
         Raises:
-            InvalidValue: an argument is not finite, or the sample is as fast as the scan.
+            InvalidValue: an argument is not finite, the duration is below zero, or the sample moves along the slow
+                axis as fast as the scan.
         """
         from afspm.model.drift_removal import undistorted
 
@@ -186,7 +187,7 @@ class Scan:
                 robust against long features, or by a straight "line"; None: not at all.
 
         Raises:
-            InvalidValue: there is no such fit or order, or too few pixels were measured.
+            InvalidValue: there is no such fit, order, quantile or levelling of rows, or too few pixels were measured.
         """
         from afspm.model.levelling import levelled
 
@@ -201,7 +202,9 @@ class Scan:
         vmin: float | None = None,
         vmax: float | None = None,
     ) -> Axes:
-        """Draw the scan with matplotlib: with a scale bar, and a colour bar with units.
+        """Draw the scan with matplotlib; an image or contours get a scale bar, and a colour bar with units.
+
+        Only the first scan drawn into the axes gets these bars.
 
         Args:
             kind: "image", "contour" or "surface" (in three dimensions).
@@ -216,7 +219,7 @@ class Scan:
             `axes.plot(*spectrum.position_m, "o")`, appears at its measured position.
 
         Raises:
-            InvalidValue: there is no such kind, or nothing was measured.
+            InvalidValue: there is no such kind, nothing was measured, or `vmin` is above `vmax`.
         """
         drawn: Axes = required(DISPLAYS, "plot")(self, kind, axes, colorbar=colorbar, vmin=vmin, vmax=vmax)
         return drawn
@@ -234,7 +237,8 @@ class Scan:
         """Return a two-dimensional `sidpy.Dataset` as a scan; axes in any unit of length.
 
         Raises:
-            InvalidValue: the data are not an image, or the axes are not lengths.
+            InvalidValue: the data are not an image, or an axis has only one value.
+            UnitError: an axis is not a length.
         """
         scan: Scan = required(DISPLAYS, "from_sidpy")(dataset)
         return scan
@@ -295,12 +299,12 @@ class ScanSet(Mapping[str, Scan]):
 
     @property
     def time(self) -> datetime | None:
-        """Return the end of the scan, UTC."""
+        """Return the end of the scan, UTC; None if unknown."""
         return self.first.time
 
     @property
     def time_ns(self) -> int | None:
-        """Return the end of the scan, ns since the Unix epoch."""
+        """Return the end of the scan, ns since the Unix epoch; None if unknown."""
         return self.first.time_ns
 
     def __getitem__(self, channel: str) -> Scan:

@@ -1,4 +1,4 @@
-"""Sessions: the decision which connection owns a name, over restarts, and with two processes under one name.
+"""Sessions: ownership of a client's name by one connection, over restarts, and with two processes under one name.
 
 A name belongs to one session at a time: one life of one process. Its first connection binds the name. Later
 connections show the session's token in their request ids ("<name>/<token>/<n>"). For peers without ids, the connection
@@ -33,7 +33,7 @@ _RUN = re.compile("[0-9a-f]{16}")
 
 
 class Hearing(Enum):
-    """The verdict on a message from a connection."""
+    """The verdict on a message under a name from a connection."""
 
     ACCEPTED = auto()
     STALE = auto()

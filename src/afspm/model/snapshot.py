@@ -85,8 +85,9 @@ def from_plain(type_: Any, plain: Any) -> Any:
     """Return plain data as a value of a type: the inverse of `to_plain`.
 
     Raises:
-        KeyError: a field without a default is missing.
-        TypeError, ValueError: a value does not fit its type.
+        TypeError: a field without a default is missing, or a value does not fit its type.
+        ValueError: a field is unknown, or a value is not allowed.
+        AttributeError: the plain data of a dataclass are no mapping.
     """
     origin, arguments = get_origin(type_), get_args(type_)
     if type_ is Any:

@@ -55,11 +55,15 @@ class Spectrum:
 
     @property
     def time(self) -> datetime | None:
-        """Return the time of measurement, UTC."""
+        """Return the time of measurement, UTC; None if unknown."""
         return None if self.time_ns is None else utc_time(self.time_ns)
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
-        """Return the values of a variable, shape (points,)."""
+        """Return the values of a variable, shape (points,).
+
+        Raises:
+            NoSuchItem: there is no such variable.
+        """
         if name not in self.names:
             raise NoSuchItem(f"no variable {name!r}; there are {', '.join(self.names)}")
         return self.values[:, self.names.index(name)]

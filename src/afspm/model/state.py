@@ -65,7 +65,10 @@ class Feedback:
 
 @dataclass(frozen=True)
 class ProbePosition:
-    """The position of the probe between scans: (x, y) in m, in tip coordinates unless a component maps them."""
+    """The position of the probe between scans: (x, y) in m.
+
+    The position is in tip coordinates; for components of a run whose scheduler corrects drift, in sample coordinates.
+    """
 
     xy_m: XY
 

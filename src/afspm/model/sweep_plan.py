@@ -43,7 +43,7 @@ class SweepAxis:
         """Read the values of a parameter from a list or a range.
 
         Raises:
-            InvalidValue, UnitError: there are no values, or values that this parameter can't have.
+            InvalidValue, UnitError: there are no values, a value twice, or values that this parameter can't have.
         """
         if isinstance(given, Mapping):
             unit, values = (
@@ -62,7 +62,7 @@ class SweepAxis:
         return cls(name, values, unit)
 
     def parameter(self, place: int) -> Parameter:
-        """Return the request to set a value."""
+        """Return the Parameter that sets the value with index `place`."""
         value = self.values[place]
         if isinstance(value, bool):
             return Parameter(self.name, str(value).lower())
@@ -73,7 +73,10 @@ class SweepAxis:
         return Parameter(self.name, text, self.unit)
 
     def in_steps(self) -> SweepAxis:
-        """Return the axis with its numbers sorted; the first and last listed number give the direction."""
+        """Return the axis with its numbers sorted; the first and last listed number give the direction.
+
+        An axis with texts or switches stays unchanged.
+        """
         numbers = [value for value in self.values if not isinstance(value, str | bool)]
         if len(numbers) < len(self.values):
             return self
@@ -119,7 +122,7 @@ class SweepPlan:
         return math.prod(len(axis.values) for axis in self.axes)
 
     def places(self) -> list[tuple[int, ...]]:
-        """Return the points in their order, each as one index per axis."""
+        """Return the points in the order of measurement, each as a tuple of one value's index per axis."""
         if self.order == "snake":
             return [self._snake(index) for index in range(self.total)]
         listed = [self._listed(index) for index in range(self.total)]
@@ -132,7 +135,7 @@ class SweepPlan:
         return tuple(axis.parameter(place) for axis, place in zip(self.axes, places, strict=True))
 
     def values(self, places: Sequence[int]) -> dict[str, SweptValue]:
-        """Return the values at a point by their parameters."""
+        """Return the values at a point by parameter name."""
         return {axis.name: axis.values[place] for axis, place in zip(self.axes, places, strict=True)}
 
     def _listed(self, index: int) -> tuple[int, ...]:

@@ -18,10 +18,10 @@ from afspm.transport.rate_limited_log import RateLimitedLog
 
 
 class ControlClient:
-    """A client that sends requests to the scheduler as a REQ socket does, but need not wait for each answer.
+    """A client that sends requests to the scheduler in a REQ socket's format, but need not wait for each answer.
 
     Args:
-        name: name of the component; after a restart the scheduler recognises the same client.
+        name: name of the component, under which the scheduler recognises the same client after a restart.
     """
 
     def __init__(self, network: Network, name: str, address: str, log: RateLimitedLog) -> None:
@@ -36,10 +36,10 @@ class ControlClient:
         network.connect(self.socket, address)
 
     def send(self, frames: Sequence[bytes]) -> None:
-        """Send a request; it is dropped while there is no scheduler.
+        """Send a request; without a connection to the scheduler the request is dropped.
 
-        A second request before the answer to the first opens a new connection: the old one may look intact while it is
-        cut off, or while another process has taken its identity.
+        A repetition of the last request (the same id) before its answer is not sent, but opens a new connection: the
+        old connection may look intact while it is cut off, or while another process has taken its identity.
         """
         if not self._connected:
             return
@@ -62,7 +62,7 @@ class ControlClient:
         self.socket.connect(self._address)
 
     def receive(self) -> list[Incoming]:
-        """Return the next answer."""
+        """Return the next answer; empty for the scheduler's probe or a malformed reply."""
         frames = [frame.bytes for frame in receive_frames(self.socket)]
         if not frames or frames == [b""]:  # an empty message is the scheduler's probe
             return []

@@ -69,9 +69,9 @@ class Versions:
 
 
 def of_packages(declared: Iterable[DeclaredName]) -> Iterator[Diagnosis]:
-    """Yield the names that each package adds to afspm, one line for each group, then the unusable names.
+    """Yield a warning for each unusable name, then the names that each package adds to afspm, one line per group.
 
-    An unusable name is a warning: only an experiment with this name fails.
+    An unusable name is no error: only an experiment with this name fails.
     """
     usable: dict[tuple[str, str], list[str]] = {}
     for one in declared:
@@ -133,7 +133,11 @@ def of_address(owner: str, address: str, reach: Reach, *, is_here: bool, expecte
 
 
 def of_handshake(address: str, handshake: Handshake, key: str, server: str) -> Diagnosis:
-    """Return the diagnosis of the key exchange of `key` at an address of `server`."""
+    """Return the diagnosis of a key exchange at an address of the process `server`.
+
+    Args:
+        key: owner of the key of this computer's connection; empty without keys.
+    """
     code = f"key-{handshake.value}"
     if handshake is Handshake.DONE:
         return fine(code, address, f"the key of {key} is accepted" if key else "no key is needed")
@@ -151,7 +155,12 @@ MOST_AHEAD_S = 1.0
 
 
 def of_clock(ahead_s: float, uncertain_s: float) -> Diagnosis:
-    """Return the diagnosis of the difference between this computer's clock and the scheduler's."""
+    """Return the diagnosis of the difference between this computer's clock and the scheduler's clock.
+
+    Args:
+        ahead_s: lead of this computer's clock over the scheduler's clock.
+        uncertain_s: uncertainty of the measured lead.
+    """
     where = "the clock of this computer"
     if abs(ahead_s) <= MOST_AHEAD_S + uncertain_s:
         return fine("clock", where, f"agrees with the scheduler's clock to {abs(ahead_s) + uncertain_s:.2f} s")
@@ -162,7 +171,7 @@ def of_clock(ahead_s: float, uncertain_s: float) -> Diagnosis:
 
 
 def of_versions(ours: Versions, theirs: Versions | None) -> Diagnosis:
-    """Return the diagnosis of the versions on this computer and on the scheduler's."""
+    """Return the diagnosis of the versions on this computer and on the scheduler's computer; None: unknown there."""
     here = f"afspm {ours.afspm}, Python {ours.python}, libzmq {ours.libzmq}"
     if theirs is None or theirs == ours:
         return fine("versions", "this computer", here)
@@ -198,7 +207,12 @@ LEAST_MEMORY_BYTES = 1 << 30
 
 
 def of_memory(available: int, used: Mapping[str, int]) -> Diagnosis:
-    """Return the diagnosis of this computer's memory; `used` is in bytes per process of the experiment."""
+    """Return the diagnosis of this computer's memory.
+
+    Args:
+        available: free memory in bytes.
+        used: memory of each process of the experiment, in bytes.
+    """
     largest = sorted(used.items(), key=lambda one: -one[1])[:5]
     users = "".join(f", {name} {size / 1e6:.0f} MB" for name, size in largest)
     what = f"{available / 1e9:.1f} GB available{users}"
@@ -209,7 +223,7 @@ def of_memory(available: int, used: Mapping[str, int]) -> Diagnosis:
 
 @dataclass(frozen=True)
 class Heard:
-    """The packets received under one envelope while listening."""
+    """The packets received under one envelope: their number, and their size in bytes."""
 
     envelope: str
     count: int
@@ -226,7 +240,11 @@ class Heard:
 
 
 def of_publisher(address: str, heard: Iterable[Heard], *, caught_up: bool) -> Diagnosis:
-    """Return the diagnosis of the packets received from the scheduler's publisher."""
+    """Return the diagnosis of the packets received from the scheduler's publisher.
+
+    Args:
+        caught_up: whether all cached packets have arrived.
+    """
     count = sum(one.count for one in heard)
     if caught_up:
         return fine("heard", address, f"{count} packets while listening, after all that was cached")

@@ -34,7 +34,7 @@ def contents(frames: Sequence[zmq.Frame]) -> list[Buffer]:
 
 
 def send_frames(socket: Socket, frames: Sequence[bytes]) -> bool:
-    """Send a whole message; return False if no peer can take it. Never blocks.
+    """Send a whole message; return False if no peer can take the message. Never blocks.
 
     Raises:
         zmq.ZMQError: the addressed peer is gone, on sockets that report it.
@@ -52,8 +52,8 @@ def send_packet(socket: Socket, packet: Packet, stamp: bytes | None, *, topic: b
     """Publish a packet; a received payload is sent from its own buffer.
 
     Args:
-        stamp: the third frame; None: the packet has two.
-        topic: frame before the envelope.
+        stamp: the third frame, a serialised time; None: the packet has two frames.
+        topic: frame before the envelope, for a replay to one subscriber; None: no such frame.
     """
     payload: Buffer | zmq.Frame = packet.payload
     if isinstance(payload, memoryview):
@@ -71,7 +71,7 @@ def send_packet(socket: Socket, packet: Packet, stamp: bytes | None, *, topic: b
 def descriptor_of(frame: zmq.Frame) -> int:
     """Return the file descriptor of a message's connection; -1 for peers older than ZMTP 3.
 
-    Only for REQ sockets and plain subscribers, see `router` and `publisher`: the library calls this option obsolete.
+    Only for REQ sockets, see `router`: the library calls this option obsolete.
     """
     try:
         return int(frame.get(zmq.SRCFD))

@@ -24,8 +24,8 @@ class Heartbeat(NamedTuple):
     Attributes:
         name: name of the process.
         closing: whether the process ends on purpose, so that no more heartbeats follow.
-        step_age_s: age of the current step; 0 when idle. None if the process does not send it.
-        longest_step_s: longest allowed step; None if the process does not send it.
+        step_age_s: age of the current step in real time; 0 when idle, None if missing.
+        longest_step_s: longest allowed duration of a step; None if missing.
     """
 
     name: str
@@ -37,14 +37,14 @@ class Heartbeat(NamedTuple):
 class HeartbeatSender:
     """A thread that sends heartbeats, so that a busy process is not presumed dead.
 
-    The first heartbeat is sent once there is a listener.
+    A heartbeat is sent as soon as the listener has connected; earlier heartbeats are lost.
 
     Args:
         address: address of the listener.
         period_s: real seconds between heartbeats.
         step_age_s: returns the age of the current step; called in the thread.
         longest_step_s: returns the longest allowed step; called in the thread.
-        token: token of the launch line, which proves the sender.
+        token: token of the launch line, which proves the sender's identity.
         network: network of this socket only, closed with it.
 
     Attributes:
@@ -112,12 +112,12 @@ class _Expected:
 class HeartbeatListener:
     """A receiver of the heartbeats of several processes, each with its own address and token.
 
-    Other users of this computer can't reach an address: it is a unix socket, or encrypted with a key that only the
-    process gets. Other processes of this user can. So once a process has sent its token, heartbeats without it are
-    ignored. A program that never sends a token is believed.
+    With `encrypts`, other users of this computer can't send heartbeats: an address is a unix socket, or encrypted with
+    a key that only the process gets. Other processes of this user can. So once a process has sent its token, heartbeats
+    without the token are ignored. Until then they count, unless the process needs a token.
 
     Args:
-        take_address: returns a new address.
+        take_address: returns a new address to listen at.
         encrypts: whether to encrypt sockets that other users can reach.
     """
 
@@ -134,7 +134,9 @@ class HeartbeatListener:
         self._poller.register(descriptor, zmq.POLLIN)
 
     def listen(self, name: str, *, token: str = "", needs_token: bool = False) -> tuple[str, bytes | None]:
-        """Listen to heartbeats of the process `name`; return the address and its key, None for a plain socket.
+        """Listen for heartbeats of the process `name`; return the address and its public key.
+
+        The key is None for a socket without encryption.
 
         Args:
             token: the token that the process also receives.
@@ -178,7 +180,10 @@ def _is_by(expected: _Expected, frames: list[bytes]) -> bool:
 
 
 def read_beat(name: str, frames: list[bytes]) -> Heartbeat | None:
-    """Return a heartbeat of one or four frames; None for other frames."""
+    """Return the heartbeat in some frames; None if the first frame is neither BEAT nor CLOSING.
+
+    A missing or malformed age is None; see `basics.launch` for the frames.
+    """
     if not frames or frames[0] not in (BEAT, CLOSING):
         return None
     ages = [_seconds(frame) for frame in frames[1:3]]

@@ -27,7 +27,7 @@ from afspm.model import component_of
 from afspm.transport.polling import WakeUp
 
 GUEST = "guest"
-"""Owner of the key for notebooks and terminal commands, if keys are made for a run; good for other names too."""
+"""Owner of the key for notebooks and terminal commands of a run with its own keys; also valid under other names."""
 MARK = b"\0"
 """Separates the name from the random part of a socket's identity."""
 DOMAIN = b"afspm"
@@ -46,9 +46,9 @@ class Keys:
         peers: accepted public keys, with the names of their owners.
         servers: names of the peers that bind the addresses to connect to, by address.
         folder: folder to which public keys may be added later; None: no further keys.
-        everywhere: every socket is encrypted. Otherwise, on one computer, only connections to `servers` are, and of the
-            process's own sockets those of `guards`.
-        guards: whether sockets for requests and all but unix sockets are encrypted.
+        everywhere: whether every socket is encrypted. If False (all on one computer), only connections to `servers` are
+            encrypted, and with `guards` some bound sockets.
+        guards: whether bound sockets are encrypted if they receive requests, or are not unix sockets.
     """
 
     name: str
@@ -89,7 +89,10 @@ class Keys:
         return self.everywhere or (self.guards and (requests or not is_private(address)))
 
     def user_as(self, user: str | None, name: str) -> str | None:
-        """Return the user of a key that acts under a name; the guests' key fits every process without a key."""
+        """Return the user for messages under `name` over a connection of the key of `user`.
+
+        The guests' key counts as the key of any component that has none of its own.
+        """
         component = component_of(name)
         return component if user == GUEST and component not in self.peers.values() else user
 
@@ -116,7 +119,7 @@ def routing_id(name: str) -> bytes:
     """Return a new, random socket identity for requests under a name.
 
     A ROUTER socket sends answers to the newest connection of an identity. With the bare name as identity, a second
-    process would cut off the first.
+    process of the same name would cut off the first.
     """
     return name.encode() + MARK + secrets.token_hex(8).encode()
 
@@ -146,7 +149,7 @@ def load(folder: str | Path, name: str, servers: Mapping[str, str] | None = None
 
 
 def require_private(file: Path) -> None:
-    """Refuse a secret that other users may read.
+    """Refuse a secret key that other users may read; no check on Windows, which has no file modes.
 
     Raises:
         ConfigError: the mode of the file lets other users read it.
@@ -170,12 +173,15 @@ def public_keys(folder: Path, name: str) -> dict[bytes, str]:
 
 
 def from_launch(name: str, entries: PlainMapping | None) -> Keys | None:
-    """Return the keys in a launch line, either whole (`Keys.as_launch`) or as names, for programs that join.
+    """Return the keys in a launch line, given whole (`Keys.as_launch`) or by folder and names; None without keys.
 
     A component that acts for a person ("dashboard:Ada") uses its own key.
 
     Args:
         entries: the result of `as_launch`; or `{"folder": …, "<address>": "<name of the binding process>", …}`.
+
+    Raises:
+        ConfigError: as for `load`, for keys in a folder.
     """
     if not entries:
         return None
@@ -216,7 +222,7 @@ def pair() -> tuple[bytes, bytes]:
 
 
 def generate(folder: str | Path, names: Iterable[str]) -> list[Path]:
-    """Make a key pair for each of `names` without one; return the files written.
+    """Make the missing key pairs of `names`; return the files written.
 
     Existing keys stay: a new component joins without changes on the other computers. A public key without its secret
     key belongs to a process on another computer. A lost public key is restored from the file of the secret key.
@@ -276,8 +282,9 @@ def _read(file: Path, name: str) -> dict[str, bytes]:
 class Authenticator:
     """The handler of ZeroMQ's authentication protocol (ZAP, RFC 27) for CURVE keys, in its own thread.
 
-    It answers whether a key may connect, with the name of its owner, which becomes the "User-Id" of every message of
-    the connection. Keys may be added while the experiment runs: at an unknown key, a changed folder is read again.
+    Each answer accepts or refuses a key. It holds the name of the key's owner, which becomes the "User-Id" of every
+    message of the connection. Keys may be added while the experiment runs: at an unknown key, a changed folder is read
+    again.
     """
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], keys: Keys) -> None:
@@ -330,7 +337,7 @@ class Authenticator:
         self._names, self._read_ns = {**found, **self._names}, changed_ns
 
     def close(self) -> None:
-        """Stop the thread; the context must be closed after it."""
+        """Stop the thread. Close the context only afterwards."""
         self._stop.post()
         self._thread.join()
         self._stop.close()

@@ -76,7 +76,7 @@ def is_reserved(subscription: bytes) -> bool:
 
 
 def spelled_out(prefixes: Iterable[bytes]) -> list[bytes]:
-    """Return the prefixes for the socket; an empty prefix is replaced by all first bytes of envelopes."""
+    """Return the prefixes to subscribe a socket to; an empty prefix becomes all possible first bytes of envelopes."""
     found: list[bytes] = []
     for prefix in prefixes:
         found.extend([prefix] if prefix else FIRST_BYTES)
@@ -86,7 +86,8 @@ def spelled_out(prefixes: Iterable[bytes]) -> list[bytes]:
 class PublishedHistory:
     """The kept packets of a publisher, which also assigns times to packets.
 
-    It keeps the last packet of every envelope, and a limited number of other new packets.
+    Kept are the last packet of each envelope, and the newest packets of all envelopes. `most_packets` limits the number
+    of both, `most_bytes` the size of the newest packets.
     """
 
     def __init__(self, clock: Clock, *, most_packets: int = _MOST_PACKETS, most_bytes: int = _MOST_BYTES) -> None:

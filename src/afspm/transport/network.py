@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 MAX_PACKET_BYTES = 256 * 1024 * 1024
 """Longest frame of a published packet: twice a scan of 4096² pixels in one channel."""
 MAX_REQUEST_BYTES = 1024 * 1024
-"""Longest frame of a request, response or subscription."""
+"""Longest frame of a request or response."""
 HAS_PRIVATE_SOCKETS = sys.platform != "win32" and zmq.has("ipc")
 """Whether the system has unix sockets, and modes of folders to protect them."""
 QUEUE_LENGTH = 4000
-"""Limit of waiting messages for one peer; a publisher drops further ones."""
+"""Limit of waiting messages for one peer; a publisher drops further messages."""
 
 _LINGER_MS = 200
 # ZMTP heartbeats: a peer that is frozen or cut off is noticed within seconds, not after hours as by TCP.
@@ -85,12 +85,12 @@ def _can_end_stalled() -> bool:
 
 
 class Network:
-    """A maker of sockets, limited to this computer unless there are keys or `insecure` is set.
+    """A maker of sockets, limited to this computer unless `keys.everywhere` or `insecure` is set.
 
     Args:
-        keys: keys of this process. With keys, connections are encrypted and their owners known: all connections, or
-            only connections for requests and all but unix sockets (`Keys.binds_encrypted`).
-        insecure: bind and connect to other computers without keys. Anyone there can then move the tip.
+        keys: keys of this process. Connections with keys are encrypted, and the owners of their keys are known.
+            `Keys.everywhere` and `Keys.guards` choose these connections.
+        insecure: whether to bind and connect to other computers without keys. Anyone there can then move the tip.
     """
 
     def __init__(self, keys: Keys | None = None, *, insecure: bool = False) -> None:
@@ -110,6 +110,9 @@ class Network:
 
         Args:
             entries: see `keys.from_launch`, or `{"insecure": "true"}`; None: this computer only, without keys.
+
+        Raises:
+            ConfigError: a key is missing or can't be used.
         """
         if not entries:
             return cls()
@@ -144,10 +147,10 @@ class Network:
         """Bind a socket, and return its address, with the chosen port if `address` has port 0.
 
         Args:
-            requests: peers send requests to this socket, so that they must prove their names.
+            requests: whether peers send requests to this socket, and so must prove their names.
 
         Raises:
-            TransportError: the address is taken or malformed.
+            TransportError: the address is taken, malformed, or not of this computer.
             ConfigError: other computers could connect, and there are no keys.
         """
         self._guard(address)
@@ -168,7 +171,8 @@ class Network:
 
         Raises:
             TransportError: the address is malformed.
-            ConfigError: the address belongs to another computer, and there are no keys.
+            ConfigError: the address belongs to another computer, and there are no keys; or the public key of the
+                process at this address is unknown.
         """
         self._guard(address)
         if self.keys is not None and (server_key := self.keys.server_key(address)) is not None:
@@ -267,7 +271,7 @@ ACCEPTED = int(zmq.EVENT_ACCEPTED)
 REFUSED = int(
     zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 )
-"""The peer has no key or an unknown one. A peer without keys may also hang up first, an event without a detail."""
+"""The peer has no key, or an unknown key. A peer without keys may also hang up first: an event without a detail."""
 _EVENT = struct.Struct("=hi")
 _numbers = itertools.count()
 

@@ -44,7 +44,7 @@ class WakeUp(Generic[T]):
         """Wake the poller up, with or without an item."""
         if item is not None:
             self._items.append(item)
-        # a full pipe wakes the poller anyway; a closed one has no poller any more
+        # a full socket wakes the poller anyway; a closed socket has no poller any more
         with contextlib.suppress(BlockingIOError, OSError):
             self._writer.send(b"\0")
 
@@ -61,7 +61,7 @@ class WakeUp(Generic[T]):
 
 
 class Poller(Generic[S]):
-    """A poller: it waits until a socket is readable, or another thread ends the wait."""
+    """A wait for readable sockets, which another thread can end through a `WakeUp`."""
 
     def __init__(self, wake_up: WakeUp[Any]) -> None:
         self._poller = zmq.Poller()

@@ -50,7 +50,7 @@ class Killed:
 
 @dataclass(frozen=True, slots=True)
 class ParentGone:
-    """The event that the parent process has ended or stops this process, which must close."""
+    """The event that the parent process has ended, or stops this process, which then must close."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ class Port(Protocol):
         """
 
     def publish(self, envelope: str, payload: bytes) -> None:
-        """Publish on the component's own publisher, with the strictly increasing experiment time.
+        """Publish on the component's own publisher, at a later experiment time than each earlier packet.
 
         Raises:
             ConfigError: the component has no address to publish on.
@@ -113,9 +113,9 @@ class RequestReceived:
     """A request to a server, as frames for `wire.decode_request`.
 
     Attributes:
-        user: owner of the key of its connection.
+        user: owner of the key of its connection; None without keys.
         epoch: epoch of the sending scheduler; empty for other senders.
-        connection: its connection.
+        connection: identity of its connection, for `ServerPort.is_connected`.
     """
 
     frames: Sequence[bytes]
@@ -126,7 +126,7 @@ class RequestReceived:
 
 @dataclass(frozen=True, slots=True)
 class SubscriberJoined:
-    """The event that a peer (such as the scheduler) subscribed and received the earlier packets."""
+    """The event that a peer, such as the scheduler, has subscribed, after the kept packets were sent to the peer."""
 
 
 Served = RequestReceived | SubscriberJoined | ParentGone
@@ -158,7 +158,7 @@ class ServerPort(Protocol):
         """Return whether the connection of a scheduler with an epoch still exists."""
 
     def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:
-        """Publish a packet with the strictly increasing experiment time.
+        """Publish a packet, at a later experiment time than each earlier packet.
 
         Args:
             time_ns: time of the packet. After a kill, a restarted translator publishes possibly lost packets again,

@@ -14,7 +14,7 @@ from afspm.transport.diagnosis import Handshake, Reach, Versions
 from afspm.transport.network import CONNECTED, REFUSED, Monitor, Network
 
 WITHIN_S = 5.0
-_ZMTP = b"\xff"
+_ZMTP = b"\xff"  # the first byte of ZeroMQ's greeting (ZMTP)
 _NO_ROUTE = (errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN)
 
 
@@ -24,7 +24,7 @@ def versions_here() -> Versions:
 
 
 def reach(address: str, within_s: float = WITHIN_S) -> Reach:
-    """Return the outcome of a connection to a `tcp://` address."""
+    """Return the outcome of an attempt to connect to a `tcp://` address; `within_s` limits connection and greeting."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     try:
         with socket.create_connection((host.strip("[]"), int(port)), timeout=within_s) as peer:

@@ -44,7 +44,7 @@ class Publisher:
         self.socket.send(wire.KILL)
 
     def serve(self) -> int:
-        """Serve new subscriptions; return the number of subscribers that joined."""
+        """Process a batch of subscriptions; return the number of subscribers that joined."""
         joined = 0
         for _ in range(_BATCH):
             frames = receive_frames(self.socket) if joined < _MOST_REPLAYS else []

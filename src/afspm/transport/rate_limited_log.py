@@ -11,7 +11,7 @@ _PERIOD_S = 10.0
 
 
 class RateLimitedLog:
-    """A log of at most five warnings in ten seconds; the next warning adds the number of dropped ones."""
+    """A log of at most five warnings in ten seconds; the next period begins with the number of dropped warnings."""
 
     def __init__(self, log: logging.Logger, clock: Clock) -> None:
         self._log = log

@@ -1,13 +1,12 @@
 """The scheduler's control socket: requests with their senders, and the disconnections of senders.
 
 The identity of its socket identifies a sender: its name, a zero byte, and a random text (`keys.routing_id`). So two
-processes with one name are two senders, and answers to one never reach the other. Sockets with a bare name as identity,
-such as a REQ socket of a program without a client, share one sender.
+processes with one name are two senders, and no answer reaches the wrong process. Sockets with the same bare name as
+identity, such as REQ sockets of programs without a client of afspm, share one sender.
 
 ZeroMQ reports the end of a connection without its peer. So each known sender is then probed with an empty message,
 which every client ignores: ROUTER refuses to send to a disconnected peer (ROUTER_MANDATORY). A REQ socket would take
-the
-probe for the answer to its request: its end is recognised by the descriptor of its connection.
+the probe for the answer to its request: its end is recognised by the descriptor of its connection.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from afspm.transport.rate_limited_log import RateLimitedLog
 _LAST_WORDS = 200
 """Limit of messages received before the end of a sender is reported."""
 _LOOKS_S = (0.0, 0.02, 0.5)
-"""Real times, after the end of a connection, at which its sender is probed: ZeroMQ reports the end a moment before it
+"""Real times after the end of a connection at which all senders are probed: ZeroMQ reports the end a moment before it
 forgets the peer."""
 
 
@@ -45,7 +44,7 @@ class PeerAsked(NamedTuple):
 
     Attributes:
         name: name of the peer; "" without a readable name.
-        user: owner of its key; None without keys.
+        user: owner of the peer's key; None without keys.
     """
 
     connection: int

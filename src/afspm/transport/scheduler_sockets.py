@@ -40,8 +40,9 @@ class LinkReply(NamedTuple):
 class TranslatorLink:
     """A client that sends requests to the translator.
 
-    A REP socket returns the frames before the empty frame: a number, so that a late answer is never taken for the
-    answer to another request, and the scheduler's epoch, which the translator checks.
+    Before the empty frame of a request go its number and the scheduler's epoch; a REP socket returns both with the
+    answer. By the number a late answer is never taken for the answer to another request; the translator checks the
+    epoch.
 
     Args:
         epoch: epoch of the scheduler; empty: none.
@@ -125,7 +126,10 @@ class SchedulerSockets:
             self._poller.register(monitor.socket, monitor)
 
     def wait(self, timeout_ms: int | None) -> list[Source]:
-        """Return the readable sources; return early, perhaps without sources, after `wake_up`."""
+        """Return the readable sources, after a wait of up to `timeout_ms` (None: without limit).
+
+        Returns early, perhaps without sources, after `wake_up`.
+        """
         sources, woken = self._poller.wait(timeout_ms)
         if woken:
             self._wake_up.take()

@@ -28,8 +28,8 @@ class Subscriber:
         name: name of this component.
         prefixes: prefixes of the wanted envelopes; None for all. The signal KILL always comes.
         since_ns: time up to which the receiver has all packets.
-        filtered: whether to drop packets not newer than the newest of their envelope. False for a translator, whose
-            clock may be set back: then the receiver must drop repeated packets.
+        filtered: whether to drop packets not newer than the newest packet of their envelope. False for packets of a
+            translator, whose clock may be set back: then the receiver must drop repeated packets.
 
     Raises:
         ConfigError: the prefixes are too long for one marker.

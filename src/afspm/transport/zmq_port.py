@@ -22,10 +22,10 @@ T = TypeVar("T")
 
 
 class BasePort(Generic[T]):
-    """Base of the ports: it waits for its sockets and publishes.
+    """Base of the ports, with the wait for events and the publisher.
 
     Args:
-        publish: address to publish on; None: none.
+        publish: address to publish on; None: no publisher.
     """
 
     def __init__(self, network: Network, clock: Clock, publish: str | None) -> None:
@@ -83,11 +83,12 @@ class ZmqPort(BasePort[Incoming]):
         clock: clock of the experiment.
         subscribe: addresses of the publishers.
         envelopes: prefixes of the envelopes to subscribe to; None: all.
-        control: the scheduler's address for requests.
-        publish: address to publish on.
+        control: the scheduler's address for requests; None: no requests.
+        publish: address to publish on; None: no publisher.
 
     Raises:
         TransportError: an address can't be used.
+        ConfigError: the prefixes are too long, or an address of another computer needs keys.
     """
 
     def __init__(

@@ -20,8 +20,8 @@ _WITHOUT_EPOCH = 3  # frames without an epoch: connection, number, empty frame; 
 class ZmqServerPort(BasePort[Served]):
     """A translator's port, see `transport.port.ServerPort`.
 
-    To a client it behaves as a REP socket: it returns all frames before the empty one, so that a scheduler can number
-    its requests. The socket is a ROUTER, since an answer may also be withheld.
+    The port answers as a REP socket does: with all frames before the empty frame, so that a scheduler can number its
+    requests. The socket is a ROUTER, since an answer may also be withheld.
 
     Args:
         serve: address for requests.
@@ -48,6 +48,7 @@ class ZmqServerPort(BasePort[Served]):
         self._poller.register(self._socket, self._request)
 
     def poll(self, timeout_s: float | None) -> list[Served]:
+        # until `reply`, further requests wait in the socket: a readable socket would end every wait at once
         if is_busy := self._asker is not None:
             self._poller.pause(self._socket)
         try:

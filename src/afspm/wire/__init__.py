@@ -8,8 +8,8 @@ handler of a component for it. Every other list of messages is derived from the 
     state         the registry; the user's message types are added to it once, at the start of a process
     outputs       values of the model; bytes
     invariants    equal values give equal bytes (reference bytes in `proto/golden.json`); unreadable bytes raise
-                  WireError and disturb no other message; a scan's values are a view of the received buffer, never a
-                  copy
+                  WireError and disturb no other message; a scan's values are a view of the received buffer, unless
+                  the peer sent them in several pieces
 """
 
 from __future__ import annotations

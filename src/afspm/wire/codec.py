@@ -39,7 +39,7 @@ def encode(thing: object) -> tuple[str, bytes]:
 def decode(name: str, payload: Buffer) -> Any:
     """Return the message `name` as a model object if it has one, else as the generated message.
 
-    A scan's values are a view of `payload`.
+    A scan's values are a view of `payload`, or a copy if the peer sent them in several pieces.
 
     Raises:
         WireError: the bytes are no such message, or hold invalid values.
@@ -52,7 +52,7 @@ def decode(name: str, payload: Buffer) -> Any:
 
 
 def header(name: str, payload: Buffer) -> model.PacketHeader:
-    """Return the fields of a message that determine its envelope, without reading its values.
+    """Return the fields of a message that determine its envelope, and its time, without reading its values.
 
     Raises:
         WireError: the bytes are no such message.

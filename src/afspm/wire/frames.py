@@ -39,7 +39,7 @@ PROTOCOL_VERSION: Final = 2
 KILL: Final = b"KILL"
 """The packet of one frame to all subscribers that announces the end of the experiment."""
 CLOSE: Final = bytes([100])
-"""The request of one frame that ends the translator, which subscribes to no publisher, with the experiment."""
+"""The request of one frame that ends a translator, which subscribes to no publisher and so receives no KILL."""
 BEAT: Final = b"\x00"
 CLOSING: Final = b"\x01"
 LONGEST_ID: Final = 200
@@ -99,9 +99,9 @@ def encode_request(request: Request) -> list[bytes]:
 
 
 def encode_subject(subject: object) -> bytes:
-    """Return the subject of a request in bytes.
+    """Return the subject of a request in bytes; empty for None.
 
-    One byte for a whole number, a Duration for seconds, an ActionMsg for text, else the bytes of the model object.
+    A whole number is one byte, a float is a Duration in seconds, text is an ActionMsg, and a model object its message.
     """
     if subject is None:
         return b""
@@ -148,7 +148,7 @@ def decode_request(frames: Sequence[Buffer]) -> Request:
 
 
 def id_of(frames: Sequence[Buffer]) -> str:
-    """Return the id of a request, even a malformed one, for its refusal; empty without an id."""
+    """Return the id of a request, even a malformed one, for its refusal; empty without an id of a valid length."""
     return str(frames[2], "utf-8", "replace") if len(frames) == 3 and len(frames[2]) <= LONGEST_ID else ""
 
 

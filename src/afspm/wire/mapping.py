@@ -50,7 +50,7 @@ def known(kind: type[E], number: int) -> E:
 
 
 def shortest(number: float) -> float:
-    """Return the shortest decimal number for a float32: 0.1, not 0.10000000149011612 (above a limit of 0.1)."""
+    """Return the shortest decimal number for a float32: 0.1, not 0.10000000149011612, which a limit of 0.1 refuses."""
     for digits in range(6, 9):
         decimal = float(f"{number:.{digits}g}")
         if _FLOAT32.unpack(_FLOAT32.pack(decimal)) == (number,):
@@ -319,12 +319,12 @@ MAPPINGS: tuple[MessageMapping[Any], ...] = (
 
 
 def encode_orders(restart: Iterable[str]) -> bytes:
-    """Return the answer to RELAY_REQUEST in bytes: the names of the processes to restart."""
+    """Return the answer to a supervisor's RELAY_REQUEST in bytes: the names of the processes to restart."""
     return journal_pb2.Orders(restart=restart).SerializeToString()
 
 
 def decode_instrument_orders(payload: Buffer) -> model.InstrumentOrders:
-    """Return the orders for an instrument.
+    """Return the orders in the answer to an instrument's report.
 
     Raises:
         WireError: the bytes are no orders.
@@ -334,7 +334,7 @@ def decode_instrument_orders(payload: Buffer) -> model.InstrumentOrders:
 
 
 def decode_orders(payload: Buffer) -> tuple[str, ...]:
-    """Return the names of the processes to restart.
+    """Return the names of the processes to restart, from the answer to a supervisor's report.
 
     Raises:
         WireError: the bytes are no orders.

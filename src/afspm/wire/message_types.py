@@ -19,7 +19,9 @@ def register_all(sources: Iterable[str]) -> None:
     A module may hold `MessageDeclaration`s, which give more than the types of its messages.
 
     Raises:
-        ConfigError: a module or file does not exist, has errors, or holds no messages.
+        ConfigError: a module or file does not exist, has errors, or holds no messages; or a .proto file has no compiler
+            (the extra `messages`).
+        InvalidValue: another message has the name of one of these.
     """
     for source in sources:
         module = _compiled(Path(source)) if source.endswith(".proto") else _imported(source)

@@ -1,13 +1,12 @@
-"""The registry of messages: one declaration for each message, used by all other rooms.
+"""The registry of messages: one declaration for each message, used by all other packages.
 
-Nothing outside of this package imports the generated modules; it provides message classes to other rooms.
+Nothing outside of `wire` imports the generated modules; this module provides their classes.
 
 | a declaration states | and thereby |
 | --- | --- |
 | type | the class that reads the bytes; the name, with which its envelopes begin |
-| kind, source, always | what clients follow, what a terminal subscribes to, what `afspm check` expects to be published
-|
-| history | how many packets of an envelope the scheduler keeps for late joiners |
+| kind, source, always | which messages clients follow, a terminal subscribes to, and `afspm check` expects |
+| history | the number of packets of an envelope that the scheduler keeps for late joiners |
 | handler | the method of a component, and of an overview of the record, for this message |
 | attribute | the attribute of a client that holds the newest message |
 | event | the kind of event under which the gateway streams it |
@@ -69,8 +68,8 @@ class MessageDeclaration:
         type: the generated class.
         kind: see `MessageKind`.
         source: role of the process that publishes the message; None: only published on behalf of another process.
-        always: whether every process of that role publishes the message; otherwise only on some request or event.
-        named: its envelopes continue after the message's name with size and channel, kind or owner.
+        always: whether `afspm check` assumes that every process of this role publishes the message.
+        named: whether an envelope continues after the message's name with size and channel, kind or owner.
         history: number of packets for each envelope that the scheduler keeps for late joiners.
         handler: method of a `Component` and of an `Overview` for this message.
         attribute: attribute of a client's view for the newest message; empty: not kept.
@@ -285,7 +284,7 @@ def declare(declaration: MessageDeclaration) -> MessageDeclaration:
     """Register a message of another package with its declaration, and return the declaration.
 
     Raises:
-        InvalidValue: another type has this name.
+        InvalidValue: another type has this name, or the message is already declared differently.
     """
     name = declaration.name
     known = _declared.setdefault(name, declaration)
@@ -343,7 +342,7 @@ def known_messages() -> tuple[str, ...]:
 
 
 def messages_of_the_experiment() -> tuple[str, ...]:
-    """Return the names of messages about sample, microscope and control; others concern processes and logs."""
+    """Return the names of all messages except those about processes, requests, logs, progress, sweeps and notes."""
     beside = journal_pb2.DESCRIPTOR.name
     return tuple(name for name, one in _declared.items() if one.type.DESCRIPTOR.file.name != beside)
 
@@ -360,7 +359,7 @@ def messages_without_values() -> tuple[str, ...]:
 
 
 def message_of(envelope: str) -> str:
-    """Return the name of a packet's message: its whole envelope, or the part before an underscore.
+    """Return the name of a packet's message: its whole envelope, or the longest known name before an underscore.
 
     Raises:
         WireError: the envelope begins with no known name.
@@ -378,7 +377,7 @@ def message_of(envelope: str) -> str:
 
 
 def parse(message: type[M], payload: bytes | memoryview) -> M:
-    """Return bytes as a message of the given class.
+    """Return the message of the given class that the bytes hold.
 
     Raises:
         WireError: the bytes are no such message.

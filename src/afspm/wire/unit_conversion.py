@@ -1,6 +1,7 @@
 """Conversion of places, positions and scan parameters to and from the units and corners on the wire.
 
-Sent messages are in metres and degrees and have every field; received messages may have any unit and lack fields.
+Sent messages are in metres and degrees; received messages may have any unit. A request to change a part of a setting
+has only the fields to change.
 """
 
 from __future__ import annotations
@@ -37,10 +38,10 @@ def spatial_to_wire(region: model.Region | model.RegionChange) -> scan_pb2.Spati
 
 
 def spatial_from_wire(spatial: scan_pb2.SpatialAspects) -> model.RegionChange | None:
-    """Return the given fields of a message's region, in SI; None without any.
+    """Return the given fields of a message's region, in SI; None for a message without a region.
 
     Raises:
-        UnitError: a unit is neither a length nor an angle.
+        UnitError: the unit of lengths is not a length, or the unit of angles not an angle.
     """
     if not spatial.HasField("roi"):
         return None
@@ -91,7 +92,7 @@ def scan_parameters_to_wire(parameters: model.ScanParameters) -> scan_pb2.ScanPa
 
 
 def scan_parameters_from_wire(message: scan_pb2.ScanParameters2d) -> model.ScanParameters:
-    """Return scan parameters, with a RegionChange if the region or its angle is incomplete.
+    """Return scan parameters, with a RegionChange if a field of the region, such as its angle, is missing.
 
     Raises:
         InvalidValue, UnitError: a value is invalid.

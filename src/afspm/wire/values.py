@@ -32,7 +32,7 @@ _PLACES: dict[str, tuple[type[Message], Callable[[Any], Message], int]] = {
 
 
 def without_values(message: str, payload: Buffer) -> bytes:
-    """Return a message without the values of a scan, of lines or of a spectrum; other messages unchanged.
+    """Return a serialised message without the values of a scan, lines or a spectrum; other messages unchanged.
 
     Raises:
         WireError: the bytes are no message.

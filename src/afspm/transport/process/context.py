@@ -20,9 +20,9 @@ DEFAULT_LONGEST_STEP_S = 30.0
 
 
 class ProcessActivity:
-    """The age of the current step, which distinguishes a busy process from a frozen one.
+    """The age of the current step, which distinguishes a busy process from a frozen process.
 
-    Written by the process, read by the thread that sends its heartbeats.
+    The process writes it; the thread that sends the heartbeats reads it.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -32,7 +32,7 @@ class ProcessActivity:
 
     @contextmanager
     def step(self) -> Iterator[None]:
-        """Count the `with` block as one step."""
+        """Count the `with` block as one step, and afterwards go on with the step around it, if any."""
         before, self.since_s = self.since_s, self._clock.monotonic_s()
         try:
             yield
@@ -55,7 +55,7 @@ class ProcessActivity:
 
 
 def new_session(run: str) -> str:
-    """Return a random identity for this life of a process, preceded by the identity of its run, if known."""
+    """Return a random identity for this life of a process; the identity of its run, if known, stands before it."""
     return "-".join(filter(None, [run, os.urandom(4).hex()]))
 
 

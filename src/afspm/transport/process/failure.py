@@ -1,4 +1,4 @@
-"""Exceptions as text that points to the user's own code, and the file that reports a fault to the supervisor."""
+"""Exceptions as text with the lines of the user's own code, and the file that reports a fault to the supervisor."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def describe(error: BaseException, name: str = "", package: Path = PACKAGE) -> s
 
 
 def may_pass(error: BaseException) -> bool:
-    """Return whether a retry may succeed, as after a controller's failure, unlike after a code fault."""
+    """Return whether a retry may succeed: True after a controller's failure, for instance, False after a code fault."""
     if isinstance(error, Refused):
         return error.response not in _REFUSED_AGAIN
     return isinstance(error, (RequestError, FileError, TransportError, OSError, MemoryError))

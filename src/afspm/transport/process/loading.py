@@ -37,7 +37,11 @@ def load(launch: Launch) -> ExperimentProcess:
 
 
 def made_of(value: object, where: str) -> object:
-    """Return a setting with each table that has a `class` replaced by the constructed object."""
+    """Return a setting in which each table with a `class` is replaced by the object constructed from the table.
+
+    Raises:
+        ConfigError: there is no such class.
+    """
     if isinstance(value, list | tuple):
         return [made_of(item, where) for item in value]
     if not isinstance(value, dict):

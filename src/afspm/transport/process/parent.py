@@ -1,4 +1,4 @@
-"""The bond to the parent process: its end of the standard input of this process.
+"""The bond to the parent process: a pipe from the parent to the standard input of this process.
 
 The pipe closes when the parent stops the process, and when the parent dies in any way, on every system.
 """
@@ -59,8 +59,8 @@ class StopRequested(BaseException):
 class ParentWatch:
     """A watch over the parent, which runs callbacks in another thread when the parent ends or stops the process.
 
-    If the process has not ended `END_WITHIN_S` later (a handler that computes, a library that hangs), it exits at once
-    with `code_if_late`; if the tip is in danger, `TIP_WITHIN_S` later.
+    A process that has not ended `END_WITHIN_S` later (a handler that computes, a library that hangs) is ended with the
+    exit code `code_if_late`; with the tip in danger, `TIP_WITHIN_S` later.
 
     Args:
         pipe: descriptor of a pipe; the parent holds its other end.

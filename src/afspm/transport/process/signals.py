@@ -15,7 +15,7 @@ ENDING = (*CTRL_C, "SIGTERM", "SIGBREAK", "SIGHUP")
 
 @contextmanager
 def caught(tell: Callable[[int], None], wakeup_fd: int, names: Sequence[str] = ENDING) -> Iterator[None]:
-    """Pass signals that end a program to `tell` during the `with` block; each also writes to `wakeup_fd`.
+    """Call `tell` with the number of each signal of `names` in the `with` block; a signal also writes to `wakeup_fd`.
 
     An ignored signal (SIGHUP under nohup) stays ignored. Outside the main thread this function has no effect, since
     Python delivers no signals there.
