@@ -1,7 +1,7 @@
 """`Activity`: the measurement that runs in a maker's program, from its start to its file.
 
 Theory of operation. A program is polled (`status`), and most programs do not report that a measurement began or ended.
-The life of a measurement is the same with all of them:
+The life of a measurement is the same with all programs:
 
 | step | by |
 | --- | --- |
@@ -89,7 +89,7 @@ class Activity(ABC):
         """Wait until the started measurement is running, or has already produced its file.
 
         Raises:
-            Refused: ACTION_ERROR: the program did not start it, and reported no error.
+            Refused: ACTION_ERROR: the program did not start the measurement within `settles_s`, and reported no error.
         """
         # without a pause: each look takes as long as the program's answer
         until_s = self._clock.monotonic_s() + self.settles_s
@@ -125,7 +125,10 @@ class Activity(ABC):
         self._results.forget()
 
     def at_rest(self, state: ScopeState = ScopeState.FREE) -> ScopeStatus:
-        """Return the state while nothing is measured: INTERRUPTED once after a failure or an interrupted scan."""
+        """Return the state while nothing is measured.
+
+        INTERRUPTED replaces `state` once after a failed call, and while `broken_off` is True.
+        """
         failed, self._failed = self._failed, False
         return ScopeStatus(ScopeState.INTERRUPTED if failed or self._results.broken_off else state)
 

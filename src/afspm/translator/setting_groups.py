@@ -92,7 +92,10 @@ def watched(table: ParameterTable) -> list[str]:
 
 
 def messages(values: Mapping[str, Value]) -> dict[str, Published]:
-    """Return the messages to publish, by name; messages with a missing parameter are left out."""
+    """Return the messages to publish, by name, as far as `values` has their parameters.
+
+    Scan parameters may lack the angle; a feedback message needs only one of its parameters.
+    """
     published: dict[str, Published] = {}
     if all(name in values for name in FRAME if name != names.SCAN_ANGLE):
         published[_FRAME_MESSAGE] = scan_parameters(values)
@@ -134,7 +137,7 @@ def frame_values(region: Region, shape: tuple[int, int]) -> dict[str, Value]:
 def feedback(values: Mapping[str, Value]) -> Feedback:
     """Return the z feedback in `values`.
 
-    For a withdrawn tip, a feedback that is off is left out: at the sample it would be a danger.
+    For a withdrawn tip, a feedback that is off is left out: it is a danger only at the sample.
     """
     on = values.get(FEEDBACK_ON)
     is_away = values.get(names.ENGAGED) is False
@@ -147,7 +150,7 @@ def feedback(values: Mapping[str, Value]) -> Feedback:
 
 
 def check_together(values: Mapping[str, Value], table: ParameterTable, max_pixels: int) -> None:
-    """Check a frame as a whole: its size, its number of pixels, and the reach of the probe.
+    """Check a frame as a whole: its size, its number of pixels, and the reach of the probe; skip an incomplete frame.
 
     Raises:
         Refused: PARAM_ERROR.
