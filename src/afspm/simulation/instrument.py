@@ -95,7 +95,7 @@ class Instrument:
     """A simulated instrument with one activity at a time. Not thread-safe.
 
     Args:
-        world_settings: `surface`, `tip`, `drift` … of the simulated world, as of the Simulator.
+        world_settings: `surface`, `tip`, `drift` … of the simulated world, as in `World.from_settings`.
         seed: seed of all random numbers.
         start_s: the first time of any call.
         run: runs the computation of scans; by default at once.
@@ -104,8 +104,9 @@ class Instrument:
     Attributes:
         setup: the present settings.
         drawing: the computation of scans.
-        engaged: the tip is at the sample; otherwise all channels show noise.
-        scan, spectrum: the last started scan and spectrum, also after their end; None before the first.
+        engaged: True while the tip is at the sample; otherwise all channels show noise.
+        scan, spectrum: the last started scan and spectrum, also after their end; None before the first, and for a
+            stopped spectrum.
         world: the physics, with its ground truth (`world.truth`).
         ledger: the damage so far, counted up to the last call.
     """
@@ -148,7 +149,7 @@ class Instrument:
         return {name: unit for name, (unit, _) in scan.channels().items()}
 
     def doing(self, now_s: float) -> str:
-        """Return the activity: "scan", "spectrum", "move", "pulse", "crash", "approach", as in `occupy`, or ""."""
+        """Return the activity: "scan", "spectrum", "move", or the name given to `occupy`; empty if free."""
         return self._doing.what if self._doing is not None and self._doing.running(now_s) else ""
 
     def busy(self, now_s: float) -> bool:
@@ -216,7 +217,7 @@ class Instrument:
     # -- scans
 
     def start_scan(self, now_s: float) -> ScanActivity:
-        """Scan the frame.
+        """Start a scan of the frame.
 
         Raises:
             InstrumentBusy. InvalidValue: the setup allows no scan.
@@ -282,7 +283,7 @@ class Instrument:
     # -- spectra
 
     def start_spectrum(self, kind: str, now_s: float, sweeps: int = 1) -> SpectrumActivity:
-        """Take a curve of a kind ("IV", "force") at the probe's position, the mean of `sweeps`.
+        """Start a curve of a kind ("IV", "force") at the probe's position, the mean of `sweeps` (at most 32 computed).
 
         Raises:
             InstrumentBusy. InvalidValue: an unknown kind.
@@ -386,7 +387,7 @@ class Instrument:
         return outcome
 
     def pulsed(self, voltage_v: float, duration_s: float, now_s: float) -> str:
-        """Apply the effect of a pulse during which the caller set and restored the bias; return as `pulse`."""
+        """Apply the effect of a pulse for which the caller set and restored the bias; return the outcome as `pulse`."""
         self.drawing.wait()
         if not self.engaged or duration_s <= 0.0:
             return "unchanged"
@@ -400,7 +401,11 @@ class Instrument:
         return outcome
 
     def crash(self, depth_m: float, speed_m_s: float, now_s: float) -> str:
-        """Drive the tip into the sample and back at the probe's position; return as `pulse`."""
+        """Drive the tip into the sample and back at the probe's position; return the outcome as `pulse`.
+
+        Raises:
+            InstrumentBusy. InvalidValue: depth or speed is not above 0.
+        """
         if not min(depth_m, speed_m_s) > 0.0:
             raise InvalidValue(f"a crash {depth_m} m deep with {speed_m_s} m/s", hint="depth and speed must be above 0")
         self._check_free(now_s)
@@ -534,7 +539,7 @@ class Instrument:
     # -- inside
 
     def note(self, time_s: float, event: str, facts: Mapping[str, object]) -> None:
-        """Record an event with the ground truth, unless the world is in use by the computation of a scan."""
+        """Record an event; add the ground truth unless the computation of a scan is using the world."""
         if self._note is not None:
             truth = {} if self.drawing.goes_on else {"truth": self.world.truth(time_s)}
             self._note(time_s, event, {**facts, **truth})

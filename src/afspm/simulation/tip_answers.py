@@ -105,7 +105,7 @@ class TipAnswers:
     """The answers of all flaws.
 
     A tip with several flaws answers as its first flaw in the order blunt, double, contaminated, since a missing apex
-    hides the other flaws. A sharp tip answers like a blunt one, and has no flaw to cure.
+    hides the other flaws. A sharp tip answers like a blunt tip, and has no flaw to cure.
     """
 
     def __init__(self, of_flaw: Mapping[str, FlawAnswers]) -> None:
