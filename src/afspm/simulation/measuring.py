@@ -149,7 +149,7 @@ class Measured:
     pressed_m: float
 
     def continued(self, anew: Measured, rows: NDArray[np.bool_]) -> Measured:
-        """Return the measurement with `rows` taken from `anew`, the same scan computed with other settings."""
+        """Return the measurement with `rows` taken from the first argument, the same scan with other settings."""
         channels = {
             name: (unit, np.where(rows[:, None], anew.channels[name][1], values))
             for name, (unit, values) in self.channels.items()

@@ -226,7 +226,7 @@ class Feed:
             self._timeline.after(self._weather.reconnect_s * (0.5 + self._timeline.random.random()), self._try)
 
     def fall_silent(self, for_s: float) -> None:
-        """Lose all messages; see `ControlLine.fall_silent`."""
+        """Lose all messages in one or both directions; both ends notice only after `for_s`."""
         _fall_silent(self._timeline, (self._there, self._back))
         self._timeline.after(for_s, self.cut)
 

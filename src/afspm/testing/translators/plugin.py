@@ -2,9 +2,9 @@
 
     pytest -p afspm.testing.translators.plugin experiment.toml [--overlay FILE] [--without-process NAME]
 
-It is not loaded automatically, so it does not disturb other tests in an environment with afspm. In the tests of a
-translator's package: `addopts = ["-p", "afspm.testing.translators.plugin"]` and `testpaths = ["tests",
-"experiment.toml"]`. The tip is assumed to be withdrawn.
+The plugin is not loaded automatically, so that other tests in an environment with afspm are not disturbed. In the tests
+of a translator's package: `addopts = ["-p", "afspm.testing.translators.plugin"]` and `testpaths = ["tests",
+"experiment.toml"]`. The checks assume that the tip is withdrawn.
 """
 
 from __future__ import annotations

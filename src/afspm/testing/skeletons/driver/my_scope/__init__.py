@@ -22,7 +22,7 @@ class MyScope(Driver):
 
     Args:
         address: address of the controller.
-        settings: common to all drivers.
+        settings: settings that all drivers take.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
