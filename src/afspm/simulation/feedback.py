@@ -63,7 +63,7 @@ class SensorSettings:
 
     @property
     def largest_hz(self) -> float:
-        """The frequency shift in contact, the most negative one."""
+        """The frequency shift in contact, the most negative shift."""
         return float(self.shift_hz(np.zeros(())))
 
     @property
@@ -119,7 +119,7 @@ class FeedbackSettings:
             raise ConfigError(refusal, where="setpoint")
 
     def refusal_of(self, setpoint: float) -> str:
-        """Return the reason why a setpoint is impossible in this mode; empty if it is possible."""
+        """Return the reason why a setpoint is impossible in this mode; empty for a possible setpoint."""
         if self.mode != "frequency-shift":
             return "" if 0 < setpoint < math.inf else f"a setpoint is above zero, not {setpoint:g}"
         largest = self.sensor.largest_hz

@@ -47,7 +47,7 @@ _STATE_VERSION = 2
 
 
 class InstrumentBusy(AfspmError):
-    """The error that another activity is running; wait for its end or stop it first."""
+    """The error that another activity is running: wait for its end, or stop that activity first."""
 
     code = "instrument-busy"
 
@@ -56,8 +56,9 @@ class InstrumentSetup:
     """The present settings of the instrument.
 
     Attributes:
-        region, shape, line_s, upwards: for the next scan: the frame, (rows, columns), seconds of trace and retrace, and
-            whether it begins with the smallest y.
+        region, shape: frame of the next scan, and its (rows, columns).
+        line_s: seconds of trace and retrace together.
+        upwards: True if the next scan begins with the smallest y.
         slope: compensation of tilt, (x, y).
         move_speed_m_s: speed of the probe outside of scans.
         approach_s: duration of an approach or a withdrawal.
@@ -320,7 +321,7 @@ class Instrument:
         """Move the tip at the move speed. A call during a move changes its target.
 
         Args:
-            way_m: path length of the frame, if it moves at the same time.
+            way_m: path length of a frame that moves at the same time.
 
         Raises:
             InstrumentBusy: during another activity. InvalidValue: the position is not finite.
@@ -458,7 +459,7 @@ class Instrument:
     def account(self, now_s: float) -> None:
         """Count an ended measurement and the time since the last call in the ledger.
 
-        Call it before changing `setup.feedback` or `engaged`: the elapsed time counts with the previous values.
+        Call this method before a change of `setup.feedback` or `engaged`: the elapsed time counts with the old values.
         """
         self._count(now_s, "feedback", self.ledger)
         measured = self._uncounted
@@ -533,6 +534,7 @@ class Instrument:
         self._doing = found.scan or found.spectrum or found.move or found.occupied
         self.ledger, self._scanned = found.ledger, found.scanned
         self._uncounted = (found.scan or found.spectrum) if found.engaged else None
+        # the values are not saved: the world at the start of the scan gives the same values again
         if self.scan is not None:
             self._redraw(self.scan.adjusted)
 
@@ -548,6 +550,7 @@ class Instrument:
         doing = self.doing(now_s)
         if doing:
             raise InstrumentBusy(f"the instrument is busy with a {doing}")
+        # a stopped scan may still be computed, and only one thread at a time may use the world
         self.drawing.wait()
         self.account(now_s)
 

@@ -24,7 +24,7 @@ class IVSettings:
     """Sweep and sample of current-voltage curves.
 
     Attributes:
-        range_v: the sweep goes from -range to +range.
+        range_v: largest bias: the sweep goes from -range_v to range_v.
         set_bias_v, set_current_a: the current at this bias before the feedback is opened (tunnelling: the setpoint at
             the present bias).
         gap_ev: band gap of material 0; material 1 is a metal.

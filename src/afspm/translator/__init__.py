@@ -12,7 +12,7 @@
                   has switched its feedback off (`safe_exit`)
 
 A driver (`driver`) reads and sets the parameters of its table (`parameters`), starts and stops measurements, and
-returns their results. It may fail at any time with `ControllerLost`; the translator reconnects.
+returns their results. A driver may fail at any time with `ControllerLost`; the translator reconnects.
 """
 
 from __future__ import annotations

@@ -5,11 +5,11 @@ The life of a measurement is the same with all programs:
 
 | step | by |
 | --- | --- |
-| it begins: on request, or at the panel, where only the next poll shows it | `begin`, `follow` |
-| it settles: a request is answered once the measurement is seen running, or its file exists | `settle` |
-| it ends: no measurement is seen running any more, and its file is awaited | `follow`, `end` |
-| it is stopped on request: a measurement that still runs for a moment is not a new one, and has no result | `stopped` |
-| an interruption or a failure is reported once as INTERRUPTED | `at_rest` |
+| start: on request, or at the panel, where only the next poll shows the measurement | `begin`, `follow` |
+| settling: a request is answered once a poll shows the measurement running, or its file exists | `settle` |
+| end: a poll shows no running measurement any more, and the file is awaited | `follow`, `end` |
+| stop on request: the measurement may still run for a moment, counts as no new measurement, has no result | `stopped` |
+| interruption or failure: reported once as INTERRUPTED | `at_rest` |
 
 A curve may have to wait until the tip arrives at its position (`curve_awaited`), and a command may last as long as the
 measurement itself (`call`). A maker's driver detects a running measurement and records it with the files.
@@ -73,7 +73,7 @@ class Activity(ABC):
     # --- the life of a measurement ---
 
     def follow(self, what: str) -> None:
-        """Compare with the program: record the end of a measurement, and the start of one at the panel.
+        """Compare with the program: record the end of a measurement, and the start of a measurement at the panel.
 
         Args:
             what: `SCAN`, the kind of a curve, or empty.

@@ -18,7 +18,7 @@ _STARTUP_RETRY_S = 0.1
 
 
 class Connection:
-    """The connection of a driver to its controller; it decides which errors mean that the controller is lost.
+    """The connection of a driver to its controller, with the decision which errors mean that the controller is lost.
 
     Args:
         controller: the emulator of this run, the only controller to connect to; None: the driver knows the

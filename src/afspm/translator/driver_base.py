@@ -43,7 +43,7 @@ def connected(link: T | None, program: str, address: str = "") -> T:
 
 
 LOST = (ControllerLost, ConnectionError, TimeoutError)
-"""The errors of a lost controller, as opposed to those of a refusal."""
+"""The errors of a lost controller, as opposed to errors of a refusal."""
 
 
 @dataclass(frozen=True)

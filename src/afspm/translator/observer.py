@@ -96,7 +96,7 @@ class Observer:
 
         Args:
             announce: messages to publish even if unchanged.
-            values: False leaves out the settings, which take one question for each parameter.
+            values: False leaves out the settings, whose reading takes a question for each parameter.
             status: the status just read, since a driver reports an interruption only once; None: read the status now.
         """
         if values:

@@ -39,7 +39,7 @@ class ParameterSpec:
 
     Attributes:
         name: the generic name, e.g. "scan-speed".
-        vendor: the controller's name for it; by default the generic name.
+        vendor: the controller's name of the parameter; by default the generic name.
         unit: the controller's unit.
         type: "float", "int", "bool" or "text".
         range: the smallest and largest value accepted, in SI.
@@ -65,7 +65,7 @@ class ParameterSpec:
 
     @property
     def si_unit(self) -> str:
-        """The SI unit of the value; for the setpoint and for parameters of a maker it follows from the row's `unit`."""
+        """The SI unit of the value; for the setpoint and a maker's own parameters, by the `unit` of the row."""
         si = names.BASE_PARAMETERS.get(self.name)
         return units.si_unit(self.unit) if si is None else si
 
@@ -163,7 +163,10 @@ class ParameterSpec:
         return number
 
     def for_peer(self, value: Value, unit: str | None = None) -> tuple[str, str]:
-        """Convert a value in SI to (text, unit), in the peer's unit if it fits, otherwise in the unit of the wire."""
+        """Convert a value in SI to (text, unit), in the peer's unit.
+
+        Without a unit, or with a unit of another dimension, the unit is that on the wire (`wire_unit`).
+        """
         if isinstance(value, bool):
             return ("true" if value else "false"), ""
         if isinstance(value, str):
@@ -184,7 +187,7 @@ class ParameterSpec:
         return f"{number:.6g} {unit_text(self.unit)}".rstrip()
 
     def range_text(self) -> str:
-        """Return the range as readable text, with the place where it was set."""
+        """Return the range as readable text, with the place where the range was set."""
         text = f"{self.quantity(self.range[0])} to {self.quantity(self.range[1])}"
         return f"{text} (set in {self.where})" if self.where else text
 

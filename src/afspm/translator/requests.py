@@ -178,7 +178,7 @@ class RequestOutcomes:
     """The outcomes of the last requests with an id. See `model.idempotency_cache` for older ids.
 
     Args:
-        kept: the translator's memory, which is saved with every request. So an entry is one text, which is quick to
+        kept: the translator's memory, which is saved with every executed request. So an entry is one text, quick to
             write: the fingerprint of the request, then its outcome.
         all_or_nothing: the microscope's own state is saved together with these outcomes: a request without an outcome
             was not done. Otherwise a request that was begun and has no outcome may have been done.

@@ -1,4 +1,4 @@
-"""Files saved by a controller, assigned to the running measurement, the last ended one, and the results.
+"""Files saved by a controller, assigned to the running measurement, the last ended measurement, and the results.
 
 This state is saved and survives a restart of the translator.
 """

@@ -1,6 +1,6 @@
 """The order in which peers receive the states of a microscope (wire format, "What a translator does"). Pure.
 
-The controller is polled: it may be free again before a poll finds it scanning, and its file may come after its state.
+A polled controller may be free again before a poll shows its scan, and the file may come after the state.
 The published sequence is always complete: SS_SCANNING, the results, SS_FREE; or SS_SCANNING, SS_INTERRUPTED, SS_FREE.
 """
 
@@ -80,7 +80,7 @@ class StatusSequence:
         """Return the steps that follow from the status just read from the controller.
 
         Args:
-            seen: the status.
+            seen: the status of the controller.
             results: whether there are unpublished results.
             now_s: experiment time.
         """

@@ -11,7 +11,7 @@ from afspm.basics.errors import ConfigError
 from afspm.translator.driver_base import ControllerLost
 from afspm.translator.trace import TCP, TRACE, TracedAnswer
 
-_AT_ONCE: Final = 1 << 20
+_AT_ONCE: Final = 1 << 20  # bounds the buffer of one `recv`: a reply may announce any size
 _SLOWEST_BYTES_PER_S: Final = 1e6  # a whole scan may take longer than the timeout of a small answer
 
 T = TypeVar("T")

@@ -60,7 +60,7 @@ class ZmqConnection:
         """Send a request and return its reply, decoded by `parse`, which returns None for another request's reply.
 
         Raises:
-            ControllerLost: no reply, or one that `parse` rejects.
+            ControllerLost: no reply, or a reply that `parse` rejects.
         """
         try:
             with self._trace.asking(what, message) as traced:
@@ -102,7 +102,7 @@ class ZmqConnection:
             raise self._lost("a reply", error) from error
 
     def reply(self, what: str) -> bytes | None:
-        """Return the reply to `begin`, or None while there is none.
+        """Return the reply to `begin`; None until the reply has arrived.
 
         Raises:
             ControllerLost

@@ -195,7 +195,7 @@ class Emulator(ABC):
     # -- services for subclasses
 
     def show_button(self, name: str, why: str, pressed: Callable[[], object]) -> None:
-        """Show a button until it is pressed or removed. Only one button is shown at a time.
+        """Show a button until a person presses it or it is removed. Only one button is shown at a time.
 
         A person, or a test, presses the button by deleting the file `delete-to-NAME.txt` in `folder`: so any program
         with access to the folder can press it, inside an experiment and standalone.

@@ -140,7 +140,7 @@ class TcpServer:
 
     def _listener(self, host: str, port: int) -> socket.socket:
         listener = socket.create_server((host, port))
-        listener.settimeout(0)
+        listener.settimeout(0)  # a client may have gone before `accept`, which must not block then
         self._selector.register(listener, selectors.EVENT_READ, listener)
         return listener
 

@@ -229,7 +229,7 @@ class Simulator(Driver):
         in_background(work)
 
     def connect(self) -> None:
-        """Switch the instrument on, with its saved state if any; reconnect if it is on already.
+        """Switch the instrument on, with its saved state if any, unless it is on already.
 
         Raises:
             ControllerLost: the fault "restart" is active.

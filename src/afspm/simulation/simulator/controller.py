@@ -254,6 +254,7 @@ class SimulatedController:
         self._keep()
 
     def _prepare(self, now_s: float) -> None:
+        # an ended measurement is saved before another takes its place
         self._advance(now_s)
         doing = self.instrument.doing(now_s)
         if doing:

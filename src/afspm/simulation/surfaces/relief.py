@@ -65,9 +65,9 @@ def patches(seed: int, x_m: Array, y_m: Array, size_m: float) -> Array:
 
 
 def around(x_m: Array, y_m: Array, x0_m: float, y0_m: float, reach_m: float) -> Iterator[tuple[Any, Array, Array]]:
-    """Yield (index, x - x0, y - y0) for the positions near a point; nothing if there are none.
+    """Yield (index, x - x0, y - y0) once for the positions near a point; nothing without positions.
 
-    `index` selects those positions from the broadcast array.
+    `index` selects the positions from the broadcast array.
     """
     if is_separable(x_m, y_m):
         columns = slice(*np.searchsorted(x_m[0], (x0_m - reach_m, x0_m + reach_m)))

@@ -88,7 +88,7 @@ class JudgedExperiment:
 
     Args:
         folder: the folder of this run.
-        security: the encrypted connections.
+        security: the kind of encryption.
 
     Attributes:
         launch: the client's launch line; the caller adds the heartbeat's address.

@@ -27,7 +27,7 @@ class Prompts(Protocol):
         """Ask for a line, which may be empty."""
 
     def choose(self, question: str, options: Sequence[str], default: str = "") -> str:
-        """Ask for one of the options; an empty answer selects the default, if there is one."""
+        """Ask for one of the options; an empty answer selects the default, if any."""
 
 
 UNSEEN = "unseen"
@@ -117,7 +117,7 @@ class Guide:
         return self.prompts.text(question) if self._can_be_seen(question) else None
 
     def require_choice(self, question: str, right: str, wrong: Sequence[str], what: str) -> bool:
-        """Ask which option the panel shows; return False if it can't be seen.
+        """Ask which option the panel shows; return False if the person can't see any option.
 
         Raises:
             Failed: a wrong option.
@@ -130,7 +130,7 @@ class Guide:
         return seen == right
 
     def compare(self, what: str, value: float, unit: str, absolute: float = 0.0) -> bool:
-        """Ask for a value shown at the panel; return False if it is not shown.
+        """Ask for a value shown at the panel; return False if the panel does not show the value.
 
         The person types the value before afspm shows its own: a person who knows the expected value may misread a wrong
         value.

@@ -11,7 +11,7 @@ from afspm.testing.conformance import Check, CheckOutcome, CheckResult
 _MISMATCH: Final = "mismatch"
 """The word for a failed step in reports and in the public matrix."""
 _GOES_ON = (CheckOutcome.PASSED, CheckOutcome.SKIPPED, CheckOutcome.UNSUPPORTED)
-"""An unsupported step, or one not shown at the panel, does not block others."""
+"""The outcomes after which later steps are possible: a step that is unsupported or not shown blocks no other step."""
 
 
 _WORSE = (

@@ -69,7 +69,7 @@ class Bench:
 
     Args:
         component: the component under test. Each life runs a copy.
-        others: more components by name, such as one that takes the scans.
+        others: more components by name, such as a component that takes the scans.
         microscope: settings of the simulated microscope, as in the experiment file.
         problems: names and numbers of your own problems, as in the experiment file.
         limits: limits of the scheduler.

@@ -190,7 +190,7 @@ class CheckClient:
         self.at_start = tuple(self.observations.all)
 
     def regain_control(self, within_s: float) -> None:
-        """Request control again, after it was lost together with the controller.
+        """Request control again, after a loss of the controller and of control.
 
         Raises:
             Lost: control is not granted within `within_s` real seconds.

@@ -90,7 +90,7 @@ class FrameSettings:
 
 
 def difference(expected: Region, came: Region) -> str:
-    """Describe the difference of two regions; empty if they agree to a controller's precision."""
+    """Describe the difference of two regions; empty if size, angle and centre agree within `NEAR`."""
     size = math.hypot(*expected.size_m)
     if math.dist(expected.size_m, came.size_m) > NEAR * size:
         return f"a size of {in_words(came.size_m)} instead of {in_words(expected.size_m)}"
