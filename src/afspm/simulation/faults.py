@@ -20,7 +20,7 @@ INSTRUMENT_FAULTS: Final[Mapping[str, str]] = {
     "late-file": "a file appears only after the duration",
     "half-file": "the second half of a file appears only after the duration",
 }
-"""The faults of any microscope, except those of its connection."""
+"""The faults of any microscope, except connection faults."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ _SPLINE_VARIANCE = 1.0 / 3.0  # of the cubic B-spline as a blur, in samples squa
 
 @dataclass(frozen=True)
 class SampleGrid:
-    """A grid along the sample's axes on which the sample is computed, finer than the scan.
+    """A grid along the sample's axes on which the sample is computed, usually finer than the scan.
 
     Attributes:
         x0_m, y0_m: the first point.

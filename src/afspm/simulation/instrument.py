@@ -356,7 +356,7 @@ class Instrument:
         """Set the velocity (x, y) at which the scanner follows the sample from now on, also during a scan.
 
         Raises:
-            InvalidValue: faster than any drift.
+            InvalidValue: the velocity is above 1e-6 m/s, faster than any drift.
         """
         if not max(map(abs, velocity_m_per_s)) <= _FASTEST_DRIFT_M_S:
             raise InvalidValue(f"a drift of {velocity_m_per_s} m/s", hint=f"at most {_FASTEST_DRIFT_M_S} m/s")
@@ -423,7 +423,7 @@ class Instrument:
         return outcome
 
     def engage(self, now_s: float) -> None:
-        """Approach the sample."""
+        """Start the approach to the sample; `engaged` is True from its start."""
         self._check_free(now_s)
         self.engaged = True
         self.occupy("approach", self.setup.approach_s, now_s)
@@ -524,7 +524,7 @@ class Instrument:
         """Restore the instrument from `state`; the caller restores the settings in `setup`.
 
         Raises:
-            InvalidValue: a state of another world or version, or a damaged one.
+            InvalidValue: a state of another world or version, or a damaged state.
         """
         found = restored(InstrumentState, kept["instrument"], "instrument", _STATE_VERSION)
         self.world.restore(kept["world"])

@@ -1,8 +1,8 @@
 """The simulated world: a sample, a tip and an instrument, in experiment time.
 
 `World` keeps the state between measurements: the tip and its history, marks on the sample, the position of the tip. A
-measurement is called with its time; predictions beyond that time (tip changes and wear in the rest of a stopped scan)
-are revoked. The same seed and the same calls give the same world.
+measurement is called with its time, and revokes predictions beyond that time (tip changes and wear in the rest of a
+stopped scan). The same seed and the same calls give the same world.
 """
 
 from __future__ import annotations
@@ -339,7 +339,7 @@ class World:
         indenter.
 
         Args:
-            depth_m: beyond the surface.
+            depth_m: depth beyond the surface.
 
         Returns:
             "cured", "worsened" or "unchanged".
@@ -409,7 +409,7 @@ class World:
         """Restore the world from `state`; its settings must be the same.
 
         Raises:
-            InvalidValue: a state of another world or version, or a damaged one; then nothing has changed.
+            InvalidValue: a state of another world or version, or a damaged state; then nothing has changed.
         """
         found = restored(WorldState, state, "world", STATE_VERSION)
         for name in ("seed", "start_s"):

@@ -64,7 +64,7 @@ class Activity(ABC):
 
     @abstractmethod
     def end(self) -> None:
-        """Record the end of the measurement, and wait for its result."""
+        """Record the end of the measurement, and expect its result from now on."""
 
     @abstractmethod
     def status(self) -> ScopeStatus:
@@ -201,5 +201,5 @@ class TipWay:
 
     @property
     def next_s(self) -> float | None:
-        """The time of the arrival while the tip may be moving."""
+        """The time of the arrival while the tip may be moving; None otherwise."""
         return self.arrives_s if self.is_on else None

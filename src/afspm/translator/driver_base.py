@@ -284,7 +284,7 @@ class DriverBase(ABC):
         """Return the conformance checks that a controller cannot pass, with the reasons.
 
         Args:
-            controller: its name and version, as in `x-controller`.
+            controller: name and version of the controller, as in `x-controller`.
         """
         return {}
 

@@ -56,7 +56,7 @@ class Observer:
     def begin(self) -> None:
         """Publish the last results again (once, after a restart), then all settings and the state.
 
-        Temporary settings of an earlier process or connection are restored first.
+        Temporary settings of an earlier process or connection are restored before the settings are read.
         """
         if not self._replayed:
             self._replayed = True

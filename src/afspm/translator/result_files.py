@@ -36,8 +36,8 @@ class ResultFiles(ABC):
     """The measurements of one controller and their files.
 
     Args:
-        kept: a JSON dict on disk: "running" and "ended" are an `Entry` or None; "results" are entries with a name, by
-            "result".
+        kept: a JSON dict on disk: "running" and "ended" are an `Entry` or None; "results" is a list of entries, each
+            with the name of the result as "result".
 
     Attributes:
         broken_off: True if the ended measurement was interrupted at the controller; until the next `results`.

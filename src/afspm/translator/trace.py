@@ -2,7 +2,7 @@
 
 One process communicates with one controller, so there is one trace in a process. `begin` opens it, and each vendor's
 connection adds an exchange as one line. Without `begin` nothing is recorded. A connection leaves out its own secrets.
-Text is written unchanged, other bytes in base64, so that a person can read the file.
+Printable text is written unchanged, other bytes in base64, so that a person can read the file.
 """
 
 from __future__ import annotations

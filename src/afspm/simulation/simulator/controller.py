@@ -50,7 +50,7 @@ class PanelEvent:
     Attributes:
         at_s: experiment seconds after the start.
         set: values as in the experiment file.
-        action: one of the instrument's own actions.
+        action: a generic action of the simulated microscope, e.g. "retract"; empty: none.
     """
 
     at_s: float

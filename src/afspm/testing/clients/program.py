@@ -51,7 +51,7 @@ class ClientProgram:
         launch: the client's launch line.
         pump: waits for the program's answers.
         wake: called from other threads after output of the program, and after its end.
-        log: the file for its standard error.
+        log: the file for the program's standard error.
 
     Raises:
         ConfigError: the program can't be started.

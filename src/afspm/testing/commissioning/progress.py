@@ -44,7 +44,7 @@ class CommissioningStep(Check):
 
     Attributes:
         explained: shown to the person before the step.
-        after: required earlier steps: none may have failed or been declined.
+        after: required earlier steps: each must have passed, been skipped, or be unsupported.
         moves: True if the step acts on the microscope, so that the person confirms the step first.
         needs_panel: True if the person acts at the panel; without a panel the step is skipped.
         contact: True if the tip is at the sample; the tip is withdrawn after the step.

@@ -292,7 +292,7 @@ class Bench:
         self._settle()
 
     def refuse(self, subject: str, *, times: int = 1, reason: str = "refused by the bench") -> None:
-        """Let the microscope refuse the next requests for an action ("start-scan") or a parameter."""
+        """Let the microscope refuse the next `times` requests for an action ("start-scan") or a parameter."""
         self._translator.refusals[subject] = (times, reason)
 
     def change_tip(self, condition: str) -> None:

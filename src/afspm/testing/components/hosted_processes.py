@@ -130,8 +130,8 @@ class ComponentProcess(BlockingProcess):
 
     Args:
         make: creates the component for each life.
-        folder: its state_dir.
-        launch: its launch line, without sockets and folders.
+        folder: state_dir and run_dir of the component.
+        launch: the component's launch line, without sockets and folders.
 
     Attributes:
         publishers: other components whose packets the component receives directly.
@@ -312,7 +312,7 @@ class TranslatorProcess(BlockingProcess):
 
     Args:
         make: creates the driver for each life.
-        folder: its state_dir and run_dir.
+        folder: folder for the translator's memory, and its run folder.
     """
 
     def __init__(

@@ -19,7 +19,7 @@ class Weather:
     Attributes:
         delay_s: the longest delay of a message; most delays are much shorter.
         doubles: the chance that a request arrives twice.
-        reconnect_s: time between attempts to reconnect a broken line.
+        reconnect_s: mean time between attempts to reconnect a broken line.
     """
 
     delay_s: float = 0.01

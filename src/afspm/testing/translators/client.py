@@ -151,7 +151,7 @@ class CheckClient:
 
     Attributes:
         observations: all publications.
-        at_start: the publications before the first request.
+        at_start: the publications until control was granted, before the first request to the microscope.
     """
 
     def __init__(self, link: ExperimentLink, direct: ExperimentLink | None, lost: Callable[[], str]) -> None:

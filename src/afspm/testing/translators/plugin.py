@@ -42,7 +42,7 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 
 
 class ExperimentFile(pytest.File):
-    """The checks of one experiment file; they share one pass of its processes."""
+    """The checks of one experiment file, which share one run of its processes."""
 
     def collect(self) -> Iterable[pytest.Item]:
         for check in TRANSLATOR_SUITE.checks():

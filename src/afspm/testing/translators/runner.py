@@ -41,7 +41,7 @@ class SettingsBefore:
         )
 
     def restore(self, client: CheckClient) -> list[str]:
-        """Stop any activity, and restore all settings.
+        """Stop a running scan or spectrum, and restore all settings.
 
         Returns:
             the failures, one per line.

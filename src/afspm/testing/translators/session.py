@@ -52,7 +52,7 @@ class = "Scheduler"
 
 
 class Tester(Component):
-    """The component of the checks in the experiment: wired like any other, but not started as a process."""
+    """The component of the checks in the experiment, wired like any component, but not started as a process."""
 
 
 @dataclass(frozen=True)
