@@ -1,7 +1,7 @@
 """The simulated instrument: world, tip, feedback and noise; its driver; and the base of all emulated controllers.
 
-**Theory of operation.** A simulated night is a function of its settings and its seed. There is no clock: every call
-passes the time.
+**Theory of operation.** A simulated night is a function of its settings and its seed. The physics has no clock: every
+call passes the time.
 
     inputs        settings, a seed, commands with their times, faults on demand
     state         the sample, its drift, the tip with its history, the present activity

@@ -60,10 +60,10 @@ class ScanActivity:
         number: number of the scan, from 1 on.
         region, shape: frame, and (rows, columns).
         line_s: duration of trace and retrace together.
-        upwards: the first line is the one with the smallest y.
+        upwards: True if the first line has the smallest y.
         feedback, bias_v, slope: settings at the start of the scan.
         adjusted: changes during the scan, each in force from the next line on.
-        stopped_s: the time of its interruption; None without.
+        stopped_s: the time of the scan's interruption; None without.
     """
 
     number: int
@@ -222,7 +222,10 @@ class SpectrumActivity:
         return now_s < self.end_s
 
     def both_ways(self) -> tuple[Channels, Channels]:
-        """Return the variables forward and backward; a variable without a backward sweep has equal values in both."""
+        """Return the variables forward and backward, in the order of time.
+
+        A variable without a backward sweep has the same values in both.
+        """
         table = dict(zip(self.names, zip(self.units, self.values.T, strict=True), strict=True))
         there = {name: data for name, data in table.items() if not name.endswith(RETRACE)}
         back = {

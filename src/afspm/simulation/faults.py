@@ -20,7 +20,7 @@ INSTRUMENT_FAULTS: Final[Mapping[str, str]] = {
     "late-file": "a file appears only after the duration",
     "half-file": "the second half of a file appears only after the duration",
 }
-"""The faults of any microscope, except those of its connection."""
+"""The faults of any microscope, except connection faults."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,11 @@ class Fault:
 
     @classmethod
     def of(cls, given: str | PlainMapping | Fault) -> Fault:
-        """Create a fault from a text as on the command line, or from a table of the experiment file."""
+        """Create a fault from a text as on the command line, or from a table of the experiment file.
+
+        Raises:
+            ConfigError: the text or the table has another form.
+        """
         if isinstance(given, Fault):
             return given
         if isinstance(given, str):
@@ -88,7 +92,7 @@ class Faults:
         faults: in any order.
         known: all kinds, with the effect of each.
         start_s: the experiment time from which `Fault.at_s` counts.
-        kept: JSON-able storage for the remaining faults, where they outlive a restart (a crash strikes once).
+        kept: JSON-able storage for the remaining faults, so that they outlive a restart (a crash strikes once).
 
     Raises:
         ConfigError: an unknown kind.
@@ -116,7 +120,7 @@ class Faults:
     def strikes(self, kind: str, now_s: float) -> Fault | None:
         """Return and count the fault of this kind that is due now; None without one.
 
-        Call it once at the point where this kind has its effect: each call uses up one of `count`.
+        Call this method once at the point where this kind has its effect: each fault returned uses up one of `count`.
         """
         self._check(kind)
         for i, fault in enumerate(self._left):

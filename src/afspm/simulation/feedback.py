@@ -2,8 +2,9 @@
 
 Linearised, with error e = h - z (h the height at which the setpoint is met), a PI controller followed by a lag tau and
 a delay T of the loop obeys  (tau - Kp T) z'' + (1 + Kp - Ki T) z' + Ki z = Ki h + (Kp - Ki T) h'.
-Low gains follow late, high ones ring, and above Ki T = 1 + Kp they oscillate. The detector saturates: an amplitude is
-never below zero nor above the free one, so z can only follow so fast down a slope: the tip parachutes.
+Low gains follow late, high gains ring, and gains above Ki T = 1 + Kp oscillate. The detector saturates: an amplitude is
+never below zero nor above the free amplitude, so z can follow a downward slope only at a limited speed: the tip
+parachutes.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ class SensorSettings:
     point: shift = -f H R / (6 k (d (d + 2 A))^(3/2)) (Giessibl 1997).
 
     Attributes:
-        resonance_hz: far from the sample.
+        resonance_hz: resonance frequency far from the sample.
         oscillation_m: amplitude, kept constant.
-        radius_m: of the attracted apex.
-        hamaker_j: of the attraction.
-        contact_m: the shift stays constant below this distance.
+        radius_m: radius of the attracted apex.
+        hamaker_j: Hamaker constant of the attraction.
+        contact_m: distance below which the shift stays constant.
     """
 
     resonance_hz: float = 300e3
@@ -62,7 +63,7 @@ class SensorSettings:
 
     @property
     def largest_hz(self) -> float:
-        """The frequency shift in contact, the most negative one."""
+        """The frequency shift in contact, the most negative shift."""
         return float(self.shift_hz(np.zeros(())))
 
     @property
@@ -85,14 +86,14 @@ class FeedbackSettings:
         mode: "amplitude" (tapping; the setpoint is an amplitude in V), "current" (tunnelling; in A) or
             "frequency-shift" (non-contact; in Hz, below zero).
         integral_gain: in 1/s: an error decays in about 1 / gain.
-        free_amplitude_v: far from the sample.
-        sensitivity_m_per_v: of the detector.
-        lag_s, delay_s: of actuator and loop; gains above about 1 / delay_s oscillate.
-        range_m: of the z actuator: the tip withdraws this far if the setpoint is never reached.
-        decay_m: the gap over which a tunnelling current falls by e.
+        free_amplitude_v: amplitude far from the sample.
+        sensitivity_m_per_v: sensitivity of the detector.
+        lag_s, delay_s: lag of the actuator, delay of the loop; integral gains above about 1 / delay_s oscillate.
+        range_m: range of the z actuator; the tip withdraws by half of it if the setpoint is never reached.
+        decay_m: the gap over which a tunnelling current falls by a factor e.
         current_floor_a: the smallest current that the logarithmic amplifier resolves.
-        qplus: in the mode "current" the sensor oscillates too: a channel "Frequency Shift".
-        sensor: a table of its own, of the mode "frequency-shift" and of `qplus`.
+        qplus: True if the sensor oscillates in the mode "current" too, with a channel "Frequency Shift".
+        sensor: settings of the oscillating sensor, for the mode "frequency-shift" and for `qplus`.
     """
 
     mode: str = "amplitude"
@@ -118,7 +119,7 @@ class FeedbackSettings:
             raise ConfigError(refusal, where="setpoint")
 
     def refusal_of(self, setpoint: float) -> str:
-        """Return the reason why a setpoint is impossible in this mode; empty if it is possible."""
+        """Return the reason why a setpoint is impossible in this mode; empty for a possible setpoint."""
         if self.mode != "frequency-shift":
             return "" if 0 < setpoint < math.inf else f"a setpoint is above zero, not {setpoint:g}"
         largest = self.sensor.largest_hz
@@ -158,7 +159,7 @@ class Loop:
 
     @property
     def engages(self) -> bool:
-        """Whether the setpoint can be reached: an amplitude above the free amplitude cannot."""
+        """True if the setpoint can be reached: an amplitude must be below the free amplitude."""
         return self.settings.mode != "amplitude" or self.setpoint < self.settings.free_amplitude_v
 
     @property
@@ -195,7 +196,7 @@ class Loop:
         """Return z along the paths, one path per column.
 
         Args:
-            height_m: at which the setpoint would be reached, shape (steps, paths), `step_s` apart, linear in between.
+            height_m: heights at which the setpoint is reached, shape (steps, paths), `step_s` apart, linear in between.
             start_v: initial speed of z for each path, from which an oscillation of the loop grows.
         """
         splits = self._splits(step_s)
@@ -235,7 +236,7 @@ class Loop:
 
     @property
     def oscillates(self) -> bool:
-        """Whether the gains are beyond the limit of stability."""
+        """True if the gains are beyond the limit of stability."""
         return self._damping <= 0.0 or self._inertia <= 0.0
 
     @property

@@ -2,7 +2,7 @@
 
 The path of the tip's apex over a surface is the grey dilation of the surface by the reflected tip (Villarrubia 1997). A
 convex tip, a paraboloid that continues as a cone, is the infimal convolution of both shapes. So a dilation by the
-paraboloid and then by the cone is exact; each is done axis by axis.
+paraboloid (exact, axis by axis) is followed by a dilation by the cone, approximated by an eight-sided pyramid.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _SPLINE_VARIANCE = 1.0 / 3.0  # of the cubic B-spline as a blur, in samples squa
 
 @dataclass(frozen=True)
 class SampleGrid:
-    """A grid along the sample's axes on which the sample is computed, finer than the scan.
+    """A grid along the sample's axes on which the sample is computed, usually finer than the scan.
 
     Attributes:
         x0_m, y0_m: the first point.

@@ -47,7 +47,7 @@ _STATE_VERSION = 2
 
 
 class InstrumentBusy(AfspmError):
-    """The error that another activity is running; wait for its end or stop it first."""
+    """The error that another activity is running: wait for its end, or stop that activity first."""
 
     code = "instrument-busy"
 
@@ -56,8 +56,9 @@ class InstrumentSetup:
     """The present settings of the instrument.
 
     Attributes:
-        region, shape, line_s, upwards: for the next scan: the frame, (rows, columns), seconds of trace and retrace, and
-            whether it begins with the smallest y.
+        region, shape: frame of the next scan, and its (rows, columns).
+        line_s: seconds of trace and retrace together.
+        upwards: True if the next scan begins with the smallest y.
         slope: compensation of tilt, (x, y).
         move_speed_m_s: speed of the probe outside of scans.
         approach_s: duration of an approach or a withdrawal.
@@ -95,7 +96,7 @@ class SimulatedInstrument:
     """A simulated instrument with one activity at a time. Not thread-safe.
 
     Args:
-        world_settings: `surface`, `tip`, `drift` … of the simulated world, as of the Simulator.
+        world_settings: `surface`, `tip`, `drift` … of the simulated world, as in `World.from_settings`.
         seed: seed of all random numbers.
         start_s: the first time of any call.
         run: runs the computation of scans; by default at once.
@@ -104,8 +105,9 @@ class SimulatedInstrument:
     Attributes:
         setup: the present settings.
         drawing: the computation of scans.
-        engaged: the tip is at the sample; otherwise all channels show noise.
-        scan, spectrum: the last started scan and spectrum, also after their end; None before the first.
+        engaged: True while the tip is at the sample; otherwise all channels show noise.
+        scan, spectrum: the last started scan and spectrum, also after their end; None before the first, and for a
+            stopped spectrum.
         world: the physics, with its ground truth (`world.truth`).
         ledger: the damage so far, counted up to the last call.
     """
@@ -148,7 +150,7 @@ class SimulatedInstrument:
         return {name: unit for name, (unit, _) in scan.channels().items()}
 
     def doing(self, now_s: float) -> str:
-        """Return the activity: "scan", "spectrum", "move", "pulse", "crash", "approach", as in `occupy`, or ""."""
+        """Return the activity: "scan", "spectrum", "move", or the name given to `occupy`; empty if free."""
         return self._doing.what if self._doing is not None and self._doing.running(now_s) else ""
 
     def busy(self, now_s: float) -> bool:
@@ -216,7 +218,7 @@ class SimulatedInstrument:
     # -- scans
 
     def start_scan(self, now_s: float) -> ScanActivity:
-        """Scan the frame.
+        """Start a scan of the frame.
 
         Raises:
             InstrumentBusy. InvalidValue: the setup allows no scan.
@@ -282,7 +284,7 @@ class SimulatedInstrument:
     # -- spectra
 
     def start_spectrum(self, kind: str, now_s: float, sweeps: int = 1) -> SpectrumActivity:
-        """Take a curve of a kind ("IV", "force") at the probe's position, the mean of `sweeps`.
+        """Start a curve of a kind ("IV", "force") at the probe's position, the mean of `sweeps` (at most 32 computed).
 
         Raises:
             InstrumentBusy. InvalidValue: an unknown kind.
@@ -319,7 +321,7 @@ class SimulatedInstrument:
         """Move the tip at the move speed. A call during a move changes its target.
 
         Args:
-            way_m: path length of the frame, if it moves at the same time.
+            way_m: path length of a frame that moves at the same time.
 
         Raises:
             InstrumentBusy: during another activity. InvalidValue: the position is not finite.
@@ -354,7 +356,7 @@ class SimulatedInstrument:
         """Set the velocity (x, y) at which the scanner follows the sample from now on, also during a scan.
 
         Raises:
-            InvalidValue: faster than any drift.
+            InvalidValue: the velocity is above 1e-6 m/s, faster than any drift.
         """
         if not max(map(abs, velocity_m_per_s)) <= _FASTEST_DRIFT_M_S:
             raise InvalidValue(f"a drift of {velocity_m_per_s} m/s", hint=f"at most {_FASTEST_DRIFT_M_S} m/s")
@@ -386,7 +388,7 @@ class SimulatedInstrument:
         return outcome
 
     def pulsed(self, voltage_v: float, duration_s: float, now_s: float) -> str:
-        """Apply the effect of a pulse during which the caller set and restored the bias; return as `pulse`."""
+        """Apply the effect of a pulse for which the caller set and restored the bias; return the outcome as `pulse`."""
         self.drawing.wait()
         if not self.engaged or duration_s <= 0.0:
             return "unchanged"
@@ -400,7 +402,11 @@ class SimulatedInstrument:
         return outcome
 
     def crash(self, depth_m: float, speed_m_s: float, now_s: float) -> str:
-        """Drive the tip into the sample and back at the probe's position; return as `pulse`."""
+        """Drive the tip into the sample and back at the probe's position; return the outcome as `pulse`.
+
+        Raises:
+            InstrumentBusy. InvalidValue: depth or speed is not above 0.
+        """
         if not min(depth_m, speed_m_s) > 0.0:
             raise InvalidValue(f"a crash {depth_m} m deep with {speed_m_s} m/s", hint="depth and speed must be above 0")
         self._check_free(now_s)
@@ -417,7 +423,7 @@ class SimulatedInstrument:
         return outcome
 
     def engage(self, now_s: float) -> None:
-        """Approach the sample."""
+        """Start the approach to the sample; `engaged` is True from its start."""
         self._check_free(now_s)
         self.engaged = True
         self.occupy("approach", self.setup.approach_s, now_s)
@@ -453,7 +459,7 @@ class SimulatedInstrument:
     def account(self, now_s: float) -> None:
         """Count an ended measurement and the time since the last call in the ledger.
 
-        Call it before changing `setup.feedback` or `engaged`: the elapsed time counts with the previous values.
+        Call this method before a change of `setup.feedback` or `engaged`: the elapsed time counts with the old values.
         """
         self._count(now_s, "feedback", self.ledger)
         measured = self._uncounted
@@ -518,7 +524,7 @@ class SimulatedInstrument:
         """Restore the instrument from `state`; the caller restores the settings in `setup`.
 
         Raises:
-            InvalidValue: a state of another world or version, or a damaged one.
+            InvalidValue: a state of another world or version, or a damaged state.
         """
         found = restored(InstrumentState, kept["instrument"], "instrument", _STATE_VERSION)
         self.world.restore(kept["world"])
@@ -528,13 +534,14 @@ class SimulatedInstrument:
         self._doing = found.scan or found.spectrum or found.move or found.occupied
         self.ledger, self._scanned = found.ledger, found.scanned
         self._uncounted = (found.scan or found.spectrum) if found.engaged else None
+        # the values are not saved: the world at the start of the scan gives the same values again
         if self.scan is not None:
             self._redraw(self.scan.adjusted)
 
     # -- inside
 
     def note(self, time_s: float, event: str, facts: Mapping[str, object]) -> None:
-        """Record an event with the ground truth, unless the world is in use by the computation of a scan."""
+        """Record an event; add the ground truth unless the computation of a scan is using the world."""
         if self._note is not None:
             truth = {} if self.drawing.goes_on else {"truth": self.world.truth(time_s)}
             self._note(time_s, event, {**facts, **truth})
@@ -543,6 +550,7 @@ class SimulatedInstrument:
         doing = self.doing(now_s)
         if doing:
             raise InstrumentBusy(f"the instrument is busy with a {doing}")
+        # a stopped scan may still be computed, and only one thread at a time may use the world
         self.drawing.wait()
         self.account(now_s)
 

@@ -1,7 +1,7 @@
 """The damage ledger: totals of all actions that can damage tip or sample, as part of the ground truth.
 
 **Theory of operation.** The instrument adds each treatment, scan and interval of time. Whenever the totals have grown,
-they are appended to `truth.jsonl` as a separate line. They are no verdict: compare them with a budget.
+they are appended to `truth.jsonl` as a separate line. The totals are no verdict: compare them with a budget.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from afspm.model import Region
 
 LEDGER_EVENT = "ledger"
 PRESSED_FROM_M = 0.2e-9
-"""Mean indentation of a scan by errors of the feedback from which the scan counts: five times the usual one."""
+"""Smallest mean indentation, by errors of the feedback, of a scan that counts: five times the usual indentation."""
 
 
 @dataclass(frozen=True)
@@ -58,12 +58,12 @@ class DamageLedger:
         return replace(self, until_s=now_s, feedback_off_s=self.feedback_off_s + off_s)
 
     def pulsed(self, voltage_v: float, duration_s: float, outcome: str, radius_m: float, *, near: bool) -> DamageLedger:
-        """Return the ledger after a pulse; see `_treated`."""
+        """Return the ledger after a pulse that left a mark of `radius_m`; `near`: within `keep_away_m` of a scan."""
         done = replace(self, pulses=self.pulses + 1, pulse_v_s=self.pulse_v_s + abs(voltage_v) * duration_s)
         return done._treated(outcome, radius_m, near=near)
 
     def crashed(self, depth_m: float, outcome: str, radius_m: float, *, near: bool) -> DamageLedger:
-        """Return the ledger after a crash; see `_treated`."""
+        """Return the ledger after a crash that left a mark of `radius_m`; `near`: within `keep_away_m` of a scan."""
         done = replace(self, crashes=self.crashes + 1, crash_depth_m=self.crash_depth_m + depth_m)
         return done._treated(outcome, radius_m, near=near)
 
@@ -111,7 +111,7 @@ def distance_m(xy_m: tuple[float, float], region: Region) -> float:
 
 
 def with_place(places: Iterable[ScannedPlace], place: ScannedPlace) -> list[ScannedPlace]:
-    """Add a scanned place; it replaces an earlier scan of the same frame at the same place."""
+    """Return the places with `place` added, instead of an earlier scan of the same frame at the same place."""
     size_m = max(place.region.size_m)
 
     def same(one: ScannedPlace) -> bool:

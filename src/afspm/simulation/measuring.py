@@ -26,8 +26,8 @@ class SignalSettings:
     """The response of the sample in phase and current.
 
     Attributes:
-        dissipation: energy lost to the sample per cycle, relative to the cantilever's own loss, mean of both
-            materials; dissipation_contrast: their difference.
+        dissipation: energy lost to the sample per cycle, relative to the cantilever's own loss, mean of both materials.
+        dissipation_contrast: difference of this loss between both materials.
         conductance_s: mean conductance of the contact over a cycle of gentle tapping.
         conductance_contrast: ln of the ratio of both materials' conductances.
         current_decay_m: increase of the gap over which the tapping current falls by a factor e.
@@ -103,13 +103,12 @@ class Setup:
 
     Attributes:
         sample: returns the present relief of the sample from (x, y, resolution_m).
-        drift_m: returns (x, y, z) at times.
+        drift_m: returns the drift (x, y, z) minus the scanner's own compensation, at times.
         turn: returns rotation and scale of the sample at times, as complex factors.
         unturned: returns (x, y) without rotation and scale, from (x, y, times).
-        held_z_m: z while the feedback is off.
+        held_z_m: z while the feedback is off; None: not set.
         slope: (x, y) compensation of tilt set on the instrument, m/m.
         sharp_m: radius of the sharp tip.
-        origin_m: the fixed point (x, y) of tilt and slope.
         offset_m: returns the remaining distance (x, y) of the scanner to its target (creep), at times.
     """
 
@@ -150,7 +149,7 @@ class Measured:
     pressed_m: float
 
     def continued(self, anew: Measured, rows: NDArray[np.bool_]) -> Measured:
-        """Return the measurement with `rows` replaced by the rows of its continuation, the first argument."""
+        """Return the measurement with `rows` taken from the first argument, the same scan with other settings."""
         channels = {
             name: (unit, np.where(rows[:, None], anew.channels[name][1], values))
             for name, (unit, values) in self.channels.items()

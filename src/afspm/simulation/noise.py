@@ -23,7 +23,7 @@ class NoiseSettings:
         scar_m: height of the disturbance.
         hum_m, hum_hz: amplitude and frequency of mains hum in the height.
         debris_jumps_per_s: rate of jumps of debris on a contaminated tip.
-        amplitude_v, phase_deg, current_a, frequency_hz: white noise of those channels.
+        amplitude_v, phase_deg, current_a, frequency_hz: white noise of the channels of these names.
     """
 
     white_m: float = 0.05e-9

@@ -74,7 +74,7 @@ class PropertyMap:
     """An unbounded map, determined by its seed.
 
     Attributes:
-        is_on: whether there is a map; otherwise spectra depend on the two materials.
+        is_on: True if there is a map; otherwise spectra depend on the two materials.
         quantity: name of the quantity.
         unit: unit of the quantity.
     """

@@ -77,7 +77,7 @@ class Sample:
         return np.stack(self.drift.unturned(at[..., 0], at[..., 1], t_s), axis=-1)
 
     def to_tip(self, xy_m: ArrayLike, t_s: ArrayLike) -> Array:
-        """Map positions from tip to sample coordinates backwards: the inverse of `to_sample`."""
+        """Map positions (..., 2) at experiment times (...) from sample to tip coordinates: inverse of `to_sample`."""
         at = np.asarray(xy_m, dtype=np.float64)
         turned = np.stack(self.drift.turned(at[..., 0], at[..., 1], t_s), axis=-1)
         return np.asarray(turned + self.drift.at(t_s)[..., :2])

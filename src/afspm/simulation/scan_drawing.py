@@ -1,4 +1,4 @@
-"""Computation of the values of a scan, before its start or while it runs."""
+"""Computation of the values of a scan, at its start or while the scan runs."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ScanDrawing:
         self.log = logging.getLogger(__name__)
 
     def start(self, scan: ScanActivity, draw: Draw) -> None:
-        """Start the computation returned by `prepared`."""
+        """Start the computation returned by `prepared`; an unexpected error stops the scan and leaves it empty."""
 
         def work() -> None:
             try:

@@ -29,10 +29,11 @@ class ScannerSettings:
 
     Attributes:
         flatten: levelling of height lines before they are delivered: "none", "offset" or "line" (Flatten1).
-        band_limit_px: standard deviation of the blur of every signal.
-        oversampling: grid points per pixel and axis for the contact of tip and sample; 0: as many as the scan allows.
+        band_limit_px: standard deviation of the blur of the tip's path over the surface, in pixels.
+        oversampling: grid points per pixel and axis for the contact of tip and sample; 0: 1 to 4, by the scan's size.
         tilt_x, tilt_y: slope of the sample in its holder, m/m.
-        creep: remaining fraction of a move after 1 s; it vanishes as 1 - log10(t); 0: none.
+        creep: remaining fraction of a move right after the move; falls by a quarter per decade of 1 + t in s, to zero
+            after almost three hours; 0: none.
         backlash_m: lag of the retrace in x.
     """
 

@@ -24,12 +24,13 @@ class IVSettings:
     """Sweep and sample of current-voltage curves.
 
     Attributes:
-        range_v: the sweep goes from -range to +range.
+        range_v: largest bias: the sweep goes from -range_v to range_v.
         set_bias_v, set_current_a: the current at this bias before the feedback is opened (tunnelling: the setpoint at
             the present bias).
         gap_ev: band gap of material 0; material 1 is a metal.
         band_offset_ev: middle of the gap relative to the Fermi level (doping).
-        noise_a: white noise; `relative_noise` adds a fraction of the current.
+        noise_a: white noise of the current.
+        relative_noise: additional noise as a fraction of the current.
         duration_s: duration of a curve.
     """
 
@@ -109,10 +110,10 @@ def current_voltage(
 
 
 def force_distance(settings: ForceSettings, tip: TipShape, material: float, random: np.random.Generator) -> Curves:
-    """Return deflection and force against the piezo's extension, approach and retract, zero at the first contact.
+    """Return deflection and force against z, approach and retract; z is 0 where the unbent cantilever touches.
 
-    Contact after Derjaguin, Muller and Toporov, van der Waals attraction before it. Quasi-static: the cantilever
-    follows its branch until that ends, then jumps (snap-in, pull-off), so both directions differ.
+    The contact follows Derjaguin, Muller and Toporov; before contact, van der Waals attraction acts. Quasi-static: the
+    cantilever follows a branch until its end, then jumps (snap-in, pull-off), so both directions differ.
     """
     modulus = _mix(settings.modulus_pa, material, logarithmic=True)
     adhesion = _mix(settings.adhesion_j_per_m2, material) * (1.4 if tip.debris_m else 1.0)

@@ -28,8 +28,8 @@ class TipShape:
         radius_m: radius of the apex, without debris.
         half_angle_deg: half angle of the cone behind the apex.
         second_apex_m: (x, y, height) of a second apex beside the first, height (negative) below it; None without.
-        debris_m: size of debris that sticks to the tip and jumps; 0 for a clean one.
-        length_m: relative to the first tip; a change makes the height jump.
+        debris_m: size of debris that sticks to the tip and jumps; 0 for a clean tip.
+        length_m: length relative to the first tip; a change makes the height jump.
         flaws: a subset of FLAWS.
     """
 
@@ -77,20 +77,20 @@ class TipSettings:
 
 @dataclass(frozen=True)
 class TipRepairSettings:
-    """The repairs of `TipChangeSettings`.
+    """The settings of repairs: the effects of pulses and crashes on the tip.
 
     Attributes:
         pulse_threshold_v: a pulse below this voltage has no effect.
         pulse_cures, pulse_worsens: probability for a pulse far above the threshold that lasts `pulse_duration_s`.
-        pulse_duration_s: a longer pulse has more effect, up to twice; a shorter one has less.
+        pulse_duration_s: a longer pulse has more effect, up to twice; a shorter pulse has less.
         crash_cures, crash_worsens: probability for a crash `crash_depth_m` deep.
         crash_depth_m: an n times deeper crash has n chances of an effect.
         crash_speed_m_per_s: slower crashes are less likely to have an effect, in proportion.
-        answers: "even": every flaw answers alike, by the probabilities above; "public", "sealed": it answers by flaw,
-            polarity, voltage and depth, drawn for each seed from the prior of that name (`tip_answers`).
-        answers_seed: of that draw, for several nights with the same answers; by default the seed of the world.
-        answers_turn_s: the time after the start at which the answers turn round; 0: never.
-        keep_away_m: a treatment nearer to a place scanned before counts in the damage ledger.
+        answers: "even": every flaw answers alike, by the probabilities above; "public", "sealed": the answer depends on
+            flaw, polarity, voltage and depth, drawn for each seed from the prior of that name (`tip_answers`).
+        answers_seed: seed of that draw, for several nights with the same answers; by default the seed of the world.
+        answers_turn_s: the time after the start at which the answers change to `TipAnswers.turned`; 0: never.
+        keep_away_m: a treatment nearer than this to a place scanned before counts in the damage ledger.
     """
 
     pulse_threshold_v: float = 2.0
@@ -164,7 +164,7 @@ class TipMaker:
         self._s = settings
 
     def first(self, random: np.random.Generator) -> TipShape:
-        """Return the tip at the start: as in the settings, with their flaw if any."""
+        """Return the tip at the start, with the flaw in the settings if any."""
         sharp = TipShape(self._s.radius_m, self._s.half_angle_deg)
         return sharp if self._s.condition == "sharp" else self.changed(sharp, self._s.condition, random)
 
@@ -334,7 +334,7 @@ class SimulatedTip:
         return self._answers.turned() if self._answers is not None and turned else self._answers
 
     def pulse(self, voltage_v: float, duration_s: float, t_s: float, random: np.random.Generator) -> str:
-        """Apply a bias pulse and return its effect, which depends mostly on the voltage."""
+        """Apply a bias pulse and return its effect: "cured", "worsened" or "unchanged", depending mostly on voltage."""
         s, answers = self._settings, self.answers(t_s)
         if answers is not None:
             once = Chances(*answers.of(self.at(t_s).flaws).pulse(voltage_v))
@@ -347,7 +347,7 @@ class SimulatedTip:
         return self._treat("pulse", t_s, chances, random)
 
     def crash(self, depth_m: float, speed_m_s: float, t_s: float, random: np.random.Generator) -> str:
-        """Apply a crash and return its effect."""
+        """Apply a crash and return its effect: "cured", "worsened" or "unchanged"."""
         s, answers = self._settings, self.answers(t_s)
         effect = min(1.0, speed_m_s / s.crash_speed_m_per_s)
         if answers is not None:

@@ -7,7 +7,7 @@ prior are drawn with a key outside of the repository, so that no component can b
 
 All of it is simulated, without a source. The pictures behind it: the field of a pulse desorbs debris, or moves atoms of
 the apex, at one polarity more than at the other, above a threshold; a crash reshapes the apex where the depth fits the
-size of the flaw, and a deeper one adds flaws.
+size of the flaw, and a deeper crash adds flaws.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class AnswerPrior(Answers):
     """The distribution of one flaw's answers: medians of voltage and depth, means of probabilities and factor.
 
     Attributes:
-        plus: probability that positive pulses cure better than negative ones.
+        plus: probability that positive pulses cure better than negative pulses.
     """
 
     plus: float
@@ -105,7 +105,7 @@ class TipAnswers:
     """The answers of all flaws.
 
     A tip with several flaws answers as its first flaw in the order blunt, double, contaminated, since a missing apex
-    hides the other flaws. A sharp tip answers like a blunt one, and has no flaw to cure.
+    hides the other flaws. A sharp tip answers like a blunt tip, and has no flaw to cure.
     """
 
     def __init__(self, of_flaw: Mapping[str, FlawAnswers]) -> None:

@@ -19,8 +19,8 @@ class Truth:
     While the disk hangs, lines are queued: the microscope does not wait for the disk.
 
     Args:
-        kept: storage for the number of the last line, so that it survives a kill. The last event may then be written
-            again, under the same `n`.
+        kept: storage for the number of the last line, which then survives a kill. After a kill the last event may be
+            written again, under the same `n`.
     """
 
     def __init__(self, path: Path, kept: Plain | None = None) -> None:

@@ -1,8 +1,8 @@
 """The simulated world: a sample, a tip and an instrument, in experiment time.
 
 `World` keeps the state between measurements: the tip and its history, marks on the sample, the position of the tip. A
-measurement is called with its time; predictions beyond that time (tip changes and wear in the rest of a stopped scan)
-are revoked. The same seed and the same calls give the same world.
+measurement is called with its time, and revokes predictions beyond that time (tip changes and wear in the rest of a
+stopped scan). The same seed and the same calls give the same world.
 """
 
 from __future__ import annotations
@@ -73,10 +73,12 @@ class WorldSettings:
 
 
 def read_settings(settings: Mapping[str, object]) -> tuple[object, WorldSettings]:
-    """Split a table into the surface's table and the other settings, and check them.
+    """Split a table into the surface's table and the other settings, and check the other settings.
+
+    The surface is checked here only together with other errors; otherwise `World` checks it.
 
     Raises:
-        ConfigError: unknown names or invalid values, of all tables at once; FileError: the surface's file.
+        ConfigError: unknown names or invalid values, of all tables at once.
     """
     tables = dict(settings)
     names = ["surface", *WorldSettings.__dataclass_fields__]
@@ -210,7 +212,8 @@ class World:
     ) -> dict[str, float]:
         """Return the value of each channel while the tip stands still, without changing the world.
 
-        With the feedback off, z is the value set by `hold`, or z at the end of the last scan.
+        With the feedback off, z is the value set by `hold`, or z at the end of the last scan; before the first scan and
+        after a crash, z is the height of the surface.
 
         Args:
             random: generator for the noise, so that other measurements stay the same.
@@ -293,7 +296,7 @@ class World:
         """Set the velocity (x, y) of the scanner's own drift compensation from `t_s` on.
 
         Raises:
-            InvalidValue: `t_s` is before the last change of velocity.
+            InvalidValue: `t_s` is before the last change of velocity, or a value is not finite.
         """
         if not all(map(math.isfinite, (*velocity_m_per_s, t_s))):
             raise InvalidValue(f"a velocity of {velocity_m_per_s} m/s from {t_s} s on")
@@ -310,10 +313,10 @@ class World:
     def pulse(
         self, voltage_v: float, duration_s: float, t_s: float, position_m: tuple[float, float] | None = None
     ) -> str:
-        """Pulse the bias: it may cure or worsen the tip (`tip.pulse_times`), and leaves a small mound.
+        """Pulse the bias: a pulse may cure or worsen the tip (`tip.pulse_times`), and then leaves a small mound.
 
         Args:
-            position_m: the position of the tip; None: as at the last measurement.
+            position_m: the position of the tip; None: the position of the last measurement.
 
         Returns:
             "cured", "worsened" or "unchanged".
@@ -329,13 +332,14 @@ class World:
         return outcome
 
     def crash(self, position_m: tuple[float, float], depth_m: float, speed_m_s: float, t_s: float) -> str:
-        """Drive the tip into the sample: it may cure or worsen the tip (`tip.crash_times`), and leaves a crater.
+        """Drive the tip into the sample: a crash may cure or worsen the tip (`tip.crash_times`), and leaves a crater.
 
-        A part of the depth (`tip.indented_m`) springs back. Simulated: material is pushed aside over three times the
-        radius of contact, about as far as plastic flow reaches around an indenter.
+        The crater is shallower than the indentation (`tip.indented_m`), of which a part springs back. Simulated:
+        material is pushed aside over three times the radius of contact, about as far as plastic flow reaches around an
+        indenter.
 
         Args:
-            depth_m: beyond the surface.
+            depth_m: depth beyond the surface.
 
         Returns:
             "cured", "worsened" or "unchanged".
@@ -356,7 +360,8 @@ class World:
     def drift_m(self, t_s: ArrayLike) -> Array:
         """Return the displacement (x, y, z) of the sample: x_tip = x_sample + drift. Shape t.shape + (3,).
 
-        For a sample that rotates or expands this holds only at the fixed point; use `to_sample` and `to_tip`.
+        For a sample that rotates or expands this holds only at the fixed point; use `sample.to_sample` and
+        `sample.to_tip`.
         """
         return self.sample.drift.at(t_s)
 
@@ -366,7 +371,7 @@ class World:
         return self._tip.history[-1].tip
 
     def truth(self, t_s: float) -> dict[str, object]:
-        """Return the ground truth, JSON-able: drift, tip, its changes, marks. It is never published."""
+        """Return the ground truth, JSON-able: drift, tip, tip changes, marks. The ground truth is never published."""
         answers = self._tip.answers(t_s)
         return {
             **({} if answers is None else {"tip_answers": answers.truth()}),
@@ -404,7 +409,7 @@ class World:
         """Restore the world from `state`; its settings must be the same.
 
         Raises:
-            InvalidValue: a state of another world or version, or a damaged one; then nothing has changed.
+            InvalidValue: a state of another world or version, or a damaged state; then nothing has changed.
         """
         found = restored(WorldState, state, "world", STATE_VERSION)
         for name in ("seed", "start_s"):

@@ -115,7 +115,7 @@ def expect(holds: object, expected: str, came: str) -> None:
 
 
 def near(a: float, b: float, relative: float = 1e-3, absolute: float = 0.0) -> bool:
-    """Return whether two numbers agree to a controller's precision."""
+    """Return whether two numbers agree within `relative` or `absolute`: by default a controller's precision, 0.1 %."""
     return math.isclose(a, b, rel_tol=relative, abs_tol=absolute)
 
 
@@ -151,9 +151,9 @@ class Suite(Generic[K]):
     """The checks of one kind of program, in order.
 
     Args:
-        command: the command that runs them.
-        package: contains the modules with the checks, which are imported on first use.
-        modules: their names, in order.
+        command: the command that runs the suite.
+        package: the package with the modules of checks, which are imported on first use.
+        modules: the names of the modules, in order.
     """
 
     def __init__(self, command: str, package: str, modules: Sequence[str]) -> None:
@@ -166,7 +166,7 @@ class Suite(Generic[K]):
         self._checks.append(check)
 
     def checks(self, only: Collection[str] = ()) -> tuple[K, ...]:
-        """Return the checks whose names contain one of `only`; all checks if it is empty.
+        """Return the checks whose names contain a text in `only`; all checks if `only` is empty.
 
         Raises:
             ConfigError: no check has such a name.
@@ -225,7 +225,7 @@ class SuiteReport:
     """The results of a suite, for one program.
 
     Attributes:
-        lost: why the checks could not be finished; empty if they were.
+        lost: the reason for unfinished checks; empty if all were finished.
         folder: folder of this run, with its log and files; empty before it is created.
     """
 
@@ -290,7 +290,10 @@ class SuiteReport:
 
     @contextmanager
     def written(self) -> Iterator[None]:
-        """Write `report.json` at the end of the `with` block, with the reason of an early end."""
+        """Write `report.json` at the end of the `with` block.
+
+        `Lost` ends the block without an error; the report contains the reason.
+        """
         try:
             yield
         except Lost as lost:

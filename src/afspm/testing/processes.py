@@ -19,12 +19,12 @@ ASKED_S, KILLED_S = 5.0, 3.0
 
 
 class Processes:
-    """Running processes; an unrequested end of a process is an error.
+    """A set of running processes, whose ends and complaints are recorded.
 
     Args:
-        log: receives their output.
+        log: receives the output of the processes.
         woken: called, from any thread, after the end of a process.
-        complaints: receives their warnings and errors, each with the name of its process.
+        complaints: receives the warnings and errors, each with the name of its process.
     """
 
     def __init__(self, log: RunLog, clock: Clock, woken: Callable[[], None], complaints: list[str]) -> None:
@@ -49,7 +49,7 @@ class Processes:
             self._running[task.name] = ChildProcess(task, self._handle_event)
 
     def kill(self, name: str) -> None:
-        """Kill a process, and wait for its end."""
+        """Kill a process, and wait for its end, at most `KILLED_S`."""
         self._running[name].kill()
         self._await(KILLED_S, lambda: name in self._ended)
 

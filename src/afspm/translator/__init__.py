@@ -3,15 +3,16 @@
 **Theory of operation.** One loop waits for requests and for the next reading of the controller.
 
     inputs        requests of the scheduler; readings of the driver from the controller
-    state         the last observed state of the microscope; answers to recent requests; finished scans not yet
+    state         the last published state of the microscope; answers to recent requests; names of the results already
                   published (all on disk)
     outputs       commands to the controller; states, settings, scans and spectra as packets
     invariants    a request is checked as a whole before anything is set; no request is executed twice; only one
-                  scheduler is obeyed (`fencing`); a result is published once, even after a kill (`outbox`); when no
-                  process is left to command, the measurement is stopped and the tip is safe (`safe_exit`)
+                  scheduler is obeyed (`fencing`); a result reaches a subscriber once, even after a kill (`outbox`);
+                  when no process is left to command, the measurement is stopped, and the tip is retracted if a request
+                  has switched its feedback off (`safe_exit`)
 
 A driver (`driver`) reads and sets the parameters of its table (`parameters`), starts and stops measurements, and
-returns their results. It may fail at any time with `ControllerLost`; the translator reconnects.
+returns their results. A driver may fail at any time with `ControllerLost`; the translator reconnects.
 """
 
 from __future__ import annotations

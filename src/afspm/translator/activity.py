@@ -1,15 +1,15 @@
 """`Activity`: the measurement that runs in a maker's program, from its start to its file.
 
 Theory of operation. A program is polled (`status`), and most programs do not report that a measurement began or ended.
-The life of a measurement is the same with all of them:
+The life of a measurement is the same with all programs:
 
 | step | by |
 | --- | --- |
-| it begins: on request, or at the panel, where only the next poll shows it | `begin`, `follow` |
-| it settles: a request is answered once the measurement is seen running, or its file exists | `settle` |
-| it ends: no measurement is seen running any more, and its file is awaited | `follow`, `end` |
-| it is stopped on request: a measurement that still runs for a moment is not a new one, and has no result | `stopped` |
-| an interruption or a failure is reported once as INTERRUPTED | `at_rest` |
+| start: on request, or at the panel, where only the next poll shows the measurement | `begin`, `follow` |
+| settling: a request is answered once a poll shows the measurement running, or its file exists | `settle` |
+| end: a poll shows no running measurement any more, and the file is awaited | `follow`, `end` |
+| stop on request: the measurement may still run for a moment, counts as no new measurement, has no result | `stopped` |
+| interruption or failure: reported once as INTERRUPTED | `at_rest` |
 
 A curve may have to wait until the tip arrives at its position (`curve_awaited`), and a command may last as long as the
 measurement itself (`call`). A maker's driver detects a running measurement and records it with the files.
@@ -64,7 +64,7 @@ class Activity(ABC):
 
     @abstractmethod
     def end(self) -> None:
-        """Record the end of the measurement, and wait for its result."""
+        """Record the end of the measurement, and expect its result from now on."""
 
     @abstractmethod
     def status(self) -> ScopeStatus:
@@ -73,7 +73,7 @@ class Activity(ABC):
     # --- the life of a measurement ---
 
     def follow(self, what: str) -> None:
-        """Compare with the program: record the end of a measurement, and the start of one at the panel.
+        """Compare with the program: record the end of a measurement, and the start of a measurement at the panel.
 
         Args:
             what: `SCAN`, the kind of a curve, or empty.
@@ -89,7 +89,7 @@ class Activity(ABC):
         """Wait until the started measurement is running, or has already produced its file.
 
         Raises:
-            Refused: ACTION_ERROR: the program did not start it, and reported no error.
+            Refused: ACTION_ERROR: the program did not start the measurement within `settles_s`, and reported no error.
         """
         # without a pause: each look takes as long as the program's answer
         until_s = self._clock.monotonic_s() + self.settles_s
@@ -125,7 +125,10 @@ class Activity(ABC):
         self._results.forget()
 
     def at_rest(self, state: ScopeState = ScopeState.FREE) -> ScopeStatus:
-        """Return the state while nothing is measured: INTERRUPTED once after a failure or an interrupted scan."""
+        """Return the state while nothing is measured.
+
+        INTERRUPTED replaces `state` once after a failed call, and while `broken_off` is True.
+        """
         failed, self._failed = self._failed, False
         return ScopeStatus(ScopeState.INTERRUPTED if failed or self._results.broken_off else state)
 
@@ -198,5 +201,5 @@ class TipWay:
 
     @property
     def next_s(self) -> float | None:
-        """The time of the arrival while the tip may be moving."""
+        """The time of the arrival while the tip may be moving; None otherwise."""
         return self.arrives_s if self.is_on else None

@@ -45,7 +45,7 @@ class Commands:
 
     Args:
         sequence: decides whether the microscope is free, and the order of published states.
-        about_to_act: called right before the first step that cannot be undone.
+        about_to_act: called after all checks, right before the first change.
     """
 
     def __init__(
@@ -65,7 +65,11 @@ class Commands:
         self.actions = driver.own_actions() | self._added_actions(driver.common.actions)
 
     def do(self, request: Request) -> CommandOutcome:
-        """Execute a request; errors of the controller or its driver become the response. Raises only `LOST`."""
+        """Execute a request; errors of the controller or its driver become the response.
+
+        Raises:
+            an error in `LOST`.
+        """
         try:
             return self._dispatch(request)
         except Refused as refused:

@@ -18,7 +18,7 @@ _STARTUP_RETRY_S = 0.1
 
 
 class Connection:
-    """The connection of a driver to its controller; it decides which errors mean that the controller is lost.
+    """The connection of a driver to its controller, with the decision which errors mean that the controller is lost.
 
     Args:
         controller: the emulator of this run, the only controller to connect to; None: the driver knows the
@@ -66,7 +66,7 @@ class Connection:
         """Connect at once, unless connected.
 
         Raises:
-            an error in `LOST`.
+            an error in `LOST`, or another error of `Driver.connect`.
         """
         if self.is_reached:
             return
@@ -77,7 +77,7 @@ class Connection:
         self.is_reached = True
 
     def require(self) -> None:
-        """Raise ControllerLost unless connected."""
+        """Raise ControllerLost unless `stands`."""
         if not self.stands:
             raise ControllerLost(f"the controller is lost, and connecting is retried: {self.why_lost}")
 
@@ -86,7 +86,7 @@ class Connection:
         return max(0.0, self._retry_at_s - self._clock.monotonic_s())
 
     def guarded(self, do: Callable[[], None]) -> bool:
-        """Call `do`. Return False if it failed: the controller is then lost.
+        """Call `do`. Return False after an error, which counts as a loss of the controller.
 
         Raises:
             ConfigError: the first connection can't succeed with these settings.
@@ -106,7 +106,7 @@ class Connection:
         return False
 
     def lose(self, error: Exception) -> None:
-        """Record the loss, and publish and log it once."""
+        """Record the loss; publish a loss once, and log each reason once."""
         now_s = self._clock.monotonic_s()
         starts = isinstance(error, LOST) and not self.ever_stood and now_s - self._began_s < _STARTUP_S
         self._retry_at_s = now_s + (_STARTUP_RETRY_S if starts else RETRY_S)

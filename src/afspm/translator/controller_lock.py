@@ -27,14 +27,14 @@ class ControllerTaken(AfspmError):
 
 @contextlib.contextmanager
 def commanding(address: str, run: str) -> Iterator[None]:
-    """Lock the controller for this process against all processes and users of this computer.
+    """Lock the controller against all other processes and users of this computer, within the `with` block.
 
     Args:
-        address: address of the controller; empty: no other process can command it (a simulated one).
-        run: the name of this run, shown to refused runs.
+        address: address of the controller; empty: no lock is needed, since no other process can command the controller.
+        run: the folder of this run, shown to refused runs.
 
     Raises:
-        ControllerTaken: another process commands it.
+        ControllerTaken: another process commands the controller, or the lock file can't be opened.
     """
     if not address:
         yield

@@ -26,7 +26,7 @@ MEASURING = frozenset({ScopeState.SCANNING, ScopeState.SPEC})
 
 
 class ControllerLost(AfspmError):
-    """The error that the controller is unreachable: the translator refuses requests with this reason, and retries."""
+    """The error that the controller is unreachable: the translator refuses requests for this reason and reconnects."""
 
     code = "controller-lost"
 
@@ -43,7 +43,7 @@ def connected(link: T | None, program: str, address: str = "") -> T:
 
 
 LOST = (ControllerLost, ConnectionError, TimeoutError)
-"""The errors of a lost controller, as opposed to those of a refusal."""
+"""The errors of a lost controller, as opposed to errors of a refusal."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,9 @@ class Action:
     Attributes:
         name: the generic name, e.g. "start-scan".
         do: starts the action and returns at once; `Driver.status` shows its effect.
-        state: the state of the microscope after the action is accepted, until `status` reports another.
-        while_busy: the action is accepted while the microscope is not free.
+        state: the state of the microscope after the action is accepted, until `status` reports another; None: none
+            is published.
+        while_busy: True if the action is accepted even while the microscope is not free.
         interrupts: the states that the action interrupts.
     """
 
@@ -98,8 +99,10 @@ def action(name: str, *, state: ScopeState | None = None, while_busy: bool | Non
     """Mark a method of a `Driver` as the generic action `name`.
 
     Args:
-        state: the state of the microscope after the action is accepted; known for the base actions.
-        while_busy: the action is accepted while the microscope is not free; known for the base actions.
+        state: the state of the microscope after the action is accepted; None: as for the base action of this name, or
+            unchanged for other actions.
+        while_busy: True if the action is accepted even while the microscope is not free; None: as for the base action
+            of this name, or False for other actions.
     """
     known = _KNOWN.get(name, Action(name, _not_implemented))
     mark = replace(
@@ -161,12 +164,13 @@ class DriverBase(ABC):
     Args:
         parameters: rows added to the table or changed in it by the experiment file.
         actions: generic actions added by the experiment file: `{name = {set = {<parameter> = <value>}}}` sets
-            parameters, `{name = {command = "<text>"}}` sends a text to the controller (`command`), both does both. With
-            `for = "50 ms"` the microscope is busy for this time, and then the former values are restored.
-        poll_period_s: time between two looks at the controller while nothing is due, in real seconds; its state is read
-            more often when a measurement is about to end, as learned from earlier ones.
-        result_timeout_s: how long after a scan or spectrum its file may take to appear, in experiment seconds (see
-            `patience_s`).
+            parameters, `{name = {command = "<text>"}}` sends a text to the controller (`command`); an action may have
+            both keys. With `for = "50 ms"` the microscope is busy for this time, and then the former values are
+            restored.
+        poll_period_s: time between two polls of the controller while nothing is due, in real seconds; the state is read
+            more often when a measurement is about to end, as learned from earlier measurements.
+        result_timeout_s: longest time from the end of a scan or spectrum to its complete file, in experiment seconds;
+            at least twice `program_s` of real time.
         live_lines_s: time between two publications of a running scan's lines, in experiment seconds; 0: never; None: by
             `live_real_s`.
         trace: record all exchanges with the controller in `controller.trace.jsonl` of the run's folder.
@@ -174,7 +178,7 @@ class DriverBase(ABC):
     Attributes:
         clock, log: of the experiment; set before `connect`.
         run_dir: the folder of this run.
-        wake: call it, from any thread, to have the controller polled now.
+        wake: makes the translator poll the controller now; may be called from any thread.
         for_a_while: sets parameters by their generic names, in SI, and restores them after a time in experiment
             seconds: for actions that consist of settings. The microscope is busy meanwhile.
         adjustable: parameters that may be set during a scan, even where a row forbids it: [control] adjustable.
@@ -185,8 +189,8 @@ class DriverBase(ABC):
             an emulated controller does not belong to this run.
         groups: the parameters that the controller has in a form that a table can't describe.
         lacking: actions that this controller turned out not to have, with the reason; set it when connecting.
-        memory: a dict of JSON values, saved with every request and result, and restored after a restart.
-        common: the settings above, as given.
+        memory: a dict of JSON values, saved with every executed request and every result, and restored after a restart.
+        common: the settings above except `parameters`, as given.
     """
 
     parameters_file: ClassVar[Path]
@@ -204,11 +208,11 @@ class DriverBase(ABC):
     simulated: ClassVar[bool] = False
     """True if no real tip can break, so that the experiment's clock may differ from real time."""
     memory_is_all: ClassVar[bool] = False
-    """The microscope (a simulated one) has no state outside `memory`: an action that is not in there was not done."""
+    """True if all state of the (simulated) microscope is in `memory`: an action missing there was not executed."""
 
     program_s: ClassVar[float] = 0.0
-    """Real seconds that the controller's program may need for work beside measuring, such as saving a file: independent
-    of the speed of the experiment's clock."""
+    """Real seconds that the controller's program may need for work beside measuring, such as saving a file. They do not
+    depend on the speed of the experiment's clock."""
 
     clock: Clock
     log: logging.Logger
@@ -239,9 +243,10 @@ class DriverBase(ABC):
         self._last_written: dict[str, Value] = {}
 
     def patience_s(self, of_s: float) -> float:
-        """Return the time to wait for a step that takes the controller at most `of_s` (experiment seconds).
+        """Return the longest wait, in experiment seconds, for a step that takes the controller at most `of_s`.
 
-        It is at least `program_s` of real time: with a fast clock an emulated controller needs more experiment time.
+        The wait is at least `program_s` of real time: with a fast clock an emulated controller needs more experiment
+        time.
         """
         return max(of_s, self.program_s / self.clock.real_s(1.0))
 
@@ -279,7 +284,7 @@ class DriverBase(ABC):
         """Return the conformance checks that a controller cannot pass, with the reasons.
 
         Args:
-            controller: its name and version, as in `x-controller`.
+            controller: name and version of the controller, as in `x-controller`.
         """
         return {}
 
@@ -318,7 +323,7 @@ class DriverBase(ABC):
         """
 
     def followed(self) -> bool | None:
-        """Return the outcome of a measurement that `status` missed, because the next followed at once.
+        """Return the outcome of a measurement whose end `status` missed, because the next followed at once.
 
         Override where a panel can repeat scans. Called after `results`, which must list the measurement by then.
 
@@ -338,7 +343,11 @@ class DriverBase(ABC):
         return ()
 
     def command(self, text: str) -> None:
-        """Send a text command of the experiment file to the controller, unchanged."""
+        """Send a text command of the experiment file to the controller, unchanged.
+
+        Raises:
+            Refused: ACTION_NOT_SUPPORTED: the driver does not override this method.
+        """
         raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, f"{type(self).__name__} does not take commands as text")
 
     def next_change_s(self) -> float | None:
@@ -418,9 +427,10 @@ class DriverBase(ABC):
         }
 
     def put_in_force(self, values: Mapping[str, Value]) -> None:
-        """Write values and remember them.
+        """Write values and remember them for `in_force`.
 
-        Feedback is switched on after all other values are written, and off before: it must not act on old values.
+        The feedback is switched on after all other values are written, and off before them: it must not act on old
+        values.
         """
         rest = {name: value for name, value in values.items() if name != names.FEEDBACK_ON}
         parts = [rest] if rest else []

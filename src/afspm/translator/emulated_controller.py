@@ -96,7 +96,7 @@ class EmulatedController:
         """Check that the connected emulator still listens at the same address.
 
         Raises:
-            ControllerLost: the emulator has ended, restarted or moved.
+            ControllerLost: the emulator has ended, restarted or moved, or was never reached.
         """
         if self._reached is None or self._find() != self._reached:
             what = "the emulated controller was restarted, or moved to another address"
@@ -129,10 +129,11 @@ def notice_file(state_dir: str, name: str) -> Path:
 
 
 def wired_to(launch: Launch, microscope: DriverBase) -> EmulatedController | None:
-    """Return the emulator that a translator must connect to; None for a real controller or none.
+    """Return the emulator that a translator must connect to; None for a real controller or a driver without controller.
 
     Raises:
-        ConfigError: the experiment is simulated, and the controller in the settings is not proved to be an emulator.
+        ConfigError: the experiment is simulated, and the controller in the settings is not proved to be an emulator; or
+            the launch line or the driver lacks the emulator's place.
     """
     if not launch.controller and not (launch.simulated and microscope.controller_at):
         return None

@@ -36,7 +36,7 @@ class FolderFiles(ResultFiles):
         """Record the start of a measurement.
 
         Args:
-            taken: "frame" of a scan, "position" of a spectrum.
+            taken: the place of the measurement: "frame" of a scan, "position" of a spectrum.
         """
         # only files newer than those of now can be its result
         self._begins(what, {"folder": str(folder), "newest_ns": newest(self._files(folder))[0], **taken})
@@ -51,7 +51,7 @@ class FolderFiles(ResultFiles):
         return running is not None and self._file(running) is not None
 
     def results(self, now_ns: int) -> list[str]:
-        """Return the last results, oldest first."""
+        """Assign a complete new file to its measurement, and return the names of the last results, oldest first."""
         self.broken_off = False
         ended, running = self._kept["ended"], self._kept["running"]
         if ended is not None and self._take(ended):
@@ -78,7 +78,7 @@ class FolderFiles(ResultFiles):
         return [] if path is None else [(str(path), modified_ns(path))]
 
     def check(self, path: Path, one: Scan | Spectrum, measured: Entry) -> None:
-        """Check the first scan or spectrum of a new file."""
+        """Check the first scan or spectrum of a new file; by default there is no check."""
 
     def _goes_on(self, running: Entry) -> None:
         # the controller repeats scans: only a newer file belongs to the next image

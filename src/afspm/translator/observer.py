@@ -1,4 +1,4 @@
-"""Observation of the controller; publishes every change by a request or at the panel."""
+"""Observation of the controller: every change, by a request or at the panel, is published."""
 
 from __future__ import annotations
 
@@ -54,7 +54,10 @@ class Observer:
         self._replayed = False
 
     def begin(self) -> None:
-        """Publish the last results (after a restart), then all present settings and the state."""
+        """Publish the last results again (once, after a restart), then all settings and the state.
+
+        Temporary settings of an earlier process or connection are restored before the settings are read.
+        """
         if not self._replayed:
             self._replayed = True
             for packet in self._outbox.start():
@@ -93,8 +96,8 @@ class Observer:
 
         Args:
             announce: messages to publish even if unchanged.
-            values: False leaves out the settings, which take one question for each parameter.
-            status: the status just read, since a driver reports an interruption only once; None: read it.
+            values: False leaves out the settings, whose reading takes a question for each parameter.
+            status: the status just read, since a driver reports an interruption only once; None: read the status now.
         """
         if values:
             self._observe_values(announce)
@@ -139,7 +142,7 @@ class Observer:
                 self._adapt_polling(step.status.state)
 
     def publish_all(self) -> None:
-        """Publish all present settings and states, for a newly connected scheduler."""
+        """Publish the present settings and the published state again, for a newly connected scheduler."""
         for thing in setting_groups.messages(self.values).values():
             self.publish(thing)
         published = self._state.sequence.published
@@ -248,7 +251,7 @@ class LiveLines:
         self.due_s = None
 
     def look(self, now_s: float) -> list[tuple[str, bytes]]:
-        """Return the messages with the new lines if they are due."""
+        """Return messages with the new lines; empty before `due_s` or without new lines."""
         if self._every_s is None or self.due_s is None or now_s < self.due_s:
             return []
         self.due_s = now_s + self._every_s

@@ -1,4 +1,4 @@
-"""Publication of finished scans and spectra, each once, even if the process is killed.
+"""Publication of finished scans and spectra: each reaches a subscriber once, even if the process is killed.
 
 A subscriber recognises a duplicate by its time. So the times are saved before publishing; after a kill in between, the
 same results are published again at the same times.
@@ -55,7 +55,8 @@ class Outbox:
         """Return the packets to publish again after connecting; results from before the experiment are ignored.
 
         Returns:
-            the packets of the last results, which an earlier process may have published.
+            the packets of the last results, which an earlier process may have published; results that can't be read
+            again are left out.
         """
         # at the first start of the experiment, all results listed are older
         if "known" not in self._kept:
@@ -72,7 +73,7 @@ class Outbox:
         return again
 
     def look(self) -> bool:
-        """Read new results; return True if there are any."""
+        """Read new results; return True if any complete result is not yet published."""
         listed = list(self._microscope.results())
         known = set(self._kept["known"])
         new = [result for result in listed if result not in known]

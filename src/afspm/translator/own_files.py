@@ -30,7 +30,7 @@ class FileFacts:
     """The metadata of a file.
 
     Attributes:
-        time_ns: when the measurement was finished.
+        time_ns: the end of the measurement, ns since 1970.
         attributes: all settings in force, for a reader of the file.
     """
 
@@ -87,7 +87,7 @@ def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
 
     Raises:
         OtherFormat: another program wrote the file.
-        FileError: a part of it is missing.
+        FileError: a part of the file is missing.
     """
     if hdf5.is_hdf5(path):
         raise OtherFormat("is NetCDF-4, which the simulated microscope does not write")

@@ -29,7 +29,7 @@ _LONGEST_TEXT = 200
 
 
 def refuse_value(name: str, reason: str) -> Refused:
-    """Return the refusal of a parameter's value: REP_PARAM_ERROR, nothing changed."""
+    """Return the refusal of a parameter's value: PARAM_ERROR, with the parameter's name and the reason."""
     return Refused(ControlResponse.PARAM_ERROR, f"{name}: {reason}")
 
 
@@ -39,7 +39,7 @@ class ParameterSpec:
 
     Attributes:
         name: the generic name, e.g. "scan-speed".
-        vendor: the controller's name for it; by default the generic name.
+        vendor: the controller's name of the parameter; by default the generic name.
         unit: the controller's unit.
         type: "float", "int", "bool" or "text".
         range: the smallest and largest value accepted, in SI.
@@ -48,7 +48,7 @@ class ParameterSpec:
         while_busy: the parameter may be set during a scan or a move.
         sign: -1 where the controller's sign is opposite (an axis pointing down, angles clockwise).
         resolution: smaller differences are ignored (rounding by the controller, noise of a read-back), in SI.
-        where: the file of the row.
+        where: the place where `range` was set; empty without a range.
     """
 
     name: str
@@ -65,7 +65,7 @@ class ParameterSpec:
 
     @property
     def si_unit(self) -> str:
-        """The SI unit of the value; for the setpoint it depends on the operating mode and comes from the row."""
+        """The SI unit of the value; for the setpoint and a maker's own parameters, by the `unit` of the row."""
         si = names.BASE_PARAMETERS.get(self.name)
         return units.si_unit(self.unit) if si is None else si
 
@@ -78,7 +78,7 @@ class ParameterSpec:
         """Return a peer's value, converted and checked.
 
         Raises:
-            Refused: PARAM_ERROR, with the value, the violated bound and the place where the bound was set.
+            Refused: PARAM_ERROR; for a value out of range with the bounds, and the place where they were set.
         """
         if len(text) > _LONGEST_TEXT:
             raise refuse_value(self.name, f"a value of {len(text)} characters is too long")
@@ -93,7 +93,7 @@ class ParameterSpec:
         return self.checked(self.from_unit(number, unit))
 
     def from_unit(self, number: float, unit: str | None) -> float:
-        """Convert a number from a peer's unit to SI; None: the unit of the wire.
+        """Convert a number from a peer's unit to SI; None or empty: the unit of the wire.
 
         Raises:
             Refused: PARAM_ERROR: the unit is unknown or of another dimension.
@@ -104,7 +104,7 @@ class ParameterSpec:
             raise refuse_value(self.name, str(error)) from error
 
     def checked(self, value: Value) -> Value:
-        """Return a value in SI, checked for type and range; a whole number becomes an int.
+        """Return a value in SI, checked for type, range and choices, and converted to the type of the row.
 
         Raises:
             Refused: PARAM_ERROR.
@@ -127,7 +127,7 @@ class ParameterSpec:
         return float(value)
 
     def same(self, a: Value, b: Value) -> bool:
-        """Return True if two values are equal to the controller's precision."""
+        """Return True if two values are equal within the controller's precision (`resolution`)."""
         if isinstance(a, str) or isinstance(b, str):
             return a == b
         # a value converted to the vendor's unit and back may differ in the last bits
@@ -144,7 +144,7 @@ class ParameterSpec:
         """Convert a value of the controller to SI.
 
         Raises:
-            Refused: PARAM_ERROR: the value is not of the type in the table.
+            Refused: PARAM_ERROR: the value is not of the type in the table, or not finite.
         """
         if self.type == "text":
             return str(value)
@@ -163,7 +163,10 @@ class ParameterSpec:
         return number
 
     def for_peer(self, value: Value, unit: str | None = None) -> tuple[str, str]:
-        """Convert a value in SI to (text, unit), in the peer's unit or the unit of the wire."""
+        """Convert a value in SI to (text, unit), in the peer's unit.
+
+        Without a unit, or with a unit of another dimension, the unit is that on the wire (`wire_unit`).
+        """
         if isinstance(value, bool):
             return ("true" if value else "false"), ""
         if isinstance(value, str):
@@ -184,7 +187,7 @@ class ParameterSpec:
         return f"{number:.6g} {unit_text(self.unit)}".rstrip()
 
     def range_text(self) -> str:
-        """Return the range as readable text, with the place where it was set."""
+        """Return the range as readable text, with the place where the range was set."""
         text = f"{self.quantity(self.range[0])} to {self.quantity(self.range[1])}"
         return f"{text} (set in {self.where})" if self.where else text
 
@@ -257,7 +260,7 @@ class ParameterTable(Mapping[str, ParameterSpec]):
         return self._rows[name]
 
     def written(self, given: PlainMapping, *, where: str) -> dict[str, Value]:
-        """Return values of the experiment file in SI: "2 um/s", or plain numbers in the row's unit.
+        """Return values of the experiment file in SI, from texts like "2 um/s" or plain numbers in the row's unit.
 
         Raises:
             ConfigError: a name or a value is impossible; all such errors at once.

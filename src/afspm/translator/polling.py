@@ -25,7 +25,7 @@ _REMEMBERED = 64
 
 @dataclass(frozen=True)
 class ExpectedEnd:
-    """The expected end of a measurement that began at `began_s`, with its uncertainty; None if unknown."""
+    """The expected end of a measurement that began at `began_s`, with its uncertainty; `end_s` is None if unknown."""
 
     began_s: float
     end_s: float | None = None
@@ -53,8 +53,8 @@ class AdaptivePolling:
         """Record the start of a measurement.
 
         Args:
-            what: equal for measurements of equal duration.
-            guess_s: the duration by its settings; None if unknown.
+            what: a key, equal for measurements of equal duration.
+            guess_s: the duration computed from the settings; None if unknown.
         """
         self._measuring, self._over_s = (what, guess_s), None
         lasts_s, doubt = self._lasted_s.get(what), _SAME

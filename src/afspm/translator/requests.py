@@ -108,7 +108,7 @@ class RequestHandler:
             self._finish(request, Response(ControlResponse.NO_RESPONSE, b"", reason, request.id, detail))
 
     def act(self, action: str) -> Response:
-        """Execute an action of the translator itself."""
+        """Execute an action of the translator itself, and publish its steps."""
         done = self.commands.do(Request(ControlRequest.ACTION, action))
         self._observer.play(done.steps)
         return done.response
@@ -178,7 +178,7 @@ class RequestOutcomes:
     """The outcomes of the last requests with an id. See `model.idempotency_cache` for older ids.
 
     Args:
-        kept: the translator's memory, which is saved with every request. So an entry is one text, which is quick to
+        kept: the translator's memory, which is saved with every executed request. So an entry is one text, quick to
             write: the fingerprint of the request, then its outcome.
         all_or_nothing: the microscope's own state is saved together with these outcomes: a request without an outcome
             was not done. Otherwise a request that was begun and has no outcome may have been done.
@@ -195,7 +195,10 @@ class RequestOutcomes:
                     del shelf[request_id]
 
     def outcome(self, request: Request) -> Response | None:
-        """Return the earlier answer to a request; None if the request is new."""
+        """Return the earlier answer to a request; None if the request is new.
+
+        The answer is FAILURE if the id belongs to another request, and NO_RESPONSE if the outcome is unknown.
+        """
         entry = self._shelf(request.id).get(request.id) if request.id else None
         if entry is None:
             return self._forgotten(request)
@@ -240,7 +243,7 @@ class RequestOutcomes:
             self._shelf(request.id)[request.id] = entry
 
     def forget(self, request: Request) -> None:
-        """Remove a request that was not executed: it may be repeated."""
+        """Remove a request that was not executed, so that it may be repeated with the same id."""
         self._shelf(request.id).pop(request.id, None)
 
 

@@ -1,4 +1,4 @@
-"""Files saved by a controller, assigned to the running measurement, the last ended one, and the results.
+"""Files saved by a controller, assigned to the running measurement, the last ended measurement, and the results.
 
 This state is saved and survives a restart of the translator.
 """
@@ -36,8 +36,8 @@ class ResultFiles(ABC):
     """The measurements of one controller and their files.
 
     Args:
-        kept: a JSON dict on disk: "running" and "ended" are an `Entry` or None; "results" are entries with a name, by
-            "result".
+        kept: a JSON dict on disk: "running" and "ended" are an `Entry` or None; "results" is a list of entries, each
+            with the name of the result as "result".
 
     Attributes:
         broken_off: True if the ended measurement was interrupted at the controller; until the next `results`.
@@ -110,7 +110,7 @@ class FilePrecision:
     Attributes:
         part: the rounding of a length, relative to the largest length.
         angle_rad: the rounding of the angle.
-        positions: True if the file of a spectrum has its position as it was set.
+        positions: True if a spectrum's file has a reliable position, which replaces a different set position.
     """
 
     part: float
@@ -127,7 +127,7 @@ class FilePrecision:
     def as_set(self, one: Scan | Spectrum, measured: Entry) -> Scan | Spectrum:
         """Return a scan or spectrum with its set frame or position, and with afspm's time.
 
-        The file's own frame or position stays if it differs by more than its precision.
+        The frame in the file stays if it differs by more than the precision; so does the position if `positions`.
         """
         time_ns = measured["end_ns"]
         if isinstance(one, Scan):
@@ -170,7 +170,7 @@ def as_region(kept: Sequence[float]) -> Region:
 
 
 def lines_missing(content: Iterable[Scan | Spectrum]) -> int:
-    """Return the number of lines without any value: lines missing from interrupted scans."""
+    """Return the largest number of lines without any value in a scan: lines missing from an interrupted scan."""
     return max((one.lines_missing for one in content if isinstance(one, Scan)), default=0)
 
 

@@ -55,13 +55,15 @@ class SafeExit:
         return self._retracts and self._state.feedback.in_danger
 
     def end(self) -> None:
-        """Stop measuring and restore temporary settings, on the scheduler's request."""
+        """Stop measuring and restore temporary settings, on the scheduler's request; ignore a lost controller."""
         with contextlib.suppress(*LOST):  # the process ends in any case
             self._stop_measuring()
             self._temporary.end()
 
     def leave(self, wait: Callable[[float], None]) -> None:
-        """Stop measuring and make the tip safe without a scheduler; a person's own changes at the panel stay.
+        """Stop measuring, restore temporary settings, and retract the tip if `is_owed`.
+
+        A feedback switched off at the panel stays off. Attempts to retract are repeated for a few real seconds.
 
         Args:
             wait: waits for a time in real seconds, and then polls the controller.

@@ -1,6 +1,6 @@
 """The order in which peers receive the states of a microscope (wire format, "What a translator does"). Pure.
 
-The controller is polled: it may be free again before a poll finds it scanning, and its file may come after its state.
+A polled controller may be free again before a poll shows its scan, and the file may come after the state.
 The published sequence is always complete: SS_SCANNING, the results, SS_FREE; or SS_SCANNING, SS_INTERRUPTED, SS_FREE.
 """
 
@@ -56,18 +56,18 @@ class StatusSequence:
         self._broken_off = ScopeState.UNDEFINED
 
     def begin(self, state: ScopeState) -> list[SequenceStep]:
-        """Publish the state that follows from an accepted request, even if the controller does not show it yet."""
+        """Return the steps that publish a state after an accepted request, even before the controller shows it."""
         return self._publish(ScopeStatus(state))
 
     def interrupt(self) -> list[SequenceStep]:
-        """Publish an interruption: a request has stopped the running measurement."""
+        """Return the steps that publish an interruption: a request has stopped the running measurement."""
         return self._publish(_INTERRUPTED)
 
     def follow(self, *, is_whole: bool) -> list[SequenceStep]:
-        """Publish the end of a measurement whose end was missed, because the next followed at once.
+        """Return the steps that publish a missed end of a measurement, because the next followed at once.
 
         Args:
-            is_whole: False if it was interrupted.
+            is_whole: False if the measurement was interrupted.
         """
         if self.published.state not in MEASURING:
             return []
@@ -77,10 +77,10 @@ class StatusSequence:
         return [*self._publish(_INTERRUPTED), DiscardResults(), *self._publish(free)]
 
     def observe(self, seen: ScopeStatus, results: bool, now_s: float) -> list[SequenceStep]:
-        """Process the status that was just read from the controller.
+        """Return the steps that follow from the status just read from the controller.
 
         Args:
-            seen: the status.
+            seen: the status of the controller.
             results: whether there are unpublished results.
             now_s: experiment time.
         """

@@ -1,4 +1,4 @@
-"""Setting of parameters: all are checked first, then set, then read back; otherwise nothing changes."""
+"""Setting of parameters: all are checked first, then set, then read back; a failure restores the former values."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _UNBOUNDED: Final = (-math.inf, math.inf)
 def wanted_values(request: Request, driver: DriverBase) -> dict[str, Value] | None:
     """Return the values in SI that a request sets, each checked separately; None if the request only reads.
 
-    A read-only value that equals the present one is no change: peers change one field and send back
+    A read-only or out-of-range value that equals the present value is no change: peers change one field and send back
     a whole message.
 
     Raises:
@@ -54,13 +54,15 @@ def wanted_values(request: Request, driver: DriverBase) -> dict[str, Value] | No
 
 
 def apply(driver: DriverBase, values: Mapping[str, Value], about_to_act: Callable[[], None] = lambda: None) -> None:
-    """Set the values, or change nothing.
+    """Set the values; after any error except a lost controller the former values are restored.
 
     Args:
         about_to_act: called after all checks, right before the first change.
 
     Raises:
         Refused: PARAM_ERROR: the values do not fit together, or the controller set other values.
+        an error in `LOST`: the outcome is unknown.
+        other errors of the driver.
     """
     table = driver.table
     # the whole frame: when a part of it is set, a controller may change the rest

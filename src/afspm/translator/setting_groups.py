@@ -25,7 +25,7 @@ FRAME: Final = (
     names.SCAN_RESOLUTION_Y,
 )
 EXTENT: Final = (names.SCAN_SIZE_X, names.SCAN_RESOLUTION_Y, names.SCAN_RESOLUTION_X, names.SCAN_SIZE_Y)
-"""A scan's duration depends on these and the speed: certainly on width and rows, perhaps on the rest."""
+"""The parameters that a scan's duration depends on, with the speed: certainly width and rows, perhaps the others."""
 FEEDBACK: Final = (FEEDBACK_ON, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN, names.ZCTRL_SETPOINT)
 POSITION: Final = (names.PROBE_POS_X, names.PROBE_POS_Y)
 _FRAME_MESSAGE, _FEEDBACK_MESSAGE, _POSITION_MESSAGE = SCAN_PARAMETERS.name, FEEDBACK_STATE.name, PROBE_POSITION.name
@@ -92,7 +92,10 @@ def watched(table: ParameterTable) -> list[str]:
 
 
 def messages(values: Mapping[str, Value]) -> dict[str, Published]:
-    """Return the messages to publish, by name; messages with a missing parameter are left out."""
+    """Return the messages to publish, by name, as far as `values` has their parameters.
+
+    Scan parameters may lack the angle; a feedback message needs only one of its parameters.
+    """
     published: dict[str, Published] = {}
     if all(name in values for name in FRAME if name != names.SCAN_ANGLE):
         published[_FRAME_MESSAGE] = scan_parameters(values)
@@ -134,7 +137,7 @@ def frame_values(region: Region, shape: tuple[int, int]) -> dict[str, Value]:
 def feedback(values: Mapping[str, Value]) -> Feedback:
     """Return the z feedback in `values`.
 
-    For a withdrawn tip, a feedback that is off is left out: at the sample it would be a danger.
+    For a withdrawn tip, the state "off" is left out: a feedback that is off is a danger only at the sample.
     """
     on = values.get(FEEDBACK_ON)
     is_away = values.get(names.ENGAGED) is False
@@ -148,6 +151,8 @@ def feedback(values: Mapping[str, Value]) -> Feedback:
 
 def check_together(values: Mapping[str, Value], table: ParameterTable, max_pixels: int) -> None:
     """Check a frame as a whole: its size, its number of pixels, and the reach of the probe.
+
+    Values without a complete frame are not checked.
 
     Raises:
         Refused: PARAM_ERROR.

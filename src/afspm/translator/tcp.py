@@ -11,14 +11,14 @@ from afspm.basics.errors import ConfigError
 from afspm.translator.driver_base import ControllerLost
 from afspm.translator.trace import TCP, TRACE, TracedAnswer
 
-_AT_ONCE: Final = 1 << 20
+_AT_ONCE: Final = 1 << 20  # bounds the buffer of one `recv`: a reply may announce any size
 _SLOWEST_BYTES_PER_S: Final = 1e6  # a whole scan may take longer than the timeout of a small answer
 
 T = TypeVar("T")
 
 
 class Receiver:
-    """The bytes of the answer to one question, until its deadline."""
+    """A reader of the answer to one question, with a deadline."""
 
     def __init__(
         self,
@@ -35,7 +35,7 @@ class Receiver:
         self._what = what
 
     def some(self, most: int = _AT_ONCE, after: str = "some") -> bytes:
-        """Return at least one byte.
+        """Return at least one byte and at most `most`.
 
         Raises:
             TimeoutError: no byte came in time. ControllerLost: the connection was closed. OSError.
@@ -51,7 +51,10 @@ class Receiver:
         return part
 
     def exactly(self, size: int) -> bytearray:
-        """Return `size` bytes; memory is allocated for the bytes received, not for the size announced."""
+        """Return `size` bytes, and extend the deadline for a large answer.
+
+        Memory is allocated for the bytes received, not for the size announced.
+        """
         self._until_s += size / _SLOWEST_BYTES_PER_S
         received = bytearray()
         while len(received) < size:
@@ -62,18 +65,19 @@ class Receiver:
 class TcpConnection:
     """A TCP connection to a controller. Not thread-safe, except `close`.
 
-    Any error closes it: a late answer must never be taken for the answer to the next question.
+    Any error closes the connection: a late answer must never be taken for the answer to the next question.
 
     Args:
         timeout_s: longest time to an answer, in real time.
-        monotonic_s: real time.
+        monotonic_s: a clock of real time.
         hints: advice for a refused connection, and for a missing answer.
 
     Attributes:
-        where: "HOST:PORT", as it was given; peer: the same in numbers.
+        where: "HOST:PORT", as given.
+        peer: the controller's numeric address and port.
 
     Raises:
-        ControllerLost: no program listens there.
+        ControllerLost: no program listens at the address.
     """
 
     def __init__(
@@ -113,7 +117,7 @@ class TcpConnection:
             is_secret: the question must not be written into a trace.
 
         Raises:
-            ControllerLost: it could not be sent; the connection is closed.
+            ControllerLost: the question could not be sent; the connection is closed.
         """
 
         def send() -> None:
@@ -178,7 +182,7 @@ def host_and_port(address: str, hint: str = '"host:port"') -> tuple[str, int]:
     """Split the setting `address` into host and port.
 
     Raises:
-        ConfigError: it is no address.
+        ConfigError: `address` has another form.
     """
     host, _, port = address.rpartition(":")
     if not (host and port.isdigit()):

@@ -29,10 +29,11 @@ class TemporarySettings:
         self._log = log
 
     def begin(self, values: Mapping[str, Value], for_s: float) -> None:
-        """Set values, to be restored after `for_s`, experiment time.
+        """Set values, and restore the former values after `for_s` experiment seconds.
 
         Raises:
-            Refused: nothing was changed.
+            Refused: the former values are in force.
+            an error in `LOST`: the former values are restored after reconnecting.
         """
         values = {name: self._driver.table[name].checked(value) for name, value in values.items()}
         former = self._driver.in_force(values.keys())
@@ -71,7 +72,7 @@ class TemporarySettings:
             self.end()
 
     def end(self) -> None:
-        """Restore the former values, if any.
+        """Restore the former values, if any; values that the controller refuses are logged and given up.
 
         Raises:
             an error in `LOST`.

@@ -2,7 +2,7 @@
 
 One process communicates with one controller, so there is one trace in a process. `begin` opens it, and each vendor's
 connection adds an exchange as one line. Without `begin` nothing is recorded. A connection leaves out its own secrets.
-Text is written unchanged, other bytes in base64, so that a person can read the file.
+Printable text is written unchanged, other bytes in base64, so that a person can read the file.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ TCP, ZEROMQ = "tcp", "zeromq"
 
 @dataclass(frozen=True)
 class TraceHeader:
-    """The first line: the class of the driver, the version of afspm, and the experiment time, UTC in ISO 8601."""
+    """The first line: the driver's class, the version of afspm, the experiment time (UTC in ISO 8601) and `FORMAT`."""
 
     driver: str
     afspm: str
@@ -41,13 +41,16 @@ class TracedExchange:
     """A question and its answer.
 
     Attributes:
-        connection: the number of the connection, from 0; transport: `TCP` or `ZEROMQ`.
+        connection: the number of the connection, from 0.
+        transport: `TCP` or `ZEROMQ`.
         what: the name of the question, for people.
-        asked: None: a secret.
-        answered: empty with `lost`: there was no answer, for this reason.
-        command: the request to which the exchange belongs; empty: it only observes the controller.
-        after: number of lines in the file when the question was sent: the lines between belong to other connections.
-        at_s, took_s: real seconds since the beginning, and until the answer.
+        asked: the bytes of the question; None: a secret.
+        answered: the bytes of the answer; incomplete or empty if there is a text in `lost`.
+        after: number of lines in the file when the question was sent; the lines from there to this exchange belong to
+            other connections and files.
+        lost: the error that ended the exchange before the whole answer; empty for a whole answer.
+        command: the request to which the exchange belongs; empty: the exchange only observes the controller.
+        at_s, took_s: real seconds from the beginning to the question, and from the question to the answer.
     """
 
     connection: int
@@ -78,7 +81,7 @@ def read_trace(file: Path) -> list[TraceLine]:
     """Read a trace; an incomplete last line is left out.
 
     Raises:
-        FileError: it is no trace, or one of another version.
+        FileError: the file can't be read, is no trace, or is a trace of another version.
     """
     try:
         lines = file.read_text(encoding="utf-8").split("\n")[:-1]
@@ -128,7 +131,7 @@ class Trace:
             return TracedConnection(self, self._connections - 1, transport)
 
     def command(self, request: str) -> None:
-        """Assign all further exchanges to this request; empty: they only observe."""
+        """Assign all further exchanges to this request; empty: the exchanges only observe the controller."""
         self._command = request
 
     def file(self, path: Path) -> None:

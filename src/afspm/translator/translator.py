@@ -63,8 +63,8 @@ class Translator:
     Args:
         driver: constructed with its settings, not yet connected.
         port: access to the network.
-        memory: kept over a restart.
-        step: entered around everything that takes time, so that a busy process is not taken for a frozen one.
+        memory: values on disk, which survive a restart.
+        step: entered around everything that takes time, so that a busy process is not taken for a frozen process.
         controller: the emulator of this run, the only controller to connect to; None: the driver knows the
             address of its controller.
     """
@@ -110,7 +110,11 @@ class Translator:
         self._ended = False
 
     def run(self) -> ExitCode:
-        """Run until the experiment ends, the parent process ends, or the parent stops this process."""
+        """Run until the experiment ends, the parent process ends, or the parent stops this process.
+
+        Returns:
+            ENDED after the scheduler's CLOSE; otherwise ORPHAN, after the safe exit.
+        """
         try:
             while not self._ended:
                 with self._step():
@@ -176,7 +180,10 @@ class Translator:
 
 
 def run_translator(driver: DriverBase, context: ProcessContext, make: Callable[..., Translator] = Translator) -> int:
-    """Run a translator; end if another run commands the controller. Called by the host of processes."""
+    """Run a translator, and return its exit code: CRASHED if another run commands the controller.
+
+    Called by the host of processes.
+    """
     with contextlib.ExitStack() as stack:
         controller = wired_to(context.launch, driver)
         # a real controller of this address is not touched, so not locked

@@ -22,17 +22,18 @@ _OUTCOMES: Final = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_CLOSED | zmq.EVENT_
 class ZmqConnection:
     """A ZeroMQ connection to a controller. Not thread-safe.
 
-    It uses a DEALER socket, since a REQ socket is unusable after one lost reply. Any error closes it: a late reply must
-    never be taken for the reply to the next request. It never reconnects: another program may listen there by then.
+    The socket is a DEALER, since a REQ socket is unusable after one lost reply. A failed `ask` closes the connection: a
+    late reply must never be taken for the reply to the next request. The socket never reconnects: another program may
+    listen at the address by then.
 
     Args:
         address: e.g. "tcp://127.0.0.1:5555".
         timeout_s: longest time to a reply, in real time.
-        monotonic_s: real time.
+        monotonic_s: a clock of real time.
         hints: advice for an invalid address, for a missing program, and for a missing reply.
 
     Raises:
-        ControllerLost: no program listens there. ConfigError: it is no address.
+        ControllerLost: no program listens at the address. ConfigError: `address` has another form.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class ZmqConnection:
         """Send a request and return its reply, decoded by `parse`, which returns None for another request's reply.
 
         Raises:
-            ControllerLost: no reply, or one that `parse` rejects.
+            ControllerLost: no reply, or a reply that `parse` rejects.
         """
         try:
             with self._trace.asking(what, message) as traced:
@@ -77,7 +78,7 @@ class ZmqConnection:
             raise self._lost(what, error) from error
 
     def begin(self, what: str, message: bytes) -> None:
-        """Send a request with a slow reply; `reply` returns it.
+        """Send a request with a slow reply, for `wait` and `reply`.
 
         Raises:
             ControllerLost
@@ -90,7 +91,7 @@ class ZmqConnection:
             raise self._lost(what, error) from error
 
     def wait(self, within_s: float) -> None:
-        """Wait for the reply to `begin`, in real time.
+        """Wait for the reply to `begin`, at most `within_s` of real time.
 
         Raises:
             ControllerLost
@@ -101,7 +102,7 @@ class ZmqConnection:
             raise self._lost("a reply", error) from error
 
     def reply(self, what: str) -> bytes | None:
-        """Return the reply to `begin`, or None while there is none.
+        """Return the reply to `begin`; None until the reply has arrived.
 
         Raises:
             ControllerLost

@@ -79,11 +79,11 @@ class Emulator(ABC):
             def tick(self, now_s): ...end scans, write files; return when there is more to do
 
     Args:
-        port: to listen on; 0: any free one.
-        seed: of all random numbers.
+        port: the port to listen on; 0: any free port.
+        seed: seed of all random numbers.
         faults: each a text as on the command line (`KIND[@SECONDS][,count=N][,duration=SECONDS]`) or a table of
             `kind`, `at_s`, `count`, `duration_s`.
-        world: `surface`, `tip`, `drift` … of the simulated world, as of the Simulator.
+        world: `surface`, `tip`, `drift` … of the simulated world, as in `World.from_settings`.
 
     Attributes:
         clock, log: of the experiment; set before `open`, like all following attributes.
@@ -91,14 +91,15 @@ class Emulator(ABC):
         rig: the instrument.
         faults: queried at each point where something can go wrong.
         woken: becomes readable when `serve` must return; include its `fileno` in the wait of `serve`.
-        listening: call it with each new address, and with "" before the old one is closed, if the address changes.
+        listening: publishes an address; if it changes, call with "" before the old socket is closed, then with the new
+            address.
     """
 
     vendor: ClassVar[str]
     usual: ClassVar[PlainMapping] = {}
     """Settings for the usual address of the vendor's own controller, used by `afspm emulate` on request."""
     fault_kinds: ClassVar[Mapping[str, str]] = {}
-    """The faults of the maker's program, with the effect of each; `all_faults` adds the common ones."""
+    """The faults of the maker's program, with the effect of each; `all_faults` adds the common faults."""
 
     modes: ClassVar[Sequence[str]] = ("amplitude", "current", "frequency-shift")
     """The modes of the simulated feedback that the controller supports."""
@@ -166,8 +167,8 @@ class Emulator(ABC):
     def serve(self, timeout_s: float) -> None:
         """Wait up to `timeout_s` real seconds for clients or `woken`, and answer received requests.
 
-        Answer each request separately, and turn its errors into the vendor's own error replies: an exception that
-        reaches the base class is logged, and that client gets no answer.
+        Answer each request separately, and turn its errors into the vendor's own error replies: after an exception that
+        reaches the base class, the present activity is dropped and that client gets no answer.
 
         Raises:
             Crashed: to end without an answer.
@@ -194,13 +195,13 @@ class Emulator(ABC):
     # -- services for subclasses
 
     def show_button(self, name: str, why: str, pressed: Callable[[], object]) -> None:
-        """Show a button until it is pressed or removed. Only one button is shown at a time.
+        """Show a button until a person presses it or it is removed. Only one button is shown at a time.
 
-        A person, or a test, presses it by deleting the file `delete-to-NAME.txt` in `folder`: so any program on any
-        computer with access to the folder can press it, alone as well as in an experiment.
+        A person, or a test, presses the button by deleting the file `delete-to-NAME.txt` in `folder`: so any program
+        with access to the folder can press it, inside an experiment and standalone.
 
         Args:
-            why: the reason to press it, for the log and the file.
+            why: the reason to press the button, for the log and the file.
         """
         self.take_button_away()
         file = self.folder / f"delete-to-{name}.txt"
@@ -220,10 +221,10 @@ class Emulator(ABC):
                 button.file.unlink()
 
     def run(self, clock: Clock, folder: Path, log: logging.Logger, listening: Callable[[str], None]) -> None:
-        """Run the controller until `stop`.
+        """Run the controller until `stop`, or until shortly after the end of the experiment.
 
         Args:
-            listening: called with the address whenever it changes; empty while there is none.
+            listening: called with the address whenever it changes; empty while the controller does not listen.
 
         Raises:
             Crashed: an emulated crash.

@@ -30,7 +30,11 @@ class PendingWrites:
         self._writes.sort(key=lambda write: write.at_s)
 
     def advance(self, now_s: float, *, there: bool) -> float | None:
-        """Write all due parts if the drive is present (`there`); return the time of the next part."""
+        """Write all due parts, or drop them if the drive is missing (`there` is False).
+
+        Returns:
+            the time of the next part; None without one.
+        """
         while self._writes and self._writes[0].at_s <= now_s:
             write = self._writes.pop(0)
             with contextlib.suppress(OSError):

@@ -81,7 +81,7 @@ class Playback:
         return number
 
     def ask(self, connection: int, content: bytes) -> PlayedAnswer | None:
-        """Return the answer to a request; None if the answer is due later, or the request is incomplete.
+        """Return the answer to a request; None if the answer is due later, or the request or recording is incomplete.
 
         Raises:
             Deviation: the recording differs.

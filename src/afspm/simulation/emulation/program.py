@@ -29,8 +29,8 @@ class MakerProgram(ABC):
 
     Attributes:
         rig: the instrument.
-        repeats: another scan starts when one has ended.
-        saves_partial: an interrupted scan is saved.
+        repeats: True if another scan starts after each complete scan.
+        saves_partial: True if an interrupted scan is saved.
     """
 
     def __init__(
@@ -73,11 +73,11 @@ class MakerProgram(ABC):
 
     @abstractmethod
     def scan_files(self, scan: ScanActivity, now_s: float) -> Sequence[NamedFile]:
-        """Return the files of an ended scan; empty if it is not saved."""
+        """Return the files of an ended scan; empty: the scan is not saved."""
 
     @abstractmethod
     def curve_files(self, curve: SpectrumActivity, now_s: float) -> Sequence[NamedFile]:
-        """Return the files of an ended curve; empty if it is not saved."""
+        """Return the files of an ended curve; empty: the curve is not saved."""
 
     # -- what goes on
 
@@ -136,7 +136,7 @@ class MakerProgram(ABC):
                 self._save(self.scan_files(ended, now_s), now_s)
 
     def start_curve(self, kind: str, now_s: float) -> None:
-        """Take a curve at the tip's position. Raises InstrumentBusy, InvalidValue."""
+        """Start a curve at the tip's position. Raises InstrumentBusy, InvalidValue."""
         self._refuse_busy()
         if not self.faults.strikes("spectrum-refused", now_s):
             self.prepare_curve()

@@ -31,7 +31,7 @@ class ReplayClient:
     """A client, identified by its TCP socket or its ZeroMQ identity.
 
     Attributes:
-        introduction: the greeting before its first request; None without one.
+        introduction: the authentication before the client's first request; None without authentication.
     """
 
     number: int
@@ -46,8 +46,8 @@ class TraceReplay(Emulator):
 
     Args:
         trace: the file (`afspm trace`).
-        files: the folder for the controller's files; by default the emulator's. The translator must look there:
-            session_dir, folders or scan_dir in its section.
+        files: the folder for the controller's files; by default the emulator's own folder. The translator must read
+            this folder: session_dir, folders or scan_dir in its section.
         common: arguments of every emulator.
 
     Attributes:

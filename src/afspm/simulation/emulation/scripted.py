@@ -107,14 +107,14 @@ class ScriptedEmulator(Emulator):
 
     @abstractmethod
     def open_wire(self, port: int, on_request: OnRequest) -> ScriptWire:
-        """Listen at a port; 0 selects a free one."""
+        """Listen at a port; 0 selects a free port."""
 
     @abstractmethod
     def answer(self, client: Client, request: bytes) -> bytes | Unfinished:
         """Run the script of a request and return the reply.
 
         Raises:
-            ScriptFailed, or another AfspmError: `failure` makes the reply from it.
+            ScriptFailed, or another AfspmError: `failure` makes the reply from the error.
         """
 
     @abstractmethod

@@ -19,9 +19,10 @@ class ClientConnection:
     """A connection of a client.
 
     Attributes:
-        received: bytes not yet answered; sending: bytes not yet sent.
+        received: bytes not yet answered.
+        sending: bytes not yet sent.
         waits_for: the condition of the reply to the current request; no other request is answered meanwhile.
-        closing: no more answers; the connection ends once all bytes are sent.
+        closing: True if there are no more answers: the connection ends once all bytes are sent.
         memory: the controller's state for this client.
     """
 
@@ -37,9 +38,9 @@ class TcpServer:
     """Listening ports and their connections, without a thread: `poll` does all the work.
 
     Args:
-        ports: listening ports; 0 selects a free one.
-        stream_port: port for clients that only read; 0: any free one, None: there is none.
-        one_each: a port serves one client at a time; others wait until it has gone.
+        ports: listening ports; 0 selects a free port.
+        stream_port: port for clients that only read; 0: any free port; None: no such port.
+        one_each: True if a port serves one client at a time; other clients wait until the connection ends.
         wakes: an object with a `fileno` that ends `poll`.
         on_bytes: called with a connection after new bytes in `received`.
     """
@@ -139,7 +140,7 @@ class TcpServer:
 
     def _listener(self, host: str, port: int) -> socket.socket:
         listener = socket.create_server((host, port))
-        listener.settimeout(0)
+        listener.settimeout(0)  # a client may have gone before `accept`, which must not block then
         self._selector.register(listener, selectors.EVENT_READ, listener)
         return listener
 

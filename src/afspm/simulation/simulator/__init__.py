@@ -1,7 +1,7 @@
 """A simulated microscope: the physics of `afspm.simulation` behind a controller with all the base actions.
 
-It runs on the experiment clock, so that a night passes in a minute. Its state survives a kill: the same tip continues,
-and a measurement has gone on meanwhile.
+The microscope runs on the experiment clock, so that a night can pass in a minute. Its state survives a kill: the same
+tip continues, and a measurement has gone on meanwhile.
 """
 
 from __future__ import annotations
@@ -98,19 +98,19 @@ class Simulator(Driver):
     """The simulated microscope.
 
     Args:
-        seed: of all random numbers.
+        seed: seed of all random numbers.
         surface: a kind, or a table of `kind` and its settings.
         tip, tip_changes, drift, feedback, scanner, noise, signals, iv, force, property_map: a table of settings.
         initial: values of parameters at the start, by their generic names.
         approach_s: duration of engaging and retracting.
-        faults: faults and their times, each a table of `kind`, `at_s`, `count`, `duration_s` (below).
+        faults: faults and their times, each a table of `kind` (`FAULT_KINDS`), `at_s`, `count`, `duration_s`.
         fault_action: enable the action "x-fault", which triggers faults on demand.
         panel: actions of a person at the controller's panel, each a table of `at_s` with `set` or `action`.
         parameters: rows added to the table of parameters, or changed in it.
         actions: generic actions added: `{name = {set = {<parameter> = <value>}}}`.
-        poll_period_s: interval between reads of its state, in real seconds, while nothing is due.
+        poll_period_s: interval between reads of the state, in real seconds, while nothing is due.
         result_timeout_s: longest delay of the file after the end of a scan or spectrum.
-        live_lines_s: interval between publications of lines of a running scan, 0: none; by default twice a real second.
+        live_lines_s: interval between publications of lines of a running scan; 0: never; by default 0.5 real seconds.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
@@ -229,7 +229,11 @@ class Simulator(Driver):
         in_background(work)
 
     def connect(self) -> None:
-        """Switch the instrument on, or restore its state."""
+        """Switch the instrument on, with its saved state if any, unless it is on already.
+
+        Raises:
+            ControllerLost: the fault "restart" is active.
+        """
         if self._controller is None:
             self._controller = self._switch_on()
         self._reached(refuses=False)
@@ -308,7 +312,7 @@ class Simulator(Driver):
 
     @action(_FAULT, while_busy=True)
     def fault(self) -> None:
-        """Trigger the fault of the parameters "x-fault-…"."""
+        """Trigger the fault of the parameters "x-fault-…", after the answer to this request."""
         kind, count, duration_s = (self.memory["values"][name] for name in _FAULT_PARAMETERS)
         self.demanded = Fault(str(kind), 0.0, int(count), float(duration_s))
 

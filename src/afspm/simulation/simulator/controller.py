@@ -50,7 +50,7 @@ class PanelEvent:
     Attributes:
         at_s: experiment seconds after the start.
         set: values as in the experiment file.
-        action: one of the instrument's own actions.
+        action: a generic action of the simulated microscope, e.g. "retract"; empty: none.
     """
 
     at_s: float
@@ -62,7 +62,7 @@ class SimulatedController:
     """The controller of the simulated instrument.
 
     Args:
-        kept: the saved state, JSON-able; every call updates it.
+        kept: the saved state, JSON-able; every change of the instrument updates it.
         folder: folder for saved files.
         panel: actions of a person, in any order.
     """
@@ -114,12 +114,12 @@ class SimulatedController:
         return _STATES[self.instrument.doing(now_s)]
 
     def next_change_s(self) -> float | None:
-        """Return the time of the next event; None if there is none, or while a scan is being computed."""
+        """Return the time of the next event, without the end of a scan that is being computed; None without events."""
         times = (self._panel_s(), self._files.whole_s(), self.instrument.ends_s)
         return min((at_s for at_s in times if at_s is not None), default=None)
 
     def results(self) -> list[str]:
-        """Return the files of the last scans and spectra, oldest first."""
+        """Return the files of the last `LISTED_RESULTS` scans and spectra, oldest first."""
         return list(self._kept["results"])
 
     def lines(self, start: int, now_s: float) -> list[ScanLines]:
@@ -162,7 +162,10 @@ class SimulatedController:
     # --- values ---
 
     def set(self, values: dict[str, Value], now_s: float) -> None:
-        """Change values, by their generic names, in the table's units; move to a new frame or position."""
+        """Change values, by their generic names, in the table's units; move to a new frame or position.
+
+        A move ends the running measurement.
+        """
         self.instrument.account(now_s)  # with the feedback as it was
         before = self._si()
         self._kept["values"].update(values)
@@ -199,7 +202,7 @@ class SimulatedController:
     # --- actions ---
 
     def start_scan(self, now_s: float) -> None:
-        """Scan the frame, trace and retrace at the scan speed."""
+        """Start a scan of the frame, trace and retrace at the scan speed."""
         self._prepare(now_s)
         if not self._faults.strikes("scan-refused", now_s):
             with _refusing():
@@ -207,7 +210,7 @@ class SimulatedController:
             self._measures()
 
     def start_spectrum(self, now_s: float) -> None:
-        """Take a curve of the selected kind at the probe's position."""
+        """Start a curve of the selected kind at the probe's position."""
         self._prepare(now_s)
         if not self._faults.strikes("spectrum-refused", now_s):
             with _refusing():
@@ -215,7 +218,7 @@ class SimulatedController:
             self._measures()
 
     def stop(self, now_s: float) -> None:
-        """Interrupt the measurement; it has no result."""
+        """Interrupt the running measurement, which then has no result."""
         self.instrument.stop_scan(now_s)
         self.instrument.stop_spectrum(now_s)
         self._keep()
@@ -243,7 +246,7 @@ class SimulatedController:
         self._keep()
 
     def engage(self, now_s: float) -> None:
-        """Approach the sample."""
+        """Stop the measurement and approach the sample."""
         self.stop(now_s)
         with _refusing():
             self.instrument.engage(now_s)
@@ -251,6 +254,7 @@ class SimulatedController:
         self._keep()
 
     def _prepare(self, now_s: float) -> None:
+        # an ended measurement is saved before another takes its place
         self._advance(now_s)
         doing = self.instrument.doing(now_s)
         if doing:
@@ -327,7 +331,7 @@ class SavedFiles:
         self._faults = faults
 
     def save(self, name: str, content: bytes, end_s: float) -> None:
-        """Save a file that was finished at an experiment time."""
+        """Save the file of a measurement that ended at `end_s`; a fault may omit, delay or halve the file."""
         path, faults = self._folder / name, self._faults
         if faults.strikes("no-file", end_s):
             return
@@ -348,7 +352,11 @@ class SavedFiles:
         return None if late is None else float(late[1])
 
     def complete(self) -> None:
-        """Write the rest of the late file."""
+        """Put the whole late or incomplete file in its place.
+
+        Raises:
+            FileError: the file can't be moved.
+        """
         path = Path(self._kept.pop("late")[0])
         try:
             _hidden(path).replace(path)

@@ -53,7 +53,7 @@ class Rough:
     """A self-affine surface: sputtered, etched or fractured.
 
     Attributes:
-        rms_m: of the heights over areas far larger than `largest_m`.
+        rms_m: root mean square of the heights over areas far larger than `largest_m`.
         hurst: 0 jagged to 1 smooth; heights over a distance L vary as L**hurst up to `largest_m`.
     """
 

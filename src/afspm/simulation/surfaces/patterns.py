@@ -16,12 +16,12 @@ from afspm.simulation.surfaces.relief import Relief, around, grain, patches, smo
 
 @dataclass(frozen=True)
 class Lattice:
-    """A hexagonal lattice with vacancies and adatoms, slightly strained, so that it never repeats exactly.
+    """A hexagonal lattice with vacancies and adatoms, slightly strained, so that the pattern never repeats exactly.
 
     Attributes:
         constant_m: distance of neighbours.
-        corrugation_m: from hollow to top.
-        defect_fraction: of the sites; two of three are vacancies.
+        corrugation_m: height difference from hollow to top.
+        defect_fraction: fraction of defective sites; two of three defects are vacancies.
         strain_m: rms of the sites' displacement, over distances of about 30 constants.
     """
 

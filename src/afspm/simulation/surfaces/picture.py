@@ -22,7 +22,7 @@ class Heightmap:
 
     Attributes:
         height_m: in m if `size_m` is known, else in any unit (grey levels of an image).
-        size_m: (x, y) from first to last pixel; None if the file does not contain it.
+        size_m: (x, y) from first to last pixel; None if the file does not contain the size.
     """
 
     height_m: Array
@@ -36,7 +36,7 @@ def read(path: Path) -> Heightmap:
     """Return the heights in a file; gaps (lines that were not scanned) are filled with the mean.
 
     Raises:
-        FileError: a file that is missing, unreadable, or has no reader for its format.
+        FileError: the file is missing, unreadable, or without heights.
     """
     if not path.is_file():
         raise FileError("no such file", where=str(path))
@@ -88,9 +88,9 @@ class PictureSurface:
     """Heights read from a file, centred at the origin and mirrored at their borders, which avoids seams.
 
     Attributes:
-        path: an image (bright is high) or an SPM file.
-        width_m: distance from first to last pixel; 0: as in the SPM file. Required for an image.
-        height_range_m: from lowest to highest; 0: as in the SPM file.
+        path: an image (bright is high), a numpy file or an SPM file.
+        width_m: distance from first to last pixel; 0: as in the SPM file. Required for images and numpy files.
+        height_range_m: difference of lowest and highest; 0: as in the SPM file. Required for images and numpy files.
     """
 
     path: str

@@ -52,7 +52,7 @@ def turned(x_m: Array, y_m: Array, angle_deg: float) -> tuple[Array, Array]:
 
 
 def grain(seed: int, x_m: Array, y_m: Array, rms_m: float, size_m: float, resolution_m: float) -> Array | float:
-    """Return fine roughness with this rms; its largest grains are `size_m` wide."""
+    """Return fine roughness of this rms, with octaves from `size_m` down to a quarter of it."""
     if rms_m == 0.0:
         return 0.0
     field = rough_field(seed, x_m, y_m, largest_m=size_m, smallest_m=size_m / 4, hurst=0.6, resolution_m=resolution_m)
@@ -65,9 +65,9 @@ def patches(seed: int, x_m: Array, y_m: Array, size_m: float) -> Array:
 
 
 def around(x_m: Array, y_m: Array, x0_m: float, y0_m: float, reach_m: float) -> Iterator[tuple[Any, Array, Array]]:
-    """Yield (index, x - x0, y - y0) for the positions near a point; nothing if there are none.
+    """Yield (index, x - x0, y - y0) once for the positions near a point; nothing without positions.
 
-    `index` selects those positions from the broadcast array.
+    `index` selects the positions from the broadcast array.
     """
     if is_separable(x_m, y_m):
         columns = slice(*np.searchsorted(x_m[0], (x0_m - reach_m, x0_m + reach_m)))
@@ -91,7 +91,7 @@ class Sites:
 
     @classmethod
     def within(cls, seed: int, x_m: Array, y_m: Array, margin_m: float, spacing_m: float) -> Sites:
-        """Return the points in view: one per cell of `spacing_m` on average (0, 1 or 2), anywhere in the cell."""
+        """Return the points in view: one per cell of `spacing_m` on average (0 to 3), anywhere in the cell."""
         i = np.arange(
             math.floor((x_m.min() - margin_m) / spacing_m), math.floor((x_m.max() + margin_m) / spacing_m) + 1
         )

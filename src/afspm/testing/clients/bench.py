@@ -81,6 +81,7 @@ class ClientBench:
 
         Raises:
             Failed: a failed check, an unreadable answer, or an error in the experiment.
+            ConfigError: the conformance program can't be started.
         """
         try:
             remark: str | None = check.do(self)
@@ -118,8 +119,8 @@ class ClientBench:
         """Start a client in an experiment.
 
         Args:
-            ready: wait until it is ready.
-            changes: changes to its launch line.
+            ready: True to wait until the client is ready.
+            changes: changes to the client's launch line.
         """
         with self._started(replace(experiment.launch, **changes), experiment.pump, experiment.wake) as client:
             if ready:
@@ -133,7 +134,7 @@ class ClientBench:
         """Start a client with a scripted scheduler.
 
         Args:
-            ready: wait until it is ready.
+            ready: True to wait until the client is ready.
             owner: the owner of the scheduler's keys; None: no encryption.
             also: the address of a second publisher, the judge's.
             changes: changes to the client's launch line.

@@ -80,7 +80,7 @@ _NOTHING = logging.CRITICAL + 1
 
 
 class Judge(Component):
-    """The judge's component in the experiment: wired like any other, but not started as a process."""
+    """The judge's component in the experiment, wired like any component, but not started as a process."""
 
 
 class JudgedExperiment:
@@ -88,7 +88,7 @@ class JudgedExperiment:
 
     Args:
         folder: the folder of this run.
-        security: the encrypted connections.
+        security: the kind of encryption.
 
     Attributes:
         launch: the client's launch line; the caller adds the heartbeat's address.

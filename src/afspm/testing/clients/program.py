@@ -48,10 +48,10 @@ class ClientProgram:
 
     Args:
         command: the program and its arguments.
-        launch: its launch line.
-        pump: waits for its answers.
+        launch: the client's launch line.
+        pump: waits for the program's answers.
         wake: called from other threads after output of the program, and after its end.
-        log: the file for its standard error.
+        log: the file for the program's standard error.
 
     Raises:
         ConfigError: the program can't be started.
@@ -145,7 +145,7 @@ class ClientProgram:
 
     @property
     def ending(self) -> str:
-        """Describe how the program ended."""
+        """The end of the program in words: its exit code or signal, or "still running"."""
         code = self._popen.poll()
         return "still running" if code is None else f"exit code {code}" if code >= 0 else f"signal {-code}"
 

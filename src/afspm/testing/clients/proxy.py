@@ -1,6 +1,6 @@
 """A TCP proxy that cuts connections after a request has passed, before its reply is delivered.
 
-It parses only the frame boundaries of ZMTP, which encryption (CURVE) does not hide: after the greeting and the
+The proxy parses only the frame boundaries of ZMTP, which encryption (CURVE) does not hide: after the greeting and the
 handshake's commands, each frame from the scheduler belongs to a reply.
 """
 

@@ -1,4 +1,4 @@
-"""Runs all checks of a client in order, and writes the report."""
+"""The run of all checks of a client, in order, and its report."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ class Prompts(Protocol):
         """Ask for a line, which may be empty."""
 
     def choose(self, question: str, options: Sequence[str], default: str = "") -> str:
-        """Ask for one of the options; an empty answer selects the default, if there is one."""
+        """Ask for one of the options; an empty answer selects the default, if any."""
 
 
 UNSEEN = "unseen"
@@ -42,7 +42,7 @@ class Guide:
         folder: the run folder, for pictures.
         has_panel: True for a real controller. Without a panel, each question about it is shown and skipped.
         program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
-        in_contact: the person has approached the tip; it is withdrawn after the steps at the sample.
+        in_contact: True if the person has approached the tip, which is withdrawn after the steps at the sample.
     """
 
     kit: CheckMeasurements
@@ -60,7 +60,7 @@ class Guide:
         """Explain a step, ask for confirmation if it moves anything, and run it.
 
         Raises:
-            CheckEnded: a step that failed, was skipped or was declined.
+            CheckEnded: the step failed, was skipped or declined, or is not supported.
         """
         if missing := self.kit.support.missing(step.needs):
             raise Unsupported(", ".join(missing))
@@ -117,7 +117,7 @@ class Guide:
         return self.prompts.text(question) if self._can_be_seen(question) else None
 
     def require_choice(self, question: str, right: str, wrong: Sequence[str], what: str) -> bool:
-        """Ask which option the panel shows; return False if it can't be seen.
+        """Ask which option the panel shows; return False if the person can't see any option.
 
         Raises:
             Failed: a wrong option.
@@ -130,12 +130,13 @@ class Guide:
         return seen == right
 
     def compare(self, what: str, value: float, unit: str, absolute: float = 0.0) -> bool:
-        """Ask for a value shown at the panel; return False if it is not shown.
+        """Ask for a value shown at the panel; return False if the panel does not show the value.
 
-        The person types the value before afspm shows its own, so that a wrong value is not misread as the expected one.
+        The person types the value before afspm shows its own: a person who knows the expected value may misread a wrong
+        value.
 
         Raises:
-            Failed: the values differ.
+            Failed: the values differ by more than 1 % and `absolute`, and the person confirms the typed value.
         """
         shown = f"{value:.6g} {unit}".rstrip()
         question = f"{what}, as the panel shows it{f', e.g. in {unit}' if unit else ''}"

@@ -28,7 +28,8 @@ class CommissioningResult:
 
     Attributes:
         progress: the steps.
-        lost: why the commissioning ended early; empty if it did not.
+        file: the file of the report.
+        lost: the reason of an early end; empty after all steps.
         folder: the run folder, with the log and the trace.
     """
 

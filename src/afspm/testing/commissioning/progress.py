@@ -11,7 +11,7 @@ from afspm.testing.conformance import Check, CheckOutcome, CheckResult
 _MISMATCH: Final = "mismatch"
 """The word for a failed step in reports and in the public matrix."""
 _GOES_ON = (CheckOutcome.PASSED, CheckOutcome.SKIPPED, CheckOutcome.UNSUPPORTED)
-"""An unsupported step, or one not shown at the panel, does not block others."""
+"""The outcomes after which later steps are possible: a step that is unsupported or not shown blocks no other step."""
 
 
 _WORSE = (
@@ -44,11 +44,11 @@ class CommissioningStep(Check):
 
     Attributes:
         explained: shown to the person before the step.
-        after: required earlier steps: none may have failed or been declined.
-        moves: the step acts on the microscope, so the person confirms it first.
-        needs_panel: the person acts at the panel; skipped where there is none.
-        contact: the tip is at the sample; it is withdrawn after the step.
-        remembered: a resumed commissioning skips the passed step; steps about the tip are always repeated.
+        after: required earlier steps: each must have passed, been skipped, or be unsupported.
+        moves: True if the step acts on the microscope, so that the person confirms the step first.
+        needs_panel: True if the person acts at the panel; without a panel the step is skipped.
+        contact: True if the tip is at the sample; the tip is withdrawn after the step.
+        remembered: True if a resumed commissioning skips the passed step; steps about the tip are always repeated.
         operations: operations of the public matrix that the step tests.
     """
 
@@ -96,12 +96,15 @@ class CommissioningProgress:
 
     @property
     def passed(self) -> bool:
-        """True if no step failed, and every possible step was done."""
+        """True if there are results, and none is failed, blocked or declined."""
         found = [result.outcome for result in self.results.values()]
         return bool(found) and all(one in _GOES_ON for one in found)
 
     def operations(self) -> dict[str, str]:
-        """Return the outcome of each operation of the matrix: the worst outcome of its steps."""
+        """Return the outcome of each operation of the matrix: the worst outcome of its steps.
+
+        A pass outweighs skipped and unsupported steps.
+        """
         found: dict[str, CheckOutcome] = {}
         for step in self.steps:
             outcome = self._outcome(step.name)

@@ -1,6 +1,6 @@
 """The steps of a commissioning, in order.
 
-Each returns a line with its observation, or raises Failed, Skipped or Declined.
+Each step returns a line with its observation, or raises Failed, Skipped or Declined.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Tests of components in one process: real decisions, a simulated microscope, a fake clock, an in-memory network."""
+"""Tests of components in one process: the real scheduler core, a simulated microscope, a fake clock and network."""

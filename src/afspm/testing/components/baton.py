@@ -1,4 +1,4 @@
-"""Blocking code in simulated time: each has its own thread, and only the thread with the baton runs.
+"""Blocking code in simulated time: each process has its own thread, and only the thread with the baton runs.
 
 The simulation passes the baton to a thread. The thread returns the baton when it waits for an event or ends. So the
 timeline alone determines the order of events, and blocking code is reproducible.
@@ -37,7 +37,11 @@ class Baton:
     # --- on the side of the simulation ---
 
     def go_on(self) -> None:
-        """Run the code until it waits again or ends."""
+        """Run the code until it waits again or ends.
+
+        Raises:
+            TimeoutError: the code neither waits nor ends within a minute of real time.
+        """
         if self.over:
             return
         self._to_thread.release()

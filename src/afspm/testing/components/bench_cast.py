@@ -26,8 +26,10 @@ class BenchCast:
 
     Attributes:
         name: name of the component under test.
-        components, launches: by name; the launch lines have neither sockets nor folders.
-        simulator: class of the microscope; `microscope` are its settings.
+        components, launches: components and launch lines by name; the launch lines have no folders, and their sockets
+            are never opened.
+        simulator: class of the microscope.
+        microscope: settings of the microscope.
     """
 
     name: str

@@ -69,11 +69,11 @@ class Bench:
 
     Args:
         component: the component under test. Each life runs a copy.
-        others: more components by name, such as one that takes the scans.
+        others: more components by name, such as a component that takes the scans.
         microscope: settings of the simulated microscope, as in the experiment file.
         problems: names and numbers of your own problems, as in the experiment file.
         limits: limits of the scheduler.
-        folder: folder for saved state and scans; None: a temporary one.
+        folder: folder for saved state and scans; None: a temporary folder.
         seed: the same seed gives the same run.
         dies_in_call: the chance that the component is killed at a call to the network.
         keeps_requests: keep inputs and requests in `folder`, as `[record] requests = true` does.
@@ -141,7 +141,7 @@ class Bench:
 
         Args:
             overlays: experiment files that override the first.
-            component: name of the component under test; by default the only one with a plan of its own.
+            component: name of the component under test; by default the only component with a plan of its own.
             without: names of components to leave out, such as web pages and programs in other languages.
             folder, seed, dies_in_call: as for a bench of one component.
 
@@ -234,7 +234,8 @@ class Bench:
         """Run until an experiment time since the start.
 
         Raises:
-            Exception: the error of a component.
+            ConfigError: the time has passed.
+            Exception: the error of a component or of the translator.
         """
         until_s = _seconds(until)
         if until_s < self.now_s:
@@ -277,7 +278,7 @@ class Bench:
     def kill(self, name: str = "", *, restarts: bool = True) -> None:
         """Kill the component, or another process by name ("scheduler", "translator").
 
-        It starts again after a second with its saved state, unless `restarts` is False.
+        The process starts again after a second with its saved state, unless `restarts` is False.
         """
         if (process := self._processes.get(name or self.name)) is None:
             raise ConfigError(f"there is no process {name!r}", hint=f"there are {', '.join(self._processes)}")
@@ -291,7 +292,7 @@ class Bench:
         self._settle()
 
     def refuse(self, subject: str, *, times: int = 1, reason: str = "refused by the bench") -> None:
-        """Let the microscope refuse the next requests for an action ("start-scan") or a parameter."""
+        """Let the microscope refuse the next `times` requests for an action ("start-scan") or a parameter."""
         self._translator.refusals[subject] = (times, reason)
 
     def change_tip(self, condition: str) -> None:

@@ -49,7 +49,7 @@ class BlockingProcess(Process):
         dies_in_call: the chance of a kill in a call to its port, before or after the call has its effect.
 
     Attributes:
-        ended_with: the end of its last life: an exit code or an exception; None if it was killed.
+        ended_with: the last end of the code by itself: an exit code or an exception; None without one.
     """
 
     def __init__(self, timeline: SimulatedTime, name: str, *, dies_in_call: float = 0.0) -> None:
@@ -130,11 +130,11 @@ class ComponentProcess(BlockingProcess):
 
     Args:
         make: creates the component for each life.
-        folder: its state_dir.
-        launch: its launch line, without sockets and folders.
+        folder: state_dir and run_dir of the component.
+        launch: the component's launch line, without sockets and folders.
 
     Attributes:
-        publishers: other components to whose publishers it subscribes.
+        publishers: other components whose packets the component receives directly.
     """
 
     def __init__(
@@ -312,7 +312,7 @@ class TranslatorProcess(BlockingProcess):
 
     Args:
         make: creates the driver for each life.
-        folder: its state_dir and run_dir.
+        folder: folder for the translator's memory, and its run folder.
     """
 
     def __init__(

@@ -14,12 +14,12 @@ Deliver = Callable[..., None]
 
 @dataclass
 class Weather:
-    """The quality of the network; may be changed while it runs.
+    """The quality of the network, which may be changed at any time.
 
     Attributes:
         delay_s: the longest delay of a message; most delays are much shorter.
         doubles: the chance that a request arrives twice.
-        reconnect_s: time between attempts to reconnect a broken line.
+        reconnect_s: mean time between attempts to reconnect a broken line.
     """
 
     delay_s: float = 0.01
@@ -34,7 +34,7 @@ class Host(Protocol):
     def alive(self) -> bool: ...
     @property
     def sockets(self) -> dict[Any, None]:
-        """The lines that end at this process; they break when it dies."""
+        """The lines that end at this process, and break when the process dies."""
 
     def take(self, do: Callable[..., None], *args: object) -> None:
         """Call `do(*args)` now, after a freeze, or never if this life ends first."""
@@ -57,6 +57,7 @@ class Pipe:
         timeline = self._timeline
         # mostly quick, now and then slow
         time_s = timeline.monotonic_s() + self._weather.delay_s * timeline.random.random() ** 4
+        # a message must not overtake the message before it
         if time_s > self._last_s:
             self._last_s = time_s
         timeline.at(self._last_s, self._arrive, (do, args))
@@ -118,7 +119,7 @@ class ControlLine:
         return self._there is not None
 
     def ask(self, request: Request, number: int = 0) -> None:
-        """Send a request; it is dropped while the line is down."""
+        """Send a request; drop the request while the line is down."""
         if self._there is None:
             return
         self._there.send(self._server.peer_asked, self, _copy(request), number)
@@ -226,7 +227,7 @@ class Feed:
             self._timeline.after(self._weather.reconnect_s * (0.5 + self._timeline.random.random()), self._try)
 
     def fall_silent(self, for_s: float) -> None:
-        """Lose all messages; see `ControlLine.fall_silent`."""
+        """Lose all messages in one or both directions; both ends notice only after `for_s`."""
         _fall_silent(self._timeline, (self._there, self._back))
         self._timeline.after(for_s, self.cut)
 

@@ -58,9 +58,10 @@ class Disk:
     """The data that survives a kill of the scheduler.
 
     Attributes:
-        state: the last saved state; it is frozen, and converted to plain data only for a restart.
-        full: nothing can be written.
-        stale: the last write failed.
+        state: the last saved state, a frozen object, converted to plain data only for a restart.
+        journal: the packets to publish again after a restart.
+        full: True if nothing can be written.
+        stale: True if the last write failed.
     """
 
     state: SavedState | None = None
@@ -74,7 +75,7 @@ class Disk:
             self.state = state
 
     def keep(self, entry: LoggedPacket) -> None:
-        """Store a packet before it is published."""
+        """Store a packet before it is published; a full disk drops the packet."""
         if self.full:
             self.stale = True
             return
@@ -97,17 +98,15 @@ class StepObserver(Protocol):
 class SchedulerHost(Process):
     """The counterpart of `afspm.scheduler.shell`, without sockets.
 
-    Attributes:
-        writes_ahead: a packet is on disk before it is published, as in the shell. If False, a kill loses the
-            translator's newest packets, which is harder on the scheduler.
-
     Args:
-        journal_s: delay between a packet and its write to the journal.
-        dies_in_step: the chance of a kill between two effects of one step.
+        journal_s: longest delay between a packet and its write to the journal.
+        dies_in_step: the chance of a kill before each effect of a step.
         make_core: creates the core of each life; by default a `SchedulerCore`.
 
     Attributes:
-        worker: executes jobs of the coordinate frame in this life; None: the observer receives them.
+        writes_ahead: True if a packet is on disk before it is published, as in the shell. If False, a kill loses the
+            translator's newest packets, which is harder on the scheduler.
+        worker: executes jobs of the coordinate frame in this life; None: only the observer receives the jobs.
     """
 
     def __init__(
@@ -162,7 +161,7 @@ class SchedulerHost(Process):
         self._carry_out(None, self.core.start(self.timeline.monotonic_s(), self.timeline.now_ns()))
 
     def fall_silent(self, for_s: float) -> None:
-        """Lose all messages of the translator's connections, before these break after `for_s`."""
+        """Lose the translator's messages in one or both directions, and break its connections after `for_s`."""
         if self.alive:
             self._link.fall_silent(for_s)
             self._from_translator.fall_silent(for_s)
@@ -225,7 +224,7 @@ class SchedulerHost(Process):
         self._step(TranslatorCaughtUp())
 
     def killed(self, feed: Feed) -> None:
-        """Not used: the translator sends no KILL."""
+        """Do nothing: the translator sends no KILL."""
 
     # --- as a publisher ---
 

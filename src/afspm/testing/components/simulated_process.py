@@ -46,10 +46,10 @@ class Process:
     """A process over all its lives. Subclasses set up the memory of one life in `begin`.
 
     Attributes:
-        alive: the process is running or frozen.
-        banned: the process can't be started.
-        frozen: the process does nothing, and messages wait.
-        sockets: connections from other processes, including broken ones not yet noticed.
+        alive: True while the process is running or frozen.
+        banned: True if the process can't be started.
+        frozen: True while the process does nothing, and messages wait.
+        sockets: connections from other processes, including broken connections not yet noticed.
         since_s: the time of its start or of the end of its last freeze.
         step_age_s: the reported age of its current step.
     """

@@ -58,7 +58,7 @@ class SimulatedTime:
         return self.at_ns(self._time_s)
 
     def at_ns(self, time_s: float) -> int:
-        """Return the experiment time at a moment of real time."""
+        """Return the experiment time in ns at a moment of real (simulated) time."""
         return _START_NS + round(time_s * self.speed * 1e9)
 
     def now_s(self) -> float:
@@ -85,7 +85,11 @@ class SimulatedTime:
         return timer
 
     def step(self) -> bool:
-        """Run the next event; return False if there is none."""
+        """Run the next event; return False if there is none.
+
+        Raises:
+            GoesInCircles: thousands of events have passed at the same time.
+        """
         while self._coming:
             time_s, _, timer = heapq.heappop(self._coming)
             if timer.cancelled:

@@ -35,9 +35,9 @@ class Observation:
     """A received packet.
 
     Attributes:
-        message: its name.
-        thing: its content, or the error that prevents decoding.
-        time_ns: the time of its publication.
+        message: the name of the message.
+        thing: the content of the packet, or the error that prevents decoding.
+        time_ns: the time of publication; None without one.
     """
 
     message: str
@@ -66,7 +66,7 @@ class Observations:
         self.all: list[Observation] = []
 
     def take(self, packet: Packet, ours: bool) -> None:
-        """Record a packet, as a listener of an `ExperimentLink`."""
+        """Record a packet of the translator, or an unreadable packet; a listener of an `ExperimentLink`."""
         message = packet.envelope
         try:
             message = wire.message_of(packet.envelope)
@@ -146,12 +146,12 @@ class CheckClient:
 
     Args:
         link: connection to the scheduler; may still be connecting.
-        direct: to the translator, bypassing the scheduler's own refusals; None if there is none.
-        lost: returns the name of the process that has ended, after a link reports the end of the parent.
+        direct: connection to the translator, bypassing the scheduler's own refusals; None: use `link` instead.
+        lost: returns a description of the ended processes, after a link reports the end of the parent.
 
     Attributes:
         observations: all publications.
-        at_start: the publications before the first request.
+        at_start: the publications until control was granted, before the first request to the microscope.
     """
 
     def __init__(self, link: ExperimentLink, direct: ExperimentLink | None, lost: Callable[[], str]) -> None:
@@ -190,7 +190,7 @@ class CheckClient:
         self.at_start = tuple(self.observations.all)
 
     def regain_control(self, within_s: float) -> None:
-        """Request control again, after it was lost together with the controller.
+        """Request control again, after a loss of the controller and of control.
 
         Raises:
             Lost: control is not granted within `within_s` real seconds.
@@ -233,7 +233,7 @@ class CheckClient:
         return response
 
     def ask_directly(self, kind: ControlRequest, subject: object) -> Response:
-        """Send a request to the translator without the scheduler, to test the translator's own refusals."""
+        """Send a request over `direct`, to test the translator's own refusals."""
         return self._request_over(self._direct, kind, subject)
 
     def _request_over(self, link: ExperimentLink, kind: ControlRequest, subject: object) -> Response:
@@ -302,7 +302,7 @@ class CheckClient:
         return self.observations.since(mark)
 
     def quiet(self) -> None:
-        """Wait for a pause in the publications."""
+        """Wait for a pause in the publications, at most `NOTICED_S`."""
         self._stirred = False
         until_s = self.clock.monotonic_s() + NOTICED_S
         while self.clock.monotonic_s() < until_s:
@@ -315,7 +315,7 @@ class CheckClient:
         return self.clock.real_s(experiment_s) + NOTICED_S
 
     def come_to_rest(self) -> None:
-        """Stop any activity, and wait until the microscope is free.
+        """Stop a running scan or spectrum, and wait until the microscope is free.
 
         Raises:
             Lost: the activity does not stop.
@@ -358,7 +358,7 @@ def value_in(response: Response, name: str) -> Parameter:
     """Return the parameter in a successful answer.
 
     Raises:
-        Failed: no parameter, or another one.
+        Failed: no readable parameter, another parameter, or no value.
     """
     try:
         found = wire.decode_parameter(response.payload)

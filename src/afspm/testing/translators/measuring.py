@@ -51,7 +51,7 @@ class FrameSettings:
     """The frames of one pass. Column counts are multiples of 16, as some controllers require.
 
     Attributes:
-        whole: the frame at the beginning.
+        whole: the frame set at the beginning, or the square about its centre that the checks must not leave.
     """
 
     whole: Region
@@ -90,7 +90,7 @@ class FrameSettings:
 
 
 def difference(expected: Region, came: Region) -> str:
-    """Describe the difference of two regions; empty if they agree to a controller's precision."""
+    """Describe the difference of two regions; empty if size, angle and centre agree within `NEAR`."""
     size = math.hypot(*expected.size_m)
     if math.dist(expected.size_m, came.size_m) > NEAR * size:
         return f"a size of {in_words(came.size_m)} instead of {in_words(expected.size_m)}"
@@ -159,11 +159,13 @@ class Taken:
 class CheckMeasurements:
     """Measurements for checks. A failed measurement is not repeated: dependent checks are skipped.
 
-    Attributes:
+    Args:
+        frame_m: side of the square that contains the frames to scan; None: the frame set at the beginning.
         excused: checks that this controller can't pass, with the reason.
         complaints: logged warnings and errors; the list grows.
-        frames: the frames to scan; Skipped where the microscope has not published its frame.
-            `frame_m` is the side of the square that contains them, instead of the set frame.
+
+    Attributes:
+        frames: the frames to scan; raises Skipped if the microscope has not published its frame.
     """
 
     def __init__(
@@ -245,7 +247,11 @@ class CheckMeasurements:
         return self._begin(names.START_SCAN, ScopeState.SCANNING)
 
     def prepare(self, frame: FrameSetting, lasts_s: float) -> float | None:
-        """Set frame and speed; return the expected duration of the scan."""
+        """Set frame and speed for a scan of `lasts_s`.
+
+        Returns:
+            the expected duration by the speed in force, experiment seconds; None without a scan speed.
+        """
         client = self.client
         client.come_to_rest()
         mark = client.observations.mark()

@@ -2,9 +2,9 @@
 
     pytest -p afspm.testing.translators.plugin experiment.toml [--overlay FILE] [--without-process NAME]
 
-It is not loaded automatically, so it does not disturb other tests in an environment with afspm. In the tests of a
-translator's package: `addopts = ["-p", "afspm.testing.translators.plugin"]` and `testpaths = ["tests",
-"experiment.toml"]`. The tip is assumed to be withdrawn.
+The plugin is not loaded automatically, so that other tests in an environment with afspm are not disturbed. In the tests
+of a translator's package: `addopts = ["-p", "afspm.testing.translators.plugin"]` and `testpaths = ["tests",
+"experiment.toml"]`. The checks assume that the tip is withdrawn.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 
 
 class ExperimentFile(pytest.File):
-    """The checks of one experiment file; they share one pass of its processes."""
+    """The checks of one experiment file, which share one run of its processes."""
 
     def collect(self) -> Iterable[pytest.Item]:
         for check in TRANSLATOR_SUITE.checks():

@@ -20,7 +20,7 @@ class CheckReport(SuiteReport):
     """The results of all checks of one translator.
 
     Attributes:
-        translator: its class or command.
+        translator: class or command of the translator.
         unrestored: settings that could not be restored, one per line.
     """
 

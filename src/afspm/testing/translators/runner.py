@@ -41,7 +41,7 @@ class SettingsBefore:
         )
 
     def restore(self, client: CheckClient) -> list[str]:
-        """Stop any activity, and restore all settings.
+        """Stop a running scan or spectrum, and restore all settings.
 
         Returns:
             the failures, one per line.
@@ -134,7 +134,8 @@ def run(
     """Run the selected checks, restore the settings, and write `report.json` into the run's folder.
 
     Args:
-        begun: called with the report before the first check, `done` with each result.
+        begun: called with the report before the first check.
+        done: called with each result.
 
     Raises:
         ConfigError: the experiment file or the options are wrong; nothing was started.

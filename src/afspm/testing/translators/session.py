@@ -52,7 +52,7 @@ class = "Scheduler"
 
 
 class Tester(Component):
-    """The component of the checks in the experiment: wired like any other, but not started as a process."""
+    """The component of the checks in the experiment, wired like any component, but not started as a process."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,8 @@ class CheckSession:
 
     Attributes:
         support: the supported actions and parameters.
-        translator: its class or command; maker: maker of its controller, if the driver names it.
+        translator: class or command of the translator.
+        maker: maker of the controller; empty if unknown.
         folder: the run folder.
         excused: checks that this controller can't pass, with the reason.
         complaints: the logged warnings and errors; the list grows.
@@ -130,7 +131,7 @@ def opened(options: CheckOptions) -> Iterator[CheckSession]:
 
     Raises:
         ConfigError: the experiment file or the options are wrong; nothing was started.
-        Lost: the program did not start.
+        Lost: the program did not start, or control was refused.
     """
     experiment = prepare(options)
     resolved = experiment.resolved

@@ -18,10 +18,10 @@ class Support:
     """The supported actions and parameters, by generic name.
 
     Attributes:
-        actions: whether each is supported; None if the microscope does not report it.
-        parameters: the initial value; None if it is not supported.
+        actions: True for a supported action; None if the microscope does not report its support.
+        parameters: the initial value of a parameter; None for an unsupported parameter.
         errors: errors in the answers.
-        settable: results of the checks; None if not tested.
+        settable: True if a check could set the parameter; None if not tested.
     """
 
     actions: dict[str, bool | None] = field(default_factory=dict)

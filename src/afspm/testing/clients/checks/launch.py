@@ -24,7 +24,7 @@ def await_beat(beats: BeatRecorder, pump: Pump) -> None:
 
 
 def require_beats(beats: BeatRecorder, since_s: float) -> None:
-    """Raise Failed if heartbeats have been irregular since `since_s`."""
+    """Raise Failed if a pause between heartbeats since `since_s` was longer than `_MOST_BEATS_APART` periods."""
     pause_s = beats.longest_pause_s(since_s)
     expect(pause_s <= _MOST_BEATS_APART * BEAT_S, f"a beat every {BEAT_S} s", f"a pause of {pause_s:.1f} s")
 

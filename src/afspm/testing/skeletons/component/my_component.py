@@ -8,7 +8,7 @@ from afspm import Component, Scan
 
 
 class MyComponent(Component):
-    """Logs the roughness of each scan, and at the end the roughest scan.
+    """A component that logs the roughness of each scan, and at the end the roughest scan.
 
     Args:
         channel: the evaluated channel.

@@ -31,7 +31,11 @@ def in_force(kit: CheckMeasurements) -> Feedback:
 
 
 def set_and_require(kit: CheckMeasurements, wanted: Feedback) -> None:
-    """Set the given fields, and raise Failed if any other field changes."""
+    """Set the given fields, and raise Failed unless exactly these fields change, published once.
+
+    Raises:
+        Skipped: the microscope refused the values, and changed nothing.
+    """
     kit.client.come_to_rest()
     before, mark = in_force(kit), kit.client.observations.mark()
     given = {name: value for name, value in vars(wanted).items() if value is not None}
@@ -48,7 +52,7 @@ def set_and_require(kit: CheckMeasurements, wanted: Feedback) -> None:
 
 
 def require_same(wanted: Feedback, came: Feedback) -> None:
-    """Raise Failed unless both agree to the precision of a float32."""
+    """Raise Failed unless both agree within the tolerance of `near`."""
     for name, value in vars(wanted).items():
         other = getattr(came, name)
         if value is None or other is None or isinstance(value, bool):

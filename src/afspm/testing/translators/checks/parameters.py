@@ -19,7 +19,7 @@ _BAD_UNIT = "kg"
 
 @dataclass(frozen=True)
 class ParameterStep:
-    """The change of a parameter in a check: by a factor, by an amount from 0, or by a fixed amount."""
+    """The change of a parameter in a check: by a factor, from 0 by `from_zero`, or always by `by`."""
 
     factor: float = 1.02
     from_zero: float = 0.0

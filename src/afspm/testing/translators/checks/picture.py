@@ -39,7 +39,7 @@ Idea = Callable[[ScanPicture], ScanPicture]
 
 
 def ideas(angle_rad: float) -> dict[str, Idea]:
-    """Return possible errors in a translator's axes, by description; `angle_rad` is the larger scan's."""
+    """Return possible errors in a translator's axes, by description; `angle_rad` is the angle of the larger scan."""
 
     def turned_back(picture: ScanPicture) -> ScanPicture:
         return replace(picture, region=replace(picture.region, angle_rad=2 * angle_rad - picture.region.angle_rad))
@@ -80,7 +80,7 @@ def likenesses(larger: ScanPicture, details: Sequence[ScanPicture]) -> dict[str,
 
 
 def best_of(found: dict[str, float]) -> tuple[str, float]:
-    """Return the idea with the highest likeness, and the likeness; among equal ones the first and simplest.
+    """Return the idea with the highest likeness, and the likeness; among equal ideas the first and simplest.
 
     With few details two ideas may be equal: a square detail fits swapped as well as shifted by half a frame.
     """

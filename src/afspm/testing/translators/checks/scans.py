@@ -131,7 +131,13 @@ def time(kit: CheckMeasurements) -> None:
 
 
 def require_time(time_ns: int | None, taken: Taken, begun: ScopeState, what: str) -> None:
-    """Raise Failed unless a measurement's time is its end: not its start, and not from another scan or clock."""
+    """Raise Failed unless a measurement's time lies between half of its expected duration and its end.
+
+    The tolerance is `CLOCK_S` on both sides.
+
+    Raises:
+        Skipped: the measurement has no time.
+    """
     if time_ns is None:
         raise Skipped(f"the {what} has no time")
     begin_s, free_s = taken.time_s(begun), taken.time_s(ScopeState.FREE)

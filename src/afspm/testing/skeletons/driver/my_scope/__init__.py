@@ -22,7 +22,7 @@ class MyScope(Driver):
 
     Args:
         address: address of the controller.
-        settings: common to all drivers.
+        settings: settings that all drivers take.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
@@ -69,12 +69,12 @@ class MyScope(Driver):
 
     @action(names.STOP_SCAN)
     def stop_scan(self) -> None:
-        """Interrupt the scan; it must not produce a file."""
+        """Interrupt the scan, which must not produce a file."""
         self.controller.stop()
 
 
 class PretendController:
-    """A stand-in for your controller: it stores values, scans at its speed, and saves a file."""
+    """A stand-in for your controller, which stores values, scans at its speed, and saves a file."""
 
     def __init__(self, clock: Clock, folder: Path) -> None:
         self.folder = folder
