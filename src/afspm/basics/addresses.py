@@ -47,8 +47,9 @@ def reaches(connect: str, bind: str) -> bool:
 def connectable(bind: str) -> str:
     """Return the address at which processes on this computer reach a socket bound to `bind`.
 
-    The wildcard hosts `*` and 0.0.0.0 become loopback.
+    The wildcard hosts `*`, 0.0.0.0 and [::] become loopback.
     """
+    bind = re.sub(r"^tcp://\[::\](?=:)", "tcp://[::1]", bind)
     return re.sub(r"^tcp://(\*|0\.0\.0\.0)(?=:)", f"tcp://{LOOPBACK}", bind)
 
 

@@ -20,19 +20,24 @@ class Interrupts:
 
     def __init__(self, port: Port) -> None:
         self._port = port
+        self._is_heeded = False
         self._is_deferred = False
         self._has_come = False
 
     @contextmanager
     def heeded(self) -> Iterator[None]:
         """Raise KeyboardInterrupt only where the block calls `heed`, and at the end of the block."""
-        if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-            yield  # components handle SIGINT themselves, as does an outer block of this kind
-            return
-        self._has_come = False
-        with signals.caught(self._come, self._port.wakeup_fileno(), signals.CTRL_C):
+        # components handle SIGINT themselves; an outer block handles what comes between two inner ones
+        if self._is_heeded or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
             yield
-            self.heed()
+            return
+        self._is_heeded, self._has_come = True, False
+        try:
+            with signals.caught(self._come, self._port.wakeup_fileno(), signals.CTRL_C):
+                yield
+                self.heed()
+        finally:
+            self._is_heeded = False
 
     @contextmanager
     def deferred(self) -> Iterator[None]:

@@ -22,7 +22,7 @@ _OUTCOMES: Final = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_CLOSED | zmq.EVENT_
 class ZmqConnection:
     """A ZeroMQ connection to a controller. Not thread-safe.
 
-    The socket is a DEALER, since a REQ socket is unusable after one lost reply. A failed `ask` closes the connection: a
+    The socket is a DEALER, since a REQ socket is unusable after one lost reply. A failed call closes the connection: a
     late reply must never be taken for the reply to the next request. The socket never reconnects: another program may
     listen at the address by then.
 
@@ -71,11 +71,11 @@ class ZmqConnection:
                     found = parse(self._taken(traced))
                     if found is not None:
                         return found
-        except ControllerLost:
+        except ControllerLost:  # also of `parse`
             self.close()
             raise
         except zmq.ZMQError as error:
-            raise self._lost(what, error) from error
+            raise self._broken(what, error) from error
 
     def begin(self, what: str, message: bytes) -> None:
         """Send a request with a slow reply, for `wait` and `reply`.
@@ -88,7 +88,7 @@ class ZmqConnection:
             with self._trace.failing():
                 self._send(what, message)
         except zmq.ZMQError as error:
-            raise self._lost(what, error) from error
+            raise self._broken(what, error) from error
 
     def wait(self, within_s: float) -> None:
         """Wait for the reply to `begin`, at most `within_s` of real time.
@@ -99,7 +99,7 @@ class ZmqConnection:
         try:
             self._socket.poll(max(0, round(within_s * 1000.0)))
         except zmq.ZMQError as error:
-            raise self._lost("a reply", error) from error
+            raise self._broken("a reply", error) from error
 
     def reply(self, what: str) -> bytes | None:
         """Return the reply to `begin`; None until the reply has arrived.
@@ -113,7 +113,7 @@ class ZmqConnection:
             with self._trace.answering() as traced:
                 return self._taken(traced)
         except zmq.ZMQError as error:
-            raise self._lost(what, error) from error
+            raise self._broken(what, error) from error
 
     def close(self) -> None:
         """Close the connection and its context."""
@@ -132,22 +132,24 @@ class ZmqConnection:
         try:
             self._socket.send_multipart([b"", message])
         except zmq.Again as error:
-            raise ControllerLost(f"the connection was lost before {what}", where=self._address) from error
+            raise self._lost(f"the connection was lost before {what}") from error
 
     def _await_reply(self, what: str, until_s: float) -> None:
         left_s = until_s - self._monotonic_s()
         if left_s <= 0.0 or not self._socket.poll(math.ceil(left_s * 1000.0)):
-            message = f"no reply to {what} within {self._timeout_s:g} s"
-            raise ControllerLost(message, where=self._address, hint=self._hints[2])
+            raise self._lost(f"no reply to {what} within {self._timeout_s:g} s", self._hints[2])
 
     def _taken(self, traced: TracedAnswer) -> bytes:
         frames = self._socket.recv_multipart()
         if len(frames) != 2 or frames[0]:
-            raise ControllerLost(f"the controller sent a reply of {len(frames)} frames", where=self._address)
+            raise self._lost(f"the controller sent a reply of {len(frames)} frames")
         traced.add(frames[1])
         traced.is_whole = True
         return frames[1]
 
-    def _lost(self, what: str, error: zmq.ZMQError) -> ControllerLost:
+    def _broken(self, what: str, error: zmq.ZMQError) -> ControllerLost:
+        return self._lost(f"the connection was lost at {what}: {error}")
+
+    def _lost(self, why: str, hint: str = "") -> ControllerLost:
         self.close()
-        return ControllerLost(f"the connection was lost at {what}: {error}", where=self._address)
+        return ControllerLost(why, where=self._address, hint=hint)

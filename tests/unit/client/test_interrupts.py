@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from tests.unit.client.client_lab import REGION, SCAN_S, Lab
@@ -120,3 +121,17 @@ def test_a_program_that_handles_ctrl_c_itself_is_left_alone(lab: Lab, scope: Sco
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     assert heard == [signal.SIGINT]
+
+
+def test_interrupt_between_two_waits_of_a_thread_is_heeded(lab: Lab, scope: Scope) -> None:
+    def wait_twice() -> None:
+        interrupts = scope._link.interrupts
+        with interrupts.heeded():
+            with interrupts.heeded():
+                pass
+            scope.interrupt()
+            with interrupts.heeded():
+                interrupts.heed()
+
+    with ThreadPoolExecutor(1) as thread, pytest.raises(KeyboardInterrupt):
+        thread.submit(wait_twice).result()

@@ -72,6 +72,17 @@ def test_file_appears_late(scope: Simulator, fake_clock: Any) -> None:
     assert Path(result).exists()
 
 
+@pytest.mark.parametrize("scope", [{"kind": "late-file", "count": 2, "duration_s": 60.0}], indirect=True)
+def test_each_of_several_late_files_appears(scope: Simulator, fake_clock: Any) -> None:
+    for _ in range(2):
+        assert scanned(scope, fake_clock) is FREE
+    results = [Path(result) for result in scope.results()]
+    assert [result.exists() for result in results] == [False, False]
+    fake_clock.t_s += 60.0
+    assert scope.status().state is FREE
+    assert [result.exists() for result in results] == [True, True]
+
+
 @pytest.mark.parametrize("scope", [{"kind": "restart", "at_s": 2.0, "duration_s": 10.0}], indirect=True)
 def test_controller_is_lost_for_a_while_and_its_scan_goes_on(scope: Simulator, fake_clock: Any) -> None:
     scope.start_scan()

@@ -54,3 +54,15 @@ def test_address_without_a_listener_is_reported() -> None:
 def test_invalid_address_is_reported() -> None:
     with pytest.raises(ConfigError, match="is not an address"):
         ZmqConnection("nonsense", 5.0, time.monotonic, HINTS)
+
+
+def test_reply_of_several_frames_closes_the_connection(controller: zmq.Socket[bytes]) -> None:
+    connection = ZmqConnection(address(controller), 5.0, time.monotonic, HINTS)
+    connection.begin("a scan", b"scan")
+    who, *_ = controller.recv_multipart()
+    controller.send_multipart([who, b"", b"one", b"two"])
+    connection.wait(5.0)
+    with pytest.raises(ControllerLost, match="3 frames"):
+        connection.reply("a scan")
+    with pytest.raises(ControllerLost, match="was lost"):
+        connection.begin("another", b"scan")

@@ -341,23 +341,23 @@ class SavedFiles:
             write_atomic(path, [content])
         else:
             write_atomic(_hidden(path), [content])
-            self._kept["late"] = [str(path), end_s + late.duration_s]
+            self._kept["late"] = [*self._kept.get("late", []), [end_s + late.duration_s, str(path)]]
         if half is not None:
             path.write_bytes(content[: len(content) // 2])
         self._kept["results"] = [*self._kept["results"], str(path)][-LISTED_RESULTS:]
 
     def whole_s(self) -> float | None:
-        """Return the time at which a late or incomplete file becomes complete, or None."""
-        late = self._kept.get("late")
-        return None if late is None else float(late[1])
+        """Return the time at which the next late or incomplete file becomes complete, or None."""
+        return min((float(at_s) for at_s, _ in self._kept.get("late", [])), default=None)
 
     def complete(self) -> None:
-        """Put the whole late or incomplete file in its place.
+        """Put the next late or incomplete file, whole, in its place.
 
         Raises:
             FileError: the file can't be moved.
         """
-        path = Path(self._kept.pop("late")[0])
+        (_, name), *later = sorted(self._kept["late"])
+        self._kept["late"], path = later, Path(name)
         try:
             _hidden(path).replace(path)
         except OSError as error:
