@@ -172,9 +172,13 @@ class Lab:
     def connect(self) -> None:
         self._inbox.append(ControlConnected())
 
+    def wake_up(self) -> None:
+        """End the present `poll`."""
+        self._is_woken = True
+
     def ctrl_c(self) -> None:
         """Interrupt as the user does, which ends the present `poll`."""
-        self._is_woken = True
+        self.wake_up()
         signal.raise_signal(signal.SIGINT)
 
     def disconnect(self) -> None:
@@ -384,7 +388,8 @@ class LabPort:
         self._lab.close()
 
     def wake_up(self, incoming: Incoming | None = None) -> None:
-        raise NotImplementedError
+        assert incoming is None
+        self._lab.wake_up()
 
     def wakeup_fileno(self) -> int:
         return -1
