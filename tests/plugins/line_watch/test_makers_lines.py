@@ -11,6 +11,7 @@ import pytest
 from tests.plugins.gxsm.gxsm_bench import Bench as GxsmBench
 from tests.plugins.line_watch.test_line_watch import flags, verdicts
 from tests.plugins.nanonis.nanonis_bench import Bench as NanonisBench
+from tests.plugins.nanosurf.nanosurf_bench import Bench as NanosurfBench
 from tests.plugins.vendor_bench import VendorBench, benches, ready
 from tests.unit.client.client_lab import Lab, run
 
@@ -29,11 +30,14 @@ class Maker(NamedTuple):
     bench: type[VendorBench[Any]]
     channels: tuple[str, str]
     emulator: Mapping[str, Any] = {}
+    settings: Mapping[str, Any] = {}
 
 
 MAKERS = {
     "nanonis": Maker(NanonisBench, ("Z Forward", "Z Backward")),
-    "gxsm": Maker(GxsmBench, ("Topo", "Topo Backward"), {"version": 3}),
+    "gxsm3": Maker(GxsmBench, ("Topo", "Topo Backward"), {"version": 3}),
+    "gxsm4": Maker(GxsmBench, ("ZS-Topo", "ZS-Topo Backward"), {"version": 4}),
+    "nanosurf": Maker(NanosurfBench, ("Height Forward", "Height Backward"), settings={"image_buffer": 4410}),
 }
 
 
@@ -53,7 +57,7 @@ def test_changed_tip_stops_the_scan_of_a_maker_and_a_good_scan_goes_on(
     maker: Maker, bench: Callable[..., VendorBench[Any]]
 ) -> None:
     made = bench(speed=20.0, surface={"kind": "particles"}, **maker.emulator)
-    peer = made.start(live_lines_s=1.0)
+    peer = made.start(live_lines_s=1.0, **maker.settings)
     ready(peer, REGION, SHAPE)
     assert peer.set(names.SCAN_SPEED, 3, "um/s").ok
 
