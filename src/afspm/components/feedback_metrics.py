@@ -54,7 +54,7 @@ class FeedbackError:
 
     @property
     def share(self) -> float:
-        """Share of the pixels beyond the threshold."""
+        """Share of the pixels beyond the threshold, on either side of the setpoint."""
         return self.over + self.under
 
     def __str__(self) -> str:
@@ -107,13 +107,14 @@ def feedback_error(error: Array, threshold: float, height_m: Array | None = None
 
     A loop that lags leaves in the error the relief that is missing in the height. Compared in metres, this ratio is the
     same for every sample, speed and noise, since white noise has no correlation from pixel to pixel. A loop that
-    oscillates moves height and error together; a lagging loop moves the height by the sum of the error.
+    oscillates moves height and error together; a lagging loop moves the height by the sum of the error. Without
+    heights, with a gap of 0, or with too few complete rows, `missed` and `swing` are 0.
 
     Args:
         error: result of `relative_error`, [y, x].
-        threshold: the threshold of the relative error.
+        threshold: relative error above which a pixel counts in `over` or `under`.
         height_m: the heights of the same pixels; None if unknown.
-        gap_m: excess height of the tip at a relative error of one.
+        gap_m: excess height of the tip at a relative error of one, in m; 0 if unknown.
     """
     there = error[np.isfinite(error)]
     over, under = float(np.mean(there > threshold)), float(np.mean(there < -threshold))

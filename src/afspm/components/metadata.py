@@ -1,4 +1,4 @@
-"""`Metadata`: a table of all measurements, with facts that the microscope's files lack: the holder of control."""
+"""`Metadata`: a table of all measurements, with facts that measurement files lack (control, problems)."""
 
 from __future__ import annotations
 

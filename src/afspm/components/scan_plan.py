@@ -75,7 +75,7 @@ class ScanPlan:
 class RoundSchedule:
     """Due times of the rounds of a plan: multiples of a period after the start, in experiment time.
 
-    A round is missed if its time passes while another round is taken or waits for a tip repair; the next one is due
+    A round is missed if its time passes while another round is taken or waits for a tip repair; the next round is due
     at the next multiple.
 
     Attributes:
@@ -91,7 +91,7 @@ class RoundSchedule:
             raise InvalidValue(f"a period of {self.period_s} s")
 
     def next_due_s(self, done_s: float | None) -> float:
-        """Return when the next round is due after a round that ended at `done_s`; None: no round has ended yet."""
+        """Return the due time after a round that ended at `done_s` (None: no round yet); `start_s` without a period."""
         if done_s is None or self.period_s == 0.0:
             return self.start_s
         beats = math.floor((done_s - self.start_s) / self.period_s) + 1
@@ -102,7 +102,7 @@ class RoundSchedule:
         return max(0, round((next_due_s - due_s) / self.period_s) - 1) if self.period_s else 0
 
     def too_slow_for(self, left_out: int, pace_s: float) -> int:
-        """Return how many of these rounds were missed because a round takes `pace_s`, longer than the period."""
+        """Return the number of left-out rounds that a round of length `pace_s`, longer than the period, explains."""
         return min(left_out, max(0, math.ceil(pace_s / self.period_s - 1e-9) - 1)) if self.period_s else 0
 
 
@@ -118,7 +118,7 @@ class PlanRest:
     last: int
 
     def since(self, row: int, *, downwards: bool) -> PlanRest:
-        """Return the rows from a row of this part on, with a few rows of overlap before it.
+        """Return the rows still to be taken from a row of this part on, with REST_OVERLAP; at least FEWEST_ROWS.
 
         Args:
             row: index in this part.
@@ -130,7 +130,7 @@ class PlanRest:
         return PlanRest(max(self.first, min(at - REST_OVERLAP, self.last - FEWEST_ROWS + 1)), self.last)
 
     def of(self, step: PlanStep) -> PlanStep:
-        """Return the step that measures only these rows, under its own key."""
+        """Return the step that measures only these rows, under its own key; the step itself if all rows are left."""
         rows, columns = step.shape or (0, 0)
         if (self.first, self.last) == (0, rows - 1):
             return step

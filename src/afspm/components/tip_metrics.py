@@ -88,7 +88,7 @@ def slopes(trace: Array, retrace: Array | None = None) -> Slopes:
 
 
 def autocorrelation(of: Slopes, reach_px: int) -> Array:
-    """Return the autocorrelation of the slopes, 1 at zero lag.
+    """Return the autocorrelation of the slopes, 1 at the peak near zero lag.
 
     Returns:
         Lags of 0 … reach rows by -reach … reach columns; the other half is the same by symmetry.
