@@ -30,7 +30,7 @@ class MicroscopeCapabilities:
     table: ParameterTable
 
     def refuses(self, parameter: Parameter) -> str:
-        """Return why the microscope would refuse a value; empty for a valid value or an unknown parameter."""
+        """Return the reason of the microscope to refuse a value; empty for a valid value or an unknown parameter."""
         if parameter.name not in self.table or parameter.value is None:
             return ""
         try:

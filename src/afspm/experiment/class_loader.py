@@ -113,7 +113,7 @@ def load(path: str) -> Any:
     """Return the object `module.Name`.
 
     Raises:
-        Unloadable: no such module or name, or its import fails.
+        Unloadable: `path` has no dot, there is no such module or name, or its import fails.
     """
     module_name, _, name = path.rpartition(".")
     if not module_name or not name:

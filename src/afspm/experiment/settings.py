@@ -38,7 +38,7 @@ def check(
     given: Collection[str] = (),
     wrong: set[str] | None = None,
 ) -> Settings:
-    """Return the settings for the process: validated, in SI units, of JSON's types. Reports errors.
+    """Return the settings for the process: validated, in SI units, of JSON's types; report errors.
 
     Args:
         given: parameters that the table must not set.

@@ -182,7 +182,7 @@ def check_listens_to(resolved: ResolvedExperiment) -> None:
 
 
 def check_problems(resolved: ResolvedExperiment) -> None:
-    """Require that all problems exist, and that each problem that is flagged is also solved, or ends the experiment."""
+    """Require that all problems exist, and each flagged problem is solved (also by hand) or ends the experiment."""
     control = resolved.sections.control
     by_hand = (*control.solved_by_hand, *control.end_on)
     solvers = (problem for process in resolved.processes.values() for problem in process.declared.solves)
