@@ -219,7 +219,7 @@ def previous_generation(path: Path) -> Path:
 
 
 class CheckpointFile:
-    """A small text, saved too often to wait for the disk, that survives a power cut.
+    """A file for a small state that is saved often, without waiting for the disk, and survives a power cut.
 
     Each generation is an appended line, which takes ten microseconds: a twentieth of a replacement of the file. The
     file is replaced only at `longest` bytes. The last line survives a kill of any process, and a moment later a power
@@ -239,7 +239,7 @@ class CheckpointFile:
         self._thread: threading.Thread | None = None
 
     def save(self, content: bytes) -> None:
-        """Add a generation: a text without line breaks and without a valid prefix.
+        """Add a generation: a text without line breaks, no beginning of which is valid (a power cut may cut it).
 
         Raises:
             FileError: the text can't be written.
@@ -311,16 +311,17 @@ def _is_there(file: io.FileIO) -> bool:
 
 
 def load_checkpoint(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, str]:
-    """Return the last generation in a file of `CheckpointFile`; None if there is no such file.
+    """Return the last readable generation in a file of `CheckpointFile`, and the damage of the last.
 
     Args:
         read: converts a generation; raises ValueError, KeyError or TypeError for a damaged one.
 
     Returns:
-        The converted generation; and the damage of the last generation if an earlier one was read, else "".
+        The converted generation, None if there is no file; and the damage of the last generation if an earlier
+        generation was read, else "".
 
     Raises:
-        FileError: no generation can be read, or the folder does not exist.
+        FileError: no generation can be read, or neither the folder nor its parent exists.
     """
     try:
         generations = path.read_bytes().splitlines() or [b""]

@@ -27,10 +27,10 @@ COMMITTED_FILE = "recorded"
 """File in the log's folder with the committed position, if there is a recorder."""
 SEGMENT_BYTES = 16 << 20
 CAPACITY_BYTES = 64 << 20
-"""Smallest size of the log; it is also never smaller than twice the cached packets."""
+"""Size up to which no segment is freed; twice the size of the cached packets, if that is larger."""
 MOST_UNRECORDED_BYTES = 1 << 30
 SPARE_BYTES = 256 << 20
-"""Bytes kept in spare files, enough for a flood of packets until it is recorded."""
+"""Largest size of all spare files together, enough for a flood of packets until it is recorded."""
 SYNCED_WITHIN_S = 5.0
 _SPARE_SUFFIX = ".spare"
 
@@ -50,10 +50,11 @@ class PacketLog:
 
     Args:
         folder: created with the first packet.
-        most_unrecorded_bytes: most bytes that wait for the recorder; beyond that the oldest packets are dropped.
+        most_unrecorded_bytes: bytes by which packets that wait for the recorder may enlarge the log; beyond that the
+            oldest packets are dropped.
 
     Attributes:
-        has_grown: a segment was filled since the last `clean`.
+        has_grown: whether a segment was filled since the last `clean`; True before the first `clean`.
     """
 
     def __init__(self, folder: Path, *, most_unrecorded_bytes: int = MOST_UNRECORDED_BYTES) -> None:
@@ -88,7 +89,7 @@ class PacketLog:
         """Free the oldest segments while the log is too large; packets in `cached` stay in the log.
 
         Returns:
-            False if packets were given up before they were recorded.
+            False if packets were dropped before they were recorded.
 
         Raises:
             OSError: the disk is full, or does not sync.
@@ -247,7 +248,11 @@ def committed(folder: Path) -> Position | None:
 
 
 def discard_if_recorded(folder: Path) -> None:
-    """Remove the log of an ended experiment if all of it is recorded."""
+    """Remove the log of an ended experiment, unless a recorder has not recorded all of it yet.
+
+    Raises:
+        OSError: the log can't be read.
+    """
     position = committed(folder)
     if position is not None and LogReader(folder, position).read(1):
         return

@@ -16,7 +16,7 @@ _TOPOGRAPHY = ("height", "zsensor", "topo", "zs-topo", "z")
 
 
 class OtherFormat(FileError):
-    """A file of another format with the same suffix; the next reader of the suffix is tried."""
+    """The error that a file has another format with the same suffix; the next reader of the suffix is tried."""
 
     code = "file-format"
 
@@ -48,7 +48,7 @@ class FileContent:
 
     @property
     def topography(self) -> Scan | None:
-        """Return the first scan of heights; None if there is none."""
+        """The scan of heights, by a usual name of its channel, or the only scan if in m; None if there is none."""
         heights = [scan for scan in self.scans if scan.unit == "m"]
         for start in _TOPOGRAPHY:
             for scan in heights:
