@@ -32,7 +32,7 @@ TRIES = 200
 CAN_HOLD = sys.platform == "linux"
 """Whether a port can be held for a child: other systems let no second process bind a held port."""
 LONGEST_FOLDER = 90
-"""Limit on the path of a folder of sockets, in bytes. macOS has the lowest limit for a socket's path: 103."""
+"""Limit on the path in which a folder of sockets is made, in bytes. macOS has the lowest limit for a socket: 103."""
 # limits the open descriptors of a process that chooses ports for many runs
 _MOST_HELD = 256
 _TCP = re.compile(r"tcp://(\*|[^:/\s]+|\[[0-9A-Fa-f:.]+\]):([1-9]\d*)")

@@ -74,7 +74,7 @@ class RunEnd:
     Attributes:
         ask_s, kill_s: when to ask and to kill, in real monotonic time.
         latest_s: deadline for busy processes; then they are asked to end.
-        last: the last step taken.
+        last: the last step taken; None before the first.
         in_haste: whether a person has asked to end the run at once.
         busy_s: time at which a process was last busy after the request to end.
         began_s: time at which the end began.
@@ -189,7 +189,7 @@ class IdleWatch:
     starts: int = 0
 
     def look(self, children: Collection[SupervisedChild], now_s: float, liveness: LivenessPolicy) -> bool:
-        """Return whether the run has been idle for IDLE_AFTER_S."""
+        """Return whether the run has been idle for IDLE_AFTER_S, or is ending because it was idle."""
         acting = [child for child in children if child.spec.acts]
         starts_before, self.starts = self.starts, sum(child.starts for child in children)
         if not acting or not all(child.is_over for child in acting):
@@ -219,7 +219,7 @@ class IdleWatch:
 
 
 def describe_idle(children: Collection[SupervisedChild]) -> str:
-    """Return why nothing is left to run, as in "series is done, grid was given up"."""
+    """Return the outcomes of all components with plans, as in "series is done, grid was given up"."""
     acting = [child for child in children if child.spec.acts]
     return ", ".join(f"{child.spec.name} {'was given up' if child.given_up else 'is done'}" for child in acting)
 

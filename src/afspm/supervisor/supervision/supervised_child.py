@@ -112,7 +112,7 @@ class SupervisedChild:
         starts, ordered: number of starts, and number of restarts ordered by a person.
         rescued: whether it was started once more after the end of the experiment.
         last_exit: description of its last exit.
-        unfinished: the stop before it had finished as text; empty if it had finished.
+        unfinished: description of a stop that came before it had finished; otherwise empty.
     """
 
     spec: ChildSpec
