@@ -17,7 +17,7 @@ MESSAGE = "FeedbackAnalysis"
 class FeedbackAnalysis(FeedbackObserver):
     """A component that publishes a `FeedbackAnalysis` after each scan: the shares of pixels with too large an error.
 
-    The component flags `feedback-non-optimal` after several scans in a row beyond the limits. It clears the flag after
+    The component flags `feedback-non-optimal` after several scans in a row beyond the limits. The flag is cleared after
     scans within half of the limits; while another component has control to solve the problem, only that component
     clears the flag. A flag that was cleared although the feedback is still bad is set again only after a scan within
     the limits. Scans with the feedback off are skipped.

@@ -149,8 +149,8 @@ def gain_search(
 
     Args:
         start: within the bounds.
-        factor: the factor of one step, above 1. Between a gain that is too low and one that is too high the steps get
-            smaller.
+        factor: the factor of one step, above 1. Between a gain that is too low and a gain that is too high the steps
+            get smaller.
         lowest, highest: bounds of the gain.
         most_tries: limit on the number of gains.
     """

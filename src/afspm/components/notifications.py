@@ -68,8 +68,8 @@ class Targets:
 
     Attributes:
         command: program and arguments; it gets the JSON on its standard input.
-        webhook: address for a POST of the JSON, or "$NAME" of the environment variable that holds it. It may be a
-            secret: logs name only its host.
+        webhook: address for a POST of the JSON, or "$NAME" of the environment variable that holds it. The address may
+            be a secret: logs name only its host.
         folder: working directory of the command.
     """
 

@@ -32,12 +32,12 @@ LAST_TRIES = 2  # the end of the experiment does not wait for more
 
 
 class Notifier(Component):
-    """Calls of a command or a webhook when a problem stays unsolved, or a process is given up or logs CRITICAL.
+    """Notifications by command or webhook: a problem stays unsolved, a process is given up or logs CRITICAL.
 
-    [notify] of the experiment file adds this component to an experiment. It only subscribes, and delays no other
-    process. A failed delivery is retried at growing intervals, for about 25 minutes; retries continue after a restart.
-    A notification is sent again only if the process is killed between its delivery and the save of the delivery. The
-    end of the experiment is reported by `afspm run` itself, which knows the reason of the end.
+    [notify] of the experiment file adds this component to an experiment. The component only subscribes, and delays no
+    other process. A failed delivery is retried at growing intervals, for about 25 minutes; retries continue after a
+    restart. A notification may arrive twice if the answer of the webhook is lost, or if this process is killed right
+    after the delivery. The end of the experiment is reported by `afspm run` itself, which knows the reason of the end.
 
     Args:
         program: a command with arguments, run in the experiment file's folder; the JSON is on its standard input.

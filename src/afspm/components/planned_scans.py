@@ -299,7 +299,7 @@ class ScanList(PlannedScans):
 
 
 class RegionGrid(PlannedScans):
-    """A region at each point of a grid, back and forth row by row: a map larger than one scan, or samples of it.
+    """A region at each point of a grid, back and forth row by row, for a map larger than a scan.
 
     Args:
         size: (width, height) of each region.

@@ -50,7 +50,7 @@ class RecordWriter:
 
     Args:
         folder: the folder of the run.
-        log: folder of the packet log; without one, all packets are given by `put`.
+        log: folder of the packet log; without a log, all packets are given by `put`.
         step: context manager entered around every slow operation.
         wake: called when the result of `check` or `wants_replay` may have changed.
     """
@@ -95,7 +95,7 @@ class RecordWriter:
         return self._inbox.wants_replay()
 
     def check(self) -> None:
-        """Raise the error that ended the writing, if there is one."""
+        """Raise the error that ended the writing, if any."""
         if self._error is not None:
             raise self._error
 

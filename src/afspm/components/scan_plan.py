@@ -146,11 +146,14 @@ class PlanRest:
 
 
 def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad: float = 0.0) -> tuple[XY, ...]:
-    """Return the points of a grid about a centre, from the row of smallest y on; every other row runs backwards.
+    """Return the points of a grid about a centre, back and forth, from the row of smallest y on.
 
     Args:
         counts: (columns, rows).
         spacing_m: (x, y) between neighbours, along the axes of the rotated grid.
+
+    Raises:
+        InvalidValue: the grid is empty, or a needed spacing is not above zero.
     """
     columns, rows = counts
     if columns < 1 or rows < 1:
@@ -173,7 +176,11 @@ def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad
 
 
 def rounds_within(duration_s: float, period_s: float) -> int:
-    """Return the number of rounds that start within a duration; the first starts at once."""
+    """Return the number of rounds that start within a duration; the first starts at once.
+
+    Raises:
+        InvalidValue: there is no period.
+    """
     if period_s <= 0.0:
         raise InvalidValue("a series with a duration needs a period", hint='e.g. every = "15 min"')
     return math.floor(duration_s / period_s * (1 + 1e-12)) + 1

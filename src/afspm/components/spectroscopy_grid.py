@@ -1,4 +1,4 @@
-"""Spectra on a grid or a list of positions, each taken exactly once."""
+"""Spectra on a grid or a list of positions. A restart repeats no spectrum."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOST_LINES = 20
 
 
 class SpectroscopyGrid(Component):
-    """A spectrum at each point of a grid, back and forth row by row, or at each position of a list.
+    """A spectrum at each point of a grid, back and forth by rows, or at each position of a list.
 
     A restart after a kill neither repeats nor omits a spectrum.
 

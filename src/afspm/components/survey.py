@@ -28,7 +28,7 @@ from afspm.transport.process.loading import find_object
 
 MAPPING = "DriftMapping"
 LEAST_ZOOM_PX = 20
-"""Least width of a zoom in pixels of the survey: narrower zooms are often not registered, and below 8 px never."""
+"""Least width of a zoom in pixels of the survey: narrower zooms are often not registered, below 8 px never."""
 USUAL_PX, MOST_PX, _STEP_PX = 128, 512, 16
 
 

@@ -42,7 +42,7 @@ class Sweep(Component):
         size: (width, height) of the scans; by default the present region.
         center: (x, y) of the middle of the scans; (0, 0) if not given.
         angle: angle of the scans, counter-clockwise; 0 if not given.
-        pixels: (columns, rows) of the scans; by default the present ones.
+        pixels: (columns, rows) of the scans; by default the present numbers.
         at: (x, y) of the spectra; by default where the probe stands.
         kind: kind of the spectra, where the microscope can choose, e.g. "IV" or "force".
         end_when_done: whether to end the whole experiment after the last point.

@@ -38,20 +38,20 @@ class TipCorrector(Component):
     After each treatment it takes a test scan, and up to two more if the verdict is unclear. Test scans have the region
     and pixels of the scan last judged good or bad, if bad, since the fault was seen there; otherwise the current
     region. A component that judges scans (the `TipClassifier`) clears the flag when the tip is good, which takes
-    control from the corrector: the experiment goes on. With policy = "list", one repair makes each listed treatment
-    once at most, also over restarts; a treatment that a limit of the experiment file or the microscope refuses is
+    control from the corrector: the experiment goes on. With policy = "list", one repair tries each listed treatment
+    once, also over restarts; a treatment that a limit of the experiment file or the microscope refuses is
     logged and left out. After the last treatment the corrector flags `device-malfunction` and waits for a person: the
     experiment stops measuring rather than measure with a bad tip. Once one of the two flags is cleared, the corrector
     may repair again.
 
     Treatments are made at fresh places about `workshop_center`, never within `keep_away` of the experiment's region or
-    of the test scan. If control is lost on the way to a place (to a person who moves the probe, say), it continues with
-    another place when it has control again. It makes no treatment unless the probe's published position is the place,
-    nor a treatment that can't be saved, on a full disk: a restart would repeat it. Each treatment made is published as
-    an `ActionMsg`.
+    of the test scan. If control is lost on the way to a place (to a person who moves the probe, say), the corrector
+    continues with another place when it has control again. It makes no treatment unless the probe's published position
+    is the place, nor a treatment that can't be saved, on a full disk: a restart would repeat it. Each treatment made is
+    published as an `ActionMsg`.
 
     With policy = "learn" it chooses each treatment by its experience with the flaw in the scans: blunt, double or
-    contaminated. It counts the outcomes, and keeps them in a file for the next nights.
+    contaminated. The corrector counts the outcomes, and keeps the counts in a file for the next nights.
 
     Args:
         workshop_center: (x, y) about which pulses and crashes are made.

@@ -3,7 +3,7 @@
 **Theory of operation.** For each flaw and treatment, `TipExperience` counts how often the treatment cured the tip,
 worsened it, or did nothing. The next treatment is chosen by Thompson sampling: a probability of each outcome is drawn
 from the counts, and the treatment with the shortest expected repair under this draw is taken. So a treatment is tried
-the more often the more likely it is the best, and a new one is tried now and then.
+the more often the more likely it is the best, and a new treatment is tried now and then.
 
 The counts of a night, weakened, become the prior of the next night, since the tip may then answer otherwise. Within a
 night the weight of old outcomes falls with each new one, and a run of failures that the counts call improbable weakens

@@ -83,7 +83,7 @@ class TipTolerance:
         ghost: at a known place, the largest correlation of a ghost image.
         unrest: factor on the disagreement of trace and retrace.
         worn: at any place, the least share of the first scans' fine detail.
-        sigmas: number of standard deviations of the reference by which a bad scan must also differ; not for `worn`.
+        sigmas: least deviation of a bad scan, in standard deviations of the reference; not for `worn`.
         margin: a scan within this share of the way to a limit is good; between it and the limit it is unclear,
             so that the opinion on a tip at the limit does not alternate.
     """

@@ -43,7 +43,7 @@ def treatments(
     crash_depths_m: Sequence[float],
     crash_speed_m_per_s: float,
 ) -> tuple[Treatment, ...]:
-    """Return the treatments of one repair, gentle ones first: pulses as listed, then crashes as listed.
+    """Return the treatments of one repair: pulses as listed, then crashes as listed.
 
     Raises:
         ConfigError: no treatment is listed, or a value is invalid.

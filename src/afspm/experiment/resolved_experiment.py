@@ -47,7 +47,7 @@ class ResolvedProcess:
 
     @property
     def acts(self) -> bool:
-        """Whether the process has a plan of its own: its class has a `run` and solves no problems; True if unknown."""
+        """Whether the process has a plan of its own: a `run`, and no problems to solve; True if unknown."""
         if self.component is None or not issubclass(self.component, Component):
             return self.component is None
         return self.component.run is not Component.run and not self.declared.solves

@@ -60,7 +60,7 @@ def wire_of(table: object) -> WiringClass | None:
 
 @dataclass(frozen=True)
 class BoundSocket:
-    """A socket that a process binds; `address` is given in the file under `key`, None if the file leaves it open."""
+    """A socket that a process binds; `address` is the file's value of `key`, None if the address is open."""
 
     owner: str
     use: str

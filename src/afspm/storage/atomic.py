@@ -239,7 +239,7 @@ class CheckpointFile:
         self._thread: threading.Thread | None = None
 
     def save(self, content: bytes) -> None:
-        """Add a generation: a text without line breaks, no beginning of which is valid (a power cut may cut it).
+        """Add a generation: a text without line breaks, whose beginning alone is never valid (a power cut may cut it).
 
         Raises:
             FileError: the text can't be written.
@@ -314,7 +314,7 @@ def load_checkpoint(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, s
     """Return the last readable generation in a file of `CheckpointFile`, and the damage of the last.
 
     Args:
-        read: converts a generation; raises ValueError, KeyError or TypeError for a damaged one.
+        read: converts a generation; raises ValueError, KeyError or TypeError for a damaged generation.
 
     Returns:
         The converted generation, None if there is no file; and the damage of the last generation if an earlier

@@ -1,8 +1,9 @@
 """The packet log: every published packet of the scheduler, appended before its publication.
 
-It is the only source of truth of a run. A restarted scheduler reads its cache from it, the recorder follows it, and the
-record (HDF5 files and an SQLite journal) derives from it. An appended packet goes to the system at once, so that it
-survives a kill of all processes; a moment later it is on the disk, and survives a power cut (see `disk`).
+The log is the only source of truth about these packets. A restarted scheduler reads its cache from it, the recorder
+follows it, and the record (HDF5 files and an SQLite journal) derives from it. An appended packet goes to the system at
+once, so that it survives a kill of all processes; a moment later it is on the disk, and survives a power cut (see
+`disk`).
 
 The log is bounded. The recorder commits the position up to which all packets are in the record and on the disk.
 Segments before it are overwritten, after the packets that the scheduler still caches have been appended again.
@@ -50,8 +51,8 @@ class PacketLog:
 
     Args:
         folder: created with the first packet.
-        most_unrecorded_bytes: bytes by which packets that wait for the recorder may enlarge the log; beyond that the
-            oldest packets are dropped.
+        most_unrecorded_bytes: largest growth of the log above its usual size while packets wait for the recorder; above
+            it the oldest packets are dropped.
 
     Attributes:
         has_grown: whether a segment was filled since the last `clean`; True before the first `clean`.

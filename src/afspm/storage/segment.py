@@ -6,7 +6,7 @@ results of components are kept in the same form, in files with the number 0. The
 of its 64-bit words, which takes a hundredth of the time of sending them.
 
 Overwriting an old file takes a fraction of the time of a new file. The number of the file, new each time, distinguishes
-new packets from remains of old ones; the checksum detects an incomplete packet after a kill or power cut.
+new packets from remains of old packets; the checksum detects an incomplete packet after a kill or power cut.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ _CHUNK = 1 << 16
 
 
 def main(arguments: list[str]) -> int:
-    """Run the command and return its exit code (128 + n for signal n, as shells do); CONFIG if it can't start."""
+    """Run the command; return its exit code (128 + n for signal n, as shells do), CONFIG if it can't start."""
     command = arguments[1:] if arguments[:1] == ["--"] else arguments
     if not command:
         sys.stderr.write("ERROR foreign: no command given\n")

@@ -1,7 +1,7 @@
 """Addresses for sockets that the experiment file leaves open: unix sockets in one folder, or free ports.
 
-Only the user who runs the experiment can enter the folder (mode 0700, independent of umask). It is not the run's
-folder: the path of a unix socket has at most 107 bytes, and run folders are deep, and sometimes on a network disk.
+Only the user who runs the experiment can enter the folder (mode 0700, independent of umask). The run's folder is
+not used: the path of a unix socket has at most 107 bytes, and run folders are deep, and sometimes on a network disk.
 """
 
 from __future__ import annotations

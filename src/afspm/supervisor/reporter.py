@@ -272,7 +272,7 @@ class Reporter:
 
 
 class _OpenRequest:
-    """The request whose answer is awaited; there is at most one."""
+    """The single request whose answer is awaited."""
 
     def __init__(self, name: str, run: str) -> None:
         self.connected = self.answered = False

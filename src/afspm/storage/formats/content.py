@@ -48,7 +48,7 @@ class FileContent:
 
     @property
     def topography(self) -> Scan | None:
-        """The scan of heights, by a usual name of its channel, or the only scan if in m; None if there is none."""
+        """The scan in m with a usual name of a height channel, else the only scan if in m; None without any."""
         heights = [scan for scan in self.scans if scan.unit == "m"]
         for start in _TOPOGRAPHY:
             for scan in heights:

@@ -10,8 +10,9 @@ from afspm.supervisor.supervision.child import ChildWatch, HeartbeatReport
 from afspm.supervisor.supervision.liveness import LivenessPolicy
 
 LATE_START_S = 15.0
-"""Real time allowed for a process that restarts during the end: for its first heartbeat, unless the process is seen to
-work, and then for the packets that it missed."""
+"""Real time for a process that restarts during the end to send its first heartbeat, and then to receive missed packets.
+
+A process that is seen to work before its first heartbeat may take longer."""
 CLOSES_WITHIN_S = 1.5
 """Processor time that a process may use to end, after the request to end."""
 
