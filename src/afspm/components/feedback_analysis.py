@@ -1,4 +1,4 @@
-"""`FeedbackAnalysis`: the judge of how well the feedback follows; it flags a problem if the feedback is bad."""
+"""`FeedbackAnalysis`: the judge of the z feedback in scans, which flags a problem if the feedback is bad."""
 
 from __future__ import annotations
 

@@ -83,8 +83,8 @@ def relative_error(signal: Array, setpoint: float | None, exponential: bool) -> 
 
     Args:
         signal: the signal that the feedback holds at the setpoint, such as the amplitude; NaN where not measured.
-        setpoint: the setpoint in the same unit; None: the signal's median, which equals it unless the feedback is far
-            off.
+        setpoint: the setpoint in the same unit; None: the signal's median, which is close to the setpoint unless
+            the feedback is far off.
         exponential: whether the signal falls exponentially with the distance, as a tunnelling current of either sign
             does: then its logarithm is compared.
 
@@ -142,10 +142,10 @@ def _smooth_variance(values: Array) -> float:
 def gain_search(
     start: float, factor: float, lowest: float, highest: float, most_tries: int
 ) -> Generator[float, FeedbackQuality | None, float | None]:
-    """Search for a gain at which the feedback follows well: raise it while too slow, lower it while oscillating.
+    """Search for a gain at which the feedback follows well: higher while too slow, lower while oscillating.
 
-    Yields gains to try, `start` first; send it the quality at each, or None if the gain was refused. Returns the gain
-    to keep, or None if no gain was good.
+    Yields gains to try, `start` first. The caller sends the quality at each gain, or None if the gain was refused. The
+    returned value is the gain to keep, or None if no gain was good.
 
     Args:
         start: within the bounds.

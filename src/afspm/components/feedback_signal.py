@@ -88,7 +88,7 @@ class FeedbackSignal:
 
 
 class FeedbackObserver(Component):
-    """Base of components that judge scans by how well the feedback followed.
+    """Base of components that judge the feedback by its error signal in scans.
 
     Args:
         channel: the signal that the feedback holds at the setpoint, in a unit that fits the setpoint's.

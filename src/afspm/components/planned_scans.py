@@ -227,7 +227,7 @@ class PlannedScans(Component):
 class ScanSeries(PlannedScans):
     """The same region again and again, with a period, for a number of scans or a duration.
 
-    With neither `scans` nor `duration` it continues until another component or a person ends the experiment.
+    With neither `scans` nor `duration` the series continues until another component or a person ends the experiment.
 
     Args:
         size: (width, height) of the region, e.g. ["2 um", "2 um"].
@@ -331,7 +331,7 @@ class RegionGrid(PlannedScans):
 
 
 def pair(values: Sequence[float]) -> XY:
-    """Return a pair of numbers as a tuple; JSON delivers it as a list."""
+    """Return two numbers as a tuple (JSON delivers a list). Raises InvalidValue for another length."""
     if len(values) != 2:
         raise InvalidValue(f"{list(values)!r} is not a pair of x and y")
     return float(values[0]), float(values[1])

@@ -1,4 +1,4 @@
-"""`Recorder`: the component that keeps the record of a run, in every experiment unless [record] excludes it."""
+"""`Recorder`: the component that keeps the record of a run; part of every experiment unless [record] is off."""
 
 from __future__ import annotations
 

@@ -236,7 +236,7 @@ class RecordWriter:
 
 
 class RecordInbox:
-    """Packets that wait to be recorded, and the end of the recording: the state that listener and writer share."""
+    """Packets that wait to be recorded, and the request to end: the state shared by listener and writer."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()

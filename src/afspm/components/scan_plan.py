@@ -1,4 +1,4 @@
-"""Plans of scans, and the times when they are due, as plain values that need no microscope."""
+"""Plans of scans, and their due times, as plain values that need no microscope."""
 
 from __future__ import annotations
 

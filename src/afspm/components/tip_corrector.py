@@ -1,4 +1,4 @@
-"""`TipCorrector`: the repair of a flagged tip, with the treatments that it is allowed."""
+"""`TipCorrector`: the repair of a flagged tip by the allowed treatments."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ VERDICT_WITHIN_S = 20.0  # real time: after that no verdict is expected
 
 
 class TipCorrector(Component):
-    """A solver of `tip-shape-changed`: it applies bias pulses one after the other, then ever deeper controlled crashes.
+    """A solver of `tip-shape-changed`: it applies bias pulses, then controlled crashes, in the order of the lists.
 
     After each treatment it takes a test scan, and up to two more if the verdict is unclear. Test scans have the region
     and pixels of the scan last judged good or bad, if bad, since the fault was seen there; otherwise the current
@@ -50,8 +50,8 @@ class TipCorrector(Component):
     is the place, nor a treatment that can't be saved, on a full disk: a restart would repeat it. Each treatment made is
     published as an `ActionMsg`.
 
-    With policy = "learn" it chooses each treatment by its experience with the flaw in the scans: blunt, double or
-    contaminated. The corrector counts the outcomes, and keeps the counts in a file for the next nights.
+    With policy = "learn" the corrector chooses each treatment by experience with the flaw in the scans: blunt, double
+    or contaminated. It counts the outcomes, and keeps the counts in a file for the next nights.
 
     Args:
         workshop_center: (x, y) about which pulses and crashes are made.

@@ -84,8 +84,8 @@ class TipTolerance:
         unrest: factor on the disagreement of trace and retrace.
         worn: at any place, the least share of the first scans' fine detail.
         sigmas: least deviation of a bad scan, in standard deviations of the reference; not for `worn`.
-        margin: a scan within this share of the way to a limit is good; between it and the limit it is unclear,
-            so that the opinion on a tip at the limit does not alternate.
+        margin: a scan within this share of the way to a limit is good; from there to the limit a scan is unclear, so
+            that the opinion on a tip at the limit does not alternate.
     """
 
     detail: float = 0.85
@@ -137,7 +137,7 @@ class TipReference:
         size_m, angle_rad, shape: size, angle and shape of these scans.
         places: the places of these scans, the last seen at the end.
         first: metrics of the scans that were learnt from.
-        deviations: differences of such scans at the same place: detail and unrest as ratios, ghost as it is.
+        deviations: differences of such scans at the same place: detail and unrest as ratios, ghost unchanged.
         suspect: whether a fault was found at a known place and is not over yet.
         confirmed: whether a scan of any kind was judged good after the last scan that was learnt from.
     """

@@ -1,4 +1,4 @@
-"""Import of the classes that an experiment file names as `class = "module.Name"`, when it is checked or started."""
+"""Import of the classes named in an experiment file by `class = "module.Name"`, for its check and its start."""
 
 from __future__ import annotations
 

@@ -169,7 +169,7 @@ def _nearest_text(region: Region, allowed: Region | None) -> str:
 
 _REACH = 1e-9  # the tolerance of the limits: a point on the border counts as inside despite rounding
 _MARGIN = 1e-3
-"""Relative distance of a suggested region from the border, used if its rounded numbers would exceed it."""
+"""Relative distance of a suggested region from the border, used if rounded numbers would exceed the border."""
 
 
 def nearest_region(region: Region, allowed: Region) -> Region:
@@ -219,7 +219,7 @@ def _shift_m(points: Iterable[XY], allowed: Region, margin: float) -> XY | None:
 
 
 def too_slow(planned: PlannedMeasurements, usual_m_s: float | None) -> str:
-    """Return a warning if a round of scans takes longer than its period; empty if not, or at unknown speed.
+    """Return a warning if a round of scans takes longer than its period; empty otherwise, or at unknown speed.
 
     Args:
         usual_m_s: scan speed if the plan sets no speed.

@@ -103,7 +103,7 @@ def check_commands(resolved: ResolvedExperiment) -> None:
 
 
 def check_intermediaries(resolved: ResolvedExperiment) -> None:
-    """Check intermediary tables: known settings only, and addresses where they belong."""
+    """Require known settings, numbers and valid addresses in intermediary tables."""
     names = [*resolved.parts.variables, *resolved.parts.intermediaries]
     for name, table in resolved.parts.intermediaries.items():
         kind = wire_of(table)

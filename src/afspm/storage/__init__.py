@@ -1,6 +1,6 @@
 """Files that must survive: atomic files, saved memory, threads that write, the packet log; and file formats.
 
-**Theory of operation.** The scheduler appends every packet to the packet log before it publishes it. Cache, record and
+**Theory of operation.** The scheduler appends every packet to the packet log before its publication. Cache, record and
 resume are derived from that log, so they can't contradict each other.
 
     comes in      packets, states, memories

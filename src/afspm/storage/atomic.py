@@ -158,10 +158,11 @@ def _sync_and_close(descriptor: int) -> None:
 
 
 class OutageLog:
-    """A log of failed writes, once for each outage; a full or missing disk must not end an experiment.
+    """A log of failed writes, one line for each outage; a full or missing disk must not end an experiment.
 
     A slow disk is logged as a warning after `SLOW_S`: a busy disk takes a moment now and then, and its writes are only
-    late. A disk that refuses to write, or whose backlog is full so that data are lost, is CRITICAL at once.
+    late. A disk that refuses to write, or whose backlog is full so that data are lost, is CRITICAL at once, even after
+    the warning.
 
     Args:
         loss: the consequence, for people.

@@ -24,10 +24,10 @@ T = TypeVar("T")
 DEADLINE_S = 0.2
 SYNC_PERIOD_S = 0.1
 MOST_BYTES = 256 << 20
-"""Most bytes that wait for a disk that hangs; further data are not written."""
+"""Limit in bytes on data that wait for a hanging disk; further data are not written."""
 MOST_TASKS = 10_000
 FULL_BYTES = 1 << 20
-"""Free bytes below which a disk counts as full: no scan fits."""
+"""Free bytes below which a disk counts as full: too little for a usual scan."""
 _log = logging.getLogger("afspm.disk")
 
 

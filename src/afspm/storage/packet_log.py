@@ -6,7 +6,8 @@ once, so that it survives a kill of all processes; a moment later it is on the d
 `disk`).
 
 The log is bounded. The recorder commits the position up to which all packets are in the record and on the disk.
-Segments before it are overwritten, after the packets that the scheduler still caches have been appended again.
+If the log is too large, segments before that position are overwritten, after the packets that the scheduler still
+caches have been appended again.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ class OutputLimit:
         self.pausing = False
 
     def passes(self, line: bytes, now_s: float) -> bool:
-        """Return whether a line passes now; otherwise hold the line back, as it may be one of the last.
+        """Return whether a line passes now; otherwise hold the line back, as it may be among the last lines.
 
         Args:
             now_s: real monotonic time.

@@ -52,7 +52,7 @@ def main(arguments: list[str]) -> int:
 
 
 class _ForeignProgram:
-    """A child program that gets this process's standard input, and is ended with it.
+    """A child program that gets this process's standard input, and is ended when that input ends.
 
     Attributes:
         stopped: whether the child was terminated or killed because it outlived its standard input.

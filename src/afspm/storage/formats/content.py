@@ -79,6 +79,6 @@ def local_ns(text: str, layout: str, zone: tzinfo | None) -> int:
 
 
 def clock_ns(time: datetime, zone: tzinfo | None) -> int:
-    """Return a time of the controller's clock, without a zone, in ns since the Unix epoch."""
+    """Return a time of the controller's clock in ns since the Unix epoch; `zone` None: this computer's zone."""
     moment = time.astimezone() if zone is None else time.replace(tzinfo=zone)
     return round(moment.timestamp() * 1e6) * 1000

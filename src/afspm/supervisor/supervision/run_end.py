@@ -1,4 +1,4 @@
-"""End of a run: when to ask processes to end, when to kill them, when to leave them. Decisions only."""
+"""End of a run: the times to ask processes to end, to kill them, and to leave them. Decisions only."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class RunEnd:
     """A run that is ending: processes that still run are asked to end, then killed, then left.
 
     Attributes:
-        ask_s, kill_s: when to ask and to kill, in real monotonic time.
+        ask_s, kill_s: times to ask and to kill, real monotonic.
         latest_s: deadline for busy processes; then they are asked to end.
         last: the last step taken; None before the first.
         in_haste: whether a person has asked to end the run at once.
@@ -205,7 +205,7 @@ class IdleWatch:
         return now_s >= self.since_s + IDLE_AFTER_S
 
     def asks(self, now_s: float) -> bool:
-        """Return whether to ask the scheduler now if the microscope is in use; note the time."""
+        """Return whether to ask the scheduler now about the use of the microscope; if so, note the time."""
         if not self.ends or self.is_ending or now_s < self.asked_s + ASK_AGAIN_S:
             return False
         self.asked_s = now_s

@@ -65,7 +65,7 @@ class ChildLife:
         return self.beat is not None and self.beat.closing
 
     def overdue_s(self, liveness: LivenessPolicy) -> float | None:
-        """Return the time at which a heartbeat or exit is so late that the process's activity is sampled."""
+        """Return the time from which the process counts as overdue, and is sampled; None before its first heartbeat."""
         if self.beat is None:
             return None
         return self.beat_s + (liveness.closing_s if self.beat.closing else liveness.silence_s) / 2.0
@@ -113,7 +113,7 @@ class SupervisedChild:
         starts, ordered: number of starts, and number of restarts ordered by a person.
         rescued: whether it was started once more after the end of the experiment.
         last_exit: description of its last exit.
-        unfinished: description of a stop that came before it had finished; otherwise empty.
+        unfinished: description of a stop before the process had finished; otherwise empty.
     """
 
     spec: ChildSpec
