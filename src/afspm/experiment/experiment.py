@@ -162,7 +162,7 @@ class Experiment:
         return process_starts.ends_idle(self.resolved, names)
 
     def asking(self, names: Collection[str]) -> Launch | None:
-        """Return a launch line for requests to a scheduler on another computer, in the name of the first of `names`.
+        """Return a launch line for requests to a scheduler on another computer; the sender is the first of `names`.
 
         None if the scheduler's address is unknown, or if the scheduler is not afspm's.
         """

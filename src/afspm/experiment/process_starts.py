@@ -230,7 +230,7 @@ def _variable_name(secret: object) -> list[str]:
 
 
 def asking(resolved: ResolvedExperiment, names: Collection[str]) -> Launch | None:
-    """Return a launch line for requests to a scheduler elsewhere, under the first of `names`.
+    """Return a launch line for requests to a scheduler elsewhere; the sender is the first of `names`.
 
     None if the file lacks the scheduler's address, or the scheduler is a command, which may not know these requests.
     """
