@@ -24,7 +24,7 @@ class HeightPair:
         """Return the judge's verdict on the tip; `learns` as in `TipJudge.judge`.
 
         Raises:
-            UnitError: the channels are no heights.
+            UnitError: the values of a channel are not lengths.
         """
         retrace = None if self.retrace is None else self.retrace.values * convert(1.0, self.retrace.unit, "m")
         trace = self.trace.values * convert(1.0, self.trace.unit, "m")
@@ -59,7 +59,7 @@ class ChannelPairing:
 
 
 class MissingChannels:
-    """A single warning if scans arrive but none has a required channel.
+    """A monitor that logs one error if a required channel is missing from the first `ENOUGH_SCANS` scans.
 
     Args:
         channels: names of the required channels; empty names are ignored.

@@ -1,4 +1,4 @@
-"""`FeedbackAnalysis`: the judge of how well the feedback follows; it flags a problem if the feedback is bad."""
+"""`FeedbackAnalysis`: the judge of the z feedback in scans, which flags a problem if the feedback is bad."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ MESSAGE = "FeedbackAnalysis"
 class FeedbackAnalysis(FeedbackObserver):
     """A component that publishes a `FeedbackAnalysis` after each scan: the shares of pixels with too large an error.
 
-    It flags `feedback-non-optimal` when several scans in a row have too large an error, and clears the flag when scans
-    have less than half that error; while a component has control to solve the problem, that component decides. If the
-    flag was cleared although the feedback is no better, it is not set again until the feedback has followed well in
-    between. Scans with the feedback off are not judged.
+    The component flags `feedback-non-optimal` after several scans in a row beyond the limits. The flag is cleared after
+    scans within half of the limits; while another component has control to solve the problem, only that component
+    clears the flag. A flag that was cleared although the feedback is still bad is set again only after a scan within
+    the limits. Scans with the feedback off are skipped.
 
     Args:
-        flag_after: bad scans in a row until the problem is flagged.
-        clear_after: good scans in a row until it is cleared.
+        flag_after: number of scans in a row beyond the limits until the problem is flagged.
+        clear_after: number of scans in a row within half of the limits until the flag is cleared.
     """
 
     flags: ClassVar = ("feedback-non-optimal",)

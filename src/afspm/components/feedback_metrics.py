@@ -54,7 +54,7 @@ class FeedbackError:
 
     @property
     def share(self) -> float:
-        """Share of the pixels beyond the threshold."""
+        """Share of the pixels beyond the threshold, on either side of the setpoint."""
         return self.over + self.under
 
     def __str__(self) -> str:
@@ -83,8 +83,8 @@ def relative_error(signal: Array, setpoint: float | None, exponential: bool) -> 
 
     Args:
         signal: the signal that the feedback holds at the setpoint, such as the amplitude; NaN where not measured.
-        setpoint: the setpoint in the same unit; None: the signal's median, which equals it unless the feedback is far
-            off.
+        setpoint: the setpoint in the same unit; None: the signal's median, which is close to the setpoint unless
+            the feedback is far off.
         exponential: whether the signal falls exponentially with the distance, as a tunnelling current of either sign
             does: then its logarithm is compared.
 
@@ -107,13 +107,14 @@ def feedback_error(error: Array, threshold: float, height_m: Array | None = None
 
     A loop that lags leaves in the error the relief that is missing in the height. Compared in metres, this ratio is the
     same for every sample, speed and noise, since white noise has no correlation from pixel to pixel. A loop that
-    oscillates moves height and error together; a lagging loop moves the height by the sum of the error.
+    oscillates moves height and error together; a lagging loop moves the height by the sum of the error. Without
+    heights, with a gap of 0, or with too few complete rows, `missed` and `swing` are 0.
 
     Args:
         error: result of `relative_error`, [y, x].
-        threshold: the threshold of the relative error.
+        threshold: relative error above which a pixel counts in `over` or `under`.
         height_m: the heights of the same pixels; None if unknown.
-        gap_m: excess height of the tip at a relative error of one.
+        gap_m: excess height of the tip at a relative error of one, in m; 0 if unknown.
     """
     there = error[np.isfinite(error)]
     over, under = float(np.mean(there > threshold)), float(np.mean(there < -threshold))
@@ -141,15 +142,15 @@ def _smooth_variance(values: Array) -> float:
 def gain_search(
     start: float, factor: float, lowest: float, highest: float, most_tries: int
 ) -> Generator[float, FeedbackQuality | None, float | None]:
-    """Search for a gain at which the feedback follows well: raise it while too slow, lower it while oscillating.
+    """Search for a gain at which the feedback follows well: higher while too slow, lower while oscillating.
 
-    Yields gains to try, `start` first; send it the quality at each, or None if the gain was refused. Returns the gain
-    to keep, or None if no gain was good.
+    Yields gains to try, `start` first. The caller sends the quality at each gain, or None if the gain was refused. The
+    returned value is the gain to keep, or None if no gain was good.
 
     Args:
         start: within the bounds.
-        factor: the factor of one step, above 1. Between a gain that is too low and one that is too high the steps get
-            smaller.
+        factor: the factor of one step, above 1. Between a gain that is too low and a gain that is too high the steps
+            get smaller.
         lowest, highest: bounds of the gain.
         most_tries: limit on the number of gains.
     """

@@ -20,13 +20,14 @@ _CURRENT_DECAY_M = 0.05e-9  # a tenth of the current for 0.1 nm: work functions 
 
 
 class FeedbackSignal:
-    """The comparison of a channel with the setpoint, which is published without a unit.
+    """The comparison of a channel with the setpoint.
 
-    The microscope is asked once for each unit whether the unit fits the setpoint.
+    The setpoint is published without a unit. So the first scan in each unit causes a request to the microscope: whether
+    it can return the setpoint in that unit.
 
     Args:
-        threshold: largest error, as a share of the setpoint (of a current: of its logarithm); None: 0.1, and 0.5 for a
-            current.
+        threshold: error above which a pixel is bad, as a share of the setpoint (of a current: as a difference of
+            logarithms); None: 0.1, and 0.5 for a current.
         sensitivity: height in m for 1 V of the channel, or, for a current, for a factor e; None: 50 nm, and 0.05 nm.
     """
 
@@ -43,7 +44,8 @@ class FeedbackSignal:
 
         Raises:
             InvalidValue: the channel's unit does not fit the setpoint (an amplitude in m where the setpoint is in V),
-                the translator does not answer at present, the channel has no value, or the setpoint is zero.
+                the translator does not answer at present, the channel has no value, the setpoint is zero, or `height`
+                is not in a unit of length or differs in pixels.
         """
         if setpoint is not None:
             if signal.unit not in self._reasons:
@@ -86,14 +88,14 @@ class FeedbackSignal:
 
 
 class FeedbackObserver(Component):
-    """Base of components that judge scans by how well the feedback followed.
+    """Base of components that judge the feedback by its error signal in scans.
 
     Args:
         channel: the signal that the feedback holds at the setpoint, in a unit that fits the setpoint's.
         height: the channel of the heights; empty if not recorded: then a slightly slow feedback is not detected.
-        threshold: largest error, as a share of the setpoint (of a current: of its logarithm); by default 0.1, and 0.5
-            for a current.
-        limit: share of the pixels that may lie beyond the threshold.
+        threshold: error above which a pixel is bad, as a share of the setpoint (of a current: as a difference of
+            logarithms); by default 0.1, and 0.5 for a current.
+        limit: largest share of bad pixels with a good feedback.
         relief_limit: share of the relief that may be in the error instead of the height.
         sensitivity: height for 1 V of the channel, or, for a current, for a factor of 2.7; by default 50 nm, and 50 pm.
             Negative if the signal falls as the tip withdraws, as a deflection does. Not needed for a channel in metres.

@@ -17,9 +17,10 @@ BACK_WITHIN_S = 60.0
 class FeedbackTuner(FeedbackObserver):
     """A solver of `feedback-non-optimal`: it scans the current region, and searches for a good integral gain.
 
-    It raises the gain while the feedback is too slow, and lowers it while it oscillates. If no gain is good, it
-    restores the original gain, logs that, and clears the flag, so that the experiment continues as before. The original
-    gain is also restored after control was lost, or after a kill.
+    The component raises the gain while the feedback is too slow, and lowers the gain while the feedback oscillates. If
+    no gain is good, the component restores the original gain, logs an error, and clears the flag, so that the
+    experiment continues as before. After a loss of control or a kill, it sets the last good gain of the search, or the
+    original gain if none was good.
 
     Args:
         lowest_gain, highest_gain: bounds of the integral gain.

@@ -1,4 +1,4 @@
-"""Files that grow line by line and survive a kill: a line is in the file completely or not at all."""
+"""Files that grow line by line; after a kill a line is in the file completely or not at all."""
 
 from __future__ import annotations
 

@@ -17,8 +17,8 @@ _WRITTEN_NS = "written_ns"
 class LogCollector(Component):
     """One log file of all processes of an experiment, on all its computers.
 
-    On one computer `log.txt` in the run folder has them already. On several, each computer has a `log.txt` of its own
-    processes; the scheduler also publishes the lines, from INFO on, and this component writes them.
+    On one computer `log.txt` in the run folder has all lines already. On several, each computer has a `log.txt` of its
+    own processes; the scheduler also publishes the lines, from INFO on, and this component writes them.
 
     Args:
         file: name of the file in the run folder.

@@ -1,4 +1,4 @@
-"""`Metadata`: a table of all measurements, with facts that the microscope's files lack: the holder of control."""
+"""`Metadata`: a table of all measurements, with facts that measurement files lack (control, problems)."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _BUSY = {ScopeState.SCANNING: "scan", ScopeState.SPEC: "spectrum"}
 
 
 class Metadata(Component):
-    """The writer of `metadata.csv` in the run folder: a row for each channel of a scan, each spectrum and each note.
+    """The writer of `metadata.csv` in the run folder: a row for each channel of a scan, spectrum and note.
 
     Columns: end time (UTC); `scan`, `spectrum` or `note`; file; channel (or kind); place in metres; pixels; units; and,
     as they were when the measurement began, holder of control, mode, flagged problems and the microscope's state; for a
-    note its author and text. A note on a scan has the time of that scan. Unknown values are empty, such as those of a
-    scan that began while this component was not running.
+    note its author and text. A note on a scan has the time of that scan. Unknown values are empty, such as the
+    holder of control when a scan began while this component was not running.
 
     The file has one header, and each row exactly once, even if processes are killed.
 

@@ -1,4 +1,4 @@
-"""`NightPicture`: the night on one page: scans, control and problems over time."""
+"""`NightPicture`: a picture of the night on one page, with scans, control and problems over time."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from afspm.record.night_record import NightRecord, control_entry, mark_entry, sc
 class NightPicture(Component):
     """The picture `night.png`, drawn when the experiment ends: the scans in a row, control and problems over time.
 
-    A simulated microscope is marked in the picture. The component subscribes to all packets, and saves as it goes:
-    killed and restarted, it draws the same picture.
+    A simulated microscope is marked in the picture. The component subscribes to all packets, and saves each entry at
+    once, so that the picture is the same after a kill and restart.
 
     Args:
         channel: shown channel of each scan.

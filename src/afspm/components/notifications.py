@@ -23,7 +23,7 @@ OCCASIONS: Final = (END, UNSOLVED, GIVEN_UP, CRITICAL)
 
 TIMEOUT_S = 10.0  # of one attempt
 FIRST_DELAY_S, LONGEST_DELAY_S = 2.0, 300.0
-MOST_TRIES = 12  # half an hour
+MOST_TRIES = 12  # about 25 minutes, with the delays between them
 # a webhook that is down all night must not fill the memory
 MOST_WAITING = 50
 
@@ -44,6 +44,7 @@ class Notification:
         run: folder of the run.
         time_ns: experiment time.
         text: a sentence.
+        simulated: whether the microscope is simulated.
     """
 
     what: str
@@ -67,8 +68,8 @@ class Targets:
 
     Attributes:
         command: program and arguments; it gets the JSON on its standard input.
-        webhook: address for a POST of the JSON, or "$NAME" of the environment variable that holds it. It may be a
-            secret: logs name only its host.
+        webhook: address for a POST of the JSON, or "$NAME" of the environment variable that holds it. The address may
+            be a secret: logs name only its host.
         folder: working directory of the command.
     """
 
@@ -87,6 +88,7 @@ class Targets:
 
         Raises:
             NotDelivered: the attempt failed; the error contains no secret.
+            ConfigError: the address of the webhook is invalid, or its environment variable is not set.
         """
         if way == "command":
             _run(self.command, notice, self.folder)
@@ -170,5 +172,5 @@ def _reason_without_secret(reason: object) -> str:
 
 
 def delay_s(tries: int) -> float:
-    """Return the delay after a number of failed attempts, in real time."""
+    """Return the delay after a number of failed attempts, in seconds of real time."""
     return float(min(LONGEST_DELAY_S, FIRST_DELAY_S * 2 ** max(0, tries - 1)))

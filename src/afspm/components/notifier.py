@@ -32,17 +32,17 @@ LAST_TRIES = 2  # the end of the experiment does not wait for more
 
 
 class Notifier(Component):
-    """Calls of a command or a webhook when a problem stays unsolved, a component is given up or logs CRITICAL.
+    """Notifications by command or webhook: a problem stays unsolved, a process is given up or logs CRITICAL.
 
-    [notify] of the experiment file adds it to an experiment. It only subscribes, and delays no other process. A failed
-    delivery is retried at growing intervals for half an hour; retries continue after a restart, and a delivered
-    notification is never sent twice. The end of the experiment is reported by `afspm run` itself, which knows its
-    reason.
+    [notify] of the experiment file adds this component to an experiment. The component only subscribes, and delays no
+    other process. A failed delivery is retried at growing intervals, for about 25 minutes; retries continue after a
+    restart. A notification may arrive twice if the answer of the webhook is lost, or if this process is killed right
+    after the delivery. The end of the experiment is reported by `afspm run` itself, which knows the reason of the end.
 
     Args:
         program: a command with arguments, run in the experiment file's folder; the JSON is on its standard input.
         webhook: address for a POST of the JSON; "$NAME" is taken from the environment.
-        on: occasions: "unsolved-problem", "given-up", "critical".
+        on: occasions: "unsolved-problem", "given-up", "critical"; by default all. ("end" is left to `afspm run`.)
         unsolved_after: experiment time after which a flagged problem counts as unsolved.
         folder: working directory of the command; [notify] sets it to the experiment file's folder.
     """

@@ -1,4 +1,4 @@
-"""Scans by plan: one region repeatedly, a list of regions, or a grid. Each scan is taken exactly once."""
+"""Scans by plan: one region repeatedly, a list of regions, or a grid. A restart repeats no scan."""
 
 from __future__ import annotations
 
@@ -39,8 +39,9 @@ _MISSED: dict[Missed, str] = {
 class PlannedScans(Component):
     """The scans of a plan. Derive from this class for a plan of your own; set `plan` (and `beat_s`) in `__init__`.
 
-    Each scan has a key, so no scan is left out or taken twice, even if processes are killed. While control is lost (to
-    the repair of a tip, to a person) the scan waits; an interruption is logged.
+    Each scan has a key, so a restart after a kill neither repeats nor omits a scan. While control is lost (to the
+    repair of a tip, to a person) the scan waits; an interruption is logged. Scans are left out only as `missed` and
+    `ends_on_time` define.
 
     Args:
         keep_control: whether to keep control between scans; by default others may measure meanwhile.
@@ -160,6 +161,7 @@ class PlannedScans(Component):
             self._round_began_s = None
         if self._round_began_s is not None and (step.index + 1) % len(self.plan.regions) == 0:
             round_s = self.clock.now_s() - self._round_began_s
+            # the fastest round counts, since a slower round may have waited for control
             self.memory["pace_s"] = min(round_s, float(self.memory.get("pace_s", round_s)))
         self.memory["done"], self.memory["done_s"] = step.index + 1, self.clock.now_s()
         rest = self.memory.pop("rest", None)
@@ -225,7 +227,7 @@ class PlannedScans(Component):
 class ScanSeries(PlannedScans):
     """The same region again and again, with a period, for a number of scans or a duration.
 
-    With neither `scans` nor `duration` it continues until another component or a person ends the experiment.
+    With neither `scans` nor `duration` the series continues until another component or a person ends the experiment.
 
     Args:
         size: (width, height) of the region, e.g. ["2 um", "2 um"].
@@ -234,7 +236,7 @@ class ScanSeries(PlannedScans):
         pixels: (columns, rows).
         every: experiment time from the start of one scan to the start of the next; 0 for no pause.
         scans: number of scans.
-        duration: time within which scans are started (instead of `scans`).
+        duration: time within which scans are started (instead of `scans`); needs `every`.
     """
 
     def __init__(
@@ -297,7 +299,7 @@ class ScanList(PlannedScans):
 
 
 class RegionGrid(PlannedScans):
-    """A region at each point of a grid, back and forth row by row: a map larger than one scan, or samples of it.
+    """A region at each point of a grid, back and forth row by row, for a map larger than a scan.
 
     Args:
         size: (width, height) of each region.
@@ -329,14 +331,14 @@ class RegionGrid(PlannedScans):
 
 
 def pair(values: Sequence[float]) -> XY:
-    """Return a pair of numbers as a tuple; JSON delivers it as a list."""
+    """Return two numbers as a tuple (JSON delivers a list). Raises InvalidValue for another length."""
     if len(values) != 2:
         raise InvalidValue(f"{list(values)!r} is not a pair of x and y")
     return float(values[0]), float(values[1])
 
 
 def checked_parameters(given: Mapping[str, str | float] | None, where: str) -> dict[str, str | float]:
-    """Return the parameters to set before a scan. Raises ConfigError if one is invalid."""
+    """Return the parameters to set before a scan. Raises ConfigError for an invalid name, value or unit."""
     parameters = dict(given or {})
     for name, quantity in parameters.items():
         try:

@@ -1,4 +1,4 @@
-"""`Recorder`: the component that keeps the record of a run, in every experiment unless [record] excludes it."""
+"""`Recorder`: the component that keeps the record of a run; part of every experiment unless [record] is off."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ SIGNS_OF_LIFE = ("ControlState",)
 class Recorder(Component):
     """The writer of `journal.sqlite`, and of an HDF5 file for every scan and spectrum, in the run folder.
 
-    It follows the scheduler's packet log at low processor priority. Even if all processes are killed at once, the
-    record of a resumed run has each published packet exactly once. A full disk is logged; the experiment goes on, and
-    missed packets are recorded once there is room, as far as the log still has them.
+    The recorder follows the scheduler's packet log at low processor priority. Even if all processes are killed at once,
+    the record of a resumed run has each published packet exactly once. A full disk is logged; the experiment goes on,
+    and missed packets are recorded once there is room, as far as the log still has them.
 
     Args:
         scans: whether to keep scans and spectra; otherwise only the journal.

@@ -50,7 +50,7 @@ class RecordWriter:
 
     Args:
         folder: the folder of the run.
-        log: folder of the packet log; without one, all packets are given by `put`.
+        log: folder of the packet log; without a log, all packets are given by `put`.
         step: context manager entered around every slow operation.
         wake: called when the result of `check` or `wants_replay` may have changed.
     """
@@ -91,11 +91,11 @@ class RecordWriter:
         self._inbox.put(SourcedPacket(packet, source), is_disk_full=self._told_full)
 
     def wants_replay(self) -> bool:
-        """Return whether to request publishers' cached packets: some were missed, and the disk has room again."""
+        """Return once whether to request publishers' cached packets, after a full disk or a damaged journal."""
         return self._inbox.wants_replay()
 
     def check(self) -> None:
-        """Raise the error that ended the writing, if there is one."""
+        """Raise the error that ended the writing, if any."""
         if self._error is not None:
             raise self._error
 
@@ -236,7 +236,7 @@ class RecordWriter:
 
 
 class RecordInbox:
-    """Packets that wait to be recorded, and the end of the recording: the state that listener and writer share."""
+    """Packets that wait to be recorded, and the request to end: the state shared by listener and writer."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -248,7 +248,7 @@ class RecordInbox:
         self._until_s = 0.0
 
     def put(self, packet: SourcedPacket, *, is_disk_full: bool) -> None:
-        """Queue a packet. If too many wait for room on the disk, all are dropped, and requested again later."""
+        """Queue a packet. If more than MOST_BYTES wait on a full disk, all are dropped, and requested again later."""
         with self._changed:
             self._queue.append(packet)
             self._bytes += len(packet.packet.payload)
@@ -258,9 +258,9 @@ class RecordInbox:
             self._changed.notify()
 
     def take(self, *, within_s: float) -> tuple[list[SourcedPacket], bool | None]:
-        """Return the queued packets, and whether the experiment has ended (None: the recording continues).
+        """Return the queued packets, and the argument `ended` of `end`; None before `end` was called.
 
-        Waits up to `within_s` for many packets, or for the end.
+        Wait up to `within_s` for more than AT_ONCE_BYTES, or for the end of the recording.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._bytes > AT_ONCE_BYTES or self._ending is not None, within_s)
@@ -284,7 +284,7 @@ class RecordInbox:
             self._wants_replay = True
 
     def has_room_for_missed(self) -> bool:
-        """Request publishers' cached packets if some were missed; return whether some were."""
+        """Request publishers' cached packets if packets were dropped; return whether packets were dropped."""
         with self._changed:
             missed, self._missed = self._missed, False
             self._wants_replay = self._wants_replay or missed
@@ -333,7 +333,7 @@ class LogProgress:
         return max(0, self._reader.newest - self._reader.position.segment - 1) * SEGMENT_BYTES
 
     def took(self, batch: list[SourcedPacket], waiting: list[Packet]) -> None:
-        """Register packets that will be recorded only after later packets have arrived."""
+        """Register the packets of a batch that are still in `waiting`: `commit` stays before them."""
         for packet, _, before in batch:
             if before is not None:
                 self._waiting.setdefault((packet.time_ns, packet.envelope), before)

@@ -1,4 +1,4 @@
-"""Plans of scans, and the times when they are due, as plain values that need no microscope."""
+"""Plans of scans, and their due times, as plain values that need no microscope."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class ScanPlan:
 class RoundSchedule:
     """Due times of the rounds of a plan: multiples of a period after the start, in experiment time.
 
-    A round is missed if its time passes while another round is taken or waits for a tip repair; the next one is due
+    A round is missed if its time passes while another round is taken or waits for a tip repair; the next round is due
     at the next multiple.
 
     Attributes:
@@ -91,7 +91,7 @@ class RoundSchedule:
             raise InvalidValue(f"a period of {self.period_s} s")
 
     def next_due_s(self, done_s: float | None) -> float:
-        """Return when the next round is due after a round that ended at `done_s`; None: no round has ended yet."""
+        """Return the due time after a round that ended at `done_s` (None: no round yet); `start_s` without a period."""
         if done_s is None or self.period_s == 0.0:
             return self.start_s
         beats = math.floor((done_s - self.start_s) / self.period_s) + 1
@@ -102,7 +102,7 @@ class RoundSchedule:
         return max(0, round((next_due_s - due_s) / self.period_s) - 1) if self.period_s else 0
 
     def too_slow_for(self, left_out: int, pace_s: float) -> int:
-        """Return how many of these rounds were missed because a round takes `pace_s`, longer than the period."""
+        """Return the number of left-out rounds that a round of length `pace_s`, longer than the period, explains."""
         return min(left_out, max(0, math.ceil(pace_s / self.period_s - 1e-9) - 1)) if self.period_s else 0
 
 
@@ -118,7 +118,7 @@ class PlanRest:
     last: int
 
     def since(self, row: int, *, downwards: bool) -> PlanRest:
-        """Return the rows from a row of this part on, with a few rows of overlap before it.
+        """Return the rows still to be taken from a row of this part on, with REST_OVERLAP; at least FEWEST_ROWS.
 
         Args:
             row: index in this part.
@@ -130,7 +130,7 @@ class PlanRest:
         return PlanRest(max(self.first, min(at - REST_OVERLAP, self.last - FEWEST_ROWS + 1)), self.last)
 
     def of(self, step: PlanStep) -> PlanStep:
-        """Return the step that measures only these rows, under its own key."""
+        """Return the step that measures only these rows, under its own key; the step itself if all rows are left."""
         rows, columns = step.shape or (0, 0)
         if (self.first, self.last) == (0, rows - 1):
             return step
@@ -146,11 +146,14 @@ class PlanRest:
 
 
 def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad: float = 0.0) -> tuple[XY, ...]:
-    """Return the points of a grid about a centre, from the row of smallest y on; every other row runs backwards.
+    """Return the points of a grid about a centre, back and forth, from the row of smallest y on.
 
     Args:
         counts: (columns, rows).
         spacing_m: (x, y) between neighbours, along the axes of the rotated grid.
+
+    Raises:
+        InvalidValue: the grid is empty, or a needed spacing is not above zero.
     """
     columns, rows = counts
     if columns < 1 or rows < 1:
@@ -173,7 +176,11 @@ def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad
 
 
 def rounds_within(duration_s: float, period_s: float) -> int:
-    """Return the number of rounds that start within a duration; the first starts at once."""
+    """Return the number of rounds that start within a duration; the first starts at once.
+
+    Raises:
+        InvalidValue: there is no period.
+    """
     if period_s <= 0.0:
         raise InvalidValue("a series with a duration needs a period", hint='e.g. every = "15 min"')
     return math.floor(duration_s / period_s * (1 + 1e-12)) + 1

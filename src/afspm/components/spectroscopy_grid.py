@@ -1,4 +1,4 @@
-"""Spectra on a grid or a list of positions, each taken exactly once."""
+"""Spectra on a grid or a list of positions. A restart repeats no spectrum."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ MOST_LINES = 20
 
 
 class SpectroscopyGrid(Component):
-    """A spectrum at each point of a grid, back and forth row by row, or at each position of a list.
+    """A spectrum at each point of a grid, back and forth by rows, or at each position of a list.
 
-    No spectrum is left out or taken twice, even if processes are killed.
+    A restart after a kill neither repeats nor omits a spectrum.
 
     Args:
         counts: (columns, rows) of the grid.
@@ -29,7 +29,7 @@ class SpectroscopyGrid(Component):
         positions: a list of (x, y) instead of a grid.
         kind: kind of spectrum, if the microscope has several, e.g. "IV" or "force".
         repeats: number of spectra at each point.
-        end_when_done: whether to end the whole experiment after the last.
+        end_when_done: whether to end the whole experiment after the last spectrum.
     """
 
     needs_actions = (names.START_SPEC,)

@@ -28,17 +28,17 @@ from afspm.transport.process.loading import find_object
 
 MAPPING = "DriftMapping"
 LEAST_ZOOM_PX = 20
-"""Least width of a zoom in pixels of the survey: narrower zooms are often not registered, and below 8 px never."""
+"""Least width of a zoom in pixels of the survey: narrower zooms are often not registered, below 8 px never."""
 USUAL_PX, MOST_PX, _STEP_PX = 128, 512, 16
 
 
 class Survey(Component):
     """A wide scan, a search for targets in it, and a zoom and curves at each target.
 
-    It writes a table into the run folder (number, position, height, outcome, files of zoom and curves) and a picture:
-    the survey with its numbered targets, their zooms and curves. If the zoom or a curve of a target is refused, for
-    instance by a limit, the table has the reason, and the survey goes on with the next target. With a Drift Compensated
-    Scheduler, positions are those on the sample.
+    The component writes a table into the run folder (number, position, height, outcome, files of zoom and curves) and a
+    picture: the survey with its numbered targets, their zooms and curves. If the zoom or a curve of a target is
+    refused, for instance by a limit, the table has the reason, and the survey goes on with the next target. With a
+    Drift Compensated Scheduler, positions are positions on the sample.
 
     Each scan and each curve is taken once, even if processes are killed. If the experiment ends early, table and
     picture show the measurements up to then. Their keys are `survey`, `zoom-3`, `curve-top-3` and so on:
@@ -347,11 +347,11 @@ class TargetFinder:
     """The search for targets in a survey, and for each target in its zoom.
 
     Attributes:
-        function: the user's, "module.name"; None: find particles.
+        function: import path of the user's function, "module.name"; None: find particles.
         count: largest number of targets.
         min_height: the least height of a particle, in the unit of the scan; None: six times the noise.
-        separation_m: the least distance of two particles; of a nearer pair only the higher counts.
-        widest_m: width of the survey: a particle that fills its zoom must not be taken for ground.
+        separation_m: the least distance of two particles, in m; of a nearer pair only the higher counts.
+        widest_m: shorter side of the survey, in m: a particle that fills its zoom must not be taken for ground.
         refines: whether targets are found again in their zooms.
     """
 

@@ -24,17 +24,17 @@ _PROBE = (names.PROBE_POS_X, names.PROBE_POS_Y)
 class Sweep(Component):
     """A scan or a spectrum at each combination of the values of some parameters.
 
-    At the end the parameters are set back to their values before the sweep, also where a process was killed in
-    between. Each point is measured once, whichever process is killed. Control is kept over the whole sweep; a point
-    that was interrupted, by the repair of a tip for instance, is measured again with its parameters set again.
+    At the end the parameters are set back to their values before the sweep, also after a kill and restart. A restart
+    repeats no point. Control is kept over the whole sweep; a point that was interrupted, by the repair of a tip for
+    instance, is measured again with its parameters set again.
 
     The keys of its measurements are `sweep-1`, `sweep-2` …, in the order of measurement, and the swept parameters are
     columns of `run.scans` and `run.spectra`. The report shows the scans beside each other in `sweep.png`.
 
     Args:
         parameters: the values of each parameter: a list, such as ["50 pA", "100 pA"], or a range, such as {from =
-            "0.5 um/s", to = "4 um/s", points = 4, spacing = "log"}, with `step` in place of `points` where wanted. The
-            first parameter changes least often.
+            "0.5 um/s", to = "4 um/s", points = 4, spacing = "log"}, or with `step` instead of `points`. The first
+            parameter changes least often.
         measure: the measurement at each point.
         order: "snake": from point to point one parameter changes, to a neighbouring value; "listed": nested loops over
             the values as listed; "random": shuffled by `seed`.
@@ -42,7 +42,7 @@ class Sweep(Component):
         size: (width, height) of the scans; by default the present region.
         center: (x, y) of the middle of the scans; (0, 0) if not given.
         angle: angle of the scans, counter-clockwise; 0 if not given.
-        pixels: (columns, rows) of the scans; by default the present ones.
+        pixels: (columns, rows) of the scans; by default the present numbers.
         at: (x, y) of the spectra; by default where the probe stands.
         kind: kind of the spectra, where the microscope can choose, e.g. "IV" or "force".
         end_when_done: whether to end the whole experiment after the last point.
@@ -92,7 +92,7 @@ class Sweep(Component):
 
     @property
     def planned_parameters(self) -> dict[str, tuple[Parameter, ...]]:
-        """All values to be set, by the setting that contains them: `afspm check` compares them with the limits."""
+        """All values that the sweep sets, under its setting `parameters`, for comparison with the limits."""
         return {
             "parameters": tuple(axis.parameter(place) for axis in self.sweep.axes for place in range(len(axis.values)))
         }
@@ -128,7 +128,7 @@ class Sweep(Component):
 
 
 def value_text(value: SweptValue, unit: str) -> str:
-    """Return a swept value for a person: "50 pA", "12.5", "on"."""
+    """Return a swept value as text for people: "50 pA", "12.5", "on"."""
     if isinstance(value, bool):
         return "on" if value else "off"
     return value if isinstance(value, str) else quantity(value, unit)

@@ -65,7 +65,7 @@ class RepairBudget:
     def affordable(
         self, treatments: Sequence[Treatment], spent: RepairCost, spacing_m: float, step_s: float
     ) -> tuple[Treatment, ...]:
-        """Return the treatments that fit into the rest of the budget, each with a test that ends `step_s` later."""
+        """Return the treatments that fit into the rest of the budget; each takes `step_s` with its test scans."""
         return tuple(
             one for one in treatments if not self.exceeded_by(spent.plus(cost_of(one, spacing_m)).after(step_s))
         )

@@ -17,10 +17,10 @@ _SCORES = {Opinion.GOOD: tip_verdict.GOOD, Opinion.BAD: tip_verdict.BAD, Opinion
 class TipClassifier(Component):
     """A judge of scans: it flags `tip-shape-changed` for a blunt, double or contaminated tip, and clears the flag.
 
-    It learns the reference from the first scans of each size and number of pixels, so the tip must be good then; it
-    learns nothing while a problem is flagged or after a scan that was not good. It judges best at places that it has
-    seen before; elsewhere it detects only large changes. The verdict on each scan is published as a
-    `SpatialROIWithScoreList` (1 good, 0.5 unclear, 0 bad).
+    The judge learns a reference from the first scans of each size and number of pixels, so the tip must be good then.
+    No scan is added to an incomplete reference while a problem is flagged, or after a scan that was not good. The judge
+    works best at places of earlier scans; elsewhere it detects only large changes. The verdict on each scan is
+    published as a `SpatialROIWithScoreList` (1 good, 0.5 unclear, 0 bad); scans for the reference have no verdict.
 
     Args:
         channel: channel of the heights.
@@ -32,7 +32,7 @@ class TipClassifier(Component):
         ghost: correlation of a ghost image at a known place above which the tip is double.
         unrest: factor on the disagreement of trace and retrace above which the tip carries debris.
         worn: share of the first scans' fine detail below which the tip is worn, at any place.
-        sigmas: standard deviations of the reference beyond which a scan must lie to be bad.
+        sigmas: standard deviations of the reference beyond which a scan must lie to be bad; not for `worn`.
         problem: the problem to flag.
     """
 

@@ -1,4 +1,4 @@
-"""`TipCorrector`: the repair of a flagged tip, with the treatments that it is allowed."""
+"""`TipCorrector`: the repair of a flagged tip by the allowed treatments."""
 
 from __future__ import annotations
 
@@ -33,40 +33,41 @@ VERDICT_WITHIN_S = 20.0  # real time: after that no verdict is expected
 
 
 class TipCorrector(Component):
-    """A solver of `tip-shape-changed`: it applies bias pulses one after the other, then ever deeper controlled crashes.
+    """A solver of `tip-shape-changed`: it applies bias pulses, then controlled crashes, in the order of the lists.
 
-    After each treatment it takes a test scan, with the region and pixels of the scan last judged bad, since the fault
-    was seen there; without such a verdict, of the current region. A component that judges scans (the `TipClassifier`)
-    clears the flag when the tip is good, which takes control from the corrector: the experiment goes on. The lists
-    below are all that one repair may do, also over restarts; a treatment that a limit of the experiment file or the
-    microscope refuses is logged and left out. After the last treatment it flags `device-malfunction` and waits for a
-    person: the experiment stops measuring rather than measure with a bad tip. Once that flag is cleared it may try
-    again.
+    After each treatment it takes a test scan, and up to two more if the verdict is unclear. Test scans have the region
+    and pixels of the scan last judged good or bad, if bad, since the fault was seen there; otherwise the current
+    region. A component that judges scans (the `TipClassifier`) clears the flag when the tip is good, which takes
+    control from the corrector: the experiment goes on. With policy = "list", one repair tries each listed treatment
+    once, also over restarts; a treatment that a limit of the experiment file or the microscope refuses is
+    logged and left out. After the last treatment the corrector flags `device-malfunction` and waits for a person: the
+    experiment stops measuring rather than measure with a bad tip. Once one of the two flags is cleared, the corrector
+    may repair again.
 
     Treatments are made at fresh places about `workshop_center`, never within `keep_away` of the experiment's region or
-    of the test scan. If control is lost on the way to a place (to a person who moves the probe, say), it continues with
-    another place when it has control again. It makes no treatment unless the probe's published position is the place,
-    nor a treatment that can't be saved, on a full disk: a restart would repeat it. Each treatment made is published as
-    an `ActionMsg`.
+    of the test scan. If control is lost on the way to a place (to a person who moves the probe, say), the corrector
+    continues with another place when it has control again. It makes no treatment unless the probe's published position
+    is the place, nor a treatment that can't be saved, on a full disk: a restart would repeat it. Each treatment made is
+    published as an `ActionMsg`.
 
-    With policy = "learn" it chooses each treatment by its experience with the flaw in the scans: blunt, double or
-    contaminated. It counts the outcomes, and keeps them in a file for the next nights.
+    With policy = "learn" the corrector chooses each treatment by experience with the flaw in the scans: blunt, double
+    or contaminated. It counts the outcomes, and keeps the counts in a file for the next nights.
 
     Args:
         workshop_center: (x, y) about which pulses and crashes are made.
         test_center: (x, y) of a first test scan, so that a worse tip stays off the experiment's region. The next test
-            scan is where the fault was seen, which shows best whether the tip is good; without `test_center` it is the
-            first.
+            scan, taken unless the first shows a bad tip, is where the fault was seen. Without `test_center` all test
+            scans are taken there.
         pulse_voltages: voltages of the pulses of one repair, in order.
         pulse_duration: duration of each pulse.
         crash_depths: depths of the crashes of one repair, in order, after the pulses.
         crash_speed: speed of each crash.
         place_spacing: distance between the places of two treatments.
         keep_away: least distance of a treatment from the experiment's region and the test scans.
-        judge: "classifier" waits until the component that judges scans clears the flag; "self" compares the test scans
-            with the first scans of the experiment, and clears it.
-        channel, retrace_channel: channels of the heights, for judge = "self".
-        reference_scans: number of scans for the reference, for judge = "self".
+        judge: "classifier" leaves the verdict and the flag to the component that judges scans (no verdict in time
+            counts as bad); "self" compares the test scans with the first scans of the experiment, and clears the flag.
+        channel, retrace_channel: channels of the heights, for judge = "self" or policy = "learn".
+        reference_scans: number of scans for the reference, for judge = "self" or policy = "learn".
         problem: the problem to solve.
         policy: "list" makes the treatments in the order of the lists; "learn" chooses among them, again and again.
         most_treatments: largest number of treatments of one repair, with policy = "learn".
@@ -74,7 +75,8 @@ class TipCorrector(Component):
         night_pulses: most pulses of all repairs of a run, also over restarts; by default no bound.
         night_depth: largest sum of the depths of all crashes of a run.
         night_places: most places of treatments, each with an area of `place_spacing` squared.
-        night_time: longest time of all repairs of a run together. No treatment begins whose test scan would end later.
+        night_time: longest time of all repairs of a run together. No treatment begins whose test scans are expected
+            to end later.
     """
 
     solves: ClassVar = ("tip-shape-changed",)

@@ -3,14 +3,14 @@
 **Theory of operation.** For each flaw and treatment, `TipExperience` counts how often the treatment cured the tip,
 worsened it, or did nothing. The next treatment is chosen by Thompson sampling: a probability of each outcome is drawn
 from the counts, and the treatment with the shortest expected repair under this draw is taken. So a treatment is tried
-the more often the more likely it is the best, and a new one is tried now and then.
+the more often the more likely it is the best, and a new treatment is tried now and then.
 
 The counts of a night, weakened, become the prior of the next night, since the tip may then answer otherwise. Within a
 night the weight of old outcomes falls with each new one, and a run of failures that the counts call improbable weakens
 the counts of its flaw at once: the tip may have begun to answer otherwise.
 
-Nothing here knows time, files or messages. Each draw follows from the number of the night and of its outcomes, so a
-restarted process, or a replay, chooses the same treatment.
+This module uses no clock, no files and no messages. Each draw follows from the number of the night and of its outcomes,
+so a restarted process, or a replay, chooses the same treatment.
 
 The constants were chosen among some twenty sets, on nights with the public half of the simulated answers and with one
 sealed key (`benchmarks/tip_learning.py` judges other nights).
@@ -77,13 +77,13 @@ Counts = dict[str, dict[str, OutcomeCounts]]
 
 @dataclass
 class TipExperience:
-    """Outcomes of treatments, by flaw; see above.
+    """Outcomes of treatments, by flaw, and the choice of the next treatment (see the module).
 
     Attributes:
         nights: number of nights before this one.
         outcomes: number of outcomes in this night.
-        counts: the experience.
-        doubt: by flaw, the probability of its present run of failures.
+        counts: counts of outcomes, by flaw, then by treatment.
+        doubt: by flaw, the probability that the counts give to the present run of failures.
     """
 
     nights: int = 0
@@ -116,7 +116,7 @@ class TipExperience:
         return self.counts.get(flaw, {}).get(str(treatment), OutcomeCounts())
 
     def learn(self, flaw: str, treatment: Treatment, outcome: str) -> bool:
-        """Count an outcome. Return whether it was a surprise that weakened the counts of its flaw."""
+        """Count an outcome. Return whether an improbable run of failures has weakened the counts of the flaw."""
         run = 1.0 if outcome == CURED else self.doubt.get(flaw, 1.0) * (1.0 - self.of(flaw, treatment).cures)
         surprised = run < IMPROBABLE
         if surprised:

@@ -28,7 +28,7 @@ def experience_text(experience: TipExperience) -> str:
 
 
 def write_experience(path: Path, experience: TipExperience) -> None:
-    """Write the file. Raises FileError."""
+    """Write an experience file, and make its folder. Raises FileError."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

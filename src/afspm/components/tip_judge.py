@@ -2,7 +2,7 @@
 
 At a known place the judge compares like with like, and detects small changes. Its reference there follows the good
 scans, since the sample drifts; the first scans stay as the measure of slow wear. Elsewhere it detects only changes that
-no place explains: a large loss of detail, or debris. It can't distinguish a ghost image there from order of the sample.
+no place explains: a large loss of detail, or debris. At an unknown place a ghost image looks like order of the sample.
 
 Scans of another size or number of pixels have a reference of their own, since the effect of a tip on a scan depends on
 the pixel: a fault in a zoom may be finer than the pixels of an overview. A reference is begun only while all others
@@ -83,9 +83,9 @@ class TipTolerance:
         ghost: at a known place, the largest correlation of a ghost image.
         unrest: factor on the disagreement of trace and retrace.
         worn: at any place, the least share of the first scans' fine detail.
-        sigmas: number of standard deviations of the reference that a bad scan must also be away.
-        margin: a scan within this share of the way to a limit is good; between it and the limit it is unclear,
-            so that the opinion on a tip at the limit does not alternate.
+        sigmas: least deviation of a bad scan, in standard deviations of the reference; not for `worn`.
+        margin: a scan within this share of the way to a limit is good; from there to the limit a scan is unclear, so
+            that the opinion on a tip at the limit does not alternate.
     """
 
     detail: float = 0.85
@@ -137,9 +137,9 @@ class TipReference:
         size_m, angle_rad, shape: size, angle and shape of these scans.
         places: the places of these scans, the last seen at the end.
         first: metrics of the scans that were learnt from.
-        deviations: differences of such scans at the same place: detail and unrest as ratios, ghost as it is.
+        deviations: differences of such scans at the same place: detail and unrest as ratios, ghost unchanged.
         suspect: whether a fault was found at a known place and is not over yet.
-        confirmed: whether a comparison was good after the last scan that was learnt from.
+        confirmed: whether a scan of any kind was judged good after the last scan that was learnt from.
     """
 
     size_m: tuple[float, float]
@@ -197,7 +197,7 @@ class JudgeState:
 
     Attributes:
         kinds: references, complete and incomplete, the last used at the end.
-        doubtful: whether the last scan that was compared was not good.
+        doubtful: whether the last scan that was compared with a reference was bad or unclear.
     """
 
     kinds: list[TipReference] = field(default_factory=list)
@@ -225,7 +225,7 @@ class TipJudge:
         return tuple(self._state.kinds)
 
     def knows(self, region: Region, shape: tuple[int, int]) -> bool:
-        """Return whether a scan of this region and shape is compared with a reference rather than learnt from."""
+        """Return whether the reference for scans of this size, angle and shape is complete."""
         return any(self._is_known(kind) and kind.fits(region, shape) for kind in self._state.kinds)
 
     def state(self) -> Plain:
@@ -248,7 +248,7 @@ class TipJudge:
         Args:
             trace, retrace: heights in m, [y, x]; retrace None if not recorded.
             region: the scanned region.
-            learns: whether a new kind of scan may be learnt from.
+            learns: whether a scan may be added to an incomplete reference, or begin one.
         """
         shape = (trace.shape[0], trace.shape[1])
         if not self.knows(region, shape) and not (learns and self._is_trusted):

@@ -3,9 +3,9 @@
 A changed tip blunts, doubles or shakes all features in the same way, so three properties of a scan characterise the tip
 rather than the place:
 
-- `detail`: the power of the slopes at short wavelengths against that at long ones. Every edge of the sample has both;
-  a blunt tip loses the short ones. (Heights of terraces, or the number of particles, scale both.) The power is the
-  cross spectrum of trace and retrace, in which noise averages out.
+- `detail`: the power of the slopes at short wavelengths against the power at long wavelengths. Every edge of the sample
+  has both; a blunt tip loses the short wavelengths. (Heights of terraces, or the number of particles, scale both.) The
+  power is the cross spectrum of trace and retrace, in which noise averages out.
 - `ghost`: the autocorrelation of the slopes away from zero. A second apex repeats every feature at one distance.
 - `unrest`: the disagreement of trace and retrace over stretches of flat ground, which loose debris causes and feedback
   does not.
@@ -88,7 +88,7 @@ def slopes(trace: Array, retrace: Array | None = None) -> Slopes:
 
 
 def autocorrelation(of: Slopes, reach_px: int) -> Array:
-    """Return the autocorrelation of the slopes, 1 at zero lag.
+    """Return the autocorrelation of the slopes, 1 at the peak near zero lag.
 
     Returns:
         Lags of 0 … reach rows by -reach … reach columns; the other half is the same by symmetry.

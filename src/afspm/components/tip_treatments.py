@@ -43,7 +43,7 @@ def treatments(
     crash_depths_m: Sequence[float],
     crash_speed_m_per_s: float,
 ) -> tuple[Treatment, ...]:
-    """Return the treatments of one repair, gentle ones first: pulses as listed, then crashes as listed.
+    """Return the treatments of one repair: pulses as listed, then crashes as listed.
 
     Raises:
         ConfigError: no treatment is listed, or a value is invalid.
@@ -60,7 +60,8 @@ def treatments(
 
 
 def fresh_place(center_m: XY, spacing_m: float, number: int) -> XY:
-    """Return the number-th place around a centre, `spacing_m` from all others: sunflower seeds (Vogel 1979)."""
+    """Return place `number`, from 0, of a spiral of places at least `spacing_m` apart: sunflower seeds (Vogel 1979)."""
+    # with this factor the two nearest places are 1.2 spacings apart
     radius = 1.2 * spacing_m * math.sqrt(number)
     angle = number * math.pi * (3.0 - math.sqrt(5.0))
     return center_m[0] + radius * math.cos(angle), center_m[1] + radius * math.sin(angle)

@@ -42,7 +42,7 @@ class LineVerdict:
         since_row: index of the first row with the change, by estimate.
         downwards: whether rows are scanned from the last to the first.
         confidence: share of scans with a good tip that give less evidence.
-        stops: whether the scan is stopped; else a person may look.
+        stops: whether the scan is stopped; otherwise the verdict only informs people.
     """
 
     region: Region

@@ -24,7 +24,8 @@ class TipWorkshop:
         center: the centre of the places.
         spacing: the distance between the places of two treatments, in m.
         keep_away: least distance of a treatment from scanned regions, in m.
-        charge: called before each attempt, whose save keeps its changes of the memory; it may raise.
+        charge: called with the treatment before each attempt. Its changes of the memory are saved before the attempt;
+            an error that it raises prevents the attempt.
     """
 
     def __init__(
@@ -47,7 +48,14 @@ class TipWorkshop:
     def treat(self, number: int, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
         """Do the `number`-th treatment at a fresh place, without losing control between move and treatment.
 
-        Return whether it was done. Raises FileError if the state can't be saved.
+        A treatment interrupted by a loss of control is retried at another place, while the problem is flagged.
+
+        Returns:
+            Whether the treatment was done.
+
+        Raises:
+            FileError: the state can't be saved; the treatment is not attempted.
+            ControlLost: control was lost, and the problem is no longer flagged.
         """
         while True:
             self._charge(treatment)

@@ -6,7 +6,7 @@
     comes in      TOML files
     state         none: an `Experiment` is frozen
     goes out      launch lines; findings, each with file, line, and what to write instead
-    always holds  all findings are reported at once; an experiment that passes the check starts
+    always holds  all findings are reported at once; an experiment with an error never starts
 """
 
 from afspm.experiment.experiment import Experiment, load, load_expanded

@@ -1,4 +1,4 @@
-"""Capabilities of a microscope, as far as its class shows them before it runs."""
+"""Capabilities of a microscope, as far as they are known from its class before the microscope runs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class MicroscopeCapabilities:
     table: ParameterTable
 
     def refuses(self, parameter: Parameter) -> str:
-        """Return why the microscope would refuse a value; empty for a valid value or an unknown parameter."""
+        """Return the reason of the microscope to refuse a value; empty for a valid value or an unknown parameter."""
         if parameter.name not in self.table or parameter.value is None:
             return ""
         try:
@@ -41,7 +41,7 @@ class MicroscopeCapabilities:
 
 
 def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None:
-    """Return the capabilities of a `Driver` class with these settings; None if they can't be known before it runs."""
+    """Return the capabilities of a `Driver` class with these settings; None if they are not known before the start."""
     from afspm.translator.driver import Driver
 
     if not issubclass(microscope, Driver):

@@ -1,4 +1,4 @@
-"""Import of the classes that an experiment file names as `class = "module.Name"`, when it is checked or started."""
+"""Import of the classes named in an experiment file by `class = "module.Name"`, for its check and its start."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def load(path: str) -> Any:
     """Return the object `module.Name`.
 
     Raises:
-        Unloadable: no such module or name, or its import fails.
+        Unloadable: `path` has no dot, there is no such module or name, or its import fails.
     """
     module_name, _, name = path.rpartition(".")
     if not module_name or not name:

@@ -45,7 +45,7 @@ class ConditionsReader:
     problems: ProblemNames
 
     def read(self, table: Table) -> InstrumentSettings:
-        """Return the settings; report errors, and leave faulty entries out."""
+        """Return the settings; after errors, which are reported, entries may be missing."""
         for instrument, parameters in self.instruments.items():
             for one in parameters:
                 if instrument_of(one) != instrument:

@@ -19,8 +19,8 @@ class Document:
     """Merged tables, and the place where each key was last set.
 
     Attributes:
-        homes: folders for relative file names and modules; empty: the folders of the files. (An expanded file lies in
-            the run folder, but names files beside the original.)
+        homes: folders in which modules are found; the first is also the start of relative file names. Empty: the
+            folders of the files. (An expanded file lies in the run folder, but names files beside the original.)
         is_whole: whether all files could be read.
         findings: errors and warnings so far.
     """
@@ -39,7 +39,7 @@ class Document:
         self.findings.warning(what, self.place(*path), hint)
 
     def place(self, *path: str | int) -> SourceLocation:
-        """Return the file and line that set `path`, or the line of the innermost table around `path`."""
+        """Return the file and line that set `path`, or the innermost table around `path`; else the first file."""
         for depth in range(len(path), 0, -1):
             found = self.places.get(path[:depth])
             if found is not None:
@@ -47,17 +47,20 @@ class Document:
         return SourceLocation(str(self.files[0]))
 
     def folder_of(self, *path: str | int) -> Path:
-        """Return the folder of the file that sets `path`: the start of relative file names."""
+        """Return the start of relative file names: `homes[0]`, else the folder of the file that sets `path`."""
         return self.homes[0] if self.homes else Path(self.place(*path).file).resolve().parent
 
     @property
     def folders(self) -> list[Path]:
-        """Folders of the files, in order, in which modules are found."""
+        """Folders in which modules are found: `homes`, else the folders of the files, in order."""
         return list(self.homes or dict.fromkeys(file.resolve().parent for file in self.files))
 
 
 def read(files: Sequence[Path], homes: Sequence[Path] = ()) -> Document:
-    """Read the files and merge them in order: tables key by key; for any other value the last file wins."""
+    """Read the files and merge them in order: tables key by key; for any other value the last file wins.
+
+    A file that can't be read or parsed is reported in the findings, and left out.
+    """
     document = Document(tuple(files), homes=tuple(homes))
     for file in files:
         text = _text(file, document.findings)

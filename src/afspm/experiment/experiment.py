@@ -50,12 +50,12 @@ class Experiment:
 
     @property
     def folder(self) -> Path:
-        """Folder of the first file, absolute: the start of relative paths in that file."""
+        """Folder of the first file, absolute; of the first original file, if this file is expanded."""
         return self._document.folders[0]
 
     @property
     def folders(self) -> list[Path]:
-        """Folders of all files, absolute, in which modules are found."""
+        """Folders of all files (the originals, if a file is expanded), absolute, in which modules are found."""
         return self._document.folders
 
     @property
@@ -80,7 +80,7 @@ class Experiment:
         return self.resolved.declaring(RECORDS)
 
     def check(self, only: Collection[str] = (), without: Collection[str] = ()) -> list[Finding]:
-        """Return all errors and warnings: errors first, then by line. No process is started.
+        """Return all errors and warnings: errors first, then by file and line. No process is started.
 
         Args:
             only, without: as for `launches`; classes of processes started elsewhere need not be installed here.
@@ -158,11 +158,11 @@ class Experiment:
         return self.resolved.simulated_with(process_starts.chosen_names(self.resolved, only, without))
 
     def ends_idle(self, names: Collection[str]) -> bool:
-        """Return whether a run of these processes ends once no process with a plan is left."""
+        """Return whether a run of these processes ends once no process with a plan is left; see `process_starts`."""
         return process_starts.ends_idle(self.resolved, names)
 
     def asking(self, names: Collection[str]) -> Launch | None:
-        """Return a launch line for requests to a scheduler on another computer, in the name of the first of `names`.
+        """Return a launch line for requests to a scheduler on another computer; the sender is the first of `names`.
 
         None if the scheduler's address is unknown, or if the scheduler is not afspm's.
         """

@@ -70,7 +70,7 @@ class Findings:
 
 
 def nearest(name: str, valid: Iterable[str], cutoff: float = 0.6) -> str:
-    """Return a hint with the valid name nearest to `name`, or with a few valid names if none is near."""
+    """Return a hint with the valid name nearest to `name`, or up to 12 valid names; empty without any."""
     names = sorted(set(valid))
     close = closest(name, names, cutoff)
     if close:

@@ -25,5 +25,5 @@ class FileForm(Converter, Protocol):
 
 @cache
 def all_forms() -> tuple[FileForm, ...]:
-    """Return all installed forms. Raises ConfigError if one can't be loaded."""
+    """Return all installed forms. Raises ConfigError if a form can't be loaded."""
     return tuple(entry_points.load(entry_points.FORMS, name) for name in entry_points.names(entry_points.FORMS))

@@ -33,7 +33,7 @@ BAR_HEIGHT, ARROW_AT, MOST_LABELS = 62.0, 16.0, 7
 
 @dataclass
 class ProcessBox:
-    """The drawn box of one process, and its column. Widths are set first, then places."""
+    """The drawn box of one process, and its column. Place and height follow from the widths of all boxes."""
 
     part: ExperimentPart
     lines: list[tuple[str, str]]

@@ -23,7 +23,7 @@ RECORDS, NOTIFIES = "records", "notifies"
 
 
 def recorder(resolved: ResolvedExperiment) -> ExperimentPart | None:
-    """Return the recorder of [record]; None if switched off, in the file already, or without a scheduler."""
+    """Return the recorder of [record]; None if it is switched off or in the file, or there is no scheduler."""
     section = resolved.sections.record
     if not section.on or resolved.declaring(RECORDS) or not resolved.with_role(Role.SCHEDULER):
         return None
@@ -58,7 +58,7 @@ def targets(section: NotifySection, folder: Path) -> Targets:
 
 
 def check_notify(resolved: ResolvedExperiment) -> None:
-    """Check that [notify] has a target, and that the target can be reached."""
+    """Check that [notify] has a target, its program exists, and its webhook is a valid address."""
     section = resolved.sections.notify
     if "notify" in resolved.parts.sections and not (section.command or section.webhook):
         resolved.document.error("[notify] has no recipient", "notify", hint="give a `command` or a `webhook`")
@@ -75,5 +75,5 @@ def check_notify(resolved: ResolvedExperiment) -> None:
 
 
 def is_program(name: str, folder: Path) -> bool:
-    """Return whether `name` can be run: "python", an installed program, or a file in `folder`."""
+    """Return whether a program exists: "python", an installed program, or a file in `folder`."""
     return name == "python" or shutil.which(name) is not None or (folder / name).is_file()

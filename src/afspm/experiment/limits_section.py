@@ -106,7 +106,7 @@ class LimitsReader:
         return frozenset((*names.BASE_ACTIONS, *names.EXTENSION_ACTIONS)) if self.actions is None else self.actions
 
     def read(self, table: Table) -> ExperimentLimits:
-        """Return the limits; report errors, and leave faulty entries out."""
+        """Return the limits; after errors, which are reported, entries may be missing or empty."""
         own = {key: value for key, value in table.items() if key in LimitsSection.model_fields}
         whole = parse(LimitsSection, "limits", own, self.document)
         parameters = {key: value for key, value in table.items() if key not in _OWN}

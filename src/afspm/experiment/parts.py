@@ -174,7 +174,7 @@ def _report_unused(parts: ExperimentParts, used: set[str], document: Document) -
 
 
 class VariableReferences:
-    """A replacer of references: a text that equals a top-level key stands for that key's value, as in the paper.
+    """A replacer of references: a text that equals a top-level key stands for that key's value.
 
     Only whole texts count, and only keys of variables and intermediary tables. Names of components and sections are not
     replaced, so that roles and limits can name a component.

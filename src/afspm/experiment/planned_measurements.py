@@ -65,7 +65,7 @@ class Refusal:
     """The reason why the limits refuse a part of a plan.
 
     Attributes:
-        where: path of the setting; empty if several are concerned.
+        where: path of the setting within the component; empty if no single setting is the cause.
     """
 
     reason: str
@@ -74,13 +74,13 @@ class Refusal:
 
 
 def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
-    """Return the plan of a component with these settings; None if there is no plan, or it can't be known.
+    """Return the plan of a component with these settings; None for a class that may not be constructed here.
 
     Only classes declared by entry points, and classes derived from them, are constructed: their `__init__` only stores
-    and checks settings.
+    and checks settings. The plan of a component without measurements is empty.
 
     Raises:
-        AfspmError: the component refuses its settings.
+        AfspmError: the component refuses its settings. A user's constructor may raise other errors.
     """
     if not entry_points.is_declared(component):
         return None
@@ -117,7 +117,7 @@ def _as_parameters(values: Mapping[str, object]) -> tuple[Parameter, ...]:
 
 
 def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[Refusal]:
-    """Return the reasons why the limits would refuse the plan, each once."""
+    """Return the reasons of the limits to refuse the plan, each once; of a grid of regions only the first."""
     # steps and rates depend on the value before, which is unknown here
     guard = LimitChecker(_without_changes(limits))
     found: dict[str, Refusal] = {}
@@ -169,7 +169,7 @@ def _nearest_text(region: Region, allowed: Region | None) -> str:
 
 _REACH = 1e-9  # the tolerance of the limits: a point on the border counts as inside despite rounding
 _MARGIN = 1e-3
-"""Relative distance of a suggested region from the border, used if its rounded numbers would exceed it."""
+"""Relative distance of a suggested region from the border, used if rounded numbers would exceed the border."""
 
 
 def nearest_region(region: Region, allowed: Region) -> Region:
@@ -219,7 +219,7 @@ def _shift_m(points: Iterable[XY], allowed: Region, margin: float) -> XY | None:
 
 
 def too_slow(planned: PlannedMeasurements, usual_m_s: float | None) -> str:
-    """Return a warning if a round of scans takes longer than its period; empty if not, or at unknown speed.
+    """Return a warning if a round of scans takes longer than its period; empty otherwise, or at unknown speed.
 
     Args:
         usual_m_s: scan speed if the plan sets no speed.

@@ -84,7 +84,10 @@ def starts(
 
 
 def knowing_the_run(resolved: ResolvedExperiment) -> set[str]:
-    """Return the processes that get the run's identity: all, unless the scheduler is written in another language."""
+    """Return the processes that get the run's identity.
+
+    These are all processes; with a scheduler in another language only the translator and emulators.
+    """
     if all(not scheduler.part.command for scheduler in resolved.with_role(Role.SCHEDULER)):
         return set(resolved.processes)
     return {*resolved.emulators, *(translator.name for translator in resolved.with_role(Role.TRANSLATOR))}
@@ -106,7 +109,8 @@ def chosen_names(resolved: ResolvedExperiment, only: Collection[str], without: C
 def ends_idle(resolved: ResolvedExperiment, names: Collection[str]) -> bool:
     """Return whether a run of these processes ends once no process with a plan is left.
 
-    True only if all processes with plans, and the scheduler, are started here: plans elsewhere may go on.
+    True only with [control] idle = "end", and if all processes with plans, and the scheduler, are started here: plans
+    elsewhere may go on.
     """
     acting = {name for name, process in resolved.processes.items() if process.role is Role.COMPONENT and process.acts}
     schedulers = {scheduler.name for scheduler in resolved.with_role(Role.SCHEDULER)}
@@ -226,7 +230,7 @@ def _variable_name(secret: object) -> list[str]:
 
 
 def asking(resolved: ResolvedExperiment, names: Collection[str]) -> Launch | None:
-    """Return a launch line for requests to a scheduler elsewhere, in the name of the first of `names`.
+    """Return a launch line for requests to a scheduler elsewhere; the sender is the first of `names`.
 
     None if the file lacks the scheduler's address, or the scheduler is a command, which may not know these requests.
     """

@@ -48,7 +48,7 @@ DRIFT = "DriftMapping"
 
 
 def resolve(parts: ExperimentParts, document: Document) -> ResolvedExperiment:
-    """Resolve the experiment; report errors, and leave faulty parts out."""
+    """Resolve the experiment, and report errors. A process whose class can't be loaded stays, without class."""
     resolved = ResolvedExperiment(
         parts=parts,
         document=document,

@@ -47,7 +47,7 @@ class ResolvedProcess:
 
     @property
     def acts(self) -> bool:
-        """Whether the process follows a plan of its own: a script that solves no problems, or a command (unknown)."""
+        """Whether the process has a plan of its own: a `run`, and no problems to solve; True if unknown."""
         if self.component is None or not issubclass(self.component, Component):
             return self.component is None
         return self.component.run is not Component.run and not self.declared.solves
@@ -81,7 +81,7 @@ class ResolvedExperiment:
     Attributes:
         processes: processes by name, in the order of the file.
         listening: sockets that components bind by settings of their own, beside the wiring.
-        plans: plan of each component, as far as its settings define one.
+        plans: plan of each component whose settings define a plan.
     """
 
     parts: ExperimentParts
@@ -151,9 +151,10 @@ class ResolvedExperiment:
         )
 
     def controller_of(self, translator: str, started: Collection[str]) -> str:
-        """Return the name of the emulator that a translator is wired to; empty if no emulator is started as well.
+        """Return the name of the emulator that a translator is wired to; empty without an emulator among `started`.
 
-        Always empty for a translator written in another language: nothing proves to which controller it connects.
+        Empty also if the translator is not started, or is the simulated microscope itself. Always empty for a
+        translator written in another language: nothing proves to which controller it connects.
         """
         process = self.processes[translator]
         if process.is_microscope or process.part.command or translator not in started:

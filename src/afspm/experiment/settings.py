@@ -38,7 +38,7 @@ def check(
     given: Collection[str] = (),
     wrong: set[str] | None = None,
 ) -> Settings:
-    """Return the settings for the process: validated, in SI units, of JSON's types. Reports errors.
+    """Return the settings for the process: validated, in SI units, of JSON's types; report errors.
 
     Args:
         given: parameters that the table must not set.
@@ -87,7 +87,7 @@ def default_of(component: type, name: str) -> Any:
 
 
 def listening(component: type, settings: Table) -> Iterator[tuple[str, str, bool]]:
-    """Yield (setting, address, whether keys guard it) of each socket that a component binds by its settings."""
+    """Yield (setting, address, True if guarded by keys) of each socket that a component binds by its settings."""
     everything = {**{name: default_of(component, name) for name in _parameters(component)}, **settings}
     for name, annotation in _annotations(component).items():
         for mark in getattr(annotation, "__metadata__", ()):

@@ -103,7 +103,7 @@ def check_commands(resolved: ResolvedExperiment) -> None:
 
 
 def check_intermediaries(resolved: ResolvedExperiment) -> None:
-    """Check intermediary tables: known settings only, and addresses where they belong."""
+    """Require known settings, numbers and valid addresses in intermediary tables."""
     names = [*resolved.parts.variables, *resolved.parts.intermediaries]
     for name, table in resolved.parts.intermediaries.items():
         kind = wire_of(table)
@@ -182,7 +182,7 @@ def check_listens_to(resolved: ResolvedExperiment) -> None:
 
 
 def check_problems(resolved: ResolvedExperiment) -> None:
-    """Require that all problems exist, and that each problem that is flagged is also solved, or ends the experiment."""
+    """Require that all problems exist, and each flagged problem is solved (also by hand) or ends the experiment."""
     control = resolved.sections.control
     by_hand = (*control.solved_by_hand, *control.end_on)
     solvers = (problem for process in resolved.processes.values() for problem in process.declared.solves)

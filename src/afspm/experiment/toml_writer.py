@@ -63,6 +63,7 @@ def dumps(document: Table) -> str:
 
 
 def _table(path: tuple[str, ...], table: Table) -> str:
+    # TOML has no null: a missing key stands for None
     header = "[" + ".".join(map(_key, path)) + "]"
     return "\n".join([header, *(f"{_key(k)} = {value(v)}" for k, v in table.items() if v is not None)])
 

@@ -10,7 +10,11 @@ from afspm.model import Role
 
 
 def trace_overlay(experiment: ResolvedExperiment, folder: Path) -> Path | None:
-    """Write an overlay into `folder` that switches the trace on; None if no translator can trace a controller."""
+    """Write an overlay into `folder` that switches the trace of the first translator with the setting `trace` on.
+
+    Returns:
+        The path of the overlay; None if no translator has the setting.
+    """
     for translator in experiment.with_role(Role.TRANSLATOR):
         if translator.component is not None and default_of(translator.component, "trace") is not None:
             overlay = folder / "trace.toml"

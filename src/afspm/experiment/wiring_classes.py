@@ -60,7 +60,7 @@ def wire_of(table: object) -> WiringClass | None:
 
 @dataclass(frozen=True)
 class BoundSocket:
-    """A socket that a process binds, at the address that the file gives under `key`; None if left open."""
+    """A socket that a process binds; `address` is the file's value of `key`, None if the address is open."""
 
     owner: str
     use: str

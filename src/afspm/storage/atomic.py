@@ -158,10 +158,11 @@ def _sync_and_close(descriptor: int) -> None:
 
 
 class OutageLog:
-    """A log of failed writes, once for each outage; a full or missing disk must not end an experiment.
+    """A log of failed writes, one line for each outage; a full or missing disk must not end an experiment.
 
     A slow disk is logged as a warning after `SLOW_S`: a busy disk takes a moment now and then, and its writes are only
-    late. A disk that refuses to write, or whose backlog is full so that data are lost, is CRITICAL at once.
+    late. A disk that refuses to write, or whose backlog is full so that data are lost, is CRITICAL at once, even after
+    the warning.
 
     Args:
         loss: the consequence, for people.
@@ -219,7 +220,7 @@ def previous_generation(path: Path) -> Path:
 
 
 class CheckpointFile:
-    """A small text, saved too often to wait for the disk, that survives a power cut.
+    """A file for a small state that is saved often, without waiting for the disk, and survives a power cut.
 
     Each generation is an appended line, which takes ten microseconds: a twentieth of a replacement of the file. The
     file is replaced only at `longest` bytes. The last line survives a kill of any process, and a moment later a power
@@ -239,7 +240,7 @@ class CheckpointFile:
         self._thread: threading.Thread | None = None
 
     def save(self, content: bytes) -> None:
-        """Add a generation: a text without line breaks and without a valid prefix.
+        """Add a generation: a text without line breaks, whose beginning alone is never valid (a power cut may cut it).
 
         Raises:
             FileError: the text can't be written.
@@ -311,16 +312,17 @@ def _is_there(file: io.FileIO) -> bool:
 
 
 def load_checkpoint(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, str]:
-    """Return the last generation in a file of `CheckpointFile`; None if there is no such file.
+    """Return the last readable generation in a file of `CheckpointFile`, and the damage of the last.
 
     Args:
-        read: converts a generation; raises ValueError, KeyError or TypeError for a damaged one.
+        read: converts a generation; raises ValueError, KeyError or TypeError for a damaged generation.
 
     Returns:
-        The converted generation; and the damage of the last generation if an earlier one was read, else "".
+        The converted generation, None if there is no file; and the damage of the last generation if an earlier
+        generation was read, else "".
 
     Raises:
-        FileError: no generation can be read, or the folder does not exist.
+        FileError: no generation can be read, or neither the folder nor its parent exists.
     """
     try:
         generations = path.read_bytes().splitlines() or [b""]

@@ -24,10 +24,10 @@ T = TypeVar("T")
 DEADLINE_S = 0.2
 SYNC_PERIOD_S = 0.1
 MOST_BYTES = 256 << 20
-"""Most bytes that wait for a disk that hangs; further data are not written."""
+"""Limit in bytes on data that wait for a hanging disk; further data are not written."""
 MOST_TASKS = 10_000
 FULL_BYTES = 1 << 20
-"""Free bytes below which a disk counts as full: no scan fits."""
+"""Free bytes below which a disk counts as full: too little for a usual scan."""
 _log = logging.getLogger("afspm.disk")
 
 
@@ -65,7 +65,7 @@ class DiskThread:
     """A thread that runs one task after the other.
 
     Attributes:
-        hangs: whether a task is late; no caller waits until it is finished.
+        hangs: whether a task was late or refused; until all tasks are finished, `run` does not wait.
     """
 
     def __init__(self, deadline_s: float = DEADLINE_S, most_bytes: int = MOST_BYTES) -> None:
@@ -84,8 +84,8 @@ class DiskThread:
             size: bytes that the task keeps in memory.
 
         Raises:
-            DiskTimeout: not in time; the task runs later.
-            DiskBacklogFull: too much waits; the task never runs.
+            DiskTimeout: not in time; the task is finished later.
+            DiskBacklogFull: too many tasks or bytes wait; the task never runs.
             Exception: any exception of `work`.
         """
         task = self.submit(work, size)
@@ -100,7 +100,7 @@ class DiskThread:
         """Queue a task without waiting.
 
         Raises:
-            DiskBacklogFull: too much waits; the task never runs.
+            DiskBacklogFull: too many tasks or bytes wait; the task never runs.
         """
         with self._lock:
             if self._count and (self._bytes + size > self._most_bytes or self._count >= MOST_TASKS):
@@ -188,7 +188,7 @@ class Syncer:
         _with_folder(folder, self.soon)
 
     def now(self, within_s: float) -> None:
-        """Wait until all data written so far are on the disk.
+        """Wait until all data passed to `soon` and `folder_soon` so far are on the disk.
 
         Raises:
             DiskTimeout: not in time.

@@ -1,4 +1,4 @@
-"""A log of JSON lines; each line goes to the operating system at once, so that a kill loses no line."""
+"""A log of JSON lines. Each line goes to the operating system at once, so that a kill loses no line."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class Memory(MutableMapping[str, Any]):
         damage: the damage of the file, if an earlier generation was read instead; "" else.
 
     Raises:
-        FileError: the file can't be read, or holds no JSON object.
+        FileError: no generation of the file can be read as a JSON object.
     """
 
     def __init__(self, path: Path | None, *, synced: bool = True) -> None:
@@ -56,7 +56,7 @@ class Memory(MutableMapping[str, Any]):
         action that must not happen twice.
 
         Returns:
-            True if the values were written.
+            True if the values were written, or there is no file; False if writing failed, or is late.
 
         Raises:
             InvalidValue: a value is not of JSON's types.
@@ -70,7 +70,7 @@ class Memory(MutableMapping[str, Any]):
 
     @property
     def saved_text(self) -> str:
-        """Return all saved values as JSON."""
+        """All values as JSON, as of the last successful save."""
         return self._saved
 
     def _write(self, text: str, *, synced: bool) -> bool:

@@ -1,11 +1,13 @@
 """The packet log: every published packet of the scheduler, appended before its publication.
 
-It is the only source of truth of a run. A restarted scheduler reads its cache from it, the recorder follows it, and the
-record (HDF5 files and an SQLite journal) derives from it. An appended packet goes to the system at once, so that it
-survives a kill of all processes; a moment later it is on the disk, and survives a power cut (see `disk`).
+The log is the only source of truth about these packets. A restarted scheduler reads its cache from it, the recorder
+follows it, and the record (HDF5 files and an SQLite journal) derives from it. An appended packet goes to the system at
+once, so that it survives a kill of all processes; a moment later it is on the disk, and survives a power cut (see
+`disk`).
 
 The log is bounded. The recorder commits the position up to which all packets are in the record and on the disk.
-Segments before it are overwritten, after the packets that the scheduler still caches have been appended again.
+If the log is too large, segments before that position are overwritten, after the packets that the scheduler still
+caches have been appended again.
 """
 
 from __future__ import annotations
@@ -27,10 +29,10 @@ COMMITTED_FILE = "recorded"
 """File in the log's folder with the committed position, if there is a recorder."""
 SEGMENT_BYTES = 16 << 20
 CAPACITY_BYTES = 64 << 20
-"""Smallest size of the log; it is also never smaller than twice the cached packets."""
+"""Size up to which no segment is freed; twice the size of the cached packets, if that is larger."""
 MOST_UNRECORDED_BYTES = 1 << 30
 SPARE_BYTES = 256 << 20
-"""Bytes kept in spare files, enough for a flood of packets until it is recorded."""
+"""Largest size of all spare files together, enough for a flood of packets until it is recorded."""
 SYNCED_WITHIN_S = 5.0
 _SPARE_SUFFIX = ".spare"
 
@@ -50,10 +52,11 @@ class PacketLog:
 
     Args:
         folder: created with the first packet.
-        most_unrecorded_bytes: most bytes that wait for the recorder; beyond that the oldest packets are dropped.
+        most_unrecorded_bytes: largest growth of the log above its usual size while packets wait for the recorder; above
+            it the oldest packets are dropped.
 
     Attributes:
-        has_grown: a segment was filled since the last `clean`.
+        has_grown: whether a segment was filled since the last `clean`; True before the first `clean`.
     """
 
     def __init__(self, folder: Path, *, most_unrecorded_bytes: int = MOST_UNRECORDED_BYTES) -> None:
@@ -88,7 +91,7 @@ class PacketLog:
         """Free the oldest segments while the log is too large; packets in `cached` stay in the log.
 
         Returns:
-            False if packets were given up before they were recorded.
+            False if packets were dropped before they were recorded.
 
         Raises:
             OSError: the disk is full, or does not sync.
@@ -247,7 +250,11 @@ def committed(folder: Path) -> Position | None:
 
 
 def discard_if_recorded(folder: Path) -> None:
-    """Remove the log of an ended experiment if all of it is recorded."""
+    """Remove the log of an ended experiment, unless a recorder has not recorded all of it yet.
+
+    Raises:
+        OSError: the log can't be read.
+    """
     position = committed(folder)
     if position is not None and LogReader(folder, position).read(1):
         return

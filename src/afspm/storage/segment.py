@@ -1,12 +1,12 @@
 """One file of the packet log: packets one after the other, each with its length and a checksum.
 
 A packet is: "AFp3", the number of the file, the lengths of envelope and payload, its time and the translator's time of
-it (-1: none), the number of cached packets of its envelope, the checksum of these fields; envelope; payload. Keyed
+it (-1: none), the number of cached packets of its envelope, the checksum of the whole packet; envelope; payload. Keyed
 results of components are kept in the same form, in files with the number 0. The checksum of a large payload is the sum
 of its 64-bit words, which takes a hundredth of the time of sending them.
 
 Overwriting an old file takes a fraction of the time of a new file. The number of the file, new each time, distinguishes
-new packets from remains of old ones; the checksum detects an incomplete packet after a kill or power cut.
+new packets from remains of old packets; the checksum detects an incomplete packet after a kill or power cut.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Supervision of an experiment's processes: start them, watch them, restart dead ones, and end the run.
+"""Supervision of an experiment's processes: start, watch and restart them, and end the run.
 
 **Theory of operation.** The decisions are pure (`supervision/`): events and real monotonic times in, effects out. The
 loop around them (`supervisor`) waits in one poller for heartbeats, exits, output, signals and the next deadline.

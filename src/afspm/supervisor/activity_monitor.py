@@ -68,7 +68,7 @@ class ActivityMonitor:
         return self._seen[-1][1].processor_s if self._seen else None
 
     def work(self, now_s: float) -> bool | None:
-        """Take a sample if one is due, and return whether the process works; None if unknown."""
+        """Take a sample if it is due, and return whether the process works; None if unknown."""
         if now_s >= self.again_s:
             self.again_s = now_s + self._lately_s / LOOKS
             self._works = self._judge(self._look(self._pid), now_s)

@@ -36,7 +36,7 @@ class OutputLine:
 
 @dataclass(frozen=True, slots=True)
 class OutputDropped:
-    """A number of lines of a child that were dropped because its output exceeded the limit."""
+    """The number of a child's lines dropped in one pause, because its output exceeded the limit."""
 
     name: str
     lines: int
@@ -45,8 +45,8 @@ class OutputDropped:
 class OutputLimit:
     """Rate limit on the lines of one stream.
 
-    A stream may write AT_ONCE bytes in a burst, and then BYTES_PER_S. Above that a pause begins, in which all lines but
-    the last are dropped. `go_on` ends the pause, after PAUSE_S or at the end of the stream.
+    A stream may write AT_ONCE bytes in a burst, and then BYTES_PER_S. Above that a pause begins: all its lines are
+    dropped except the last LAST_BYTES. `go_on` ends the pause, after PAUSE_S or at the end of the stream.
     """
 
     def __init__(self, now_s: float) -> None:
@@ -56,7 +56,7 @@ class OutputLimit:
         self.pausing = False
 
     def passes(self, line: bytes, now_s: float) -> bool:
-        """Return whether a line passes now; otherwise hold the line back, as it may be one of the last.
+        """Return whether a line passes now; otherwise hold the line back, as it may be among the last lines.
 
         Args:
             now_s: real monotonic time.

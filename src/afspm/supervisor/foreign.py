@@ -1,7 +1,8 @@
 """`python -m afspm.supervisor.foreign [--] command …` runs a component written in another language.
 
 The command gets the launch line on its standard input. When the standard input of this process closes, or its parent
-dies, the command is terminated, then killed. The exit code is the command's.
+dies, the command's standard input is closed, too; a command that still runs is terminated, then killed. The exit code
+is the command's, or `ExitCode.ORPHAN` if the command was ended by a signal from here.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _CHUNK = 1 << 16
 
 
 def main(arguments: list[str]) -> int:
-    """Run the command and return its exit code (128 + n for the signal n, as shells do)."""
+    """Run the command; return its exit code (128 + n for signal n, as shells do), CONFIG if it can't start."""
     command = arguments[1:] if arguments[:1] == ["--"] else arguments
     if not command:
         sys.stderr.write("ERROR foreign: no command given\n")
@@ -51,7 +52,7 @@ def main(arguments: list[str]) -> int:
 
 
 class _ForeignProgram:
-    """A child program that gets this process's standard input, and is ended with it.
+    """A child program that gets this process's standard input, and is ended when that input ends.
 
     Attributes:
         stopped: whether the child was terminated or killed because it outlived its standard input.

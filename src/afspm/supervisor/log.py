@@ -60,10 +60,10 @@ class LineReader:
 
 
 class RunLog:
-    """The log of a run: all lines in `file`, lines from `level` up in the terminal; `names` are padded to one width.
+    """The log of a run: all lines in `file`, lines from `level` up in the terminal. `names` are padded to one width.
 
     Neither a terminal that has gone or blocks (text marked in it, Ctrl-S) nor a disk that is full or hangs may stop a
-    measurement, so each has a thread of its own. A line that one of them loses is still in the other.
+    measurement, so each has a thread of its own. A line from `level` up that one of them loses is still in the other.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Addresses for sockets that the experiment file leaves open: unix sockets in one folder, or free ports.
 
-Only the user who runs the experiment can enter the folder (mode 0700, independent of umask). It is not the run's
-folder: the path of a unix socket has at most 107 bytes, and run folders are deep, and sometimes on a network disk.
+Only the user who runs the experiment can enter the folder (mode 0700, independent of umask). The run's folder is
+not used: the path of a unix socket has at most 107 bytes, and run folders are deep, and sometimes on a network disk.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TRIES = 200
 CAN_HOLD = sys.platform == "linux"
 """Whether a port can be held for a child: other systems let no second process bind a held port."""
 LONGEST_FOLDER = 90
-"""Limit on the path of a folder of sockets, in bytes. macOS has the lowest limit for a socket's path: 103."""
+"""Limit on the path in which a folder of sockets is made, in bytes. macOS has the lowest limit for a socket: 103."""
 # limits the open descriptors of a process that chooses ports for many runs
 _MOST_HELD = 256
 _TCP = re.compile(r"tcp://(\*|[^:/\s]+|\[[0-9A-Fa-f:.]+\]):([1-9]\d*)")

@@ -62,7 +62,7 @@ def follow(
     """Send the notifications of [notify], then log a summary and write the report.
 
     Notifications go first, because the rest needs the disk and may take long. If parts run on several computers, only
-    the one with the scheduler sends them.
+    the computer with the scheduler sends notifications.
     """
     notify = experiment.resolved.sections.notify
     if any(start.role is Role.SCHEDULER for start in starts):
@@ -126,7 +126,7 @@ def _times(count: int) -> str:
 
 
 def report(folder: Path, log: RunLog) -> None:
-    """Write the report of a recorded run, in a separate process that can't harm or delay the run."""
+    """Write the report of a recorded run, in a separate process within REPORT_WITHIN_S; log a failure."""
     if not (folder / JOURNAL_FILE).is_file():
         return  # no record, no report
     log.write(LOGGED_AS, logging.INFO, "writing the report …")
@@ -157,7 +157,7 @@ def report(folder: Path, log: RunLog) -> None:
 
 
 def tell(ended: EndedRun, targets: Targets, on: tuple[str, ...], clock: Clock, log: RunLog) -> None:
-    """Send a notification of the run's end. Failed deliveries are repeated for half a minute."""
+    """Notify of the run's end, if `on` includes the occasion; retry failed deliveries for half a minute."""
     is_lost = ended.outcome.why in (EndReason.LOST, EndReason.PLANS_LOST)
     what = GIVEN_UP if is_lost and GIVEN_UP in on else END
     if what not in on:

@@ -1,4 +1,4 @@
-"""One child process: start, launch line, output, exit, kill. Every difference between platforms is here."""
+"""One child process: start, launch line, output, exit and kill, on each platform."""
 
 from __future__ import annotations
 
@@ -47,6 +47,8 @@ class Task:
         environment: variables in addition to the supervisor's.
         hidden: variables of the supervisor that the process does not get.
         beats: whether it sends heartbeats; without heartbeats only an exit shows that a process is dead.
+        leaves_last: whether it stays until the other components have ended, to record their last packets.
+        acts: whether it follows a plan of its own (True if unknown), or only reacts.
     """
 
     launch: Launch
@@ -136,7 +138,7 @@ class ChildProcess:
                 self._popen.stdin.close()
 
     def kill(self) -> None:
-        """Kill the child and its process group now; does nothing after its exit."""
+        """Kill the child and its process group now, also processes that the child has left behind."""
         if sys.platform == "win32":
             with contextlib.suppress(OSError):
                 self._popen.kill()
@@ -177,6 +179,7 @@ class ChildProcess:
 
 
 def _start(command: Sequence[str], environment: Mapping[str, str], folder: Path | None) -> subprocess.Popen[bytes]:
+    # unbuffered, so that a kill loses no line of output; UTF-8, since the output is decoded as UTF-8
     return subprocess.Popen(
         command,
         stdin=subprocess.PIPE,

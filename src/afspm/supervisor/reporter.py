@@ -1,4 +1,4 @@
-"""The reporter: sends process states and log lines to the scheduler, and receives the scheduler's orders.
+"""The reporter of process states and log lines to the scheduler, which answers with orders.
 
 The reporter has a thread of its own, so that a slow or dead scheduler never delays the supervisor.
 """
@@ -118,7 +118,7 @@ class ReportQueue:
         return None
 
     def take_lines(self) -> tuple[LogLine, ...]:
-        """Return as many lines as the scheduler accepts in one report."""
+        """Return the oldest lines, as many as fit into one report, after a line about dropped lines."""
         batch, size = [], 0
         with self._lock:
             if self._dropped:
@@ -173,12 +173,12 @@ class Reporter:
             self._wake()
 
     def line(self, name: str, level: int, text: str) -> None:
-        """Queue a log line of a process or of the supervisor; `level` is a number of `logging`."""
+        """Queue a log line above DEBUG, of a process or the supervisor; `level` is a number of `logging`."""
         if level > logging.DEBUG and self._queue.put_line(name, logging.getLevelName(level), text):
             self._wake()
 
     def ask(self, wanted: AskUse | EndExperiment) -> None:
-        """Send the scheduler a request, before the next report."""
+        """Queue a request to the scheduler, to be sent before the next report."""
         self._asked.append(_REQUESTS[type(wanted)])
         self._wake()
 
@@ -272,7 +272,7 @@ class Reporter:
 
 
 class _OpenRequest:
-    """The request whose answer is awaited; there is at most one."""
+    """The single request whose answer is awaited."""
 
     def __init__(self, name: str, run: str) -> None:
         self.connected = self.answered = False

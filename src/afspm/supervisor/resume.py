@@ -75,7 +75,7 @@ def find(where: Path) -> ResumableRun:
 
     Raises:
         FileError: there is no run, or one of its files can't be read.
-        ConfigError: the run has ended, or its experiment file was edited since its start.
+        ConfigError: the run has ended or is a replay, or the experiment file at `where` was edited since its start.
     """
     folder = find_run(where).resolve()
     facts = read_run_json(folder)

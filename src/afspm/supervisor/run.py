@@ -183,7 +183,7 @@ def facts_to_resume(experiment: Experiment, starts: Sequence[ProcessStart], opti
 
 
 def dry_run(experiment: Experiment, options: RunOptions = RunOptions()) -> list[ProcessStart]:
-    """Return the processes that `run` would start, and start none. Raises as `run` does."""
+    """Return the processes that `run` would start, and start no process. Raises ConfigError as `run` does."""
     experiment.require_valid(options.only, options.without)
     return _starts(experiment, options, _own_identity(experiment, options), FreePorts().address)
 

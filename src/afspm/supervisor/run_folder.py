@@ -19,7 +19,7 @@ MOST_RUNS_A_SECOND = 1000
 
 
 def create(runs: Path, experiment: str, started: datetime) -> Path:
-    """Make the run folder `runs/<experiment>-<time>/` and return it, absolute; `runs/latest` then leads to it.
+    """Make the run folder `runs/<experiment>-<time>/` and return its absolute path; `runs/latest` then leads to it.
 
     Raises:
         FileError: the folder can't be made.

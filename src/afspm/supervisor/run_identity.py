@@ -44,7 +44,8 @@ def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
     """Wait for the scheduler, and return the identity of its run. A scheduler without a clock uses real time.
 
     Raises:
-        ConfigError: the scheduler refuses the request.
+        ConfigError: the scheduler still refuses the request after `REFUSED_S`.
+        WireError: the answer can't be read.
     """
     wall = ExperimentClock.real()
     port = open_port(launch, wall)

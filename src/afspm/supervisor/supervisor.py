@@ -148,7 +148,7 @@ class Supervisor:
         return RunOutcome(ending.why, ending.text, self._core.reports(), ending.began_s - began_s)
 
     def stop(self) -> None:
-        """End the run as Ctrl-C does. From any thread; a second call kills at once."""
+        """End the run as Ctrl-C does, from any thread; a second call kills the processes at once."""
         self._wakeup.post(EndSignal(signal.SIGINT))
 
     # --- events ---

@@ -20,7 +20,7 @@ class Outcome(Enum):
 
     MEASURED = "measured"
     REFUSED = "refused"
-    """Zoom or curves were refused, for the reason in the table."""
+    """The zoom or a curve was refused; the table has the reason."""
     INCOMPLETE = "incomplete"
     """The survey ended before the last curve."""
     NOT_REACHED = "not-reached"
@@ -32,11 +32,12 @@ class Visit:
 
     Attributes:
         number: counts from 1, in the order of the targets.
-        center_m: (x, y) from which offsets of curves are counted: the target's position in the survey, or in its zoom.
+        center_m: (x, y), the origin of the offsets of curves: the target's position in its zoom; before the zoom, in
+            the survey.
         zoom: the scan of the target; None: not taken, or not yet.
         curves: the measured curves, by name.
         refusals: reasons of refusals.
-        registration: how the zoom's position on the sample is known; None without drift correction.
+        registration: source of the zoom's position on the sample; None without drift correction.
         position_sd_m: standard deviation of that position; None: unknown.
     """
 
@@ -78,11 +79,12 @@ class SurveyRecord:
     def write(self, path: str | Path) -> None:
         """Write the table: a row for each target, with the controller's files of its zoom and curves.
 
-        If drift is corrected, `registration` and `position_sd` give the source and error of its position: registered,
-        coarse, or by dead reckoning (refused, failed, new). Paths of files in the table's folder are relative to it.
+        If drift is corrected, `registration` and `position_sd` are the source and the standard deviation of a zoom's
+        position: registered, coarse, or by dead reckoning (refused, failed, new). Paths of files in the table's folder
+        are relative.
 
         Raises:
-            OSError: the disk is full …
+            FileError: the table can't be written.
         """
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows(self._rows(Path(path).absolute().parent))

@@ -16,7 +16,7 @@ _TOPOGRAPHY = ("height", "zsensor", "topo", "zs-topo", "z")
 
 
 class OtherFormat(FileError):
-    """A file of another format with the same suffix; the next reader of the suffix is tried."""
+    """The error that a file has another format with the same suffix; the next reader of the suffix is tried."""
 
     code = "file-format"
 
@@ -48,7 +48,7 @@ class FileContent:
 
     @property
     def topography(self) -> Scan | None:
-        """Return the first scan of heights; None if there is none."""
+        """The scan in m with a usual name of a height channel, else the only scan if in m; None without any."""
         heights = [scan for scan in self.scans if scan.unit == "m"]
         for start in _TOPOGRAPHY:
             for scan in heights:
@@ -79,6 +79,6 @@ def local_ns(text: str, layout: str, zone: tzinfo | None) -> int:
 
 
 def clock_ns(time: datetime, zone: tzinfo | None) -> int:
-    """Return a time of the controller's clock, without a zone, in ns since the Unix epoch."""
+    """Return a time of the controller's clock in ns since the Unix epoch; `zone` None: this computer's zone."""
     moment = time.astimezone() if zone is None else time.replace(tzinfo=zone)
     return round(moment.timestamp() * 1e6) * 1000

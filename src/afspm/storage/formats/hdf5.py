@@ -29,7 +29,8 @@ def opened(path: Path) -> h5py.File:
     """Return the open file, which the caller closes.
 
     Raises:
-        FileError: the file is not HDF5, is damaged, or has a part in another file.
+        FileError: the file is not HDF5, has a damaged heap, or has a part in another file.
+        OSError: the file can't be read, or is damaged otherwise.
     """
     import h5py
 

@@ -41,7 +41,7 @@ def read_wave(data: bytes) -> Wave:
     """Return the wave in the bytes of a file.
 
     Raises:
-        FileError: the file has another version, is incomplete, or its checksum is wrong.
+        FileError: the file has another version or no real numbers, is incomplete, or its checksum is wrong.
     """
     if len(data) < _DATA:
         raise FileError(f"is incomplete: {len(data)} bytes are too few for an Igor wave")
@@ -58,7 +58,7 @@ def read_wave(data: bytes) -> Wave:
     sizes = [formula, note, unit, *units, *struct.unpack_from(f"{order}4i", data, 36)]
     values, after = _values(data, order)
     parts = []
-    for size in sizes:
+    for size in sizes:  # the texts follow the values in the order of their sizes
         if size < 0 or after + size > len(data):
             raise FileError("is incomplete: its strings are cut off")
         parts.append(data[after : after + size])

@@ -85,7 +85,7 @@ class ChildPhase(Enum):
     """Not started yet."""
     RUNNING = auto()
     KILLING = auto()
-    """The process was killed as dead or frozen; its exit is awaited."""
+    """The process was killed, as dead or frozen or for an ordered restart; its exit is awaited."""
     WAITING = auto()
     """The process crashed, and is restarted after the delay."""
     STOPPING = auto()
@@ -151,7 +151,7 @@ class ChildWatch:
         return self.phase in (ChildPhase.DONE, ChildPhase.GIVEN_UP)
 
     def died(self, code: int) -> bool:
-        """Return whether an exit code means that the process had not finished."""
+        """Return whether an exit code means a failure: neither a final code nor a requested end."""
         return code not in (*self._policy.final_codes, ExitCode.ORPHAN)
 
     def begin(self, now_s: float) -> list[ChildEffect]:

@@ -36,7 +36,7 @@ class LivenessPolicy:
         missed_beats: number of missing heartbeats after which the process counts as dead.
         start_s: limit until the first heartbeat.
         longest_step_s: limit for one step, unless the process declares its own.
-        closing_s: limit for closing.
+        closing_s: limit from the announcement of an end to the exit.
     """
 
     beat_period_s: float = 1.0

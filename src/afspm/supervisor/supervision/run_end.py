@@ -1,4 +1,4 @@
-"""End of a run: when to ask processes to end, when to kill them, when to leave them. Decisions only."""
+"""End of a run: the times to ask processes to end, to kill them, and to leave them. Decisions only."""
 
 from __future__ import annotations
 
@@ -72,9 +72,9 @@ class RunEnd:
     """A run that is ending: processes that still run are asked to end, then killed, then left.
 
     Attributes:
-        ask_s, kill_s: when to ask and to kill, in real monotonic time.
+        ask_s, kill_s: times to ask and to kill, real monotonic.
         latest_s: deadline for busy processes; then they are asked to end.
-        last: the last step taken.
+        last: the last step taken; None before the first.
         in_haste: whether a person has asked to end the run at once.
         busy_s: time at which a process was last busy after the request to end.
         began_s: time at which the end began.
@@ -189,7 +189,7 @@ class IdleWatch:
     starts: int = 0
 
     def look(self, children: Collection[SupervisedChild], now_s: float, liveness: LivenessPolicy) -> bool:
-        """Return whether the run has been idle for IDLE_AFTER_S."""
+        """Return whether the run has been idle for IDLE_AFTER_S, or is ending because it was idle."""
         acting = [child for child in children if child.spec.acts]
         starts_before, self.starts = self.starts, sum(child.starts for child in children)
         if not acting or not all(child.is_over for child in acting):
@@ -205,7 +205,7 @@ class IdleWatch:
         return now_s >= self.since_s + IDLE_AFTER_S
 
     def asks(self, now_s: float) -> bool:
-        """Return whether to ask the scheduler now if the microscope is in use; note the time."""
+        """Return whether to ask the scheduler now about the use of the microscope; if so, note the time."""
         if not self.ends or self.is_ending or now_s < self.asked_s + ASK_AGAIN_S:
             return False
         self.asked_s = now_s
@@ -219,7 +219,7 @@ class IdleWatch:
 
 
 def describe_idle(children: Collection[SupervisedChild]) -> str:
-    """Return why nothing is left to run, as in "series is done, grid was given up"."""
+    """Return the outcomes of all components with plans, as in "series is done, grid was given up"."""
     acting = [child for child in children if child.spec.acts]
     return ", ".join(f"{child.spec.name} {'was given up' if child.given_up else 'is done'}" for child in acting)
 

@@ -10,8 +10,9 @@ from afspm.supervisor.supervision.child import ChildWatch, HeartbeatReport
 from afspm.supervisor.supervision.liveness import LivenessPolicy
 
 LATE_START_S = 15.0
-"""Real time allowed for a process that restarts during the end: for its first heartbeat, unless the process is seen to
-work, and then for the packets that it missed."""
+"""Real time for a process that restarts during the end to send its first heartbeat, and then to receive missed packets.
+
+A process that is seen to work before its first heartbeat may take longer."""
 CLOSES_WITHIN_S = 1.5
 """Processor time that a process may use to end, after the request to end."""
 
@@ -64,7 +65,7 @@ class ChildLife:
         return self.beat is not None and self.beat.closing
 
     def overdue_s(self, liveness: LivenessPolicy) -> float | None:
-        """Return the time at which a heartbeat or exit is so late that the process's activity is sampled."""
+        """Return the time from which the process counts as overdue, and is sampled; None before its first heartbeat."""
         if self.beat is None:
             return None
         return self.beat_s + (liveness.closing_s if self.beat.closing else liveness.silence_s) / 2.0
@@ -112,7 +113,7 @@ class SupervisedChild:
         starts, ordered: number of starts, and number of restarts ordered by a person.
         rescued: whether it was started once more after the end of the experiment.
         last_exit: description of its last exit.
-        unfinished: the stop before it had finished as text; empty if it had finished.
+        unfinished: description of a stop before the process had finished; otherwise empty.
     """
 
     spec: ChildSpec

@@ -55,7 +55,7 @@ from afspm.supervisor.supervision.supervisor_events import (
 )
 
 SCHEDULER_ANSWERS_WITHIN_S = 15.0
-"""Time after which components start although the scheduler has not answered."""
+"""Time from the scheduler's start, after which components start although the scheduler has not answered."""
 
 
 class SupervisorCore:
@@ -66,7 +66,7 @@ class SupervisorCore:
         ends_idle: whether the run ends once no process with a plan is left.
 
     Attributes:
-        ending: how the run ends; None while it goes on.
+        ending: state of the end of the run; None until the end begins.
     """
 
     def __init__(

@@ -89,7 +89,7 @@ class SchedulerAnswered:
 
 @dataclass(frozen=True, slots=True)
 class UseReported:
-    """The scheduler's answer whether the microscope is in use; an empty `why` means that it is not in use."""
+    """The scheduler's answer about the use of the microscope: the reason `why`; empty if not in use."""
 
     why: str
 
@@ -145,7 +145,7 @@ class ProcessCommand:
 
 @dataclass(frozen=True, slots=True)
 class ReleaseComponents:
-    """The effect that lets the components begin that wait for the scheduler."""
+    """The effect that sends the waiting components their launch lines, so that they begin."""
 
 
 @dataclass(frozen=True, slots=True)
