@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from afspm.plugins.agent.plan import LONGEST_TITLE, MOST_PIXELS, MOST_STEPS
 
 LARGEST_PX = 512
-"""Rows and columns of a picture; more would only cost tokens."""
+"""Largest number of rows or columns of a picture; more would only cost tokens."""
 ProposalId = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 ScanId = Annotated[str, Field(pattern=r"^([0-9]{1,20}|newest)$", description="an id of `scans`, or newest")]
 Quantity = Annotated[str, Field(min_length=1, max_length=40)]
@@ -25,7 +25,7 @@ class Arguments(BaseModel):
 
 
 class Nothing(Arguments):
-    """Arguments of a tool that takes none."""
+    """Arguments of a tool without arguments."""
 
 
 class Newest(Arguments):

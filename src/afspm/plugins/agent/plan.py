@@ -34,7 +34,7 @@ class PlannedRequest:
 
     @property
     def step(self) -> GrantedStep:
-        """The request in the form in which it is approved and checked."""
+        """The request in its encoded form, which the scheduler compares with the approval."""
         return GrantedStep(self.kind, encode_subject(self.subject))
 
 
@@ -74,7 +74,7 @@ class SpectrumStep:
 
 @dataclass(frozen=True)
 class SetStep:
-    """Step that sets a parameter; `value` is a quantity with its unit, or a word."""
+    """Step that sets a parameter; `value` is a quantity (with a unit if the parameter has one), or a word."""
 
     parameter: str
     value: str
@@ -103,7 +103,7 @@ Step = ScanStep | SpectrumStep | SetStep | MoveStep
 
 @dataclass(frozen=True)
 class Plan:
-    """Steps in order. The agent chooses the title, for people; the id depends on it, too."""
+    """A title, which the agent writes for people, and steps in order. The id is a hash of both."""
 
     title: str
     steps: tuple[Step, ...]
@@ -127,7 +127,7 @@ def read_plan(plain: object) -> Plan:
     """Return the plan described by a tool's arguments.
 
     Raises:
-        InvalidValue: a field is unknown or missing, a quantity has no unit or is not finite, …
+        InvalidValue: a field is unknown, missing or out of bounds, or a quantity has no unit or is not finite.
     """
     table = _table(plain, "plan", ("title", "steps"))
     steps = table["steps"]

@@ -38,7 +38,7 @@ from afspm.storage.memory import Memory
 from afspm.transport.process.parent import StopRequested
 
 LEASE_S = 30.0
-"""Real: an agent whose process is gone loses control after this time."""
+"""Real seconds after which an agent whose process is gone loses control."""
 RENEW_S = 10.0
 STOP_ANSWERED_S = 5.0
 STOP_AGAIN_S = 0.5
@@ -55,7 +55,7 @@ class Requests(Protocol):
     def name_of(self, person: str) -> str: ...
 
     def submit(self, person: str, action: Callable[[PersonCommands], T]) -> Future[T]:
-        """Carry out an action in the thread that belongs to a name."""
+        """Start an action in the thread of an agent's name, and return its future."""
 
 
 @dataclass
@@ -63,6 +63,9 @@ class Run:
     """A plan or single measurement in progress or finished.
 
     Attributes:
+        who: the agent's name, as the scheduler knows it.
+        plan: id of the proposal; empty for a single measurement.
+        state: "running", "done", "failed", "stopped", or "interrupted" by a restart of this process.
         step: number of the current step, from 1.
         results: ids of finished scans and spectra.
         refusal: why the run failed, with the fields of a `RefusalModel`.
@@ -79,12 +82,12 @@ class Run:
 
 
 class Workplace:
-    """State shared by all agents: the published experiment, proposals and runs. For one event loop.
+    """State shared by all agents: the published experiment, proposals and runs. Runs belong to one event loop.
 
     Args:
         watch, archive: the experiment so far.
-        requests: sends requests.
-        file: keeps runs over a restart of this process; None: runs are not kept.
+        requests: sender of requests.
+        file: file that keeps runs over a restart of this process; None: runs are not kept.
 
     Attributes:
         approvals: approvals in force, as last published by the scheduler.
@@ -195,7 +198,10 @@ class Workplace:
         return run
 
     async def stop(self, person: str) -> bool:
-        """Flag `stopped-by-agent`; return whether the scheduler has accepted it yet. If not, it is tried again."""
+        """Cancel the agent's runs and flag `stopped-by-agent`; return False if the flag is not accepted within 5 s.
+
+        The request is then repeated in the background, until the scheduler accepts the flag or the experiment ends.
+        """
         for run in self.runs.values():
             if run.who == self.requests.name_of(person) and (task := self._tasks.get(run.id)) is not None:
                 task.cancel()
