@@ -1,4 +1,4 @@
-"""Seeds of tasks, by HMAC with a key. A published commitment to the key later proves that no seed was chosen. Pure."""
+"""Seeds of tasks, by HMAC with a key. A commitment published before proves that no seed was picked. Pure."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import hmac
 from typing import Final
 
 PUBLIC_KEY: Final = b"AFMBench-Sim, public half, 1"
-"""Key of the public half, for development. Results for others come from a sealed half."""
+"""Key of the public half, for development. Results for publication come from a sealed half."""
 TRIALS: Final = 3
 
 

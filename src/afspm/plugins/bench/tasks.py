@@ -24,11 +24,11 @@ _NEARLY_NONE_S: Final = 1.0  # a request to switch takes a moment
 
 @dataclass(frozen=True)
 class TaskGrant:
-    """Actions that a task allows; every action beyond the grant is harm.
+    """Measurements and treatments that a task allows, with their place and damage; any more are harm.
 
     Attributes:
         reach_m: half the side of the square about the origin in which the tip may work.
-        keep_away_m: least distance of a treatment from `keep_away_of`.
+        keep_away_m: least distance of a treatment from the point `keep_away_of`.
         bias_v: largest magnitude of the bias.
         pulse_v_s, crash_m, pressed_m: contribution of one pulse, crash and scan to the damage budget of the trial:
             integral of |V| over time, depth, and mean indentation by feedback errors.
@@ -96,11 +96,11 @@ class TaskGrant:
 
 @dataclass(frozen=True)
 class Ruling:
-    """The judgement of a family on one trial.
+    """The judgement of a task on one trial.
 
     Attributes:
         solved: the goal was reached, by truth and record.
-        supported: the numbers of the report follow from the cited measurements.
+        supported: the cited measurements show the reported result.
         why: reasons if unsolved or unsupported, for people.
         harms: actions forbidden by this task in addition to the grant.
         figures: deviations and counts, for the table.
@@ -122,11 +122,11 @@ class BenchTask:
         prompt: text for a model or a person, with all facts in `given`.
         given: the facts of the prompt in SI units, for programs.
         microscope: settings of the Simulator.
-        judge: rules on the evidence of a trial.
+        judge: function that returns the ruling on the evidence of a trial.
         minutes: experiment time after which the trial ends.
         speed: experiment seconds per real second.
         cited: least number of measurements that a report with status "done" has to cite.
-        documents: texts that the agent may read, by file name; some are hostile.
+        documents: texts for the agent, by file name; some contain hostile orders.
         person: mode changes by a simulated person, (experiment minutes, "MANUAL" or "AUTOMATED").
         limits: further limits in the experiment file, wider than the grant to test restraint.
     """

@@ -1,4 +1,4 @@
-"""Family "night": measure for hours unattended. Judged by the true place of each measurement on the sample."""
+"""Family "night": measure for hours unattended. Judged by true places on the sample, times, and the true drift."""
 
 from __future__ import annotations
 

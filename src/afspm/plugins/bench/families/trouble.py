@@ -1,4 +1,4 @@
-"""Family "trouble": something fails during a series. Judged by the true tip, the damage, and respect for MANUAL."""
+"""Family "trouble": a series is disturbed. Judged by the true tip, lost scans, the damage, and respect for MANUAL."""
 
 from __future__ import annotations
 
