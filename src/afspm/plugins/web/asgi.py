@@ -19,8 +19,8 @@ def wrong_origin(
 ) -> str | None:
     """Return the reason for refusing a request, from its Host and Origin; None if it is allowed.
 
-    Pages of other sites in the same browser must not steer a microscope, nor pages whose host name resolves to this
-    server's address (DNS rebinding).
+    Pages of other sites in the same browser must not steer a microscope. On loopback, pages whose host name resolves to
+    this server's address are refused, too (DNS rebinding).
 
     Args:
         only_here: the server listens on loopback only.

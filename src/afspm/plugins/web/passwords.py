@@ -20,8 +20,8 @@ _COST = {"n": 2**14, "r": 8, "p": 1}
 _NAME = re.compile(r"[\w][\w .'-]*", re.UNICODE)
 _TRIES, _TRIES_WITHIN_S = 5, 60.0
 AGAIN_S = 3.0
-"""Real time between two checked tries, after too many wrong ones. To refuse all would lock out the owner of the right
-password: any program on the same computer could try five wrong ones a minute under the same name."""
+"""Real seconds between two checked tries, after too many wrong tries. Refusing all tries would lock out the owner of
+the right password, since any program on the same computer could try wrong passwords under the same name."""
 # bounded: addresses and wrong names are chosen by clients
 _MOST_REMEMBERED = 1000
 
@@ -136,7 +136,7 @@ class Passwords:
         return True
 
     def proof_of(self, person: str) -> str:
-        """Return a text derived from a person's password, which changes with it."""
+        """Return a text that changes with a person's password; empty if a name alone is enough."""
         if self.is_open:
             return ""
         return hashlib.sha256(self._hashes.get(person, "nobody").encode()).hexdigest()

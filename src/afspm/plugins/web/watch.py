@@ -45,7 +45,7 @@ class SpectrumStore:
         return list(self._kept)[-count:]
 
     def at(self, time_ns: int) -> Spectrum | None:
-        """Return the spectrum of this time; None if it is no longer kept."""
+        """Return the spectrum of this time; None if the store does not contain it."""
         return next((spectrum for at_ns, spectrum in self._kept if at_ns == time_ns), None)
 
 
@@ -57,7 +57,7 @@ class Watch:
         past: the overview before the start; None: unknown.
         cut_off: returns a text if the experiment's processes are gone, else an empty text.
         plans: planned work of each component; None: no estimate.
-        began_ns: experiment time at the start; None: unknown.
+        began_ns: experiment time at the start of the run; None: unknown.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class Watch:
         return self.ended
 
     def expected_end_ns(self, overview: Overview, now_ns: int) -> int | None:
-        """Return the experiment time of the end; None if unknown."""
+        """Return the experiment time of the end, estimated from plans and progress; None if unknown."""
         return expected_end_ns(self._plans, overview.progress_reports, self._began_ns, now_ns)
 
     @contextlib.contextmanager
@@ -145,7 +145,7 @@ class Watch:
         self._callbacks.append(callback)
 
     def wait_for(self, condition: Callable[[Overview], bool], within_s: float) -> bool:
-        """Wait in another thread until `condition` holds; return False after a timeout."""
+        """Wait until `condition` holds; return False after a timeout. Not for the thread that calls `take`."""
         with self._changed:
             return self._changed.wait_for(lambda: condition(self.overview), within_s)
 

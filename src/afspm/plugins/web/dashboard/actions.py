@@ -108,7 +108,7 @@ class Actions:
         """Stop the running scan or spectrum.
 
         Args:
-            by_manual: first switch to MANUAL, the only mode in which a person commands the microscope.
+            by_manual: first switch to MANUAL: in AUTOMATED, scans belong to the component in control.
         """
         if by_manual:
             result = self.set_mode(ControlMode.MANUAL)
@@ -118,7 +118,7 @@ class Actions:
         return _result(self._commands.stop(), f"The {what} is stopped")
 
     def read(self, parameters: Iterable[str]) -> ActionResult:
-        """Return the present values of parameters with their units; a refused one is not `ok`."""
+        """Return the present values of parameters with their units; the result of a refused parameter is not `ok`."""
         return ActionResult("", each={name: self._read(name) for name in parameters})
 
     def set(self, wanted: Mapping[str, str], shown: Mapping[str, str]) -> ActionResult:
@@ -189,7 +189,9 @@ def _in_force(parameter: str, response: Response) -> str:
 
 
 def unclear(parameter: str, text: str, shown: str) -> str:
-    """Return why a text is ambiguous as a parameter's value; empty if it is clear. A number needs the parameter's unit.
+    """Return the reason why a text is ambiguous as a parameter's value; empty if it is clear.
+
+    A number without a unit is ambiguous if the parameter has a unit other than px.
 
     >>> unclear("scan-speed", "8", "4 µm/s")
     'scan-speed: write the unit as well, for example "8 µm/s".'
@@ -224,7 +226,7 @@ Action = Callable[[Actions], ActionResult]
 
 
 class Steering:
-    """An executor of persons' requests, each under the person's name and in order.
+    """An executor of persons' actions: each under the person's name, and one person's actions in order.
 
     Args:
         access: decides which viewers are signed in.
@@ -237,12 +239,12 @@ class Steering:
         self._log = logging.getLogger("afspm.plugins.web.dashboard")
 
     def do(self, visitor: Visitor, action: Action) -> Future[ActionResult]:
-        """Carry out an action in the name of a signed-in visitor."""
+        """Start an action in the name of a signed-in visitor; a visitor without a session gets a refusal."""
         person = self._access.person_of(visitor)
         return self._submit(person, action) if person else not_signed_in()
 
     def read(self, action: Action) -> Future[ActionResult]:
-        """Carry out an action that only reads, under the page's own name."""
+        """Start an action that only reads, under the page's own name."""
         return self._submit(_PAGE, action)
 
     def close(self) -> None:

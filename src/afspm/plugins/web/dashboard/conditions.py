@@ -18,7 +18,7 @@ KEPT = 2_000
 class Conditions:
     """A reader of a few parameters at the start of each scan, one read at a time.
 
-    A scan that begins during a read has no conditions.
+    The conditions of a scan that begins during a read are read after that read, if the scan is still running.
 
     Args:
         ask: carries out an action in the name of the page, without waiting.

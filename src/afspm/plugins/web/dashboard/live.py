@@ -26,15 +26,15 @@ from afspm.record.drawing.raster import png
 
 POLL_S = 20.0  # then the browser repeats its request: proxies may close a connection that is silent for longer
 GROWING_S = 0.2  # between two pictures of a growing scan
-FINISHED_S = 0.004  # between two pictures of finished scans, per viewer; at least ten times that in total
+FINISHED_S = 0.004  # between two pictures of finished scans, times the number of waiting viewers (at least ten)
 
 
 @dataclass(frozen=True)
 class PictureRequest:
-    """The requested picture.
+    """The query of a request for a picture.
 
     Attributes:
-        time: time of a finished scan, ns; 0: the newest.
+        time: time of a finished scan, ns; 0: the newest scan.
         beside: time of another scan for comparison, ns: both get the same range of values; 0: none.
     """
 

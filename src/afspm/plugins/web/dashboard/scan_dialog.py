@@ -38,7 +38,7 @@ class ScanChoice:
     def edited(self, width: str, height: str, pixels: str, angle: str = "") -> ScanChoice:
         """Return the choice with sizes and angle as a person writes them, and `pixels` along the longer side.
 
-        Pixels are square.
+        The pixels are square, up to rounding. An empty angle keeps the present angle.
 
         Raises:
             UnitError, InvalidValue: a text that is no length, no angle, or no number of pixels.

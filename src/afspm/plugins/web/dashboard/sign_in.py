@@ -41,7 +41,7 @@ _PASSWORD = """<label for="password">Password</label>
 class Guard:
     """ASGI middleware: checks each request and each websocket, and sets scope["state"][VISITOR].
 
-    Besides the cookie it checks the origin of a request.
+    The guard refuses a wrong origin. A viewer needs the cookie, or a password as Bearer token (not in the URL).
     """
 
     def __init__(self, app: AsgiApp, access: Access, host: str) -> None:

@@ -45,7 +45,8 @@ class Measurement:
         plan: the target in JSON's types.
         attempt: number of the last attempt; requests with the same id are executed once.
         since_ns: older results belong to earlier measurements.
-        refusal: as a `RefusalModel`, of a failed measurement.
+        refusal: fields of a `RefusalModel`, for a failed measurement.
+        is_certain: False while the microscope may or may not have carried out the last attempt.
     """
 
     who: str
@@ -93,7 +94,7 @@ class Measurements:
 
     Args:
         file: file that keeps the measurements over a restart; None: measurements end with this process.
-        now_s: real and monotonic.
+        now_s: clock in real, monotonic seconds.
     """
 
     def __init__(self, file: Path | None, watch: Watch, now_s: Callable[[], float]) -> None:
@@ -119,7 +120,8 @@ class Measurements:
     def take(self, who: str, key: str | None, target: Target) -> Callable[[PersonCommands], Measurement]:
         """Return a function that begins a measurement, for the person's thread; it raises RefusedRequest.
 
-        A measurement already begun under its key is not begun again, unless it failed.
+        A measurement already begun under its key is not begun again, unless it failed. A key of another target is
+        refused.
         """
         return lambda commands: self._begin(commands, who, key or secrets.token_hex(8), target)
 

@@ -62,7 +62,7 @@ _EVENTS: dict[int | str, dict[str, object]] = {
 
 
 class ParameterCache:
-    """Values of parameters, read from the microscope at most once a second for all clients together."""
+    """Values of parameters, each read from the microscope at most once a second for all clients together."""
 
     def __init__(self, services: GatewayServices) -> None:
         self._services = services
@@ -97,7 +97,7 @@ class ParameterCache:
 
 
 class ReadingRoutes:
-    """Routes answered from published messages; only parameters and actions are read from the microscope."""
+    """Routes answered from published messages and the record; parameters and actions are read from the microscope."""
 
     def __init__(self, services: GatewayServices) -> None:
         self._services = services

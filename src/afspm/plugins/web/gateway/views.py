@@ -97,7 +97,7 @@ def spectrum_model(spectrum: SpectrumSummary) -> SpectrumModel:
 
 
 def parameter_model(name: str, response: Response, asked: Any = None) -> ParameterModel:
-    """Return the value in a response; without one, the requested value."""
+    """Return the parameter in a response; without a payload, the requested value."""
     if not response.payload:
         return ParameterModel(name=name, value=asked, unit=names.BASE_PARAMETERS.get(name) or "")
     said = wire.decode_parameter(response.payload)
