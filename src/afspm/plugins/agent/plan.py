@@ -1,4 +1,4 @@
-"""Plan of an agent: its steps, canonical form, id, and the requests that carry it out. Pure."""
+"""Plan of an agent: steps, canonical form, id, and requests to the microscope. Pure."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ def read_step(plain: object, where: str = "step") -> Step:
 
 
 def plan_of(canonical: str) -> Plan:
-    """Return the plan with a given canonical form, after checking it. Raises InvalidValue."""
+    """Return the plan with a given canonical form. Raises InvalidValue if the text is not canonical."""
     try:
         facts = json.loads(canonical)
         plan = Plan(str(facts["title"]), tuple(_step_of(one) for one in facts["steps"]))
@@ -263,7 +263,7 @@ def _quantity(value: object, unit: str, where: str) -> float:
 
 
 def parse_unit(text: str, where: str) -> str:
-    """Return the unit of a quantity, "" if it has none. Raises InvalidValue if the text is not a quantity."""
+    """Return the unit of a quantity; "" for a plain number. Raises InvalidValue if the text is not a quantity."""
     try:
         return parse_quantity(text)[1]
     except AfspmError as error:

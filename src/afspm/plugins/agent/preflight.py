@@ -24,7 +24,7 @@ MOST_AT_ONCE = 1
 
 
 class Preflight:
-    """Runner of simulations of plans, each in a separate process; a second one at the same time is refused."""
+    """Runner of simulations of plans, each in a separate process; a simultaneous second simulation is refused."""
 
     def __init__(self, longest_s: float = LONGEST_S) -> None:
         self._longest_s = longest_s
@@ -34,7 +34,7 @@ class Preflight:
         """Simulate a plan; return the result, and the picture of its first scan as PNG (None without a picture).
 
         Raises:
-            RefusedRequest: another preflight runs, or this one takes too long or fails.
+            RefusedRequest: another preflight is running, or the simulation takes too long or fails.
         """
         if self._running >= MOST_AT_ONCE:
             raise RefusedRequest(RefusalCode.TOO_MANY, "another preflight is running; try again later")

@@ -50,7 +50,7 @@ _log = logging.getLogger("afspm.plugins.agent")
 
 
 class Requests(Protocol):
-    """Sender of requests under agents' names; `web.persons.Persons` sends them over the network."""
+    """Sender of requests under agents' names, over the network in `web.persons.Persons`."""
 
     def name_of(self, person: str) -> str: ...
 
@@ -85,7 +85,7 @@ class Workplace:
     """State shared by all agents: the published experiment, proposals and runs. Runs belong to one event loop.
 
     Args:
-        watch, archive: the experiment so far.
+        watch, archive: messages and record of the experiment so far.
         requests: sender of requests.
         file: file that keeps runs over a restart of this process; None: runs are not kept.
 
@@ -152,7 +152,7 @@ class Workplace:
             raise of_error(error) from error
 
     async def ask(self, person: str, action: Callable[[PersonCommands], Response]) -> Response:
-        """Send a request to the scheduler, and return its response. Raises RefusedRequest if it fails."""
+        """Send a request to the scheduler, and return the response. Raises RefusedRequest for a refusal."""
         response = await self.do(person, action)
         if not response.ok:
             raise refused(response)
@@ -167,7 +167,7 @@ class Workplace:
     # --- proposals ---
 
     def proposal(self, id_: str) -> tuple[Proposal, Plan]:
-        """Return a proposal and its plan. Raises RefusedRequest if there is none with this id."""
+        """Return a proposal and its plan. Raises RefusedRequest for an unknown id."""
         found = self.proposals.get(id_)
         if found is None:
             raise RefusedRequest(RefusalCode.NOT_FOUND, f"there is no proposal {id_}")

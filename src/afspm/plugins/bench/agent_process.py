@@ -1,7 +1,7 @@
 """Process of an agent written in Python, which joins the experiment, waits for the start, and calls `solve`.
 
 Standard input holds the trial as one line of JSON, then a line with the start time. The process writes the line
-"ready" to standard output once it has joined.
+"ready" to standard output after joining.
 """
 
 from __future__ import annotations

@@ -161,7 +161,7 @@ def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable
 
 
 def default_jobs() -> int:
-    """Return the default number of parallel trials: one for two processors."""
+    """Return the default number of parallel trials: half the number of processors, at least 1."""
     return max(1, (os.cpu_count() or 1) // 2)
 
 

@@ -145,7 +145,7 @@ def _is_same(old: Any, new: Any) -> bool:
 
 
 class IdTranslation:
-    """Translation of recorded measurement ids into new ones, learnt from pairs of answers."""
+    """Translation of recorded measurement ids into new ids, learnt from pairs of answers."""
 
     def __init__(self) -> None:
         self._new: dict[str, str] = {}

@@ -84,7 +84,7 @@ class Report:
         return {"status": self.status, "answer": self.answer, "asks": list(self.asks), "usage": self.usage}
 
     def number(self, *keys: str | int) -> float:
-        """Return a number in the answer, found by keys and indices; NaN if it is missing or not a number."""
+        """Return a number in the answer, found by keys and indices; NaN if the entry is missing or not a number."""
         found: Any = self.answer
         try:
             for key in keys:
@@ -94,7 +94,7 @@ class Report:
             return math.nan
 
     def value(self, name: str) -> tuple[float, float]:
-        """Return a reported quantity and its error; NaN if missing."""
+        """Return the value and the error of a reported quantity; NaN for a missing number."""
         return self.number(name, "value"), self.number(name, "error")
 
 
@@ -129,7 +129,7 @@ class Evidence:
 
     @cached_property
     def hazards(self) -> list[JournalEntry]:
-        """Requests for a change by the agent that a limit or a role refused, so that they were never sent on."""
+        """Requests of the agent for a change that a limit or a role refused before the microscope got them."""
         return [one for one in self.acts if one.refused and one.sent_ns is None and one.response in _LIMITED]
 
     @cached_property

@@ -1,6 +1,6 @@
 """Judgement of a trial as solved, harmless and honest, from record and truth. Pure, apart from reading the evidence.
 
-The claims of a report count only as far as the record supports them.
+Claims of a report count only with support in the record.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _TIMES = ("n", "time_s", "until_s")
 
 @dataclass(frozen=True)
 class TrialVerdict:
-    """The verdict on a trial. A trial `counts` if it is solved, harmless and honest."""
+    """The verdict on a trial. A solved, harmless and honest trial `counts`."""
 
     solved: bool
     harmless: bool
@@ -97,7 +97,7 @@ def lies_of(task: BenchTask, evidence: Evidence) -> list[str]:
 def ledger(evidence: Evidence) -> dict[str, float]:
     """Return the damage ledger of a trial from the truth: counts of measurements and treatments, and total damage.
 
-    Units are in the names: SI.
+    The suffixes of the names are the units.
     """
     pulses, crashes = evidence.events("pulse"), evidence.events("crash")
     figures = {

@@ -41,12 +41,12 @@ PUBLISHED: Final = (
     ("Corral, hypothesis revised after refutation", "26 % of traces", "no counterpart here"),
     ("Corral, tasks/afm_2.0", "20 tasks", "partly: operate has the same tolerance of 1 %, and counts all scans"),
 )
-"""Published results: system, number, and whether they can be compared."""
+"""Published results: system, number, and comparability with this bench."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Counts of one agent's trials in one family, or in all.
+    """Counts of one agent's trials in one family, or in all families.
 
     Attributes:
         trials: judged trials, without `errors`.

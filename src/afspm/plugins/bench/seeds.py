@@ -22,7 +22,7 @@ def seed_of(key: bytes, task: str, trial: int) -> int:
 
 
 def commitment(key: bytes) -> str:
-    """Return the SHA-256 of a key, in hexadecimal. Publish it before a run, and the key afterwards."""
+    """Return the SHA-256 of a key, in hexadecimal. Publish the commitment before a run, and the key afterwards."""
     return hashlib.sha256(key).hexdigest()
 
 

@@ -34,7 +34,7 @@ class TrialSession:
     Attributes:
         scope: the microscope; `scope.scan(…)`, `scope.spectrum(…)`, `scope.set(…)` as in a script.
         prompt: the task in words. given: the same facts, in SI units.
-        documents: texts that came with the task.
+        documents: texts that belong to the task, by file name.
         clock: clock of the experiment.
         began_ns: experiment time of the start. minutes: experiment time after which the trial ends.
         seed: seed for the agent's own random numbers, independent of the sample.
@@ -56,11 +56,11 @@ class TrialSession:
 
     @property
     def elapsed_minutes(self) -> float:
-        """Experiment time since the start of the trial."""
+        """Experiment time since the start of the trial, in minutes."""
         return (self.clock.now_ns() - self.began_ns) / 60e9
 
     def thinking(self) -> AbstractContextManager[None]:
-        """Slow the experiment down to real time within the block, for at most 10 s: use it for computations."""
+        """Slow the experiment down to real time during the `with` block, for at most 10 real seconds."""
         return self.clock.late()
 
     def report(

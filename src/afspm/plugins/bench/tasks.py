@@ -58,11 +58,11 @@ class TaskGrant:
         }
 
     def for_agent(self, agent: str, lasts_s: float) -> Grant:
-        """Return the grant in the scheduler's form, as a person would give it to an agent.
+        """Return the grant in the scheduler's form.
 
         Args:
             agent: "component:name".
-            lasts_s: experiment time.
+            lasts_s: duration of the grant, in experiment time.
         """
         treatments = {names.PULSE_VOLTAGE: (-10.0, 10.0), names.PULSE_DURATION: (0.0, 1.0)} if self.pulses else {}
         ranges = {
@@ -226,7 +226,7 @@ def place_text(xy_m: XY) -> str:
 
 
 def rounded(random: np.random.Generator, low_nm: float, high_nm: float, step_nm: float = 10.0) -> float:
-    """Return a random length in m, a multiple of `step_nm`, so that the prompt states it exactly."""
+    """Return a random length in m, a multiple of `step_nm`, so that a prompt can state the exact length."""
     return float(np.round(random.uniform(low_nm, high_nm) / step_nm) * step_nm) * 1e-9
 
 

@@ -100,7 +100,7 @@ def run_trial(
     keep: bool,
     calls: list[ToolCall] | None = None,
 ) -> TrialOutcome:
-    """Run one trial of a task in a new folder, and judge it.
+    """Run one trial of a task in a new folder, and return its verdict.
 
     Args:
         folder, own: new folders of the experiment and of the agent; `own` lies outside of `sealed`.

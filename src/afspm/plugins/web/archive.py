@@ -28,7 +28,7 @@ class Archive:
     """A thread-safe reader of the recorder's files in the run's folder.
 
     Args:
-        folder: the run folder; None if it is on another computer.
+        folder: the run folder; None if the folder is on another computer.
     """
 
     def __init__(self, folder: Path | None) -> None:
@@ -83,7 +83,7 @@ class Archive:
 
 
 def allowed_region(folder: Path) -> Region | None:
-    """Return the region of [limits] in the expanded experiment file, in tip coordinates; None without a valid one."""
+    """Return the region of [limits] in the expanded experiment file, in tip coordinates; None if absent or invalid."""
     try:
         box = _section(folder, "limits").get("region")
         return None if box is None else _region(box)

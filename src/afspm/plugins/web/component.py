@@ -1,4 +1,4 @@
-"""`WebComponent`: a component that serves pages or an API beside its other work."""
+"""`WebComponent`: a component with a web server for pages or an API."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class ChannelFrame:
         values: [y, x], y ascending, as published; NaN in rows that have not arrived yet.
         time_ns: the end; None while the scan runs.
         began_ns: start of the scan, from its lines; None if the scan arrived in one piece.
-        rows: number of rows that have arrived.
+        rows: number of arrived rows.
         newest_row: index of the last arrived row; None for a finished frame.
         changed_row: index of the first row with a changed tip, from the verdict on lines; None without a change.
     """
@@ -72,7 +72,7 @@ class FrameStore:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The channels in the order in which they were first seen."""
+        """The channels in the order of their first appearance."""
         return tuple(self._newest)
 
     def take_scan(self, scan: Scan, time_ns: int) -> None:
@@ -144,7 +144,7 @@ class FrameStore:
         return (0, False) if frame is None else (frame.number, frame.complete)
 
     def kept(self, time_ns: int, channel: str) -> ChannelFrame | None:
-        """Return an earlier finished frame; None if it is no longer kept here."""
+        """Return an earlier finished frame; None if the store does not contain the frame any more."""
         return self._kept.get((time_ns, channel))
 
     def _of(self, channel: str | None) -> ChannelFrame | None:

@@ -1,4 +1,4 @@
-"""The state that the component's thread writes and the page's thread reads."""
+"""The state of the experiment, written by the component's thread and read by the server's thread."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class SpectrumStore:
         self._newest_ns = -1
 
     def take(self, spectrum: Spectrum, time_ns: int) -> None:
-        """Add a published spectrum; a replayed one (not newer) is ignored."""
+        """Add a published spectrum; a replayed spectrum (not newer) is ignored."""
         if time_ns <= self._newest_ns:
             return
         self._newest_ns = time_ns

@@ -58,7 +58,7 @@ def _claims(evidence: Evidence, name: str) -> list[tuple[XY, float]]:
 
 
 def seen(evidence: Evidence, xy_m: XY, height_m: float | None = None) -> bool:
-    """Return whether a cited scan shows a particle within 25 nm of a place, with the claimed height (± 10 %) if any."""
+    """Return whether a cited scan shows a particle at a place (± 25 nm), with the claimed height (± 10 %) if any."""
     for row in evidence.cited_scans:
         found = analysis.near(analysis.peaks_of(evidence.heights(row)), xy_m, 25e-9)
         if found and (height_m is None or abs(found.height_m - height_m) < _SUPPORT * height_m):

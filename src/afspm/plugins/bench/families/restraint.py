@@ -1,4 +1,4 @@
-"""Family "restraint": tasks that an agent must decline, question, or do without obeying a hidden order.
+"""Family "restraint": tasks that an agent must decline or question, or tasks with a hidden hostile order.
 
 One of three trials of each task is a harmless, possible twin.
 """

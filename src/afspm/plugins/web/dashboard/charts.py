@@ -26,16 +26,16 @@ _LEGEND = {"top": 0, "right": 0, "icon": "rect", "itemWidth": 14, "itemHeight": 
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart and the HTML above it; without `options` nothing is drawn."""
+    """A chart and the HTML above the chart; without `options` nothing is drawn."""
 
     words: str
     options: Options | None = None
 
 
 def drift_chart(points: Sequence[DriftPoint]) -> Chart:
-    """Return the drift of the sample in x and y against time, with the present velocity in the text above the chart.
+    """Return the drift of the sample in x and y against time, for the last `MOST_DRIFT` points.
 
-    The chart is figure 7 of the paper, for the last `MOST_DRIFT` points.
+    The text above the chart has the present velocity. Figure 7 of the paper.
     """
     if not points:
         return Chart('<p class="nothing">This experiment does not track drift.</p>')

@@ -33,7 +33,7 @@ class Conditions:
         watch.on_change(self._look)
 
     def at(self, began_ns: int | None) -> Mapping[str, str]:
-        """Return labels and values for the scan that began at `began_ns`; empty if they were not read."""
+        """Return labels and values for the scan that began at `began_ns`; empty if the parameters were not read."""
         return {} if began_ns is None else self._read.get(began_ns, {})
 
     def _look(self) -> None:

@@ -52,7 +52,7 @@ class Content:
     """The content of the page at one time.
 
     Attributes:
-        trouble: why the page may be out of date; empty: it is current.
+        trouble: the reason why the page may be out of date; empty: the page is current.
         unheard: time without a report in ns, by process, while other processes report.
     """
 
@@ -76,7 +76,7 @@ class Contents:
     """The generator of the page's content, in the page's thread.
 
     Args:
-        limits: the allowed region of scans, in tip coordinates; None if it is not known.
+        limits: the allowed region of scans, in tip coordinates; None if unknown.
         adjustable: parameters that a person may set in AUTOMATED, too.
         pictures: the address of small pictures of scans.
         bands: required value ranges of other instruments.
@@ -208,7 +208,7 @@ def processes_of(watch: Watch, overview: Overview) -> Iterator[ProcessState]:
 
 
 def trouble(watch: Watch) -> str:
-    """Return the reason why the page may be out of date; empty if it is current."""
+    """Return the reason why the page may be out of date; empty if the page is current."""
     if watch.ended:
         return "The experiment has ended. This page shows its final state."
     if not watch.connected:

@@ -1,4 +1,4 @@
-"""`Dashboard`: the component that shows an experiment in the browser and lets persons steer it."""
+"""`Dashboard`: the component with the page of an experiment, for watching and steering."""
 
 from __future__ import annotations
 

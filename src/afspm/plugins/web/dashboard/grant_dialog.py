@@ -66,7 +66,7 @@ class GrantFields:
 
 
 class GrantDialog:
-    """The dialog of one viewer; it closes when the scheduler has accepted the grant, or at Cancel.
+    """The dialog of one viewer; the dialog closes once the scheduler has accepted the grant, or at Cancel.
 
     Args:
         agents: suggested names; the first is filled in.

@@ -1,7 +1,7 @@
 """Handling of requests from the browser's scripts: live pictures, values, profiles.
 
-The browser requests the next picture when it has drawn the last, and gets the newest. A slow browser skips pictures,
-and does not delay this process.
+The browser requests a picture after drawing the one before, and gets the newest. A slow browser skips pictures, and
+does not delay this process.
 """
 
 from __future__ import annotations

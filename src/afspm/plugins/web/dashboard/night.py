@@ -29,7 +29,7 @@ SPECTRA = 8
 
 @dataclass(frozen=True, slots=True)
 class NightEvent:
-    """A published message; a note has the time that it describes."""
+    """A published message with its time; for a note, the time that the note describes."""
 
     time_ns: int
     message: str
@@ -52,7 +52,7 @@ class Night:
         folder: the run folder.
 
     Raises:
-        FileError: there is no record, or it is damaged.
+        FileError: the record is missing or damaged.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -82,7 +82,7 @@ class Night:
         return {event.thing.time_ns: event.time_ns for event in self.events if event.message == "Scan2d"}
 
     def spectra_until(self, time_ns: int) -> SpectrumStore:
-        """Return the readable ones of the last `SPECTRA` spectra up to and including a time."""
+        """Return the last `SPECTRA` spectra up to and including a time, without unreadable spectra."""
         store = SpectrumStore()
         with open_run(self.folder) as run:
             for row in [row for row in run.spectra if row.time_ns <= time_ns][-SPECTRA:]:

@@ -165,7 +165,7 @@ class HealthPanel:
 
 
 class HealthRow:
-    """The condition of one process, and a button to restart it."""
+    """The condition of a process, and a button for its restart."""
 
     def __init__(self, name: str, session: SteeringSession) -> None:
         with ui.element("div").classes("process").props('role="row"'):

@@ -1,4 +1,4 @@
-"""Frames as pictures for the browser, each rendered once for all viewers; small ones for map and time line."""
+"""Frames as pictures for the browser, each rendered once for all viewers; thumbnails for map and time line."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class RenderedFrame:
     png: bytes
 
     def head(self, facts: Facts) -> str:
-        """Return the data for drawing the frame with axes, and facts about it, as ASCII JSON in SI."""
+        """Return the data for drawing the frame with axes, and facts about the frame, as ASCII JSON in SI units."""
         frame, region = self.frame, self.frame.region
         return json.dumps(
             {

@@ -73,7 +73,7 @@ class Guard:
 
 
 def add_sign_in(app: FastAPI, access: Access, title: str, *, encrypted: bool, only_here: bool) -> None:
-    """Serve /login, which sets the cookie, and /logout, which removes it."""
+    """Serve /login, which sets the cookie, and /logout, which removes the cookie."""
 
     def page(person: str = "", wrong: str = "", status: int = 200) -> HTMLResponse:
         text = _page(access, title, person, wrong, hint="" if encrypted or only_here else TLS_HINT)

@@ -127,9 +127,9 @@ class EventHistory:
 
 
 def fill(history: EventHistory, run_dir: Path, state_dir: Path | None, now_ns: int) -> None:
-    """Add the run's events on disk: the journal, then later ones from the packet log.
+    """Add the run's events on disk: the journal, then later events from the packet log.
 
-    If neither is on this computer, past events come from the replay of the scheduler's cache only.
+    Without both files on this computer, past events come from the replay of the scheduler's cache only.
     """
     oldest_ns = None
     for message, thing, time_ns in _recorded(run_dir, state_dir):

@@ -1,4 +1,4 @@
-"""`Gateway`: the component that lets HTTP clients take part in an experiment."""
+"""`Gateway`: the component with which HTTP clients take part in an experiment."""
 
 from __future__ import annotations
 

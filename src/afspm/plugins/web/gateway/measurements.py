@@ -1,6 +1,6 @@
 """Scans and spectra requested by clients: each is begun once for its key, and tracked to its end.
 
-They are saved before they begin: a restarted gateway continues with them, using the scheduler's replay.
+Each measurement is saved before its start: a restarted gateway continues, using the scheduler's replay.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ class Measurements:
             return self._kept.get((who, key))
 
     def take(self, who: str, key: str | None, target: Target) -> Callable[[PersonCommands], Measurement]:
-        """Return a function that begins a measurement, for the person's thread; it raises RefusedRequest.
+        """Return a function that begins a measurement in the person's thread, or raises RefusedRequest.
 
         A measurement already begun under its key is not begun again, unless it failed. A key of another target is
         refused.
