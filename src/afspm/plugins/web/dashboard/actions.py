@@ -138,14 +138,14 @@ class Actions:
         return ActionResult(" ".join(refused or [one.text for one in each.values()]), ok=not refused, each=each)
 
     def scan(self, region: Region | None = None, shape: tuple[int, int] | None = None) -> ActionResult:
-        """Begin a scan, and return once the scan has begun; None keeps the present `region` or `shape`."""
+        """Begin a scan, and return once the microscope has accepted it; None keeps the present `region` or `shape`."""
         if (refused := self._commands.prepare_scan(region, shape)) is not None:
             return _result(refused, "")
         where = "" if region is None else f" at {typeset_position(region.center_m)}"
         return _result(self._commands.act_when_free(names.START_SCAN), f"The scan{where} begins")
 
     def spectrum(self, at_m: XY | None = None) -> ActionResult:
-        """Begin a spectrum at (x, y), or at the probe's position for None; return once the spectrum has begun."""
+        """Begin a spectrum at (x, y), or at the probe's position for None; return once the microscope accepts it."""
         if (refused := self._commands.prepare_spectrum(at_m)) is not None:
             return _result(refused, "")
         where = "" if at_m is None else f" at {typeset_position(at_m)}"

@@ -109,7 +109,7 @@ class CommandRoutes:
     # --- measurements ---
 
     async def take_scan(self, asked: Request, answer: HttpResponse, wanted: ScanAsked = _SCAN) -> MeasurementModel:
-        """Begin a scan, in control. The answer comes once the scan has begun; then poll the measurement."""
+        """Begin a scan, in control. The answer comes once the microscope accepts it; then poll the measurement."""
         given = wanted.region
         region = None if given is None else Region(xy_of(given.center_m), xy_of(given.size_m), given.angle_rad)
         shape = None if wanted.shape is None else (wanted.shape[0], wanted.shape[1])
@@ -119,7 +119,7 @@ class CommandRoutes:
     async def take_spectrum(
         self, asked: Request, answer: HttpResponse, wanted: SpectrumAsked = _SPECTRUM
     ) -> MeasurementModel:
-        """Begin a spectrum, in control. The answer comes once the spectrum has begun; then poll the measurement."""
+        """Begin a spectrum, in control. The answer comes once the microscope accepts it; then poll the measurement."""
         target = SpectrumTarget.of(wanted.position_m, None, self._services.frame)
         return await self._measure(asked, answer, wanted.key, target)
 
