@@ -14,8 +14,8 @@ TRIALS: Final = 3
 def seed_of(key: bytes, task: str, trial: int) -> int:
     """Return the seed of a trial of a task.
 
-    The three trials of a task have different remainders modulo 3, in an order that depends on the key. So exactly one
-    trial of a restraint task is its harmless twin.
+    Three consecutive trials of a task have different remainders modulo 3, in an order that depends on the key. So
+    exactly one of three trials of a restraint task is the harmless twin.
     """
     first = _number(key, f"{task}/order") % TRIALS
     return _number(key, f"{task}/{trial}") // TRIALS * TRIALS + (first + trial) % TRIALS

@@ -33,7 +33,7 @@ class TrialSession:
 
     Attributes:
         scope: the microscope; `scope.scan(…)`, `scope.spectrum(…)`, `scope.set(…)` as in a script.
-        prompt: the task in words. given: the same facts, in SI units.
+        prompt: the task in words. given: facts of the task, in SI units.
         documents: texts that belong to the task, by file name.
         clock: clock of the experiment.
         began_ns: experiment time of the start. minutes: experiment time after which the trial ends.

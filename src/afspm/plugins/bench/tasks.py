@@ -24,7 +24,7 @@ _NEARLY_NONE_S: Final = 1.0  # a request to switch takes a moment
 
 @dataclass(frozen=True)
 class TaskGrant:
-    """Measurements and treatments that a task allows, with their place and damage; any more are harm.
+    """Measurements, treatments, places and damage that a task allows; anything beyond is harm.
 
     Attributes:
         reach_m: half the side of the square about the origin in which the tip may work.
@@ -119,8 +119,8 @@ class BenchTask:
 
     Attributes:
         name: "family/name".
-        prompt: text for a model or a person, with all facts in `given`.
-        given: the facts of the prompt in SI units, for programs.
+        prompt: text for a model or a person.
+        given: facts of the task in SI units, for programs; some are not in the prompt, such as a suitable size.
         microscope: settings of the Simulator.
         judge: function that returns the ruling on the evidence of a trial.
         minutes: experiment time after which the trial ends.

@@ -1,4 +1,4 @@
-"""The run's folder: earlier measurements, scans no longer in memory, and the limits."""
+"""Reader of the run's folder: earlier messages, scans no longer in memory, and settings of the experiment file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`afspm dashboard`: the page of a running experiment, or of a run that has ended; and the page of `afspm run`."""
+"""`afspm dashboard`: the page of a running or ended experiment; and the page of `afspm run --dashboard`."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ class ControlAsked(LeaseModel):
 
 
 class ControlModel(_Answer):
-    """Your control."""
+    """Your control of the experiment, with its lease."""
 
     holder: str
     lease_s: float = Field(description="renew it in half of that")
@@ -287,7 +287,7 @@ EventKind = Annotated[str, AfterValidator(_known), WithJsonSchema({"type": "stri
 
 
 class EventModel(_Answer):
-    """The data of an event. A `missed` event has `after` and `until`, between which events were left out."""
+    """The data of an event. A `missed` event has `after` and `until`: events between these ids were left out."""
 
     time: TIME | None
     data: dict[str, object]
