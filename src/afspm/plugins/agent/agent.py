@@ -49,4 +49,4 @@ class Agent(Gateway):
     def on_message(self, envelope: str, message: object) -> None:
         time_ns = self.packet_time_ns()
         self._place.take(message, time_ns)
-        self._watch.take(envelope.partition("_")[0], message, time_ns, envelope)  # last: it wakes waiting calls
+        self._watch.take(envelope.partition("_")[0], message, time_ns, envelope)  # last: the watch wakes waiting calls

@@ -88,7 +88,7 @@ class AgentTools:
 
     async def _call_tool(self, context: Any, asked: types.CallToolRequestParams) -> types.CallToolResult:
         request = context.request
-        # of this request: another one of the same session may come with another token
+        # from this request: a later request of the same session may carry another token
         person = self._person if request is None else getattr(request.state, PERSON, "")
         return await self.call(person, asked.name, asked.arguments or {})
 
@@ -259,7 +259,7 @@ class AgentTools:
         return {"run": run.id, "steps": 1}
 
     async def _stop(self, person: str, given: arguments.Stop) -> Content:
-        # async, and without a thread of its own: calls that wait must not delay it
+        # async, and without a thread of its own: waiting calls must not delay a stop
         _log.warning("%s calls stop", self._place.requests.name_of(person))
         accepted = await self._place.stop(person)
         return {"stopped": accepted, "next": "a person looks at the microscope, and clears stopped-by-agent"}
@@ -343,7 +343,7 @@ def _refusal(error: RefusedRequest) -> types.CallToolResult:
 
 
 def _texts(requests: list[PlannedRequest]) -> list[str]:
-    # in our own words, from numbers; a parameter's value is the agent's
+    # afspm's words around numbers; only the value of a parameter is text of the agent
     return [one.text for one in requests]
 
 

@@ -131,7 +131,7 @@ class Workplace:
         if isinstance(thing, Approvals):
             self.approvals = thing
         elif isinstance(thing, Proposal):
-            known = dict(self.proposals)  # replaced: the event loop reads it meanwhile
+            known = dict(self.proposals)  # a copy: the event loop reads the present dict meanwhile
             known[thing.id] = thing
             while len(known) > MOST_PROPOSALS:
                 del known[next(iter(known))]
@@ -246,7 +246,7 @@ class Workplace:
             self._save(run)
         try:
             await self.do(person, lambda commands: commands.release_control())
-        except RefusedRequest as error:  # the lease ends it
+        except RefusedRequest as error:  # control then ends with its lease
             _log.info("%s could not release control: %s", run.who, error.model.reason)
 
     async def _step(self, person: str, run: Run, step: Step) -> None:

@@ -143,7 +143,7 @@ def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable
             if options.replay is not None and calls is not None:
                 found = differences(read_calls(options.replay, task.full_prompt()), calls)
                 line["differences"] = [asdict(one) for one in found]
-        except TrialFailed as error:  # the other trials go on; the table counts it apart
+        except TrialFailed as error:  # the other trials go on; the page lists this trial apart
             line["error"] = str(error)
         with writing, (output / LINES_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(line, default=float) + "\n")

@@ -177,7 +177,7 @@ def refusal(response: Response) -> str:
 
 
 def _in_force(parameter: str, response: Response) -> str:
-    # in SI where it has a unit, with the prefix that reads well
+    # in SI units if the parameter has a unit, with a readable prefix
     if not response.payload:
         return "unknown"
     parameter_now = wire.decode_parameter(response.payload)

@@ -138,7 +138,7 @@ class GrantDialog:
     async def _give(self) -> None:
         try:
             table = self._read()
-            grant_of(table, self._facts)  # before it is sent, and once more with it
+            grant_of(table, self._facts)  # an invalid grant is shown here, before a request is sent
         except AfspmError as error:
             self._refusal.set_text(str(error))
             return

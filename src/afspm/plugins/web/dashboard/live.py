@@ -92,7 +92,7 @@ class Live:
         return Response(drawn.png, media_type="image/png", headers=headers)
 
     async def _value(self, asked: Asked, column: int, row: int) -> dict[str, object]:
-        # of one pixel, as published and as levelled
+        # the value of one pixel, as published and as levelled
         drawn = await asyncio.to_thread(self._drawn, asked)
         if drawn is None or not (0 <= row < drawn.values.shape[0] and 0 <= column < drawn.values.shape[1]):
             return {"value": None, "levelled": None, "unit": ""}

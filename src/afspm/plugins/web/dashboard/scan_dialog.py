@@ -126,6 +126,6 @@ def _length_m(text: str) -> float:
 
 
 def _shape(most: int, size_m: tuple[float, float]) -> Shape:
-    # `most` pixels along the longer side, and square ones
+    # `most` pixels along the longer side; the pixels are square
     longest = max(size_m)
     return max(1, round(most * size_m[1] / longest)), max(1, round(most * size_m[0] / longest))

@@ -94,7 +94,7 @@ class Gateway(WebComponent):
         name = envelope.partition("_")[0]
         self._measurements.on_packet(message, time_ns)
         self._history.take(name, message, time_ns)
-        self._watch.take(name, message, time_ns, envelope)  # last: it wakes waiting requests
+        self._watch.take(name, message, time_ns, envelope)  # last: the watch wakes waiting requests
 
     def on_end(self) -> None:
         if self._server is not None:

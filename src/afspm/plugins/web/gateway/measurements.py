@@ -156,7 +156,7 @@ class Measurements:
         return self._begun(one, response)
 
     def _attempts(self, one: Measurement) -> Iterator[str]:
-        # a caller takes another id only after a refusal of the one before
+        # a caller takes the next id only after a refusal of the attempt before
         while True:
             yield self._next_attempt(one)
             one.is_certain = True
