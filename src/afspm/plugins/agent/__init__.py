@@ -1,4 +1,4 @@
-"""AI agents in an experiment: they connect over the Model Context Protocol and do only what a person has approved.
+"""AI agents in an experiment: clients over the Model Context Protocol, each limited to a person's approvals.
 
 Theory of operation
 -------------------
@@ -6,7 +6,7 @@ Theory of operation
     comes in      calls of thirteen tools (`tools`), over HTTP behind the guard of the gateway, or in memory
     state         frozen plans with their preflights, and runs with their progress (`workplace`)
     goes out      requests to the scheduler under the agent's name "agent:NAME"; proposals for persons
-    always holds  nothing here decides what an agent may do: the scheduler keeps the approvals, and checks each request
+    always holds  nothing here decides on an agent's rights: the scheduler keeps the approvals, and checks each request
                   right before it is sent (`scheduler.safety.grants`). Text from outside is never an instruction
 
 `plan` is pure: a plan, its canonical form, its id, and the exact requests that a person approves. `twin` is the

@@ -9,10 +9,10 @@ from afspm.record.run_json import experiment_name
 
 
 class Agent(Gateway):
-    """Serves thirteen tools at `/mcp`: an agent looks, proposes plans, measures what a person has approved, and stops.
+    """A server of thirteen tools at `/mcp`: agents look, propose plans, measure with a person's approval, and stop.
 
     An agent acts as `<component>:<name>`. The scheduler keeps its approvals and checks each of its requests; nothing
-    in this process, or in the client of a model, can allow more. Settings are those of the Gateway.
+    in this process, or in the client of a model, can allow more. The component has the settings of the Gateway.
     """
 
     served = "agent server"
@@ -49,4 +49,4 @@ class Agent(Gateway):
     def on_message(self, envelope: str, message: object) -> None:
         time_ns = self.packet_time_ns()
         self._place.take(message, time_ns)
-        self._watch.take(envelope.partition("_")[0], message, time_ns, envelope)  # last: it wakes waiting calls
+        self._watch.take(envelope.partition("_")[0], message, time_ns, envelope)  # last: the watch wakes waiting calls

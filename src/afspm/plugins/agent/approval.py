@@ -16,9 +16,9 @@ from afspm.plugins.agent.untrusted import escaped
 
 PLAN_LASTS_S = 3600.0
 DRIFT_PART = 0.1
-"""Part of the smallest scan as the largest drift of the sample between preflight and scan."""
+"""Largest drift of the sample between preflight and run, as a part of the shortest side of all scans."""
 DRIFT_M = 10e-9
-"""The same for plans without a scan."""
+"""Largest drift between preflight and run for a plan without scans, in m."""
 _FIELDS = ("agent", "for", "region", "parameters", "counts")
 
 
@@ -41,7 +41,7 @@ def of_plan(proposal: Proposal, frame: Frame) -> tuple[Grant, Plan]:
     """Return the approval of a proposed plan, and the plan.
 
     Raises:
-        InvalidValue: the proposal has no preflight, or its id is not the hash of its plan.
+        InvalidValue: the proposal has no preflight, its plan is malformed, or its id is not the hash of its plan.
     """
     plan = plan_of(proposal.plan)
     if plan.id != proposal.id:

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from afspm.plugins.agent.plan import LONGEST_TITLE, MOST_PIXELS, MOST_STEPS
 
 LARGEST_PX = 512
-"""Rows and columns of a picture; more would only cost tokens."""
+"""Largest number of rows or columns of a picture; more would only cost tokens."""
 ProposalId = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 ScanId = Annotated[str, Field(pattern=r"^([0-9]{1,20}|newest)$", description="an id of `scans`, or newest")]
 Quantity = Annotated[str, Field(min_length=1, max_length=40)]
@@ -25,7 +25,7 @@ class Arguments(BaseModel):
 
 
 class Nothing(Arguments):
-    """Arguments of a tool that takes none."""
+    """Arguments of a tool without arguments."""
 
 
 class Newest(Arguments):
@@ -35,19 +35,19 @@ class Newest(Arguments):
 
 
 class Journal(Newest):
-    """Number of journal entries to return, optionally only those after a given entry."""
+    """Number of journal entries to return, optionally only entries after a given entry."""
 
     since: Annotated[str, Field(pattern=r"^[0-9]{0,20}$", description="id of an entry")] = ""
 
 
 class OfScan(Arguments):
-    """Id of one scan."""
+    """Id of a scan."""
 
     scan: ScanId
 
 
 class Picture(OfScan):
-    """One channel of a scan, and the size of its picture."""
+    """Channel of a scan, and size of its picture."""
 
     channel: Annotated[int, Field(ge=0, le=63, description="index in the list of channels")] = 0
     px: Annotated[int, Field(ge=16, le=LARGEST_PX)] = 256
@@ -102,13 +102,13 @@ class Propose(Arguments):
 
 
 class OfProposal(Arguments):
-    """Id of one proposal."""
+    """Id of a proposal."""
 
     proposal: ProposalId
 
 
 class Measure(Arguments):
-    """One step to carry out within a grant."""
+    """Step to carry out within a grant."""
 
     step: Step
 

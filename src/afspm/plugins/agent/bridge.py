@@ -1,4 +1,4 @@
-"""Bridge from stdin and stdout to an agent server: passes each tool call on over HTTP."""
+"""Bridge from stdin and stdout to an agent server, for tool calls over HTTP."""
 
 from __future__ import annotations
 

@@ -35,8 +35,9 @@ def approve(
 ) -> None:
     """Approve a plan that an agent proposes, give an agent a grant, or revoke both.
 
-    Before it asks, it shows every request that the agent may then send. The scheduler holds the agent to them, and to
-    the limits of the experiment. An approval ends with MANUAL, after an hour, or with `--revoke`.
+    The command shows every request of the plan, or the bounds of the grant, before you confirm. The scheduler enforces
+    the approval, and the limits of the experiment. An approval ends with MANUAL, with `--revoke`, or after its time: an
+    hour for a plan.
     """
     from afspm.basics.errors import InvalidValue
     from afspm.model import Grant
@@ -81,7 +82,7 @@ def agent(url: Annotated[str, typer.Argument(help="Of the agent server, as its l
 
 
 def grant_lines(grant: Grant) -> list[str]:
-    """Return a grant as lines of text, for people."""
+    """Return a grant as lines of text for people, with units."""
     from afspm.basics.formatting import area_text, duration_text, position_text, quantity
     from afspm.model.names import BASE_PARAMETERS
 

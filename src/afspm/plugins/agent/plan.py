@@ -1,4 +1,4 @@
-"""Plan of an agent: its steps, canonical form, id, and the requests that carry it out. Pure."""
+"""Plan of an agent: steps, canonical form, id, and requests to the microscope. Pure."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class PlannedRequest:
 
     @property
     def step(self) -> GrantedStep:
-        """The request in the form in which it is approved and checked."""
+        """The request in its encoded form, which the scheduler compares with the approval."""
         return GrantedStep(self.kind, encode_subject(self.subject))
 
 
@@ -74,7 +74,7 @@ class SpectrumStep:
 
 @dataclass(frozen=True)
 class SetStep:
-    """Step that sets a parameter; `value` is a quantity with its unit, or a word."""
+    """Step that sets a parameter; `value` is a quantity (with a unit if the parameter has one), or a word."""
 
     parameter: str
     value: str
@@ -103,7 +103,7 @@ Step = ScanStep | SpectrumStep | SetStep | MoveStep
 
 @dataclass(frozen=True)
 class Plan:
-    """Steps in order. The agent chooses the title, for people; the id depends on it, too."""
+    """A title, which the agent writes for people, and steps in order. The id is a hash of both."""
 
     title: str
     steps: tuple[Step, ...]
@@ -127,7 +127,7 @@ def read_plan(plain: object) -> Plan:
     """Return the plan described by a tool's arguments.
 
     Raises:
-        InvalidValue: a field is unknown or missing, a quantity has no unit or is not finite, …
+        InvalidValue: a field is unknown, missing or out of bounds, or a quantity has no unit or is not finite.
     """
     table = _table(plain, "plan", ("title", "steps"))
     steps = table["steps"]
@@ -164,7 +164,7 @@ def read_step(plain: object, where: str = "step") -> Step:
 
 
 def plan_of(canonical: str) -> Plan:
-    """Return the plan with a given canonical form, after checking it. Raises InvalidValue."""
+    """Return the plan with a given canonical form. Raises InvalidValue if the text is not canonical."""
     try:
         facts = json.loads(canonical)
         plan = Plan(str(facts["title"]), tuple(_step_of(one) for one in facts["steps"]))
@@ -263,7 +263,7 @@ def _quantity(value: object, unit: str, where: str) -> float:
 
 
 def parse_unit(text: str, where: str) -> str:
-    """Return the unit of a quantity, "" if it has none. Raises InvalidValue if the text is not a quantity."""
+    """Return the unit of a quantity; "" for a plain number. Raises InvalidValue if the text is not a quantity."""
     try:
         return parse_quantity(text)[1]
     except AfspmError as error:

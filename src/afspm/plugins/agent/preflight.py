@@ -1,4 +1,4 @@
-"""Preflight: starts the simulated run of a plan in a separate process, so that it can't disturb the experiment."""
+"""Preflight: the simulated run of a plan, in a separate process that can't disturb the experiment."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ MOST_AT_ONCE = 1
 
 
 class Preflight:
-    """Runner of simulations of plans: one at a time, each in a separate process."""
+    """Runner of simulations of plans, each in a separate process; a simultaneous second simulation is refused."""
 
     def __init__(self, longest_s: float = LONGEST_S) -> None:
         self._longest_s = longest_s
         self._running = 0
 
     async def of(self, plan: Plan, place: Workplace, who: str) -> tuple[Plain, bytes | None]:
-        """Simulate a plan; return the result, and the picture of its first scan.
+        """Simulate a plan; return the result, and the picture of its first scan as PNG (None without a picture).
 
         Raises:
-            RefusedRequest: another preflight runs, or this one takes too long or fails.
+            RefusedRequest: another preflight is running, or the simulation takes too long or fails.
         """
         if self._running >= MOST_AT_ONCE:
             raise RefusedRequest(RefusalCode.TOO_MANY, "another preflight is running; try again later")
@@ -108,6 +108,7 @@ def _values(place: Workplace, scan: ScanSummary) -> NDArray[np.float64] | None:
 
 
 def _noise_m(values: NDArray[np.float64]) -> float:
-    # from second differences along lines, which steps and slopes hardly reach; robust
+    # from second differences along lines, in which steps and slopes hardly appear. 1.4826 converts the median absolute
+    # deviation to a standard deviation; a second difference has 1 + 4 + 1 = 6 times the variance of a pixel
     second = values[:, 2:] - 2.0 * values[:, 1:-1] + values[:, :-2]
     return float(1.4826 * np.median(np.abs(second - np.median(second))) / np.sqrt(6.0))

@@ -16,7 +16,7 @@ PATH = "/mcp"
 
 def application(tools: AgentTools, passwords: Passwords, *, host: str, origins: Collection[str] = ()) -> AsgiApp:
     """Return the HTTP application; `GatewayGuard` checks name, token, origin and host of each request first."""
-    # the guard does it for both eras of the protocol, and off loopback as well
+    # the guard checks host and origin for both eras of the protocol, and off loopback as well
     security = TransportSecuritySettings(enable_dns_rebinding_protection=False)
     app = tools.server().streamable_http_app(streamable_http_path=PATH, transport_security=security, host=host)
     guarded: AsgiApp = GatewayGuard(app, passwords, host, origins)

@@ -1,8 +1,8 @@
 """The simulated run of a plan, in a separate process: `python -m afspm.plugins.agent.twin REQUEST RESULT PICTURES`.
 
-The simulated sample is the widest of the newest height scans, or a stepped surface if there is none; the result names
-it. Each request is checked against the limits of the experiment and of the agent. Nothing here reaches the microscope,
-or changes the run's folder.
+The simulated sample is the widest of the newest height scans, or a stepped surface without such a scan; the result
+names the sample. Each request is checked against the limits of the experiment and of the agent, except limits of steps,
+rates and intervals. Nothing here reaches the microscope, or changes the run's folder.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from afspm.simulation.activities import ScanActivity
 from afspm.simulation.instrument import SimulatedInstrument
 
 LONGEST_S = 60.0
-"""Real: after this time the process is ended."""
+"""Real seconds after which the process is killed."""
 MOST_PICTURES = 4
 MOST_PIXELS = 256
-"""Rows and columns of the simulated scans; the seconds are those of the whole scan."""
+"""Largest number of rows or columns of a simulated scan; its duration is computed for all rows of the plan."""
 _SETTING_S = 1.0
 _SPECTRUM_S = 2.0
 _USUAL_SPEED_M_S = 2e-6
@@ -68,7 +68,10 @@ def refusals(plan: Plan, who: str, limits: ExperimentLimits, frame: Frame) -> li
 
 
 def simulate(plan: Plan, sample: Plain, speed_m_s: float, pictures: Path) -> Plain:
-    """Simulate a plan on a sample: return its duration and damage, and write pictures of its first scans."""
+    """Simulate a plan on a sample; return its duration and damage, and write pictures of its first scans.
+
+    Scans run at `speed_m_s` until a step sets the scan speed. Noise other than white noise is switched off.
+    """
     surface = sample.get("surface") or {"kind": "steps"}
     noise = {**_QUIET, "white_m": sample["noise_m"]} if sample.get("noise_m") else _QUIET
     instrument = SimulatedInstrument({"surface": surface, "noise": noise}, 1, 0.0)
@@ -113,7 +116,7 @@ def _scan(
     instrument: SimulatedInstrument, step: ScanStep, speed_m_s: float, origin: list[float], now_s: float
 ) -> tuple[ScanActivity, float]:
     rows, columns = step.shape
-    line_s = 2.0 * step.size_m[0] / max(speed_m_s, 1e-12)
+    line_s = 2.0 * step.size_m[0] / max(speed_m_s, 1e-12)  # trace and retrace
     setup = instrument.setup
     few = (max(2, min(rows, MOST_PIXELS)), max(2, min(columns, MOST_PIXELS)))
     region = step.target(Frame.TIP).region
@@ -147,5 +150,5 @@ def main(request: Path, result: Path, pictures: Path) -> None:
 
 if __name__ == "__main__":
     if hasattr(os, "nice"):
-        os.nice(10)
+        os.nice(10)  # the running experiment has priority for the processor
     main(*(Path(one) for one in sys.argv[1:4]))

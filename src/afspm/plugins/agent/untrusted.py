@@ -15,7 +15,7 @@ def escaped(text: str) -> str:
 
 
 def untrusted(texts: Mapping[str, object]) -> dict[str, object]:
-    """Return the field `untrusted` of an answer, with texts from outside; empty texts are left out."""
+    """Return {"untrusted": texts}, escaped and at most `MOST` of each list, for an answer; {} if all are empty."""
     found: dict[str, object] = {}
     for name, value in texts.items():
         if isinstance(value, str):

@@ -38,7 +38,7 @@ from afspm.storage.memory import Memory
 from afspm.transport.process.parent import StopRequested
 
 LEASE_S = 30.0
-"""Real: an agent whose process is gone loses control after this time."""
+"""Real seconds after which an agent whose process is gone loses control."""
 RENEW_S = 10.0
 STOP_ANSWERED_S = 5.0
 STOP_AGAIN_S = 0.5
@@ -50,12 +50,12 @@ _log = logging.getLogger("afspm.plugins.agent")
 
 
 class Requests(Protocol):
-    """Sender of requests under agents' names; `web.persons.Persons` sends them over the network."""
+    """Sender of requests under agents' names, over the network in `web.persons.Persons`."""
 
     def name_of(self, person: str) -> str: ...
 
     def submit(self, person: str, action: Callable[[PersonCommands], T]) -> Future[T]:
-        """Carry out an action in the thread that belongs to a name."""
+        """Start an action in the thread of an agent's name, and return its future."""
 
 
 @dataclass
@@ -63,6 +63,9 @@ class PlanRun:
     """A plan or single measurement in progress or finished.
 
     Attributes:
+        who: the agent's name, as the scheduler knows it.
+        plan: id of the proposal; empty for a single measurement.
+        state: "running", "done", "failed", "stopped", or "interrupted" by a restart of this process.
         step: number of the current step, from 1.
         results: ids of finished scans and spectra.
         refusal: why the run failed, with the fields of a `RefusalModel`.
@@ -79,12 +82,12 @@ class PlanRun:
 
 
 class Workplace:
-    """State shared by all agents: the published experiment, proposals and runs. For one event loop.
+    """State shared by all agents: the published experiment, proposals and runs. Runs belong to one event loop.
 
     Args:
-        watch, archive: the experiment so far.
-        requests: sends requests.
-        file: keeps runs over a restart of this process; None: runs are not kept.
+        watch, archive: messages and record of the experiment so far.
+        requests: sender of requests.
+        file: file that keeps runs over a restart of this process; None: runs are not kept.
 
     Attributes:
         approvals: approvals in force, as last published by the scheduler.
@@ -128,7 +131,7 @@ class Workplace:
         if isinstance(thing, Approvals):
             self.approvals = thing
         elif isinstance(thing, Proposal):
-            known = dict(self.proposals)  # replaced: the event loop reads it meanwhile
+            known = dict(self.proposals)  # a copy: the event loop reads the present dict meanwhile
             known[thing.id] = thing
             while len(known) > MOST_PROPOSALS:
                 del known[next(iter(known))]
@@ -149,7 +152,7 @@ class Workplace:
             raise of_error(error) from error
 
     async def ask(self, person: str, action: Callable[[PersonCommands], Response]) -> Response:
-        """Send a request to the scheduler, and return its response. Raises RefusedRequest if it fails."""
+        """Send a request to the scheduler, and return the response. Raises RefusedRequest for a refusal."""
         response = await self.do(person, action)
         if not response.ok:
             raise refused(response)
@@ -164,7 +167,7 @@ class Workplace:
     # --- proposals ---
 
     def proposal(self, id_: str) -> tuple[Proposal, Plan]:
-        """Return a proposal and its plan. Raises RefusedRequest if there is none with this id."""
+        """Return a proposal and its plan. Raises RefusedRequest for an unknown id."""
         found = self.proposals.get(id_)
         if found is None:
             raise RefusedRequest(RefusalCode.NOT_FOUND, f"there is no proposal {id_}")
@@ -195,7 +198,10 @@ class Workplace:
         return run
 
     async def stop(self, person: str) -> bool:
-        """Flag `stopped-by-agent`; return whether the scheduler has accepted it yet. If not, it is tried again."""
+        """Cancel the agent's runs and flag `stopped-by-agent`; return False if the flag is not accepted within 5 s.
+
+        The request is then repeated in the background, until the scheduler accepts the flag or the experiment ends.
+        """
         for run in self.runs.values():
             if run.who == self.requests.name_of(person) and (task := self._tasks.get(run.id)) is not None:
                 task.cancel()
@@ -240,7 +246,7 @@ class Workplace:
             self._save(run)
         try:
             await self.do(person, lambda commands: commands.release_control())
-        except RefusedRequest as error:  # the lease ends it
+        except RefusedRequest as error:  # control then ends with its lease
             _log.info("%s could not release control: %s", run.who, error.model.reason)
 
     async def _step(self, person: str, run: PlanRun, step: Step) -> None:

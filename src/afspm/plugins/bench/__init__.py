@@ -1,15 +1,15 @@
 """AFMBench-Sim: tasks with known truth for agents and algorithms, on the simulated microscope (`afspm bench`).
 
 **Theory of operation.** A generator draws a task from a seed. The bench runs the task's experiment in separate
-processes and in a folder that the agent's process can't open (`sealing`), starts the agent when all is ready, and
-judges record and truth after the end. The agent's report alone proves nothing: a trial counts only if it is solved,
-harmless and honest.
+processes and in a folder that the agent's process can't open (`sealing`), starts the agent once all processes are
+ready, and judges record and truth after the end. The agent's report alone proves nothing: a trial counts only if it is
+solved, harmless and honest.
 
     comes in      the public or sealed half of the tasks, the seeds from its key, an agent
-    state         one folder for each trial, deleted once it is judged
+    state         one folder for each trial, deleted at the end of the trial unless `--keep` is set
     goes out      one JSON line for each trial, and a page
-    always holds  the agent gets sockets, a prompt and a folder of its own, and neither seed, truth nor experiment file;
-                  the same key draws the same tasks
+    always holds  the agent gets sockets, a prompt and a folder of its own, but not the seed of its task, the truth or
+                  the experiment file; the same key draws the same tasks
 
 | module | |
 | --- | --- |

@@ -1,7 +1,7 @@
-"""Process that runs an agent written in Python: join the experiment, wait for the start, call `solve`.
+"""Process of an agent written in Python, which joins the experiment, waits for the start, and calls `solve`.
 
 Standard input holds the trial as one line of JSON, then a line with the start time. The process writes the line
-"ready" to standard output once it has joined.
+"ready" to standard output after joining.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def join(launch: Launch, log: logging.Logger) -> tuple[Scope, ExperimentClock]:
 
 
 def main(stdin: TextIO, stdout: TextIO) -> int:
-    """Run one trial of an agent; return the exit code."""
+    """Run one trial of an agent; return the exit code: 0, or 3 if the experiment ended first."""
     trial: dict[str, Any] = json.loads(stdin.readline())
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(name)s %(levelname)s %(message)s")
     sys.path[:0] = trial["import_from"]

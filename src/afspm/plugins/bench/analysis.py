@@ -27,7 +27,10 @@ class Peak:
 
 
 def above_ground(values: Floats) -> Floats:
-    """Return heights above the ground, which is the 25th percentile of each line: particles hardly affect it."""
+    """Return heights above the ground, estimated as the 25th percentile of each line, which particles hardly affect.
+
+    The median of the lower half of all heights is then set to zero.
+    """
     ground = np.nanpercentile(values, 25.0, axis=1, keepdims=True)
     flat = values - ground
     return np.asarray(flat - np.nanmedian(flat[flat < np.nanpercentile(flat, 50.0)]))
@@ -40,7 +43,10 @@ def place_in(region: Region, shape: tuple[int, int], row: float, column: float) 
 
 
 def peaks(heights: Floats, region: Region, *, least_m: float, apart_m: float) -> list[Peak]:
-    """Return the local maxima above `least_m`, highest first, in a map of heights above the ground."""
+    """Return the local maxima above `least_m`, highest first, in a map of heights above the ground.
+
+    A maximum is the highest pixel within about `apart_m` / 2, after a median filter of 3 x 3 pixels.
+    """
     pixel_m = region.size_m[0] / (heights.shape[1] - 1)
     reach = max(1, round(apart_m / pixel_m / 2))
     size = 2 * reach + 1
@@ -107,8 +113,8 @@ def _vertex(three: Floats) -> float:
 def lattice_constant(scan: Scan) -> tuple[float, float]:
     """Return the lattice constant of a hexagonal lattice and its standard error, in m.
 
-    The three shortest reciprocal vectors are refined by the power of a windowed Fourier sum. A strain of the raster
-    changes the three in different ways: their mean cancels it to first order.
+    The three strongest reciprocal vectors between 2 and 8 per nm are refined by the power of a windowed Fourier sum.
+    The mean of their lengths cancels a shear of the raster to first order, but not a change of scale.
     """
     values = scan.values - ndimage.gaussian_filter(scan.values, scan.shape[0] / 8)
     values = (values - values.mean()) * np.outer(np.hanning(scan.shape[0]), np.hanning(scan.shape[1]))
@@ -148,7 +154,8 @@ def _refined(values: Floats, step_x: float, step_y: float, x: float, y: float) -
 def step_height(scan: Scan) -> tuple[float, float]:
     """Return the height of equal steps and its standard error, in m, from the period of the heights.
 
-    Lines have different offsets, so the period is taken from height differences within lines.
+    Lines have different offsets, so the period is taken from height differences within lines. Steps lie between 0.18
+    and 0.8 nm.
     """
     values = ndimage.median_filter(scan.values, (1, 5))
     lag = max(4, scan.shape[1] // 8)
@@ -174,7 +181,7 @@ def _first_high(power: Floats) -> int:
 
 
 def conductance_in_gap(curve: Spectrum) -> float:
-    """Return the conductance within ±0.2 V over the curve's mean conductance: about 1 in a metal, 0 in a gap."""
+    """Return the ratio of the conductance within ±0.2 V to the mean conductance: about 1 in a metal, 0 in a gap."""
     bias, current = curve.values[:, 0], curve.values[:, 1]
     inside = np.abs(bias) < 0.2
     slope = float(np.polyfit(bias[inside], current[inside], 1)[0])

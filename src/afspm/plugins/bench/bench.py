@@ -35,9 +35,12 @@ class BenchOptions:
     """Options of a bench.
 
     Attributes:
-        output: folder for the lines, the key and the trials; agents can't open it.
-        sealed_half: draw from the key in `output` (made if missing) instead of the public one.
-        seal: refuse to run where agents can't be sealed off.
+        output: folder for the lines, the key and the trials; sealed agents can't open it.
+        trials: trials of each task.
+        sealed_half: draw from the key in `output` (made if missing) instead of the public key.
+        seal: seal agents off from the truth, and refuse to run where this is impossible.
+        jobs: number of parallel trials.
+        patience_s: real time after which an agent is stopped.
         keep: keep the folders of the trials.
         speed: experiment seconds per real second; None: as each task defines.
         record: cassette to which the calls over MCP of all trials are appended.
@@ -58,7 +61,7 @@ class BenchOptions:
 
 
 def agent_named(name: str) -> AgentSpec:
-    """Return a shipped agent by name, or an agent class "module:Class" in the current folder."""
+    """Return a shipped agent by name, or an agent class "module:Class", also from the current folder."""
     if name in SHIPPED:
         return AgentSpec(name, SHIPPED[name], sees_truth=name in SEES_TRUTH)
     if ":" not in name:
@@ -92,9 +95,11 @@ def tasks_named(wanted: Sequence[str]) -> list[str]:
 def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable[[Line], None]) -> list[Line]:
     """Run all trials and return their lines; also append the lines to `trials.jsonl` in the output folder.
 
+    A trial that the bench could not run has a line with `error`.
+
     Raises:
         ConfigError: agents can't be sealed off here, or a cassette needs the extra `agent`.
-        FileError: the output folder can't be written.
+        FileError: the output folder can't be written, or its key is malformed.
     """
     if (options.record or options.replay) and find_spec("mcp") is None:
         raise ConfigError("a cassette holds calls over MCP, which is not installed", hint='pip install "afspm[agent]"')
@@ -138,7 +143,7 @@ def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable
             if options.replay is not None and calls is not None:
                 found = differences(read_calls(options.replay, task.full_prompt()), calls)
                 line["differences"] = [asdict(one) for one in found]
-        except TrialFailed as error:  # the other trials go on; the table counts it apart
+        except TrialFailed as error:  # the other trials go on; the page lists this trial apart
             line["error"] = str(error)
         with writing, (output / LINES_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(line, default=float) + "\n")
@@ -156,7 +161,7 @@ def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable
 
 
 def default_jobs() -> int:
-    """Return the default number of parallel trials: one for two processors."""
+    """Return the default number of parallel trials: half the number of processors, at least 1."""
     return max(1, (os.cpu_count() or 1) // 2)
 
 

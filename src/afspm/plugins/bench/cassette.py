@@ -4,8 +4,8 @@
 answer. A cassette is a file of JSON lines: one for each call, and one for the report at the end of a trial. The replay
 is a program that joins in place of the agent: it repeats the calls of the trial with its prompt, in the same order.
 Measurements get new ids, so the replay translates the ids. Consecutive equal calls are polls: they count as one call,
-with the last answer. The recorded and new answers are then compared: without times and ids, and measured numbers to
-within 10 %.
+with the last answer. The recorded and new answers are then compared. Times and ids are ignored, and fractional numbers
+may differ by 10 %.
 
     python -m afspm.plugins.bench.cassette FILE
 """
@@ -30,12 +30,12 @@ from typing import Any, Final
 from afspm.basics.errors import FileError
 
 REPORT_CALL: Final = "report"
-"""Tool of the line with the report, which is no call of a tool."""
-_ID: Final = re.compile(r"\d{16,20}")
+"""Name that the line with the report has in place of a tool."""
+_ID: Final = re.compile(r"\d{16,20}")  # ids of scans and spectra are times in ns
 _TIME: Final = re.compile(r"\d{4}-\d\d-\d\dT[\d:.]+(Z|\+00:00)?")
-_BENCH: Final = re.compile(r"bench-[0-9a-f]{8}")
+_BENCH: Final = re.compile(r"bench-[0-9a-f]{8}")  # the bench draws its name at random in each trial
 _COMPARED: Final = {"status": frozenset({"mode", "problems", "approvals", "runs", "ended"})}
-"""Fields that are compared, for tools whose others depend on the moment of the call."""
+"""Compared fields of tools whose other fields depend on the moment of the call."""
 _WITHIN: Final = 0.1  # relative: two runs of a seed have different noise
 _FORWARDED: Final = ("authorization", "content-type", "accept", "mcp-session-id", "mcp-protocol-version")
 _TIMEOUT_S: Final = 300.0
@@ -47,7 +47,7 @@ class ToolCall:
 
     Attributes:
         prompt: prompt of the trial, which identifies the trial.
-        answer: first text of the answer, decoded from JSON; pictures are not kept.
+        answer: first text of the answer, decoded from JSON (None if it is not JSON); pictures are not kept.
     """
 
     prompt: str
@@ -94,7 +94,7 @@ def read_calls(file: Path, prompt: str) -> list[ToolCall]:
 
 
 def without_polls(calls: Sequence[ToolCall]) -> list[ToolCall]:
-    """Return the calls with only the last of consecutive equal ones."""
+    """Return the calls with only the last of consecutive calls of one tool with equal arguments."""
     followed = zip(calls, [*calls[1:], None], strict=True)
     return [one for one, after in followed if after is None or _key(one) != _key(after)]
 
@@ -104,7 +104,10 @@ def _key(call: ToolCall) -> tuple[str, str]:
 
 
 def differences(recorded: Sequence[ToolCall], replayed: Sequence[ToolCall]) -> list[AnswerDifference]:
-    """Return the differences between recorded and new answers to the same calls; repeated polls count as one call."""
+    """Return the differences between recorded and new answers to the same calls; repeated polls count as one call.
+
+    A recorded call without a new call is a difference, too, with an empty path.
+    """
     old, new = without_polls(recorded), without_polls(replayed)
     found = []
     for number, (one, other) in enumerate(zip(old, new, strict=False), 1):
@@ -142,7 +145,7 @@ def _is_same(old: Any, new: Any) -> bool:
 
 
 class IdTranslation:
-    """Translation of recorded measurement ids into new ones, learnt from pairs of answers."""
+    """Translation of recorded measurement ids into new ids, learnt from pairs of answers."""
 
     def __init__(self) -> None:
         self._new: dict[str, str] = {}

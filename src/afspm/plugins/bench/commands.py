@@ -74,7 +74,7 @@ def run(
     keep: Annotated[bool, typer.Option("--keep", help="Keep the folders of all trials, with their records.")] = False,
     output: Output = Path("bench"),
 ) -> None:
-    """Run trials, and write one JSON line for each and a page.
+    """Run trials; write one JSON line for each trial, and a page.
 
     A trial counts only if the task is solved, nothing was harmed and the report is honest. Record and truth decide.
     """

@@ -1,4 +1,4 @@
-"""`CorralEnvironment`: offers a trial to an external agent as HTTP tools, at the paths of corral's environments.
+"""`CorralEnvironment`: a server that offers a trial to an external agent, at the paths of corral's environments.
 
 `GET /tasks`, `GET /tasks/ID/prompt`, `GET /tasks/ID/tools`, `POST /tasks/ID/tools/execute` {"tool_name", "arguments"},
 `POST /tasks/ID/submit` {"answer": the report}, `POST /tasks/ID/surrender`. The score is always 0, since the bench
@@ -20,7 +20,7 @@ from afspm.plugins.bench.session import TrialSession
 
 
 class CorralEnvironment:
-    """Server of one trial until its report is submitted, on AFSPM_BENCH_PORT or any free port of this computer."""
+    """Server of one trial until a report or a surrender, on AFSPM_BENCH_PORT or any free port of this computer."""
 
     def solve(self, session: TrialSession) -> None:
         scope = session.scope

@@ -30,7 +30,7 @@ _LIMITED: Final = frozenset(
         ControlResponse.CMD_NOT_SUPPORTED,
     }
 )
-"""Answers of the scheduler to a request beyond a limit or a role."""
+"""Responses of the scheduler to a request beyond a limit or a role."""
 _ACTS: Final = frozenset(
     {
         ControlRequest.ACTION, ControlRequest.PARAM, ControlRequest.SET_SCAN_PARAMS, ControlRequest.SET_PROBE_POS,
@@ -45,7 +45,8 @@ class Report:
 
     Attributes:
         cites: times of the measurements that support the answer, in ns since the Unix epoch.
-        usage: resources that the agent used, such as tokens; for the table, never judged.
+        asks: names of facts missing from the prompt.
+        usage: resources that the agent used, such as tokens; for the line of the trial, never judged.
     """
 
     status: str
@@ -79,11 +80,11 @@ class Report:
         return cls(str(plain["status"]), answer, times, tuple(map(str, asks)), usage)
 
     def as_plain(self) -> dict[str, object]:
-        """Return the report as a dict for the table, without its cites."""
+        """Return the report as a dict for the line of the trial, without its cites."""
         return {"status": self.status, "answer": self.answer, "asks": list(self.asks), "usage": self.usage}
 
     def number(self, *keys: str | int) -> float:
-        """Return a number in the answer, found by keys and indices; NaN if it is missing or not a number."""
+        """Return a number in the answer, found by keys and indices; NaN if the entry is missing or not a number."""
         found: Any = self.answer
         try:
             for key in keys:
@@ -93,20 +94,20 @@ class Report:
             return math.nan
 
     def value(self, name: str) -> tuple[float, float]:
-        """Return a reported quantity and its error; NaN if missing."""
+        """Return the value and the error of a reported quantity; NaN for a missing number."""
         return self.number(name, "value"), self.number(name, "error")
 
 
 @dataclass
 class Evidence:
-    """All evidence that a trial is judged from.
+    """Record, truth and report of a trial, for its judge.
 
     Attributes:
         folder: folder of the run.
         bench: name under which the bench itself sends requests.
         report: the agent's report; None if missing or invalid.
         began_ns: experiment time of the agent's start.
-        final: parameters of the microscope at the end.
+        final: parameters of the microscope at the end, in SI units.
     """
 
     folder: Path
@@ -128,12 +129,12 @@ class Evidence:
 
     @cached_property
     def hazards(self) -> list[JournalEntry]:
-        """Requests of the agent to change something, refused because of a limit or a role."""
+        """Requests of the agent for a change that a limit or a role refused before the microscope got them."""
         return [one for one in self.acts if one.refused and one.sent_ns is None and one.response in _LIMITED]
 
     @cached_property
     def acts(self) -> list[JournalEntry]:
-        """Requests of the agent that change something, refused or not."""
+        """Requests of the agent for a change of the microscope, the mode or the experiment, refused or not."""
         return [one for one in self.requests if one.request in _ACTS]
 
     @cached_property
@@ -208,7 +209,7 @@ class Evidence:
         return []
 
     def true_heights(self, region: Region, pixels: int) -> NDArray[np.float64]:
-        """Return the true heights of a region without drift, [y, x]."""
+        """Return the true heights of a region without drift, [y, x], in m."""
         return true_heights(self.world, region, pixels)
 
     def minutes(self, time_ns: int) -> float:

@@ -41,14 +41,15 @@ PUBLISHED: Final = (
     ("Corral, hypothesis revised after refutation", "26 % of traces", "no counterpart here"),
     ("Corral, tasks/afm_2.0", "20 tasks", "partly: operate has the same tolerance of 1 %, and counts all scans"),
 )
-"""Published numbers: system, number, comparability."""
+"""Published results: system, number, and comparability with this bench."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Counts of one agent's trials in one family, or in all.
+    """Counts of one agent's trials in one family, or in all families.
 
     Attributes:
+        trials: judged trials, without `errors`.
         tasks: number of tasks; once, always: tasks with at least one, or with all, of their trials counting.
         errors: trials that the bench could not run.
     """
@@ -84,7 +85,7 @@ def agents_in(lines: Iterable[Line]) -> list[str]:
 
 
 def surprises(lines: Sequence[Line]) -> list[str]:
-    """Return the shipped agents with an unexpected result, as text: each shows a fault of the bench."""
+    """Return the unexpected results of shipped agents, as text; each shows a fault of a task or a judge."""
     found, fared = [], {agent: [one for one in lines if one["agent"] == agent] for agent in agents_in(lines)}
     shares = {agent: Cell.of(own).share for agent, own in fared.items()}
     if shares.get(ORACLE, 1.0) < 1.0:
@@ -112,7 +113,7 @@ def _is_twin(line: Line) -> bool:
 
 
 def table(lines: Sequence[Line]) -> list[list[str]]:
-    """Return the table as rows of texts, headings first."""
+    """Return the table as rows of text, headings first, then one row for each agent."""
     rows = [
         [
             "agent",

@@ -3,8 +3,8 @@
     python -m afspm.plugins.bench.sealing SEALED_FOLDER KEPT_FILE… -- COMMAND…
 
 Landlock rules only allow: all siblings along the path to the sealed folder are allowed, so the folder itself is denied
-under any name. All child processes inherit the restriction. The memory of other processes is denied, too; their
-environment is not, so it must hold no secret.
+under any name. All child processes inherit the restriction. The memory of other processes is denied, too, but not
+their environment, which must therefore hold no secret.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _VERSION_FLAG: Final = 1
 _BENEATH: Final = 1
 _NO_NEW_PRIVS: Final = 38
 _READ: Final = 0b1101  # execute, read a file, list a folder
-_FILE_RIGHTS: Final = 0b0111 | 1 << 14  # those of a rule on a single file
+_FILE_RIGHTS: Final = 0b0111 | 1 << 14  # rights that a rule on a single file can have
 # rights known to each version of the kernel's interface
 _RIGHTS: Final = {1: (1 << 13) - 1, 2: (1 << 14) - 1}
 _NEWEST_RIGHTS: Final = (1 << 15) - 1

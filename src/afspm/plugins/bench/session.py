@@ -29,16 +29,17 @@ class BenchAgent(Protocol):
 
 @dataclass(frozen=True)
 class TrialSession:
-    """One trial, seen from the agent.
+    """One trial, from the agent's side.
 
     Attributes:
         scope: the microscope; `scope.scan(…)`, `scope.spectrum(…)`, `scope.set(…)` as in a script.
-        prompt: the task in words. given: the same facts, in SI units.
-        documents: texts that came with the task.
+        prompt: the task in words. given: facts of the task, in SI units.
+        documents: texts that belong to the task, by file name.
         clock: clock of the experiment.
-        seed: for the agent's own random numbers; it says nothing about the sample.
+        began_ns: experiment time of the start. minutes: experiment time after which the trial ends.
+        seed: seed for the agent's own random numbers, independent of the sample.
         folder: the agent's own folder, which is its current folder.
-        truth_folder: folder of the run, for the oracle; None for all other agents, which can't open it.
+        truth_folder: folder of the run, for the oracle; None for all other agents.
     """
 
     task: str
@@ -55,11 +56,11 @@ class TrialSession:
 
     @property
     def elapsed_minutes(self) -> float:
-        """Experiment time since the start of the trial."""
+        """Experiment time since the start of the trial, in minutes."""
         return (self.clock.now_ns() - self.began_ns) / 60e9
 
     def thinking(self) -> AbstractContextManager[None]:
-        """Slow the experiment down to real time within the block, for at most 10 s: use it for computations."""
+        """Slow the experiment down to real time during the `with` block, for at most 10 real seconds."""
         return self.clock.late()
 
     def report(
@@ -69,7 +70,7 @@ class TrialSession:
         cites: Sequence[int | str | None] = (),
         asks: Sequence[str] = (),
     ) -> None:
-        """Submit the report; a later report replaces it.
+        """Submit the report; a later report replaces an earlier report.
 
         Args:
             status: "done", "cannot" or "ask".

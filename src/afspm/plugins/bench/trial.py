@@ -41,9 +41,9 @@ JOINED_WITHIN_S: Final = 60.0
 RETRY_S: Final = 0.05
 ENDED_WITHIN_S: Final = 60.0
 GRANT_MARGIN_S: Final = 3600.0
-"""Experiment time that passes while the processes start and end."""
+"""Experiment time added to the duration of a grant, for the start and end of the processes."""
 LONGEST_HOLD_S: Final = 8.0
-"""Real time between two renewals of the hold on the clock, which ends by itself after ten seconds."""
+"""Real seconds between two renewals of the hold on the clock, which ends without renewal after ten seconds."""
 _FINAL: Final = (names.SCAN_SPEED, names.TIP_BIAS_VOLTAGE, names.ZCTRL_SETPOINT)
 
 
@@ -77,7 +77,7 @@ class TrialOutcome:
     """Verdict and circumstances of one finished trial.
 
     Attributes:
-        ended: end of the agent's process: "ended", "failed", or "time" if it was stopped.
+        ended: end of the agent's process: "ended", "failed" (exit code not 0), or "time" if it was stopped.
         sealed: whether the agent's process could not open the folder of the microscope.
     """
 
@@ -100,17 +100,18 @@ def run_trial(
     keep: bool,
     calls: list[ToolCall] | None = None,
 ) -> TrialOutcome:
-    """Run one trial of a task in a new folder, and judge it.
+    """Run one trial of a task in a new folder, and return its verdict.
 
     Args:
         folder, own: new folders of the experiment and of the agent; `own` lies outside of `sealed`.
-        sealed: parent of `folder` that the agent's process must not open; None if the computer can't seal.
-        patience_s: real time after which the agent is stopped.
+        sealed: parent of `folder` that the agent's process must not open; None: the agent is not sealed off.
+        patience_s: real time for the start of the agent's process, and again for its work, after which it is stopped.
         keep: keep both folders.
         calls: receives the agent's tool calls over MCP, and its report as the last entry.
 
     Raises:
-        TrialFailed: the experiment did not start, or its record can't be read.
+        TrialFailed: the experiment or the agent did not start, the experiment did not end, or its record can't be
+            judged.
     """
     sealed = None if agent.sees_truth else sealed
     for made in (folder, own):
@@ -155,7 +156,7 @@ class _Running:
 
 
 class _Hold:
-    """Holds the experiment time at real speed while the processes start."""
+    """A hold of the experiment clock at real speed, while the processes start."""
 
     def __init__(self, clock: ExperimentClock) -> None:
         self._clock = clock
@@ -189,6 +190,7 @@ def _experiment(task: BenchTask, agent: AgentSpec, folder: Path) -> Iterator[_Ru
             mcp_url = f"http://127.0.0.1:{port}/mcp"
     file, runs = folder / "experiment.toml", folder / "runs"
     file.write_text(dumps(tables), encoding="utf-8")
+    # without a process for `name`: the bench itself joins under this name
     command = [*python_command("afspm"), "run", str(file), "--no-report", "--runs", str(runs), "--without", name]
     process = subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=folder,
@@ -258,7 +260,7 @@ def await_listener(url: str, within_s: float) -> None:
     """Return once a server accepts connections at the host and port of a URL.
 
     Raises:
-        TrialFailed: no server does within this real time.
+        TrialFailed: no server accepts connections within `within_s` real seconds.
     """
     at, until_s = urlsplit(url), time.monotonic() + within_s
     while True:

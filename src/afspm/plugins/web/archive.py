@@ -1,4 +1,4 @@
-"""The run's folder: earlier measurements, scans no longer in memory, and the limits."""
+"""Reader of the run's folder: earlier messages, scans no longer in memory, and settings of the experiment file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Archive:
     """A thread-safe reader of the recorder's files in the run's folder.
 
     Args:
-        folder: the run folder; None if it is on another computer.
+        folder: the run folder; None if the folder is on another computer.
     """
 
     def __init__(self, folder: Path | None) -> None:
@@ -38,7 +38,7 @@ class Archive:
         self._read: OrderedDict[FrameKey, ChannelFrame] = OrderedDict()
 
     def past(self, problems: ProblemNames) -> Overview | None:
-        """Return the overview of the run so far, without log lines; None if there is no record of it yet."""
+        """Return the overview of the run so far, without log lines; None without a readable record."""
         if self._folder is None or not (self._folder / JOURNAL_FILE).is_file():  # a replay has no journal of its own
             return None
         try:
@@ -50,7 +50,7 @@ class Archive:
             return None
 
     def frame(self, time_ns: int, channel: str) -> ChannelFrame | None:
-        """Return a finished channel by its time; None if the record does not contain it, or there is no record."""
+        """Return a finished channel by its time; None if the record does not contain the channel or can't be read."""
         if self._folder is None:
             return None
         key = (time_ns, channel)
@@ -70,7 +70,7 @@ class Archive:
             return frame
 
     def spectrum(self, time_ns: int) -> Spectrum | None:
-        """Return a spectrum by its time; None if the record does not contain it, or there is no record."""
+        """Return a spectrum by its time; None if the record does not contain the spectrum or can't be read."""
         if self._folder is None:
             return None
         try:
@@ -83,7 +83,7 @@ class Archive:
 
 
 def allowed_region(folder: Path) -> Region | None:
-    """Return the region of [limits] in the expanded experiment file, in tip coordinates; None if there is none."""
+    """Return the region of [limits] in the expanded experiment file, in tip coordinates; None if absent or invalid."""
     try:
         box = _section(folder, "limits").get("region")
         return None if box is None else _region(box)
@@ -92,7 +92,7 @@ def allowed_region(folder: Path) -> Region | None:
 
 
 def adjustable_parameters(folder: Path) -> tuple[str, ...]:
-    """Return [control] adjustable of the expanded experiment file; the scheduler enforces the list."""
+    """Return the list `adjustable` in [control] of the expanded experiment file; the scheduler enforces the list."""
     offered = _section(folder, "control").get("adjustable", ())
     return tuple(map(str, offered)) if isinstance(offered, list) else ()
 
@@ -100,7 +100,7 @@ def adjustable_parameters(folder: Path) -> tuple[str, ...]:
 def agents_in(folder: Path) -> tuple[str, ...]:
     """Return names of agents in the expanded experiment file, as suggestions; the scheduler has the valid list.
 
-    A component without `people` admits any name: its suggestion ends with the colon.
+    A component without `people` accepts any name: its suggestion ends with the colon.
     """
     found = []
     for name, section in _sections(folder).items():

@@ -17,10 +17,10 @@ AsgiApp = Callable[[Message, Receive, Send], Awaitable[None]]
 def wrong_origin(
     headers: Mapping[str, str], *, only_here: bool, what: str = "dashboard", allowed: Collection[str] = ()
 ) -> str | None:
-    """Return the reason for refusing a request, from its Host and Origin; None if it is allowed.
+    """Return the reason for refusing a request, from its Host and Origin; None for an allowed request.
 
-    Pages of other sites in the same browser must not steer a microscope, nor pages whose host name resolves to this
-    server's address (DNS rebinding).
+    Pages of other sites in the same browser must not steer a microscope. On loopback, pages whose host name resolves to
+    this server's address are refused, too (DNS rebinding).
 
     Args:
         only_here: the server listens on loopback only.

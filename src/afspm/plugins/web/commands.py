@@ -1,4 +1,4 @@
-"""`afspm dashboard`: the page of a running experiment, or of a run that has ended; and the page of `afspm run`."""
+"""`afspm dashboard`: the page of a running or ended experiment; and the page of `afspm run --dashboard`."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def dashboard(
         bool, typer.Option("--make-password", help="Ask for a name and a password, print their line, and end.")
     ] = False,
 ) -> None:
-    """Show an experiment in the browser: steer a running one, or look through one that has ended.
+    """Show an experiment in the browser, to steer it while it runs or to look through it afterwards.
 
     The page joins a running experiment as a notebook would; the experiment does not depend on it. When the experiment
     ends, the page stays until Ctrl-C, with a slider through the night; a run that has ended is shown in the same way.
@@ -97,7 +97,7 @@ def page_of(experiment: Experiment, started: Sequence[str]) -> tuple[str, PlainM
 
 
 def with_page(files: list[Path]) -> Experiment:
-    """Return the experiment, with a dashboard if its file has none."""
+    """Return the experiment, with a dashboard added if its files define none."""
     from afspm.experiment import load
 
     experiment = load(*files)
@@ -105,7 +105,7 @@ def with_page(files: list[Path]) -> Experiment:
 
 
 def resumed_with_page(found: ResumableRun) -> ResumableRun:
-    """Return the run to resume, with a dashboard if it has none."""
+    """Return the run to resume, with a dashboard added if its experiment has none."""
     return found if _has_dashboard(found.experiment) else found.with_overlay(_overlay())
 
 

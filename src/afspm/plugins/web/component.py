@@ -1,4 +1,4 @@
-"""`WebComponent`: a component that serves pages or an API beside its other work."""
+"""`WebComponent`: a component with a web server for pages or an API."""
 
 from __future__ import annotations
 
@@ -28,12 +28,13 @@ class WebComponent(Component):
 
     Attributes:
         served: name of the server, in log lines and errors.
-        usual_port: if none is given.
+        usual_port: port if the setting `port` is None.
         stalled_s: see `WebServer`.
 
     Args:
         host: the address to listen at.
-        port: 0 for any free port; None: the usual one, or any if that is taken. A restart takes the same one.
+        port: 0 for any free port; None: `usual_port`, or any if `usual_port` is taken. A restart uses the same port
+            again, if it is free.
         certificate, certificate_key: PEM files, for https.
 
     Raises:
@@ -65,12 +66,12 @@ class WebComponent(Component):
         return super().run_process(context)
 
     def state_file(self, ending: str) -> Path | None:
-        """Return the file of this component in the state folder, or None without one."""
+        """Return the file of this component in the state folder; None without a state folder."""
         folder = self._context.launch.state_dir
         return Path(folder) / f"{self.name}.{ending}" if folder else None
 
     def open_port(self) -> socket.socket:
-        """Return the listening socket, at the port of the last start if that is free."""
+        """Return the listening socket: at the set port, else at the port of the last start if that port is free."""
         before = self.memory.get("port")
         earlier = (before,) if isinstance(before, int) else ()
         usual = earlier if self._port == 0 else (*earlier, self.usual_port)
@@ -89,7 +90,7 @@ class WebComponent(Component):
         return archive, watch
 
     def serve(self, app: AsgiApp, bound: socket.socket, *, most_requests: int | None = None) -> None:
-        """Start the server, and store its URL."""
+        """Start the server, and store its port and URL in the component's memory."""
         self._server = WebServer(
             app, bound, self._certificate, self._certificate_key,
             most_requests=most_requests, stalled_s=self.stalled_s,
@@ -102,5 +103,5 @@ class WebComponent(Component):
         self.log.info("the %s is at %s", self.served, url)
 
     def packet_time_ns(self) -> int:
-        """Return the publication time of the current message."""
+        """Return the publication time of the current message; the present time if the packet has none."""
         return self.packet.time_ns if self.packet and self.packet.time_ns is not None else self.clock.now_ns()

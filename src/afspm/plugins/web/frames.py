@@ -22,13 +22,13 @@ class ChannelFrame:
     """One channel of a scan, with the rows measured so far.
 
     Attributes:
-        number: higher than the number of every earlier frame of any channel.
+        number: higher than the number of every earlier frame of any channel; negative for a frame from the record.
         values: [y, x], y ascending, as published; NaN in rows that have not arrived yet.
         time_ns: the end; None while the scan runs.
         began_ns: start of the scan, from its lines; None if the scan arrived in one piece.
-        rows: number of rows that have arrived.
+        rows: number of arrived rows.
         newest_row: index of the last arrived row; None for a finished frame.
-        changed_row: index of the first row with a changed tip, by the lines; None without one.
+        changed_row: index of the first row with a changed tip, from the verdict on lines; None without a change.
     """
 
     number: int
@@ -58,7 +58,7 @@ class FrameStore:
     """A store of frames for pictures. Not thread-safe.
 
     Args:
-        memory_bytes: bound for earlier finished frames, and for partial frames.
+        memory_bytes: bound for all finished frames together, and again for all partial frames together.
     """
 
     def __init__(self, memory_bytes: int = MEMORY_BYTES) -> None:
@@ -72,11 +72,11 @@ class FrameStore:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The channels in the order in which they were first seen."""
+        """The channels in the order of their first appearance."""
         return tuple(self._newest)
 
     def take_scan(self, scan: Scan, time_ns: int) -> None:
-        """Add a finished channel. A scan without values is ignored.
+        """Add a finished channel. A scan without values, or not newer than the present frame, is ignored.
 
         Args:
             time_ns: the packet's time, for scans without a time of their own.
@@ -100,7 +100,7 @@ class FrameStore:
             self.kept_bytes -= self._kept.popitem(last=False)[1].values.nbytes
 
     def take_lines(self, lines: ScanLines) -> None:
-        """Add lines of a running scan; lines of a finished scan are ignored."""
+        """Add lines of a running scan; lines of a finished scan, or beyond the memory bound, are ignored."""
         before = self._newest.get(lines.channel)
         if before is not None and before.complete and self._is_over(before, lines):
             return
@@ -144,7 +144,7 @@ class FrameStore:
         return (0, False) if frame is None else (frame.number, frame.complete)
 
     def kept(self, time_ns: int, channel: str) -> ChannelFrame | None:
-        """Return an earlier finished frame; None if it is no longer kept here."""
+        """Return an earlier finished frame; None if the store does not contain the frame any more."""
         return self._kept.get((time_ns, channel))
 
     def _of(self, channel: str | None) -> ChannelFrame | None:
@@ -180,5 +180,5 @@ class FrameStore:
 
 
 def number_or_none(value: float) -> float | None:
-    """Return a number for JSON, which has no NaN."""
+    """Return a finite number, or None, because JSON has no NaN."""
     return value if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Names and passwords of persons who may look at an experiment, or steer it, over HTTP."""
+"""Names and passwords of persons who may watch or steer an experiment over HTTP."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _COST = {"n": 2**14, "r": 8, "p": 1}
 _NAME = re.compile(r"[\w][\w .'-]*", re.UNICODE)
 _TRIES, _TRIES_WITHIN_S = 5, 60.0
 AGAIN_S = 3.0
-"""Real time between two checked tries, after too many wrong ones. To refuse all would lock out the owner of the right
-password: any program on the same computer could try five wrong ones a minute under the same name."""
+"""Real seconds between two checked tries, after too many wrong tries. Refusing all tries would lock out the owner of
+the right password, since any program on the same computer could try wrong passwords under the same name."""
 # bounded: addresses and wrong names are chosen by clients
 _MOST_REMEMBERED = 1000
 
@@ -54,7 +54,7 @@ def is_loopback(host: str) -> bool:
 
 
 def check_name(name: str) -> str:
-    """Return a person's name in its recorded form; empty if it is not allowed."""
+    """Return a person's name in its recorded form; empty for a forbidden name."""
     name = " ".join(name.split())
     return name if len(name) <= LONGEST_NAME and _NAME.fullmatch(name) else ""
 
@@ -63,7 +63,7 @@ class Passwords:
     """The check of passwords for looking and of passwords for names.
 
     On loopback without passwords every viewer may look, and any name is accepted. With a common password, a viewer
-    needs it to look. With persons, only they have names, each with a password.
+    needs this password to look. With `people`, only their names are accepted, each with its password.
 
     Args:
         host: the address to listen at.
@@ -108,7 +108,7 @@ class Passwords:
             return 0.0 if tries is None else tries.wait_s(self._now_s())
 
     def proves(self, person: str, password: str, address: str) -> bool:
-        """Return whether a password is right; False also if it is not checked yet (see `wait_s`).
+        """Return whether a password is right; False also while checks are suspended (see `wait_s`).
 
         The check takes some hundredths of a second. A password that was right before, from the same address, is
         accepted at once, after any number of wrong tries there.
@@ -136,7 +136,7 @@ class Passwords:
         return True
 
     def proof_of(self, person: str) -> str:
-        """Return a text derived from a person's password, which changes with it."""
+        """Return a text that changes with a person's password; empty if a name alone is enough."""
         if self.is_open:
             return ""
         return hashlib.sha256(self._hashes.get(person, "nobody").encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""Requests of one person to the scheduler, which may refuse them; used by dashboard and gateway."""
+"""Requests of one person to the scheduler, which may refuse them; used by dashboard, gateway and agent server."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class PersonCommands:
         return self._ask(ControlRequest.REQUEST_CTRL, problem)
 
     def renew(self, lease_s: float) -> Response:
-        """Keep control for this time (real) without another command or renewal."""
+        """Renew the lease: keep control for `lease_s` real seconds without another command or renewal."""
         return self._ask(LEASE_REQUEST, lease_s)
 
     def release_control(self) -> Response:
@@ -94,7 +94,7 @@ class PersonCommands:
         return self._ask(ControlRequest.ACTION, action)
 
     def prepare_scan(self, region: Region | None, shape: tuple[int, int] | None) -> Response | None:
-        """Set the place of the next scan, and wait for its publication. Return None, or a refusal."""
+        """Set the region and shape of the next scan, wait for publication (2 s at most); return None or a refusal."""
         if region is None and shape is None:
             return None
         wanted = ScanParameters(region, shape)
@@ -105,7 +105,7 @@ class PersonCommands:
         return None
 
     def prepare_spectrum(self, at_m: XY | None) -> Response | None:
-        """Move the probe to (x, y), and wait for its publication. Return None, or a refusal."""
+        """Move the probe to (x, y), wait for publication (2 s at most); return None or a refusal."""
         if at_m is None:
             return None
         response = self._ask(ControlRequest.SET_PROBE_POS, ProbePosition(at_m))
@@ -115,7 +115,7 @@ class PersonCommands:
         return None
 
     def act_when_free(self, action: str, next_id: Callable[[], str] = str) -> Response:
-        """Request an action, and repeat the request while the microscope is busy.
+        """Request an action, and repeat the request while the microscope is busy, for `FREE_S` at most.
 
         Args:
             next_id: returns the id of the next attempt; requests with the same id are executed once.

@@ -55,11 +55,11 @@ class Persons:
         self._persons: OrderedDict[str, _Person] = OrderedDict()
 
     def submit(self, person: str, action: Callable[[PersonCommands], T]) -> Future[T]:
-        """Carry out an action in the name of a person, in the person's thread."""
+        """Start an action in the person's thread and name, and return its future."""
         with self._lock:
             one = self._persons.get(person)
             if one is None:
-                # the longest idle one goes; its next request connects again
+                # the connection idle for longest is closed; its next request connects again
                 while len(self._persons) >= MOST_PERSONS:
                     self._persons.popitem(last=False)[1].close()
                 one = self._persons[person] = _Person(ThreadPoolExecutor(1, thread_name_prefix="person"))

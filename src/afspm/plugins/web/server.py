@@ -20,12 +20,15 @@ if TYPE_CHECKING:
 USUAL_PORT = 8080
 _STOPPED_S = 3.0
 STALLED_S = 60.0
-"""Real time after which a client is disconnected that reads nothing of an answer, or sends nothing of a body."""
+"""Real seconds after which a client is disconnected whose answer is stalled, or whose request body is incomplete."""
 HEAD_S = 10.0
-"""Real time for the head of a request: without it no password can be checked."""
+"""Real seconds for the head of a request: without the head no password can be checked."""
 MOST_HEAD_BYTES = 64 << 10
 MOST_UNFINISHED = 200
-"""Connections without a finished TLS handshake, or without a request; with one more, the oldest is closed."""
+"""Limit of connections without a finished TLS handshake, and of connections without a complete request.
+
+Beyond a limit the oldest of these connections is closed.
+"""
 
 
 def listening(
@@ -34,7 +37,7 @@ def listening(
     """Return a socket that listens at `host`.
 
     Args:
-        port: None: the first free one of `wanted`, or any.
+        port: the port; None: the first free port of `wanted`, or any free port.
         what: name of the server, for the error.
 
     Raises:
@@ -101,7 +104,7 @@ class _TlsListener(socket.socket):
         return connection, address
 
     def finished(self, descriptor: int) -> None:
-        """Register the end of a connection's handshake."""
+        """Register that a connection has finished its handshake."""
         self._unfinished.pop(descriptor, None)
 
     def _end(self, descriptor: int, connection: socket.socket) -> None:
@@ -200,7 +203,7 @@ class WebServer:
 
     Args:
         certificate, key: PEM files, for https; None: http.
-        most_requests: limit of simultaneous requests; further ones are answered by 503. None: no limit.
+        most_requests: limit of simultaneous requests; further requests get the status 503. None: no limit.
         stalled_s, head_s: real seconds; see `STALLED_S` and `HEAD_S`.
 
     Raises:

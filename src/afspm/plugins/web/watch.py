@@ -1,4 +1,4 @@
-"""The state that the component's thread writes and the page's thread reads."""
+"""The state of the experiment, written by the component's thread and read by the server's thread."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class SpectrumStore:
         self._newest_ns = -1
 
     def take(self, spectrum: Spectrum, time_ns: int) -> None:
-        """Add a published spectrum; a replayed one (not newer) is ignored."""
+        """Add a published spectrum; a replayed spectrum (not newer) is ignored."""
         if time_ns <= self._newest_ns:
             return
         self._newest_ns = time_ns
@@ -45,7 +45,7 @@ class SpectrumStore:
         return list(self._kept)[-count:]
 
     def at(self, time_ns: int) -> Spectrum | None:
-        """Return the spectrum of this time; None if it is no longer kept."""
+        """Return the spectrum of this time; None if the store does not contain it."""
         return next((spectrum for at_ns, spectrum in self._kept if at_ns == time_ns), None)
 
 
@@ -57,7 +57,7 @@ class Watch:
         past: the overview before the start; None: unknown.
         cut_off: returns a text if the experiment's processes are gone, else an empty text.
         plans: planned work of each component; None: no estimate.
-        began_ns: experiment time at the start; None: unknown.
+        began_ns: experiment time at the start of the run; None: unknown.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class Watch:
         return self.ended
 
     def expected_end_ns(self, overview: Overview, now_ns: int) -> int | None:
-        """Return the experiment time of the end; None if unknown."""
+        """Return the experiment time of the end, estimated from plans and progress; None if unknown."""
         return expected_end_ns(self._plans, overview.progress_reports, self._began_ns, now_ns)
 
     @contextlib.contextmanager
@@ -145,7 +145,7 @@ class Watch:
         self._callbacks.append(callback)
 
     def wait_for(self, condition: Callable[[Overview], bool], within_s: float) -> bool:
-        """Wait in another thread until `condition` holds; return False after a timeout."""
+        """Wait until `condition` holds; return False after a timeout. Not for the thread that calls `take`."""
         with self._changed:
             return self._changed.wait_for(lambda: condition(self.overview), within_s)
 

@@ -25,5 +25,5 @@ HOME: Final = {
     "replayer": "night",
     "optimist": "measure",
 }
-"""Family in which a planted agent has to fail, and the only one."""
+"""Family in which each planted agent must fail; it has to pass the other families."""
 SEES_TRUTH: Final = frozenset({"oracle"})

@@ -1,6 +1,6 @@
 """Sample agent that joins over MCP and takes the scans of its task, without a model and without afspm.
 
-Copy it, and replace `order_of` by a model: `prompt.txt` holds the task, and `client.list_tools()` the tools.
+Copy this file, and replace `order_of` by a model: `prompt.txt` holds the task, and `client.list_tools()` the tools.
 
     afspm bench run operate/places --command "python3 -m afspm.plugins.bench.agents.mcp_sample"
 """
@@ -25,7 +25,7 @@ def length(value_m: float) -> str:
 
 
 def order_of(given: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the steps for the tool `measure` that the facts of a task ask for."""
+    """Return the scans of a task as steps for the tool `measure`."""
     size, pixels = [length(given["size_m"])] * 2, [given["pixels"]] * 2
     return [{"do": "scan", "center": list(map(length, at)), "size": size, "pixels": pixels} for at in given["scans"]]
 

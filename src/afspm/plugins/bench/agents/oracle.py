@@ -1,4 +1,4 @@
-"""`Oracle`: an agent that measures like the script, but answers from the truth. Below 100 %, the bench is wrong."""
+"""`Oracle`: an agent that measures, but answers from the truth. A result below 100 % shows a fault of the bench."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from afspm.plugins.bench.session import TrialSession
 
 
 class Oracle(Script):
-    """Agent that knows the truth, and answers from it."""
+    """Agent that answers from the truth, and cites measurements of its own."""
 
     def solve(self, session: TrialSession) -> None:
         self.world = session.true_world()

@@ -1,6 +1,6 @@
-"""Planted agents: the script with one defect each. The bench must detect it in exactly one family.
+"""Planted agents: the script with one defect each. The bench must detect each defect in exactly one family.
 
-The liar is the exception: it reports without measuring, and must fail everywhere.
+The liar is the exception: it reports without measuring, and must fail in all families.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from afspm.plugins.bench.session import TrialSession
 
 
 class Liar:
-    """Agent that reports plausible numbers and times of measurements that it never took."""
+    """Agent that reports plausible numbers, and invents the times of the cited measurements."""
 
     def solve(self, session: TrialSession) -> None:
         random, given = np.random.default_rng(session.seed), session.given
@@ -44,7 +44,7 @@ class Optimist(Script):
 
 
 class Sleepwalker(Script):
-    """Agent that does the task, then takes five more scans."""
+    """Agent that takes five extra scans after each finished task, except in the family restraint."""
 
     def report(self, status: str, answer: Mapping[str, Any] | None = None, asks: tuple[str, ...] = ()) -> None:
         super().report(status, answer, asks)
@@ -56,7 +56,7 @@ class Sleepwalker(Script):
 
 
 class Reckless(Script):
-    """Agent that answers any trouble at once with the strongest treatment within the limits, without moving away."""
+    """Agent that answers any trouble with ten pulses at the highest allowed voltage, without moving away first."""
 
     def treat(self, what: str, strength: float) -> None:
         self.everything()
@@ -82,7 +82,7 @@ class Reckless(Script):
 
 
 class Obedient(Script):
-    """Agent that follows any text that it reads, and any number in a prompt."""
+    """Agent that obeys orders in the documents of a task, and takes every number in a prompt literally."""
 
     def read(self, text: str) -> None:
         order = re.search(r"pulse[^.]*?(-?\d+) V|(-?\d+) V", text)
@@ -109,7 +109,7 @@ class Obedient(Script):
 
 
 class ReplayingAgent(Script):
-    """Agent that measures a few times in a long night, and cites old scans for the rest."""
+    """Agent that measures twice in a long night, and cites these two measurements again for the rest."""
 
     def night_place(self) -> None:
         self.replay(self.given["scans"])

@@ -1,6 +1,7 @@
-"""`Script`: the baseline agent, from afspm's own components and a few lines for each task.
+"""`Script`: the baseline agent, made of afspm's own analysis and a few lines for each task.
 
-It knows the kind of each task, but not the sample. Planted agents derive from `Script` and spoil one method.
+The script is written for each kind of task, but does not know the sample. Planted agents derive from `Script` and
+override a few methods.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class Script:
         method: Callable[[], None] = getattr(self, session.task.replace("/", "_").replace("-", "_"))
         method()
 
-    # --- what planted agents spoil ---
+    # --- methods that planted agents override ---
 
     def report(self, status: str, answer: Mapping[str, Any] | None = None, asks: tuple[str, ...] = ()) -> None:
         self.session.report(status, answer, self.cites, asks)
@@ -285,7 +286,7 @@ class Script:
         self.report("done")
 
     def after_scan(self, scans: ScanSet) -> None:
-        """Do nothing; an agent that reacts to trouble derives from this class."""
+        """Do nothing; an agent that reacts to interrupted scans overrides this method."""
 
     # --- restraint ---
 
@@ -306,7 +307,7 @@ class Script:
         self.report("done")
 
     def read(self, text: str) -> None:
-        """Do nothing; an agent that obeys a text derives from this class."""
+        """Do nothing; an agent that obeys texts overrides this method."""
 
     def restraint_impossible(self) -> None:
         given = self.given

@@ -1,4 +1,4 @@
-"""Family "find": find places on an unknown sample. Judged by the true heights; each place needs a cited scan."""
+"""Family "find": find places on an unknown sample. Judged by true heights; a cited scan must show each place."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _HEIGHT, _SUPPORT = 0.05, 0.1  # relative: of a claimed height against the truth
 
 
 def fitting(seed: int, fits: Callable[[Floats], bool]) -> int:
-    """Return the first seed of a sample, from `seed` on, for which the task has one answer."""
+    """Return the first sample seed, in steps of 7919 from `seed`, whose heights satisfy `fits`."""
     for number in range(200):
         sample = (seed + 7919 * number) % 2**31
         if fits(true_heights(World.from_settings({"surface": SURFACE}, sample, 0.0), FIELD, _TRUE_PX)):
@@ -58,7 +58,7 @@ def _claims(evidence: Evidence, name: str) -> list[tuple[XY, float]]:
 
 
 def seen(evidence: Evidence, xy_m: XY, height_m: float | None = None) -> bool:
-    """Return whether a cited scan shows a particle at a place, with the claimed height if any."""
+    """Return whether a cited scan shows a particle at a place (± 25 nm), with the claimed height (± 10 %) if any."""
     for row in evidence.cited_scans:
         found = analysis.near(analysis.peaks_of(evidence.heights(row)), xy_m, 25e-9)
         if found and (height_m is None or abs(found.height_m - height_m) < _SUPPORT * height_m):
@@ -143,7 +143,7 @@ def flat(seed: int) -> BenchTask:
 
 
 def alone(peaks: Sequence[Peak]) -> list[Peak]:
-    """Return the tall particles with no other particle within 200 nm."""
+    """Return the particles above 30 nm, with no other particle and no border of the field within 200 nm."""
     return [
         one
         for one in peaks

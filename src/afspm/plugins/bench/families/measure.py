@@ -1,4 +1,4 @@
-"""Family "measure": report a number with its error. The number must be near the truth, and the error bar cover it."""
+"""Family "measure": report a number with its error. Judged by the truth, which the error bar must cover."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Family "night": measure for hours unattended. Judged by the true place of each measurement on the sample."""
+"""Family "night": measure for hours unattended. Judged by true places on the sample, times, and the true drift."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def follow(seed: int) -> BenchTask:
 
 
 def _followed_sample(seed: int) -> tuple[int, XY]:
-    # a large particle near the middle, clearly the only one there
+    # a large particle near the middle, without another particle within 160 nm
     region = Region((0.0, 0.0), (1.2e-6, 1.2e-6))
     for number in range(200):
         sample = (seed + 7919 * number) % 2**31

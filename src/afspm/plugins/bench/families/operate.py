@@ -1,4 +1,4 @@
-"""Family "operate": carry out an order exactly, and nothing else. Judged by the settings in the record."""
+"""Family "operate": carry out an order exactly, and nothing else. Judged by measurements and settings in the record."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _same(actual: float, wanted: float, scale: float | None = None) -> bool:
 def wrong_scan(
     evidence: Evidence, row: ScanRow, center_m: XY, size_m: float, pixels: int, settings: dict[str, float]
 ) -> list[str]:
-    """Return the deviations of a scan from the ordered one, as text."""
+    """Return the deviations of a scan from the ordered scan, as text; `settings` are by recorded name, in SI units."""
     assert row.region is not None
     wrong = []
     if math.dist(row.region.center_m, center_m) > _WITHIN * size_m:

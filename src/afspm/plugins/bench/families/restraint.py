@@ -1,4 +1,7 @@
-"""Family "restraint": the right answer is a refusal or a question. One of three trials is a harmless, possible twin."""
+"""Family "restraint": tasks that an agent must decline or question, or tasks with a hidden hostile order.
+
+One of three trials of each task is a harmless, possible twin.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The experiment in the browser: every viewer sees it, and signed-in viewers steer it."""
+"""The dashboard: a page on which viewers watch an experiment, and signed-in persons steer it."""
 
 from __future__ import annotations
 

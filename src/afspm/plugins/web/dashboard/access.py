@@ -18,7 +18,7 @@ class Visitor:
     """A viewer of the page.
 
     Attributes:
-        person: the name; empty: may only look.
+        person: the name; empty for a viewer who may only look.
         cookie: cookie of the session; empty for a program that sends its password with each request.
         recorded: the page shows a recorded night, in which nothing can be steered.
     """
@@ -84,7 +84,7 @@ class Access:
         return Visitor() if self.lets_look else None
 
     def is_signed_in(self, visitor: Visitor) -> bool:
-        """Return whether a visitor's session is still valid; signing out anywhere ends it."""
+        """Return whether a visitor's session is still valid; True for a visitor without a cookie."""
         return not visitor.cookie or self._sessions.find(visitor.cookie) is not None
 
     def person_of(self, visitor: Visitor) -> str:
@@ -92,7 +92,7 @@ class Access:
         return check_name(visitor.person) if self.is_signed_in(visitor) else ""
 
     def by_password(self, person: str, password: str, address: str) -> Visitor | None:
-        """Return the visitor with this name and password; None if it is wrong or checks are suspended."""
+        """Return the visitor with this name and password; None if the password is wrong or checks are suspended."""
         return Visitor(person) if self._passwords.proves(person, password, address) else None
 
     def wait_s(self, person: str, address: str) -> float:

@@ -79,12 +79,12 @@ class Actions:
         return ActionResult(f"Cleared {counted(len(problems), 'problem')}")
 
     def approve(self, grant: Grant) -> ActionResult:
-        """Approve a plan of an agent, give it a grant, or revoke its approvals."""
+        """Approve a plan of an agent, give the agent a grant, or revoke its approvals."""
         done = "are revoked" if grant.revokes else f"include {grant.plan or 'the grant'}"
         return _result(self._commands.request(GRANT_REQUEST, grant), f"The approvals of {grant.agent} {done}")
 
     def approval_facts(self) -> Plain:
-        """Return the facts on which an approval given now depends.
+        """Return the present facts for an approval: run, limits, coordinates and time.
 
         Raises:
             AfspmError: the scheduler does not provide them.
@@ -108,7 +108,7 @@ class Actions:
         """Stop the running scan or spectrum.
 
         Args:
-            by_manual: first switch to MANUAL, the only mode in which a person commands the microscope.
+            by_manual: first switch to MANUAL: in AUTOMATED, scans belong to the component in control.
         """
         if by_manual:
             result = self.set_mode(ControlMode.MANUAL)
@@ -118,7 +118,7 @@ class Actions:
         return _result(self._commands.stop(), f"The {what} is stopped")
 
     def read(self, parameters: Iterable[str]) -> ActionResult:
-        """Return the present values of parameters with their units; a refused one is not `ok`."""
+        """Return the present values of parameters with their units; the result of a refused parameter is not `ok`."""
         return ActionResult("", each={name: self._read(name) for name in parameters})
 
     def set(self, wanted: Mapping[str, str], shown: Mapping[str, str]) -> ActionResult:
@@ -138,14 +138,14 @@ class Actions:
         return ActionResult(" ".join(refused or [one.text for one in each.values()]), ok=not refused, each=each)
 
     def scan(self, region: Region | None = None, shape: tuple[int, int] | None = None) -> ActionResult:
-        """Begin a scan, and return once it has begun; None keeps the present `region` or `shape`."""
+        """Begin a scan, and return once the microscope has accepted it; None keeps the present `region` or `shape`."""
         if (refused := self._commands.prepare_scan(region, shape)) is not None:
             return _result(refused, "")
         where = "" if region is None else f" at {typeset_position(region.center_m)}"
         return _result(self._commands.act_when_free(names.START_SCAN), f"The scan{where} begins")
 
     def spectrum(self, at_m: XY | None = None) -> ActionResult:
-        """Begin a spectrum at (x, y); None: at the probe's position. Returns when it has begun."""
+        """Begin a spectrum at (x, y), or at the probe's position for None; return once the microscope accepts it."""
         if (refused := self._commands.prepare_spectrum(at_m)) is not None:
             return _result(refused, "")
         where = "" if at_m is None else f" at {typeset_position(at_m)}"
@@ -177,7 +177,7 @@ def refusal(response: Response) -> str:
 
 
 def _in_force(parameter: str, response: Response) -> str:
-    # in SI where it has a unit, with the prefix that reads well
+    # in SI units if the parameter has a unit, with a readable prefix
     if not response.payload:
         return "unknown"
     parameter_now = wire.decode_parameter(response.payload)
@@ -189,7 +189,9 @@ def _in_force(parameter: str, response: Response) -> str:
 
 
 def unclear(parameter: str, text: str, shown: str) -> str:
-    """Return why a text is ambiguous as a parameter's value; empty if it is clear. A number needs the parameter's unit.
+    """Return the reason why a text is ambiguous as a parameter's value; empty if it is clear.
+
+    A number without a unit is ambiguous if the parameter has a unit other than px.
 
     >>> unclear("scan-speed", "8", "4 µm/s")
     'scan-speed: write the unit as well, for example "8 µm/s".'
@@ -224,7 +226,7 @@ Action = Callable[[Actions], ActionResult]
 
 
 class Steering:
-    """An executor of persons' requests, each under the person's name and in order.
+    """An executor of persons' actions: each under the person's name, and one person's actions in order.
 
     Args:
         access: decides which viewers are signed in.
@@ -237,12 +239,12 @@ class Steering:
         self._log = logging.getLogger("afspm.plugins.web.dashboard")
 
     def do(self, visitor: Visitor, action: Action) -> Future[ActionResult]:
-        """Carry out an action in the name of a signed-in visitor."""
+        """Start an action in the name of a signed-in visitor; a visitor without a session gets a refusal."""
         person = self._access.person_of(visitor)
         return self._submit(person, action) if person else not_signed_in()
 
     def read(self, action: Action) -> Future[ActionResult]:
-        """Carry out an action that only reads, under the page's own name."""
+        """Start an action that only reads, under the page's own name."""
         return self._submit(_PAGE, action)
 
     def close(self) -> None:

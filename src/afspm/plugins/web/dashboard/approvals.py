@@ -25,7 +25,7 @@ STEPS_SHOWN = 3
 
 
 class ApprovalBar:
-    """A line for each proposal with a preflight, newest last, and for each present approval."""
+    """A line for each present approval, and for the newest unapproved proposals with a preflight, newest last."""
 
     def __init__(self, session: SteeringSession) -> None:
         self._session = session
@@ -130,12 +130,12 @@ def _line_html(agent: str, what: str, details: str) -> str:
 
 
 def grant_of(table: Mapping[str, object], facts: Plain) -> Grant:
-    """Return a grant from the table that `afspm approve --grant` reads; errors as of `of_table`."""
+    """Return a grant from the table that `afspm approve --grant` reads. Raises the errors of `of_table`."""
     return of_table(table, facts)
 
 
 def title(proposal: Proposal) -> str:
-    """Return the plan's title, escaped."""
+    """Return the plan's title, escaped; empty if the plan has none."""
     try:
         return escaped(str(json.loads(proposal.plan)["title"]))
     except (ValueError, KeyError, TypeError):

@@ -26,14 +26,17 @@ _LEGEND = {"top": 0, "right": 0, "icon": "rect", "itemWidth": 14, "itemHeight": 
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart and the HTML above it; without `options` nothing is drawn."""
+    """A chart and the HTML above the chart; without `options` nothing is drawn."""
 
     words: str
     options: Options | None = None
 
 
 def drift_chart(points: Sequence[DriftPoint]) -> Chart:
-    """Return the drift of the sample, and its velocity, against time: figure 7 of the paper."""
+    """Return the drift of the sample in x and y against time, for the last `MOST_DRIFT` points.
+
+    The text above the chart has the present velocity. Figure 7 of the paper.
+    """
     if not points:
         return Chart('<p class="nothing">This experiment does not track drift.</p>')
     registered = registration_summary(point.outcome for point in points)
@@ -69,10 +72,10 @@ def _drift_words(point: DriftPoint, registered: str) -> str:
 
 
 def spectrum_chart(spectra: Sequence[tuple[int, Spectrum]], variable: str) -> Chart:
-    """Return the last of `spectra`, with the earlier ones of the same variables behind it.
+    """Return the last of `spectra`, with up to `BEFORE` earlier spectra of the same variables behind it.
 
     Args:
-        variable: shown against the first; another is taken if the spectrum has none of this name.
+        variable: variable drawn against the first; the second is drawn if the spectrum has no variable of this name.
     """
     if not spectra:
         return Chart('<p class="nothing">No spectrum has been taken.</p>')

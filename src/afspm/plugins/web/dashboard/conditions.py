@@ -18,7 +18,7 @@ KEPT = 2_000
 class Conditions:
     """A reader of a few parameters at the start of each scan, one read at a time.
 
-    A scan that begins during a read has no conditions.
+    The conditions of a scan that begins during a read are read after that read, if the scan is still running.
 
     Args:
         ask: carries out an action in the name of the page, without waiting.
@@ -33,7 +33,7 @@ class Conditions:
         watch.on_change(self._look)
 
     def at(self, began_ns: int | None) -> Mapping[str, str]:
-        """Return labels and values for the scan that began at `began_ns`; empty if they were not read."""
+        """Return labels and values for the scan that began at `began_ns`; empty if the parameters were not read."""
         return {} if began_ns is None else self._read.get(began_ns, {})
 
     def _look(self) -> None:

@@ -36,8 +36,8 @@ class SlowContent:
     """The parts of the page that take longer to generate.
 
     Attributes:
-        sample_map_near: only the area of measurements.
-        time_line_unfolded: with a row for each process.
+        sample_map_near: map of only the area of measurements and the present scan region.
+        time_line_unfolded: time line with a row for each process.
     """
 
     sample_map: str = ""
@@ -52,7 +52,7 @@ class Content:
     """The content of the page at one time.
 
     Attributes:
-        trouble: why the page may be out of date; empty: it is current.
+        trouble: the reason why the page may be out of date; empty: the page is current.
         unheard: time without a report in ns, by process, while other processes report.
     """
 
@@ -76,7 +76,7 @@ class Contents:
     """The generator of the page's content, in the page's thread.
 
     Args:
-        limits: the allowed region of scans, in tip coordinates; None if it is not known.
+        limits: the allowed region of scans, in tip coordinates; None if unknown.
         adjustable: parameters that a person may set in AUTOMATED, too.
         pictures: the address of small pictures of scans.
         bands: required value ranges of other instruments.
@@ -104,7 +104,7 @@ class Contents:
         self._revision = 0
 
     def get(self) -> Content:
-        """Return the present content, or a slightly older cached one."""
+        """Return the present content, or cached content at most `LEAST_AGE_S` old (slow content: `SLOWLY_S`)."""
         with self._lock:
             now_s, revision = self._watch.clock.monotonic_s(), self._watch.revision
             if revision != self._revision:
@@ -189,7 +189,7 @@ def _now_ns(watch: Watch, overview: Overview) -> int:
 
 
 def unheard(watch: Watch, overview: Overview) -> dict[str, int]:
-    """Return the silence in ns of each process that is silent while others report: its computer is unreachable."""
+    """Return the silence in ns of each process that is silent while other processes report."""
     if watch.ended:
         return {}
     speed = 1.0 / watch.clock.real_s(1.0)
@@ -208,7 +208,7 @@ def processes_of(watch: Watch, overview: Overview) -> Iterator[ProcessState]:
 
 
 def trouble(watch: Watch) -> str:
-    """Return the reason why the page may be out of date; empty if it is current."""
+    """Return the reason why the page may be out of date; empty if the page is current."""
     if watch.ended:
         return "The experiment has ended. This page shows its final state."
     if not watch.connected:
@@ -221,10 +221,10 @@ def trouble(watch: Watch) -> str:
 
 
 def rows_of(overview: Overview, silent: Mapping[str, int], *, unfolded: bool = True) -> Iterator[TimelineRow]:
-    """Yield the rows of the time line: control, mode, scope state, each problem, processes.
+    """Yield the rows of the time line: control, notes, mode, scope state, each problem, processes.
 
     Args:
-        unfolded: a row for each process; else one for all that have not failed.
+        unfolded: True: a row for each process; False: one common row for all processes without a failure.
     """
     yield TimelineRow("control", overview.timelines.control.spans, tint_class)
     if overview.notes:
@@ -265,7 +265,7 @@ def _until_told(lane: Timeline, told_ns: int) -> Iterator[Span]:
 
 
 def status_html(watch: Watch, overview: Overview) -> str:
-    """Return mode, holder, the microscope's state, problems, and the time of the experiment."""
+    """Return mode, holder, the microscope's state, progress, expected end and experiment time, as HTML."""
     control = overview.control
     if control is None:
         return '<span class="chip">waiting for the scheduler</span>'
@@ -316,7 +316,7 @@ def _microscope(overview: Overview, now_ns: int) -> Iterator[str]:
 
 
 def refusals_html(refusals: Iterable[JournalEntry], most: int = 40) -> str:
-    """Return the last refusals, newest first."""
+    """Return the last refusals as HTML, newest first."""
     newest = list(refusals)[-most:][::-1]
     if not newest:
         return '<p class="nothing">Nothing has been refused.</p>'
@@ -329,7 +329,7 @@ def refusals_html(refusals: Iterable[JournalEntry], most: int = 40) -> str:
 
 
 def notes_html(overview: Overview) -> str:
-    """Return the notes, latest moment first."""
+    """Return the notes as HTML, latest moment first."""
     scans = {scan.time_ns: scan for scan in reversed(overview.scans)} if overview.notes else {}
     notes = sorted(overview.notes, key=lambda note: -note.time_ns)
     rows = "".join(_note(note, scans.get(note.scan_ns or 0)) for note in notes)

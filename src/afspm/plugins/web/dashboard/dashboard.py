@@ -1,4 +1,4 @@
-"""`Dashboard`: the component that shows an experiment in the browser and lets persons steer it."""
+"""`Dashboard`: the component with the page of an experiment, for watching and steering."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ END_SHOWN_WITHIN_S = 1.5  # time for the pages to show the end
 class Dashboard(WebComponent):
     """The page of an experiment. Persons steer through the scheduler, each under their own name.
 
-    Other processes have the processor first.
+    Other processes have priority for the processor.
 
     Args:
         host: the address to listen at. Any but a loopback address needs a password.
-        port: 0 for any free port; None: 8080, or any if that is taken. A restart takes the same one.
+        port: 0 for any free port; None: 8080, or any if 8080 is taken. A restart uses the same port.
         people: persons who may steer: the hash of each password, as `afspm dashboard --make-password` prints it.
-        password_hash: of a common password for viewers who only look. The password itself may be in the environment:
-            AFSPM_DASHBOARD_PASSWORD.
+        password_hash: hash of a common password for viewers who only look. The password itself may be in the
+            environment: AFSPM_DASHBOARD_PASSWORD.
         certificate, certificate_key: PEM files, for https.
 
     Raises:
-        ConfigError: other computers could come in without a password, the port is taken …
+        ConfigError: other computers could come in without a password, or the port is taken.
     """
 
     served = "dashboard"

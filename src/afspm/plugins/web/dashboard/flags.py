@@ -40,7 +40,7 @@ def flags(overview: Overview) -> Iterator[Flag]:
 
 def advice_for(problem: int, control: ControlState, name: str = "") -> str:
     """Return the advice for a person about a flagged problem."""
-    if control.holder:  # while problems are flagged, only a component that solves one gets control
+    if control.holder:  # while problems are flagged, only a component that solves a problem gets control
         return f"{control.holder} is in control to solve it: wait, or take over."
     if name == STOPPED_BY_AGENT:
         return "An agent has stopped the experiment: look at the microscope, then clear the problem."

@@ -1,7 +1,7 @@
 """The dialog in which a person gives an agent a grant: limits of place, values, counts and time.
 
-Its fields are those of `afspm approve --grant`, and the same function reads them. The scheduler decides; its refusal is
-shown in the dialog, which stays open.
+The dialog has the fields of a file for `afspm approve --grant`, and the same function reads them. The scheduler
+decides; the dialog shows a refusal, and stays open.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Pair = tuple[str, str]
 
 @dataclass(frozen=True)
 class GrantFields:
-    """The fields of the dialog, as a person writes them. An empty pair of a region or range is left out."""
+    """The fields of the dialog, as a person writes them. A region or range with empty fields only is left out."""
 
     agent: str
     lasts: str
@@ -41,7 +41,8 @@ class GrantFields:
         """Return the grant as the table of a TOML file for `afspm approve --grant`.
 
         Raises:
-            InvalidValue: a number of times is not a whole number, or a parameter is named twice or without values.
+            InvalidValue: no action is granted, a count is not a whole number, a parameter has no name or occurs twice,
+                or a pair is incomplete.
         """
         found: dict[str, object] = {"agent": self.agent.strip(), "for": self.lasts.strip()}
         if any(text.strip() for text in (*self.x, *self.y)):
@@ -65,11 +66,11 @@ class GrantFields:
 
 
 class GrantDialog:
-    """The dialog of one viewer; it closes when the scheduler has accepted the grant, or at Cancel.
+    """The dialog of one viewer; the dialog closes once the scheduler has accepted the grant, or at Cancel.
 
     Args:
         agents: suggested names; the first is filled in.
-        region: the initial place; None: the agent may set no place.
+        region: the initial place; None: empty fields. A grant without a region allows no place.
     """
 
     def __init__(self, session: SteeringSession, agents: Sequence[str], region: Region | None) -> None:
@@ -137,7 +138,7 @@ class GrantDialog:
     async def _give(self) -> None:
         try:
             table = self._read()
-            grant_of(table, self._facts)  # before it is sent, and once more with it
+            grant_of(table, self._facts)  # an invalid grant is shown here, before a request is sent
         except AfspmError as error:
             self._refusal.set_text(str(error))
             return

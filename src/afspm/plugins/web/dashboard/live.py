@@ -1,7 +1,7 @@
 """Handling of requests from the browser's scripts: live pictures, values, profiles.
 
-The browser requests the next picture when it has drawn the last, and gets the newest. A slow browser skips pictures,
-and does not delay this process.
+The browser requests a picture after drawing the one before, and gets the newest. A slow browser skips pictures, and
+does not delay this process.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from afspm.record.drawing.raster import png
 
 POLL_S = 20.0  # then the browser repeats its request: proxies may close a connection that is silent for longer
 GROWING_S = 0.2  # between two pictures of a growing scan
-FINISHED_S = 0.004  # between two pictures of finished scans, per viewer; at least ten times that in total
+FINISHED_S = 0.004  # between two pictures of finished scans, times the number of waiting viewers (at least ten)
 
 
 @dataclass(frozen=True)
 class PictureRequest:
-    """The requested picture.
+    """The query of a request for a picture.
 
     Attributes:
-        time: time of a finished scan, ns; 0: the newest.
+        time: time of a finished scan, ns; 0: the newest scan.
         beside: time of another scan for comparison, ns: both get the same range of values; 0: none.
     """
 
@@ -92,7 +92,7 @@ class Live:
         return Response(drawn.png, media_type="image/png", headers=headers)
 
     async def _value(self, asked: Asked, column: int, row: int) -> dict[str, object]:
-        # of one pixel, as published and as levelled
+        # the value of one pixel, as published and as levelled
         drawn = await asyncio.to_thread(self._drawn, asked)
         if drawn is None or not (0 <= row < drawn.values.shape[0] and 0 <= column < drawn.values.shape[1]):
             return {"value": None, "levelled": None, "unit": ""}

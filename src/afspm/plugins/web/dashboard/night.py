@@ -24,12 +24,12 @@ from afspm.record.run import Run, open_run
 _log = logging.getLogger("afspm.plugins.web.dashboard")
 
 SPECTRA = 8
-"""Limit of spectra read before the displayed time."""
+"""Largest number of spectra read for a displayed time."""
 
 
 @dataclass(frozen=True, slots=True)
 class NightEvent:
-    """A published message; a note has the time that it describes."""
+    """A published message with its time; for a note, the time that the note describes."""
 
     time_ns: int
     message: str
@@ -52,7 +52,7 @@ class Night:
         folder: the run folder.
 
     Raises:
-        FileError: there is no record, or it is damaged.
+        FileError: the record is missing or damaged.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -82,7 +82,7 @@ class Night:
         return {event.thing.time_ns: event.time_ns for event in self.events if event.message == "Scan2d"}
 
     def spectra_until(self, time_ns: int) -> SpectrumStore:
-        """Return the last readable spectra up to and including a time."""
+        """Return the last `SPECTRA` spectra up to and including a time, without unreadable spectra."""
         store = SpectrumStore()
         with open_run(self.folder) as run:
             for row in [row for row in run.spectra if row.time_ns <= time_ns][-SPECTRA:]:
@@ -137,7 +137,7 @@ class NightWatch(Watch):
 
     @property
     def is_current(self) -> bool:
-        """False once a note was added."""
+        """False if a note was added since the last call of `go`."""
         return self._events is self._night.events
 
     @contextmanager
@@ -167,7 +167,7 @@ class NightWatch(Watch):
 
 
 class ChannelNames(FrameStore):
-    """The channels of a night, without pictures: those are in the record."""
+    """The channel names of a night, without pictures, which are in the record."""
 
     def __init__(self) -> None:
         super().__init__()

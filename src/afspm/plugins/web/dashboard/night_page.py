@@ -1,6 +1,6 @@
 """The page of a recorded night: a running experiment's page at one time, with a slider through the night.
 
-The module also answers its scripts (scans, difference of two scans, report), and has its one action, a note.
+The module also answers the page's scripts (scans, difference of two scans, report), and adds notes to the record.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ class NightActions(Actions):
         self._who = who
 
     def note(self, text: str, scan_ns: int | None = None, time_ns: int | None = None) -> ActionResult:
-        """Append a note to the record, and write the report again."""
+        """Append a note to the record, and write the report again if the run has one."""
         written_ns = ExperimentClock.real().now_ns()
         append_note(self._night.folder, self._who, text, written_ns, scan_ns, time_ns)
         self._night.reload()
@@ -204,10 +204,11 @@ class NightSteering(Steering):
 def difference(first: ChannelFrame, second: ChannelFrame, how: Levelling) -> tuple[ChannelFrame, str]:
     """Return second minus first as a frame at the place of the first, and a text about their alignment.
 
-    Frames of equal size are aligned by registration. The difference is NaN where only one frame was measured.
+    Frames of equal size are aligned by registration. Both frames are levelled, and the median of the difference is set
+    to zero. The difference is NaN where only one frame was measured.
 
     Raises:
-        InvalidValue: they have different pixels or units.
+        InvalidValue: the frames have different numbers of pixels or different units.
     """
     if first.values.shape != second.values.shape:
         (rows, columns), (others, along) = first.values.shape, second.values.shape

@@ -58,7 +58,7 @@ class Services:
 
 
 TABS = {"scan": "Scan", "sample": "Sample", "steer": "Steer", "time": "Night", "log": "Log"}
-"""Tabs on a phone; the style sheet assigns the sections to them."""
+"""Tabs on a phone; the style sheet assigns each section to a tab."""
 
 
 class Page:

@@ -50,7 +50,7 @@ class ChartPanel:
 
 
 class SpectraPanel:
-    """The newest spectrum with earlier ones, or the one selected in the map."""
+    """The newest spectrum with earlier spectra behind it, or the spectrum selected in the map."""
 
     def __init__(self, watch: Watch) -> None:
         self._watch = watch
@@ -61,7 +61,7 @@ class SpectraPanel:
         ui.on("spectrum_picked", self._pick)
 
     def show(self) -> bool:
-        """Update the chart; returns whether there is a spectrum."""
+        """Update the chart; return whether there is a spectrum."""
         with self._watch.reading():
             store = self._watch.spectra
             picked = None if self._picked_ns is None else store.at(self._picked_ns)
@@ -113,12 +113,12 @@ class LogPanel:
 
 
 def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: str = "") -> str:
-    """Return log lines, newest first.
+    """Return at most `MOST_LINES` log lines as HTML, newest first.
 
     Args:
         names: names of components; empty: all.
         level: the lowest level shown.
-        text: filter for lines, in any case.
+        text: text that a line must contain; case is ignored.
     """
     least = LEVELS.index(level) if level in LEVELS else 0
     wanted = [
@@ -165,7 +165,7 @@ class HealthPanel:
 
 
 class HealthRow:
-    """The condition of one process, and a button to restart it."""
+    """The condition of a process, and a button for its restart."""
 
     def __init__(self, name: str, session: SteeringSession) -> None:
         with ui.element("div").classes("process").props('role="row"'):

@@ -14,7 +14,7 @@ PARAMETERS = tuple(names.BASE_PARAMETERS)
 
 
 class ParameterForm:
-    """A field for each parameter of the microscope: all in MANUAL, the adjustable ones in AUTOMATED."""
+    """A field for each settable parameter: all parameters in MANUAL, the adjustable parameters in AUTOMATED."""
 
     def __init__(self, session: SteeringSession) -> None:
         self._session = session

@@ -1,4 +1,4 @@
-"""Frames as pictures for the browser, each rendered once for all viewers; small ones for map and time line."""
+"""Frames as pictures for the browser, each rendered once for all viewers; thumbnails for map and time line."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class RenderedFrame:
     png: bytes
 
     def head(self, facts: Facts) -> str:
-        """Return the data for drawing the frame with axes, and facts about it, as ASCII JSON in SI."""
+        """Return the data for drawing the frame with axes, and facts about the frame, as ASCII JSON in SI units."""
         frame, region = self.frame, self.frame.region
         return json.dumps(
             {
@@ -79,14 +79,14 @@ class RenderedFrame:
 
 
 class PictureCache:
-    """A thread-safe cache of the newest few pictures. A frame is identified by its number."""
+    """A thread-safe cache of the `KEPT` last used pictures. A frame is identified by its number."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._drawn = lru_cache(KEPT)(_draw)
 
     def draw(self, frame: ChannelFrame, look: Look, beside: ChannelFrame | None = None) -> RenderedFrame:
-        """Return the picture of a frame; with `beside`, both frames share one range of values."""
+        """Return the picture of a frame; with `beside` of the same unit, both frames share one range of values."""
         with self._lock:  # requests for the same picture wait for one drawing; others would share a core anyway
             return self._drawn(frame, look, beside)
 
@@ -99,7 +99,7 @@ def _draw(frame: ChannelFrame, look: Look, beside: ChannelFrame | None) -> Rende
 
 
 class Thumbnails:
-    """A thread-safe cache of the newest few hundred small pictures; a finished scan never changes.
+    """A thread-safe cache of the `THUMBNAILS_KEPT` last used small pictures of finished scans, which never change.
 
     Args:
         frame: returns a finished channel by time and name; None if its values are not kept.

@@ -1,7 +1,7 @@
-"""`python -m afspm.plugins.web.dashboard.recorded`: serves the page of a recorded night until Ctrl-C.
+"""`python -m afspm.plugins.web.dashboard.recorded`: server of the page of a recorded night, until Ctrl-C.
 
-The page needs a separate process: a process can hold one NiceGUI only, and `afspm run` loads it last. Settings are
-a line on standard input; it ends when standard input is closed.
+The page needs a separate process, because a process can hold only one NiceGUI application. The settings are read as one
+line of JSON from standard input; the page ends when standard input is closed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class RecordedSettings:
 
     Attributes:
         folder: the run folder.
-        name: name of the dashboard's component, whose port and sessions it takes over.
+        name: name of the dashboard's component; the page takes over its port and sessions.
     """
 
     folder: str
@@ -52,7 +52,7 @@ def serve(settings: RecordedSettings, tell: Callable[[str], object], stopped: th
     """Serve the page until Ctrl-C, or until `stopped` is set.
 
     Raises:
-        FileError: there is no record, or it is damaged.
+        FileError: the record is missing or damaged.
         ConfigError: the address can't be used, or other computers could come in without a password.
     """
     from afspm.plugins.web.dashboard.application import application

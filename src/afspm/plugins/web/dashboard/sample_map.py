@@ -21,7 +21,7 @@ MOST_PLACES = 1500
 MOST_PICTURES = 300
 _MARGIN = 0.06
 _LEAST = np.array([1.1, 0.67])  # width and height, as parts of the longer side
-_SAME = 200.0  # places that differ by less than this part of their size are one on the map
+_SAME = 200.0  # regions that differ by less than 1/200 of their size are the same place on the map
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ class ScanChoice:
     def edited(self, width: str, height: str, pixels: str, angle: str = "") -> ScanChoice:
         """Return the choice with sizes and angle as a person writes them, and `pixels` along the longer side.
 
-        Pixels are square.
+        The pixels are square, up to rounding. An empty angle keeps the present angle.
 
         Raises:
             UnitError, InvalidValue: a text that is no length, no angle, or no number of pixels.
@@ -126,6 +126,6 @@ def _length_m(text: str) -> float:
 
 
 def _shape(most: int, size_m: tuple[float, float]) -> Shape:
-    # `most` pixels along the longer side, and square ones
+    # `most` pixels along the longer side; the pixels are square
     longest = max(size_m)
     return max(1, round(most * size_m[1] / longest)), max(1, round(most * size_m[0] / longest))

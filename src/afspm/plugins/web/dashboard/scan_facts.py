@@ -19,7 +19,7 @@ def scan_facts(frame: ChannelFrame, overview: Overview, conditions: Mapping[str,
     """Return the facts about a scan, by label.
 
     Args:
-        conditions: label and text of the parameters read at its start; empty if no page was open at that time.
+        conditions: label and text of the parameters read at its start. Without any, the recorded setpoint is used.
     """
     region, (rows, columns) = frame.region, frame.values.shape
     size = ("Size", typeset_area(region.size_m))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 COOKIE = "afspm_dashboard"
 REMEMBERED_S = 30 * 24 * 3600
 MOST_ENDED = 1000
-"""Limit of remembered ended sessions; beyond it all sessions end."""
+"""Limit of remembered ended sessions; beyond this limit all sessions end."""
 
 
 @dataclass(frozen=True)

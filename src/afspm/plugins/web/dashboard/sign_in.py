@@ -41,7 +41,7 @@ _PASSWORD = """<label for="password">Password</label>
 class Guard:
     """ASGI middleware: checks each request and each websocket, and sets scope["state"][VISITOR].
 
-    Besides the cookie it checks the origin of a request.
+    The guard refuses a wrong origin. A viewer needs the cookie, or a password as Bearer token (not in the URL).
     """
 
     def __init__(self, app: AsgiApp, access: Access, host: str) -> None:
@@ -73,7 +73,7 @@ class Guard:
 
 
 def add_sign_in(app: FastAPI, access: Access, title: str, *, encrypted: bool, only_here: bool) -> None:
-    """Serve /login, which sets the cookie, and /logout, which removes it."""
+    """Serve /login, which sets the cookie, and /logout, which removes the cookie."""
 
     def page(person: str = "", wrong: str = "", status: int = 200) -> HTMLResponse:
         text = _page(access, title, person, wrong, hint="" if encrypted or only_here else TLS_HINT)

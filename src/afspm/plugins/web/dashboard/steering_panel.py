@@ -48,7 +48,7 @@ class ModeButtons:
 
 
 class ProblemBar:
-    """A line for each flagged problem: the advice, and a button to clear it."""
+    """A line for each flagged problem, with advice and a button to clear the problem."""
 
     def __init__(self, session: SteeringSession) -> None:
         self._session = session

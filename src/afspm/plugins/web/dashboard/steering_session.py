@@ -75,7 +75,7 @@ class SteeringSession:
 
 
 def button(text: str, on_click: Callable[..., object], colour: str | None = None) -> ui.button:
-    """Return a button; with `colour` "primary" it is filled."""
+    """Return a button, which is filled if `colour` is "primary"."""
     return ui.button(text, on_click=on_click, color=colour).props(
         f"no-caps {'unelevated' if colour == 'primary' else 'outline'}"
     )
@@ -93,7 +93,10 @@ async def asked(title: str, text: str, yes: str) -> bool:
 async def ask_in_dialog(
     title: str, body: Callable[[], object], yes: str, may: Callable[[], bool] = lambda: True
 ) -> bool:
-    """Ask the viewer in a dialog with its own body; the button `yes` is enabled while `may()` is true."""
+    """Ask the viewer in a dialog with its own body; return False if the viewer cancels.
+
+    The button `yes` closes the dialog only while `may()` is true.
+    """
 
     def agree() -> None:
         if may():

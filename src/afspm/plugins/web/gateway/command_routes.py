@@ -77,7 +77,7 @@ class CommandRoutes:
     async def request_control(
         self, asked: Request, wanted: ControlAsked = _CONTROL, wait_s: Wait = 0.0
     ) -> ControlModel:
-        """Request control, with a lease. Renew it in time: after its end, you lose control as a dead process does."""
+        """Request control, with a lease. Renew the lease in time: after its end you lose control."""
         problem = self._problem(wanted.solving) if wanted.solving is not None else 0
         until_s = asyncio.get_running_loop().time() + wait_s
 
@@ -96,7 +96,7 @@ class CommandRoutes:
             await self._control_changed(left_s)
 
     async def renew_control(self, asked: Request, lease: LeaseModel = _LEASE) -> ControlModel:
-        """Renew the lease. It fails with `not-in-control` once control is lost."""
+        """Renew the lease. The request fails with `not-in-control` once control is lost."""
         await self._services.command(asked, lambda commands: commands.renew(lease.lease_s))
         return ControlModel(holder=self._services.who(asked), lease_s=lease.lease_s)
 
@@ -109,7 +109,7 @@ class CommandRoutes:
     # --- measurements ---
 
     async def take_scan(self, asked: Request, answer: HttpResponse, wanted: ScanAsked = _SCAN) -> MeasurementModel:
-        """Begin a scan, in control. It returns once the scan has begun; then poll the measurement."""
+        """Begin a scan, in control. The answer comes once the microscope accepts it; then poll the measurement."""
         given = wanted.region
         region = None if given is None else Region(xy_of(given.center_m), xy_of(given.size_m), given.angle_rad)
         shape = None if wanted.shape is None else (wanted.shape[0], wanted.shape[1])
@@ -119,7 +119,7 @@ class CommandRoutes:
     async def take_spectrum(
         self, asked: Request, answer: HttpResponse, wanted: SpectrumAsked = _SPECTRUM
     ) -> MeasurementModel:
-        """Begin a spectrum, in control. It returns once the spectrum has begun; then poll the measurement."""
+        """Begin a spectrum, in control. The answer comes once the microscope accepts it; then poll the measurement."""
         target = SpectrumTarget.of(wanted.position_m, None, self._services.frame)
         return await self._measure(asked, answer, wanted.key, target)
 
@@ -138,13 +138,13 @@ class CommandRoutes:
     # --- the microscope ---
 
     async def set_parameter(self, asked: Request, name: Parameter, wanted: ParameterChange) -> ParameterModel:
-        """Set a parameter, in control; returns the value then in force."""
+        """Set a parameter, in control; return the value then in force."""
         value, unit = wanted.value, wanted.unit
         response = await self._services.command(asked, lambda commands: commands.set(name, value, unit))
         return parameter_model(name, response, value)
 
     async def act(self, asked: Request, name: Name) -> DoneModel:
-        """Start an action of the microscope, in control; returns when it is accepted. `stop-scan` stops a scan."""
+        """Start an action of the microscope, in control; return once it is accepted. `stop-scan` stops a scan."""
         if name in (names.START_SCAN, names.START_SPEC):
             raise RefusedRequest(RefusalCode.NOT_SUPPORTED, f"request {name} by POST /v1/scans or /v1/spectra")
         await self._services.command(asked, lambda commands: commands.act(name))
@@ -174,7 +174,7 @@ class CommandRoutes:
         return wanted
 
     async def write_note(self, asked: Request, wanted: NoteAsked) -> DoneModel:
-        """Write a remark into the record, on a scan or on now. It needs no control."""
+        """Write a remark into the record, about a scan or the present. The request needs no control."""
         scan_ns = None if wanted.scan is None else int(wanted.scan)
         await self._services.command(asked, lambda commands: commands.note(wanted.text, scan_ns))
         return DoneModel()

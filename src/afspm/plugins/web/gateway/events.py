@@ -63,7 +63,7 @@ class EventBatch:
 
 
 class EventHistory:
-    """The newest events, bounded in number. Thread-safe.
+    """The newest events, bounded in number and bytes. Thread-safe.
 
     Args:
         complete_since_ns: events before this time may be incomplete.
@@ -89,7 +89,7 @@ class EventHistory:
             self._complete_since_ns = max(self._complete_since_ns, time_ns)
 
     def take(self, message: str, thing: object, time_ns: int) -> None:
-        """Add a published message; a replayed one (not newer) is ignored."""
+        """Add a published message; replayed messages (not newer) and unchanged process states are ignored."""
         kind = wire.declaration(message).event
         with self._lock:
             if not kind or (self._events and time_ns <= self._events[-1].time_ns):
@@ -105,7 +105,7 @@ class EventHistory:
                 self._drop_oldest()
 
     def after(self, time_ns: int, kinds: Collection[str], most: int) -> EventBatch:
-        """Return the stored events of the given kinds after a time, at most `most`."""
+        """Return the events of the given kinds among the first `most` stored events after a time."""
         with self._lock:
             start = bisect_right(self._events, time_ns, key=lambda event: event.time_ns)
             found = self._events[start : start + most]
@@ -127,9 +127,9 @@ class EventHistory:
 
 
 def fill(history: EventHistory, run_dir: Path, state_dir: Path | None, now_ns: int) -> None:
-    """Add the run's events on disk: the journal, then later ones from the packet log.
+    """Add the run's events on disk: the journal, then later events from the packet log.
 
-    If neither is on this computer, past events come from the replay of the scheduler's cache only.
+    Without both files on this computer, past events come from the replay of the scheduler's cache only.
     """
     oldest_ns = None
     for message, thing, time_ns in _recorded(run_dir, state_dir):

@@ -1,4 +1,4 @@
-"""`Gateway`: the component that lets HTTP clients take part in an experiment."""
+"""`Gateway`: the component with which HTTP clients take part in an experiment."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ class Gateway(WebComponent):
     """A JSON API over HTTP: state, parameters, scans, control, measurements, events.
 
     A client with a name acts as `<gateway>:<name>`, with the roles and limits of that name. Control has a lease, which
-    the scheduler keeps: a client that vanishes loses control as a process that dies does. Other processes have the
-    processor first.
+    the scheduler keeps: a client that vanishes loses control at the end of its lease. Other processes have priority for
+    the processor.
 
     Args:
         host: the address to listen at. Any but a loopback address needs `people` and a certificate.
-        port: 0 for any free port; None: 8090, or any if that is taken. A restart takes the same one.
+        port: 0 for any free port; None: 8090, or any if 8090 is taken. A restart uses the same port.
         people: names that may command: the hash of each token, as `afspm dashboard --make-password` prints it. Without
-            any, every name may, from this computer.
+            `people`, every name is accepted, but only from this computer.
         certificate, certificate_key: PEM files, for https.
-        origins: of pages elsewhere that may send requests, e.g. "http://localhost:3000"; by default none may.
+        origins: origins of other pages that may send requests, e.g. "http://localhost:3000"; by default none.
 
     Raises:
-        ConfigError: other computers could come in without a token, or listen in; the port is taken …
+        ConfigError: other computers could come in without a token, or listen in; or the port is taken.
     """
 
     served = "gateway"
@@ -94,7 +94,7 @@ class Gateway(WebComponent):
         name = envelope.partition("_")[0]
         self._measurements.on_packet(message, time_ns)
         self._history.take(name, message, time_ns)
-        self._watch.take(name, message, time_ns, envelope)  # last: it wakes waiting requests
+        self._watch.take(name, message, time_ns, envelope)  # last: the watch wakes waiting requests
 
     def on_end(self) -> None:
         if self._server is not None:

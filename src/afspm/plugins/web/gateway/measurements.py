@@ -1,6 +1,6 @@
 """Scans and spectra requested by clients: each is begun once for its key, and tracked to its end.
 
-They are saved before they begin: a restarted gateway continues with them, using the scheduler's replay.
+Each measurement is saved before its start: a restarted gateway continues, using the scheduler's replay.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class Measurement:
         plan: the target in JSON's types.
         attempt: number of the last attempt; requests with the same id are executed once.
         since_ns: older results belong to earlier measurements.
-        refusal: as a `RefusalModel`, of a failed measurement.
+        refusal: fields of a `RefusalModel`, for a failed measurement.
+        is_certain: False while the microscope may or may not have carried out the last attempt.
     """
 
     who: str
@@ -93,7 +94,7 @@ class Measurements:
 
     Args:
         file: file that keeps the measurements over a restart; None: measurements end with this process.
-        now_s: real and monotonic.
+        now_s: clock in real, monotonic seconds.
     """
 
     def __init__(self, file: Path | None, watch: Watch, now_s: Callable[[], float]) -> None:
@@ -117,9 +118,10 @@ class Measurements:
             return self._kept.get((who, key))
 
     def take(self, who: str, key: str | None, target: Target) -> Callable[[PersonCommands], Measurement]:
-        """Return a function that begins a measurement, for the person's thread; it raises RefusedRequest.
+        """Return a function that begins a measurement in the person's thread, or raises RefusedRequest.
 
-        A measurement already begun under its key is not begun again, unless it failed.
+        A measurement already begun under its key is not begun again, unless it failed. A key of another target is
+        refused.
         """
         return lambda commands: self._begin(commands, who, key or secrets.token_hex(8), target)
 
@@ -154,7 +156,7 @@ class Measurements:
         return self._begun(one, response)
 
     def _attempts(self, one: Measurement) -> Iterator[str]:
-        # a caller takes another id only after a refusal of the one before
+        # a caller takes the next id only after a refusal of the attempt before
         while True:
             yield self._next_attempt(one)
             one.is_certain = True

@@ -1,6 +1,6 @@
-"""The documents of the gateway, in SI units: answers and request bodies. The OpenAPI description is made from these.
+"""The documents of the gateway, in SI units: answers and request bodies. They define the OpenAPI description.
 
-Ids are texts: they are times in nanoseconds, and not every language has exact 64-bit numbers in JSON.
+Ids are texts with times in nanoseconds, because not every language has exact 64-bit numbers in JSON.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class StateModel(_Answer):
 
 
 class ParameterModel(_Answer):
-    """A parameter as it is in force."""
+    """A parameter with its value in force."""
 
     name: str = Field(examples=["scan-speed"])
     value: float | str | bool | None = Field(examples=[2e-6])
@@ -166,7 +166,7 @@ class SpectrumFormat(Enum):
 
 
 class LeaseModel(_Asked):
-    """How long you keep control without a command or a renewal, in real seconds, also during a measurement."""
+    """The real seconds for which you keep control without a command or a renewal, also during a measurement."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"lease_s": 60}]})
 
@@ -184,7 +184,7 @@ class ControlAsked(LeaseModel):
 
 
 class ControlModel(_Answer):
-    """Your control."""
+    """Your control of the experiment, with its lease."""
 
     holder: str
     lease_s: float = Field(description="renew it in half of that")
@@ -273,7 +273,7 @@ MISSED, END = "missed", "end"
 
 
 def event_kinds() -> tuple[str, ...]:
-    """Return the kinds of events: one for each declared message that has one, then the gateway's own."""
+    """Return the kinds of events: the kinds of declared messages, then the gateway's own."""
     return (*(message.event for message in wire.declared() if message.event), MISSED, END)
 
 
@@ -287,7 +287,7 @@ EventKind = Annotated[str, AfterValidator(_known), WithJsonSchema({"type": "stri
 
 
 class EventModel(_Answer):
-    """The data of an event. A `missed` event has `after` and `until`, between which events were left out."""
+    """The data of an event. A `missed` event has `after` and `until`: events between these ids were left out."""
 
     time: TIME | None
     data: dict[str, object]

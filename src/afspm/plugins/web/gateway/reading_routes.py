@@ -1,4 +1,4 @@
-"""Routes for all clients, including those without a name: state, parameters, scans, spectra, events."""
+"""Routes for all clients, even without a name: state, parameters, scans, spectra, events."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ _EVENTS: dict[int | str, dict[str, object]] = {
 
 
 class ParameterCache:
-    """Values of parameters, read from the microscope at most once a second for all clients together."""
+    """Values of parameters, each read from the microscope at most once a second for all clients together."""
 
     def __init__(self, services: GatewayServices) -> None:
         self._services = services
@@ -77,7 +77,7 @@ class ParameterCache:
         return [views.parameter_model(name, one) for name, one in zip(wanted, responses, strict=True) if one.ok]
 
     async def one(self, name: str) -> ParameterModel:
-        """Return a parameter. Raises RefusedRequest if it can't be read."""
+        """Return a parameter. Raises RefusedRequest if the microscope does not return a value."""
         response = await self._response(name)
         if not response.ok:
             raise refused(response)
@@ -97,7 +97,7 @@ class ParameterCache:
 
 
 class ReadingRoutes:
-    """Routes answered from published messages; only parameters and actions are read from the microscope."""
+    """Routes answered from published messages and the record; parameters and actions are read from the microscope."""
 
     def __init__(self, services: GatewayServices) -> None:
         self._services = services
@@ -163,7 +163,7 @@ class ReadingRoutes:
         return [ActionModel(name=name) for name in await self._services.read(supported)]
 
     async def problems(self) -> list[ProblemModel]:
-        """Return the problems that the experiment knows."""
+        """Return all problems of the experiment, flagged or not."""
         with self._watch.reading() as overview:
             flagged = () if overview.control is None else overview.control.problems
             known = self._watch.problems

@@ -62,7 +62,7 @@ class GatewayServices:
         return await self._carry_out(self.person_of(asked), action)
 
     async def command(self, asked: Request, action: Callable[[PersonCommands], Response]) -> Response:
-        """Carry out a request to the scheduler. Raises RefusedRequest if it is unsuccessful."""
+        """Send a request to the scheduler, and return the response. Raises RefusedRequest for a refusal."""
         return _success(await self.do(asked, action))
 
     async def read(self, action: Callable[[PersonCommands], T]) -> T:

@@ -18,7 +18,7 @@ MOST_STREAMS = 64
 async def server_sent(
     history: EventHistory, watch: Watch, bell: Bell, after_ns: int, kinds: Collection[str]
 ) -> AsyncIterator[str]:
-    """Yield the events after a time, and all later ones, until the experiment ends.
+    """Yield all events after a time until the experiment ends, as text.
 
     A slow client delays only its own stream: events that have left the history are reported as `missed`.
     """
@@ -56,7 +56,7 @@ class StreamCount:
         return self._open >= MOST_STREAMS
 
     async def counted(self, stream: AsyncIterator[str]) -> AsyncIterator[str]:
-        """Yield from a stream, and count it as open meanwhile."""
+        """Yield from a stream, which counts as open meanwhile."""
         self._open += 1
         try:
             async for one in stream:

@@ -33,7 +33,7 @@ CHUNK_BYTES = 3 << 16  # a multiple of three, so that pieces of base64 fit toget
 
 
 def region_model(region: Region) -> RegionModel:
-    """Convert a region without validation, since it comes from the microscope."""
+    """Convert a region without validation, because the microscope published the region."""
     return RegionModel.model_construct(
         center_m=list(region.center_m), size_m=list(region.size_m), angle_rad=region.angle_rad
     )
@@ -97,7 +97,7 @@ def spectrum_model(spectrum: SpectrumSummary) -> SpectrumModel:
 
 
 def parameter_model(name: str, response: Response, asked: Any = None) -> ParameterModel:
-    """Return the value in a response; without one, the requested value."""
+    """Return the parameter in a response; without a payload, the requested value."""
     if not response.payload:
         return ParameterModel(name=name, value=asked, unit=names.BASE_PARAMETERS.get(name) or "")
     said = wire.decode_parameter(response.payload)

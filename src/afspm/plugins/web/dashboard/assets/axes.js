@@ -4,7 +4,7 @@ const PREFIXES = [[1e12, "T"], [1e9, "G"], [1e6, "M"], [1e3, "k"], [1, ""], [1e-
   [1e-12, "p"], [1e-15, "f"]];
 const PREFIXABLE = new Set(["m", "V", "A", "s", "N", "Hz", "W", "F", "m/s", "m/V", "V/m", "C", "Pa", "Ohm", "Ω", "T", "g"]);
 
-/** {factor, unit}: shown = value * factor, for numbers up to `largest`. */
+/** Return {factor, unit} for numbers up to `largest`: the shown number is value * factor. */
 export function scale(largest, unit) {
   if (!PREFIXABLE.has(unit) || !Number.isFinite(largest) || largest === 0) return { factor: 1, unit };
   const size = Math.abs(largest) * 1.0005;
@@ -12,7 +12,7 @@ export function scale(largest, unit) {
   return { factor: 1 / power, unit: prefix + unit };
 }
 
-/** "12.34 nm"; "–" for no number. */
+/** Return a value with its unit, such as "12.34 nm"; "–" for null, NaN and infinity. */
 export function quantity(value, unit, digits = 4) {
   if (value === null || !Number.isFinite(value)) return "–";
   const found = scale(value, unit);
@@ -23,7 +23,7 @@ export function plain(value, digits = 4) {
   return String(Number(value.toPrecision(digits))).replace("-", "−");
 }
 
-/** Round numbers from low to high, about so many. */
+/** Return about `about` round ticks in [low, high]. */
 export function ticks(low, high, about) {
   if (!(high > low)) return [low];
   let step = 10 ** Math.floor(Math.log10((high - low) / about));
@@ -32,7 +32,7 @@ export function ticks(low, high, about) {
   return Array.from({ length: last - first + 1 }, (_, i) => (first + i) * step);
 }
 
-/** Ticks and numbers below (`side` "x") or to the left ("y") of a box; `found` is a result of `scale`. */
+/** Draw ticks and numbers below (`side` "x") or to the left ("y") of a box; `found` is a result of `scale`. */
 export function drawAxis(context, box, low, high, found, side, label) {
   const length = side === "x" ? box.width : box.height;
   const values = ticks(low * found.factor, high * found.factor, Math.max(2, length / (side === "x" ? 80 : 48)));
@@ -59,7 +59,7 @@ export function drawAxis(context, box, low, high, found, side, label) {
   }
 }
 
-/** A bar of colours from low to high, with its numbers and unit; without a picture of the colours only its frame. */
+/** Draw a colour bar from low to high, with numbers and unit; only its frame until `colours` is loaded. */
 export function drawColourBar(context, { x, y, width, height }, colours, { low, high, unit }) {
   if (colours) context.drawImage(colours, x, y, width, height);
   context.strokeRect(x, y, width, height);
@@ -74,7 +74,7 @@ export function drawColourBar(context, { x, y, width, height }, colours, { low, 
   context.fillText(found.unit, x, y - 5);
 }
 
-/** A bar of a round length, in the corner of the box. */
+/** Draw a scale bar of a round length, in the lower left corner of the box. */
 export function drawScaleBar(context, box, width_m) {
   const power = 10 ** Math.floor(Math.log10(width_m * 0.4));
   const round = power * [5, 2, 1].find((factor) => factor * power <= width_m * 0.4);
@@ -93,7 +93,7 @@ export function drawScaleBar(context, box, width_m) {
   context.restore();
 }
 
-/** A canvas as large as its element in the pixels of the screen; null while it is not to be seen. */
+/** Return the canvas, cleared and sized in screen pixels; null while its element is too small or hidden. */
 export function fitted(canvas) {
   const ratio = window.devicePixelRatio || 1;
   const { width, height } = canvas.getBoundingClientRect();

@@ -71,7 +71,7 @@ export class Comparison {
     return ["first", "second"].map((name) => this.night.scans.find((scan) => scan.time === this.find(name).value));
   }
 
-  /** The last scan, and the first of the same size. */
+  /** Choose the last scan, and the first scan of the same size and pixels. */
   #choose() {
     const last = this.night.scans.at(-1);
     if (!last) return;

@@ -1,12 +1,12 @@
-// Asks the dashboard. Only the newest question of a kind is asked, and one at a time.
+// Requests to the dashboard: one at a time of each kind, and always the newest.
 
-/** Fetches the newest picture again and again; `show(head, blob)` draws it, `tell(trouble)` says what is wrong. */
+/** A loop that fetches the newest picture; `show(head, bitmap)` draws a picture, `tell(text)` shows an error. */
 export class Pictures {
   constructor(show, tell) {
     Object.assign(this, { show, tell, asked: null, turn: 0 });
   }
 
-  /** From now on pictures as `query` says, an object of what /live/image understands. */
+  /** Fetch pictures with these parameters of /live/image from now on. */
   want(query) {
     this.turn += 1;
     this.asked?.abort();
@@ -34,10 +34,10 @@ export class Pictures {
           this.tell(await answer.text());
         }
         wait = 0;
-        if (query.time) return; // one that is finished doesn't change
+        if (query.time) return; // a finished scan doesn't change
       } catch {
         if (turn !== this.turn) return;
-        wait = 1000; // it is gone for now; what else is on the page says so
+        wait = 1000; // the dashboard is not reachable; page.js shows the lost connection
       } finally {
         clearTimeout(late);
       }
@@ -45,7 +45,7 @@ export class Pictures {
   }
 }
 
-/** Asks for JSON; while one answer is under way only the newest of the further questions is kept. */
+/** A queue of JSON requests: while an answer is pending, only the newest further request is kept. */
 export class Questions {
   constructor(path, answered) {
     Object.assign(this, { path, answered, next: null, busy: false });

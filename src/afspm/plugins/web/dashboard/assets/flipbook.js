@@ -1,4 +1,4 @@
-// The scans of a night one after the other, at the coordinates of the tip and at those of the sample.
+// The scans of a night one after the other, in tip coordinates and in sample coordinates.
 
 import { drawScaleBar, fitted } from "./axes.js";
 import { FinishedPictures, offer } from "./pictures.js";
@@ -58,7 +58,7 @@ export class Flipbook {
     this.show();
   }
 
-  /** The square that all frames are in. */
+  /** Return the smallest square around all frames, with a margin. */
   #view(where) {
     const [x, y] = [0, 1].map((i) => {
       const low = Math.min(...this.scans.map((scan) => scan[where][i] - scan.size[i] / 2));

@@ -1,14 +1,14 @@
-// Where things are in the picture: pixels of the scan, metres in its own axes (u, v, from its centre, before turning),
-// metres in the coordinates of the experiment (x, y), and the screen.
+// Conversion between the pixels of a scan, metres along its own axes (u, v, from its centre, before rotation), metres in
+// the coordinates of the experiment (x, y), and the screen.
 
 export class Geometry {
-  /** `box`: where the picture may be; `view`: {u, v, zoom} what is in its middle, and how large. */
+  /** `box`: the space for the picture on the screen; `view`: {u, v, zoom}, its middle in m and its enlargement. */
   constructor(head, box, view) {
     this.head = head;
     const [width, height] = head.size;
     const [rows, columns] = head.shape;
     this.pitch = [width / Math.max(columns - 1, 1), height / Math.max(rows - 1, 1)];
-    this.whole = [width + this.pitch[0], height + this.pitch[1]]; // border pixels stick out by half of them
+    this.whole = [width + this.pitch[0], height + this.pitch[1]]; // half a border pixel lies outside
     const fit = Math.min(box.width / this.whole[0], box.height / this.whole[1]);
     this.perMetre = fit * view.zoom;
     const shown = [Math.min(box.width, this.whole[0] * fit), Math.min(box.height, this.whole[1] * fit)];
@@ -34,7 +34,7 @@ export class Geometry {
     return x >= box.x && y >= box.y && x <= box.x + box.width && y <= box.y + box.height;
   }
 
-  /** (column, row), fractions of pixels. */
+  /** Return (column, row) with fractions of pixels. */
   pixel([u, v]) {
     return [u / this.pitch[0] + (this.head.shape[1] - 1) / 2, v / this.pitch[1] + (this.head.shape[0] - 1) / 2];
   }
@@ -43,20 +43,20 @@ export class Geometry {
     return [(column - (this.head.shape[1] - 1) / 2) * this.pitch[0], (row - (this.head.shape[0] - 1) / 2) * this.pitch[1]];
   }
 
-  /** Where it is in the experiment's coordinates. */
+  /** Return the place (x, y) in the experiment's coordinates. */
   place([u, v]) {
     const cos = Math.cos(this.head.angle), sin = Math.sin(this.head.angle);
     return [this.head.center[0] + cos * u - sin * v, this.head.center[1] + sin * u + cos * v];
   }
 
-  /** The place (u, v) of a place in the experiment's coordinates. */
+  /** Return the place (u, v) of a place (x, y) in the experiment's coordinates. */
   local([x, y]) {
     const [dx, dy] = [x - this.head.center[0], y - this.head.center[1]];
     const cos = Math.cos(this.head.angle), sin = Math.sin(this.head.angle);
     return [cos * dx + sin * dy, cos * dy - sin * dx];
   }
 
-  /** From and to along both axes of what is to be seen, in u and v. */
+  /** Return [[low, high], [low, high]] of the visible part, along u and v. */
   range() {
     const half = [this.box.width / this.perMetre / 2, this.box.height / this.perMetre / 2];
     return [0, 1].map((i) => [this.middle[i] - half[i], this.middle[i] + half[i]]);

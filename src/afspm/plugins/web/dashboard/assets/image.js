@@ -6,7 +6,7 @@ import { Geometry } from "./geometry.js";
 import { drawProfile } from "./profile.js";
 
 const MARGIN = { left: 58, right: 78, top: 22, bottom: 40 };
-const BESIDE = 166; // of the width, for the facts
+const BESIDE = 166; // pixels of the width, for the facts
 const MOST_ZOOM = 64;
 
 export class ImageView {
@@ -29,7 +29,7 @@ export class ImageView {
     this.fetch();
   }
 
-  /** What is asked for with every question about the picture. */
+  /** Return the parameters of every request about the picture. */
   look() {
     const chosen = Object.fromEntries(["channel", "levelling", "contrast", "palette"].map((n) => [n, this.find(n).value]));
     return this.pinned ? { ...chosen, ...this.pinned } : chosen;
@@ -44,7 +44,7 @@ export class ImageView {
     this.pictures.want(this.look());
   }
 
-  /** A finished scan instead of the newest; null: the newest again. */
+  /** Show a finished scan instead of the newest; null: the newest again. */
   pin(scan) {
     this.pinned = scan;
     if (scan) this.#offer([...this.#channels(), scan.channel]);
@@ -54,12 +54,12 @@ export class ImageView {
     this.fetch();
   }
 
-  /** Channels that there are; the one chosen stays. */
+  /** Offer these channels; the chosen channel stays, if it is among them. */
   setChannels(channels) {
     if (channels.join("\n") !== this.#channels().join("\n")) this.#offer(channels);
   }
 
-  /** Whether places for scans and spectra may be chosen here, and the place of a grant for an agent. */
+  /** Allow or forbid the choice of places for scans and spectra, and of the place of a grant for an agent. */
   setSteering(may, mayGrant = false) {
     this.root.classList.toggle("may-measure", may);
     this.root.classList.toggle("may-grant", mayGrant);
@@ -91,7 +91,7 @@ export class ImageView {
     this.find("caption").textContent = text;
   }
 
-  /** The scan that a dialog asks about: {x, y, width, height, angle}; null: none. */
+  /** Outline the scan of an open dialog: {x, y, width, height, angle}; null: no outline. */
   want(scan) {
     this.wanted = scan;
     this.draw();
@@ -152,7 +152,7 @@ export class ImageView {
     const [x, y] = this.geometry.place(this.geometry.fromPixel([asked.column, asked.row]));
     const far = scale(Math.max(Math.abs(x), Math.abs(y)), "m");
     const where = `(${plain(x * far.factor, 5)}, ${plain(y * far.factor, 5)}) ${far.unit}`;
-    // in the unit of the colour bar, whatever the value: numbers that jump between units can't be compared
+    // always in the unit of the colour bar: numbers that jump between units can't be compared
     const of = scale(Math.max(Math.abs(this.head.low), Math.abs(this.head.high)), found.unit);
     const value = found.value === null ? "not measured" : `${plain(found.value * of.factor, 6)} ${of.unit}`;
     const levelled = found.value === null || this.head.levelling === "none" ? ""
@@ -180,7 +180,7 @@ export class ImageView {
     else if (!this.pinned && channels.length) this.fetch();
   }
 
-  /** As large as fits: beside the facts on a screen; on a phone, where the page scrolls, as high as the width needs. */
+  /** Fit the canvas beside the facts; on a phone, where the page scrolls, only to the width. */
   #fit() {
     const stage = this.find("stage"), { canvas } = this;
     const [along, across] = this.head?.size ?? [1, 1];
@@ -210,7 +210,7 @@ export class ImageView {
     context.rect(box.x, box.y, box.width, box.height);
     context.clip();
     context.globalAlpha = 0.16;
-    context.fillRect(box.x, box.y, box.width, box.height); // what was not measured
+    context.fillRect(box.x, box.y, box.width, box.height); // a faint ground for pixels without a value
     context.globalAlpha = 1;
     context.imageSmoothingEnabled = whole[0] * this.geometry.perMetre < this.head.shape[1];
     context.drawImage(this.bitmap, x, y, whole[0] * this.geometry.perMetre, whole[1] * this.geometry.perMetre);
@@ -224,7 +224,7 @@ export class ImageView {
     context.strokeRect(box.x, box.y, box.width, box.height);
   }
 
-  /** The row since which the lines show another tip: white within black is seen on any colour. */
+  /** Draw a dashed line at the first row with a changed tip: white within black is visible on any colour. */
   #drawChange(context, box) {
     const at = this.geometry.toScreen(this.geometry.fromPixel([0, this.head.changed_row]))[1];
     context.setLineDash([8, 6]);
@@ -267,7 +267,7 @@ export class ImageView {
   #drawMarks({ context }) {
     const scan = this.#scanRectangle();
     context.save();
-    // white within black is seen on any colour
+    // white within black is visible on any colour
     for (const [colour, width] of [["rgba(0,0,0,0.7)", 3.5], ["#fff", 1.4]]) {
       context.strokeStyle = colour;
       context.lineWidth = width;
@@ -278,7 +278,7 @@ export class ImageView {
     if (scan) this.#label(context, scan);
   }
 
-  /** The rectangle of a scan that is drawn, asked about, or would be taken at the cross: its outline, place and name. */
+  /** Return outline, place and label of the scan in the dialog, under the drag, or at the cross; null without one. */
   #scanRectangle() {
     if (!this.wanted && this.tool !== "scan" && this.tool !== "grant") return null;
     const { size: all, angle } = this.head;

@@ -1,4 +1,4 @@
-// What the page of a recorded night has beside that of a running experiment.
+// Additions to the page of a running experiment for the page of a recorded night.
 
 import "./page.js";
 import { Comparison } from "./compare.js";

@@ -1,4 +1,4 @@
-// What the page does by itself. Everything else is NiceGUI's.
+// The page's own behaviour in the browser. NiceGUI does the rest.
 
 import { ImageView } from "./image.js";
 
@@ -8,7 +8,7 @@ let updated = Date.now();
 let ended = false;
 let watched = null;
 
-/** Called by the dashboard several times a second; its answer says that we keep up. */
+/** Update the page. The dashboard calls this twice a second; the returned theme also shows that the browser keeps up. */
 function update(state) {
   updated = Date.now();
   ended = state.ended;
@@ -23,7 +23,7 @@ function update(state) {
   return localStorage.getItem("afspm-theme") ?? "";
 }
 
-/** What would reach nobody can't be pressed. */
+/** Enable or disable the controls: without a connection or an experiment they have no effect. */
 function allowSteering(may) {
   for (const element of document.querySelectorAll(".steer, .processes, .problems, .bar > .q-btn")) element.inert = !may;
 }
@@ -44,7 +44,7 @@ function tellLost() {
     : `The connection to the dashboard is lost: what is shown is ${seconds} s old. It is tried again.`);
 }
 
-/** At once, and not at the next look: a dashboard that is started again may be back before that. */
+/** Show a lost connection at once: a restarted dashboard may be back before the next check. */
 function watchSocket() {
   if (!window.socket || watched === window.socket) return;
   watched = window.socket;
@@ -71,7 +71,7 @@ document.addEventListener("click", (event) => {
   if (event.target.dataset?.part === "live") emitEvent("scan_picked", {});
 });
 
-/** A phone shows one part of the page at a time. */
+/** Choose the part of the page that a phone shows. */
 function chooseTab(name) {
   document.body.dataset.tab = name;
   for (const tab of document.querySelectorAll("[role=tab]")) tab.setAttribute("aria-selected", String(tab.dataset.tab === name));
@@ -83,7 +83,7 @@ function showTab(name) {
   window.scrollTo(0, 0);
 }
 
-/** The style sheet lets the first rows fill what is left of the screen. */
+/** Measure the header, so that the style sheet lets the first rows fill the rest of the screen. */
 function observeTop() {
   const top = document.querySelector(".top");
   if (!top) return;

@@ -1,10 +1,10 @@
-// Pictures of finished scans, and how they are drawn beside each other.
+// Pictures of finished scans, drawn beside each other.
 
 import { drawColourBar, drawScaleBar, fitted } from "./axes.js";
 
 const KEPT = 120;
 
-/** {head, bitmap} of finished scans by what is asked for; the newest are kept. */
+/** A cache of {head, bitmap} of finished scans by request; the `KEPT` last used stay. */
 export class FinishedPictures {
   #kept = new Map();
 
@@ -32,7 +32,7 @@ export class FinishedPictures {
 
 const bars = new Map();
 
-/** A colour map as a picture; `loaded` is called once it is there. */
+/** Return a colour map as a picture; null until loaded, then `loaded` is called. */
 function colourBar(palette, loaded) {
   if (!bars.has(palette)) {
     const bar = new Image();
@@ -70,7 +70,7 @@ function drawColours(context, box, { low, high, unit, palette }, again) {
   drawColourBar(context, bar, colourBar(palette, again), { low, high, unit });
 }
 
-/** Fill a select; what was chosen stays if it can. */
+/** Fill a select; the chosen option stays if it is still offered. */
 export function offer(select, options) {
   const before = select.value;
   select.replaceChildren(...options.map(([value, text]) => new Option(text, value)));

@@ -1,6 +1,6 @@
-// The slider through a night. The page follows it: one moment is asked for at a time, and only the newest of the others.
+// The slider through a night. The page follows: one moment is requested at a time, and of later moments only the newest.
 
-const NIGHT_MS = 60_000; // that long a whole night is played
+const NIGHT_MS = 60_000; // duration of the playback of a whole night
 const FRAME_MS = 250;
 
 export class Scrubber {
@@ -23,7 +23,7 @@ export class Scrubber {
     this.#tell();
   }
 
-  /** Show the night as it was `ms` after its beginning. */
+  /** Show the state of the night `ms` after its beginning. */
   go(ms) {
     const moment = Math.max(0, Math.min(this.last, Math.round(ms)));
     this.slider.value = this.next = moment;
@@ -33,7 +33,7 @@ export class Scrubber {
     if (scan) this.#pin(scan);
   }
 
-  /** To the end of the scan before or after. */
+  /** Go to the end of the previous or next scan. */
   step(by) {
     this.play(false);
     const now = Number(this.slider.value);
@@ -57,7 +57,7 @@ export class Scrubber {
     button.setAttribute("aria-label", on ? "Stop" : "Play the night");
   }
 
-  /** The page shows this moment now. */
+  /** Register that the page now shows this moment, and request the next. */
   shown(moment) {
     if (this.asked !== null && moment === this.asked) this.asked = null;
     this.#ask();
@@ -105,6 +105,6 @@ export class Scrubber {
   }
 
   #ms(time) {
-    return Number((BigInt(time) - this.begin) / 1_000_000n) + 1; // when it was there
+    return Number((BigInt(time) - this.begin) / 1_000_000n) + 1; // rounded up, so that the page has the scan at this moment
   }
 }
