@@ -98,10 +98,10 @@ class FeedbackTuner(FeedbackObserver):
             return None
         scans = self.scope.scan()
         for name in (self.channel, self.height):
-            if name not in scans:
+            if name and name not in scans:
                 raise InvalidValue(f"the scans have no channel {name!r}, there are {', '.join(scans)}")
         setpoint = self.scope.feedback.setpoint if self.scope.feedback else None
-        error = self.signal.error(scans[self.channel], scans[self.height], setpoint, self.scope)
+        error = self.signal.error(scans[self.channel], scans.get(self.height), setpoint, self.scope)
         following = self.limits.judge(error)
         self.log.info("integral gain %g: the feedback %s: %s", gain, following.value, error)
         return following

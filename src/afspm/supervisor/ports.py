@@ -31,8 +31,11 @@ LOWEST, HIGHEST = 20_000, 32_000
 TRIES = 200
 CAN_HOLD = sys.platform == "linux"
 """Whether a port can be held for a child: other systems let no second process bind a held port."""
-LONGEST_FOLDER = 90
-"""Limit on the path in which a folder of sockets is made, in bytes. macOS has the lowest limit for a socket: 103."""
+LONGEST_FOLDER = 82
+"""Longest path in which a folder of sockets is made, in bytes.
+
+macOS has the lowest limit for a socket, 103, and the folder and a socket take up to 21.
+"""
 # limits the open descriptors of a process that chooses ports for many runs
 _MOST_HELD = 256
 _TCP = re.compile(r"tcp://(\*|[^:/\s]+|\[[0-9A-Fa-f:.]+\]):([1-9]\d*)")
@@ -93,7 +96,7 @@ def _private_folder() -> Path:
     # XDG_RUNTIME_DIR is preferred: it has mode 0700, and the system empties it after the login session.
     tried = [os.environ.get("XDG_RUNTIME_DIR"), tempfile.gettempdir(), "/tmp"]
     for parent in filter(None, tried):
-        if len(os.fsencode(parent)) < LONGEST_FOLDER and os.access(parent, os.W_OK | os.X_OK):
+        if len(os.fsencode(parent)) <= LONGEST_FOLDER and os.access(parent, os.W_OK | os.X_OK):
             return Path(tempfile.mkdtemp(prefix="afspm-", dir=parent))
     raise OSError(f"no folder for sockets can be made in {', '.join(filter(None, tried))}")
 

@@ -63,13 +63,13 @@ class Rig(Lab):
         self.publish(Scan(region, "Height", "m", HEIGHT, self.clock.now_ns()))
 
 
-def tuner() -> FeedbackTuner:
-    return FeedbackTuner(lowest_gain=0.1, highest_gain=10.0)
+def tuner(**settings: Any) -> FeedbackTuner:
+    return FeedbackTuner(lowest_gain=0.1, highest_gain=10.0, **settings)
 
 
-def tuned(lab: Rig) -> Rig:
+def tuned(lab: Rig, **settings: Any) -> Rig:
     lab.at(5000.0, lab.kill)
-    assert run(tuner(), lab) == ExitCode.ENDED
+    assert run(tuner(**settings), lab) == ExitCode.ENDED
     return lab
 
 
@@ -80,8 +80,9 @@ def off_by(share: float) -> np.ndarray:
     return values
 
 
-def test_the_gain_is_raised_until_the_feedback_follows_well_and_the_flag_removed() -> None:
-    lab = tuned(Rig(lambda gain: off_by(0.4 / gain**2)))
+@pytest.mark.parametrize("height", ["Height", ""])
+def test_the_gain_is_raised_until_the_feedback_follows_well_and_the_flag_removed(height: str) -> None:
+    lab = tuned(Rig(lambda gain: off_by(0.4 / gain**2)), height=height)
     assert lab.gains == [1.0, 2.0, 4.0, 4.0]
     assert lab.problems == ()
 

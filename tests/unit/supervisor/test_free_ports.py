@@ -3,6 +3,8 @@ from __future__ import annotations
 import contextlib
 import socket
 import stat
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -47,18 +49,27 @@ def test_port_is_held_before_during_and_between_binds() -> None:
         peer.connect(address)
 
 
+@pytest.fixture
+def short_folder() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder:
+        yield Path(folder)
+
+
 @pytest.mark.skipif(not HAS_PRIVATE_SOCKETS, reason="there are no unix sockets")
-def test_socket_folder_is_private_and_short_in_any_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    deep = tmp_path / ("a" * LONGEST_FOLDER)
+@pytest.mark.parametrize("excess", [0, 1])
+def test_socket_folder_is_private_and_short_in_any_environment(
+    monkeypatch: pytest.MonkeyPatch, short_folder: Path, excess: int
+) -> None:
+    deep = short_folder / ("a" * (LONGEST_FOLDER + excess - len(str(short_folder)) - 1))
     deep.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(deep))
     folder = SocketFolder()
     try:
         assert stat.S_IMODE(folder.path.stat().st_mode) == 0o700
-        assert deep not in folder.path.parents
-        addresses = [folder.address() for _ in range(100)]
-        assert len(set(addresses)) == 100
-        assert max(map(len, addresses)) < len("ipc://") + 103
+        assert (deep in folder.path.parents) is (excess == 0)
+        addresses = [folder.address() for _ in range(1000)]
+        assert len(set(addresses)) == 1000
+        assert max(map(len, addresses)) <= len("ipc://") + 103
     finally:
         folder.close()
     assert not folder.path.exists()

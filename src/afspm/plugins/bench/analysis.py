@@ -90,8 +90,8 @@ def shift_m(first: Scan, second: Scan) -> XY:
     spectrum = np.fft.rfft2(b, (2 * rows, 2 * columns)) * np.conj(np.fft.rfft2(a, (2 * rows, 2 * columns)))
     found = np.fft.fftshift(np.fft.irfft2(spectrum, (2 * rows, 2 * columns)))
     row, column = np.unravel_index(int(np.argmax(found)), found.shape)
-    dy = row + _vertex(found[row - 1 : row + 2, column]) - rows if 0 < row < 2 * rows - 1 else row - rows
-    dx = column + _vertex(found[row, column - 1 : column + 2]) - columns if 0 < column < 2 * columns - 1 else 0.0
+    dy = row + _vertex(found[:, column], int(row)) - rows
+    dx = column + _vertex(found[row], int(column)) - columns
     width, height = first.region.size_m
     return float(dx) * width / (columns - 1), float(dy) * height / (rows - 1)
 
@@ -103,9 +103,11 @@ def _windowed(values: Floats) -> Floats:
     return np.asarray((clipped - clipped.mean()) * window)
 
 
-def _vertex(three: Floats) -> float:
-    # the maximum of the parabola through three values, relative to the middle one
-    left, middle, right = map(float, three)
+def _vertex(values: Floats, at: int) -> float:
+    # the maximum of the parabola through a value and its neighbours, relative to it
+    if not 0 < at < len(values) - 1:
+        return 0.0
+    left, middle, right = map(float, values[at - 1 : at + 2])
     curvature = left - 2 * middle + right
     return 0.5 * (left - right) / curvature if curvature < 0 else 0.0
 

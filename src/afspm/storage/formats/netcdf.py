@@ -58,7 +58,7 @@ def read(path: Path) -> File:
     """Return the variables and global attributes of a file.
 
     Raises:
-        FileError: the file is missing, incomplete or of another format, or scipy is missing.
+        FileError: the file is missing, incomplete or of another format.
     """
     try:
         content = path.read_bytes()
