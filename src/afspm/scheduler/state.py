@@ -34,7 +34,7 @@ class Peers:
 
     Attributes:
         timeout: the grace period of a holder without a connection.
-        supervisors: report which processes have ended.
+        supervisors: the supervisors, whose reports name the processes that have ended.
     """
 
     sessions: SessionTable
@@ -232,7 +232,7 @@ def restored_state(
     """Return the state of a scheduler after a restart.
 
     Args:
-        frame: its state at a first start.
+        frame: the coordinate frame at a first start.
     """
     state = SchedulerState.initial(settings, frame.restored(saved.frame))
     sessions, supervisors = (

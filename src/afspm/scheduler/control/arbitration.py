@@ -121,7 +121,7 @@ class ArbitrationState:
 
 @dataclass(frozen=True)
 class RoleTable:
-    """The components and people with a role. Without the key, everyone has the role.
+    """The components and people with a role. Without the key, everyone has the role, except `operate` and `approve`.
 
     A person who acts through a component ("dashboard:Ada") has the roles of the component and those given to that
     person there.

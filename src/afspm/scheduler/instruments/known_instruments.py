@@ -16,7 +16,7 @@ PUBLISH_CHANGED_S = 1.0
 """Least interval of publications of changed numbers, real."""
 _MOST_PARAMETERS = 100  # of one instrument: memory must stay bounded
 _NEVER_S = float("-inf")
-_JUST_AFTER_S = 1e-3  # a reading of exactly the oldest age is still one
+_JUST_AFTER_S = 1e-3  # a reading of exactly the oldest age still counts
 
 
 @dataclass(frozen=True)

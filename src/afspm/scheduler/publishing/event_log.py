@@ -33,7 +33,7 @@ from afspm.scheduler.control.descriptions import request_text
 PERIOD_S = 0.1
 """Least real time between two publications."""
 MOST = 1000
-"""The largest number of requests logged within `PERIOD_S`; further requests are only counted."""
+"""The largest number of entries gathered within `PERIOD_S`; further requests are only counted."""
 LONGEST = 1000
 """The longest text of a request or a reason, in characters."""
 
@@ -210,7 +210,7 @@ def control_entries(
     row: Transition,
     problems: ProblemNames,
 ) -> list[JournalEntry]:
-    """Return a log entry, with author and reason, for each change of holder, mode and problems."""
+    """Return a log entry for each change of holder, mode and problems, and for the end of the experiment."""
     name, entry = problems.name, partial(JournalEntry, now_ns, CONTROL)
     entries = []
     if before.holder is not None and after.holder != before.holder:

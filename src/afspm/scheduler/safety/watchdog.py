@@ -1,7 +1,7 @@
 """The watchdog: actions that the scheduler itself sends to the microscope when a holder loses control.
 
-It stops the running scan or spectrum. It retracts the tip if the holder lost control, rather than gave it back, and
-left the tip in a dangerous state: the holder can no longer mend that, and no other component knows of it.
+It stops the running scan or spectrum after the causes in `stop_when`. It retracts a tip that the holder left in a
+dangerous state, unless the holder gave control back or a person took over: no other component knows of the danger.
 """
 
 from __future__ import annotations
@@ -209,7 +209,10 @@ class Watchdog:
         return replace(self, tip=replace(self.tip, calls_people=False))
 
     def leave_to_people(self, microscope: MicroscopeStatus) -> Watchdog:
-        """Keep the duty towards a tip in danger when the run is stopped; the exiting translator retracts the tip."""
+        """Keep the duty towards a tip in danger when the run is stopped, and call a person.
+
+        The exiting translator retracts the tip.
+        """
         return (
             self._after(TipEvent.LEFT) if self.settings.retract is not None and microscope.danger is not None else self
         )
