@@ -31,8 +31,8 @@ def bad_scans(
 ) -> frozenset[int]:
     """Return the times of the bad scans.
 
-    A scan is bad if it was interrupted, or if the last verdict on it is bad. In a run without verdicts, the newest scan
-    is bad when a problem is flagged.
+    A scan is bad if it was interrupted, or if the last verdict on it is bad. In a run without verdicts on these scans,
+    the newest scan before each flagged problem is bad, except before thermal drift and device-malfunction.
 
     Args:
         times_ns: ends of scans, or their interruptions.

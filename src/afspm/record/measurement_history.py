@@ -84,7 +84,7 @@ class FoundPlace:
 
 @dataclass(frozen=True, slots=True)
 class DriftPoint:
-    """The drift after one scan.
+    """The drift at one scan.
 
     Attributes:
         translation_m: (x, y) displacement of the sample under the tip since the start, in tip coordinates.

@@ -36,7 +36,7 @@ def export(
     Args:
         to: a format that a package declares an exporter for.
         folder: created if it is missing.
-        scans: numbers of scans, as for `chosen`; None: all scans and spectra.
+        scans: numbers of scans, as for `chosen`, without spectra; None: all scans and spectra.
         tell: called with a message for each omitted measurement; None: a damaged file of the record is an error.
 
     Raises:
