@@ -76,7 +76,7 @@ class SpectrumSummary:
 
 @dataclass(frozen=True, slots=True)
 class FoundPlace:
-    """A place found by a component; `score` is None if the component gave none."""
+    """A place found by a component; `score` is None without a score."""
 
     xy_m: XY
     score: float | None = None

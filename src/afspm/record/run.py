@@ -165,7 +165,7 @@ class Run:
         return Table(map(self._note_row, self._notes()), NoteRow)
 
     def notes_on(self, row: ScanRow | SpectrumRow) -> Table[NoteRow]:
-        """Return the notes on a scan."""
+        """Return the notes on a scan; empty for a spectrum."""
         near = (one for one in self._notes() if one.scan_ns and abs(one.scan_ns - row.time_ns) <= _SAME_SCAN_NS)
         return Table(map(self._note_row, near), NoteRow).where(
             lambda note: isinstance(row, ScanRow) and note.scan == row.number
@@ -182,7 +182,7 @@ class Run:
 
     @property
     def journal(self) -> Table[JournalEntry]:
-        """Requests with their answers, changes of control and orders; oldest first."""
+        """Requests with their answers, changes of control, orders and notes; oldest first."""
         rows = self._query("SELECT payload FROM packets WHERE message = 'JournalEntries' ORDER BY time_ns, rowid")
         published = (self._decoded("JournalEntries", payload) for (payload,) in rows)
         entries = [entry for one in published if isinstance(one, JournalEntries) for entry in one.entries]
@@ -249,7 +249,7 @@ class Run:
 
     @property
     def drift(self) -> Table[DriftPoint]:
-        """The drift after each scan; empty without a Drift Compensated Scheduler."""
+        """The drift at each scan; empty without a Drift Compensated Scheduler."""
         from afspm.record.overview import DriftPoint
 
         return Table(self.overview(messages=("DriftMapping",)).drift, DriftPoint)
@@ -358,7 +358,7 @@ class Run:
 
     @property
     def newest_ns(self) -> int:
-        """The time of the last packet."""
+        """The time of the scheduler's last packet; 0 without packets."""
         return int(self._query("SELECT coalesce(max(time_ns), 0) FROM packets WHERE source = ?", (SCHEDULER,))[0][0])
 
     @property
