@@ -55,7 +55,7 @@ class RunSummary:
         scanned_m: the path of the probe in scans, trace and retrace, in metres.
         treatments: the number of successful executions of each action beside the base actions, by name.
         judged: the number of scans with a verdict on the tip, and of scans with a good last verdict.
-        damage: the reason why the record can't be read; empty if it can.
+        damage: the reason why the record can't be read; empty for a readable record.
     """
 
     folder: str
@@ -101,7 +101,7 @@ def find_runs(
     """Return the runs under a folder whose texts contain all words, the newest first.
 
     Args:
-        root: the folder to search with all its subfolders; it gets the index `runs.sqlite` if it is writable.
+        root: the folder to search with all its subfolders. The index `runs.sqlite` is written there, if possible.
         words: each in any field, or as "sample:gold" in that field; case is ignored.
         since, until: days (UTC). Runs that ended before `since` or began after `until` are left out.
 
@@ -145,7 +145,7 @@ def _midnight_ns(day: date) -> int:
     return int(datetime(day.year, day.month, day.day, tzinfo=UTC).timestamp()) * NS_PER_S
 
 
-# --- the index: what was read of each run, until it changes ---------------------------------------------------------
+# --- the index: the summary of each run, until the run changes ------------------------------------------------------
 
 
 def _up_to_date(root: Path) -> list[RunSummary]:

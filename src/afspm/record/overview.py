@@ -62,7 +62,7 @@ class ReadingCurve:
     """Values over time; NaN where the value was unknown.
 
     Attributes:
-        step_ns: the least time between two points; a nearer point replaces the last. It grows with the run.
+        step_ns: the least time between two points; a nearer point replaces the last. The step grows with the run.
     """
 
     unit: str = ""
@@ -253,7 +253,7 @@ class Overview:
 
     @property
     def ended_ns(self) -> int | None:
-        """The end of the experiment; None if it continues, was stopped, or was cut off."""
+        """The end of the experiment; None if the run continues, was stopped, or was cut off."""
         entries = reversed(self.entries)
         return next((one.time_ns for one in entries if one.event is ControlEvent.EXPERIMENT_ENDED), None)
 
@@ -265,7 +265,7 @@ class Overview:
 
     @property
     def control_since_ns(self) -> int | None:
-        """The time of the last change of control; in MANUAL, of the mode. None if it is unknown."""
+        """The time of the last change of control; in MANUAL, of the mode. None if no change is known."""
         is_manual = self.control is not None and self.control.mode is ControlMode.MANUAL
         return self.timelines.mode.changed_ns if is_manual else self.timelines.control.changed_ns
 

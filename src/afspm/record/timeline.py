@@ -14,8 +14,8 @@ class Span:
 
     Attributes:
         label: the state during the span.
-        start_ns, end_ns: experiment time; an end of None: it continues.
-        by: the component or person that caused it; empty if unknown.
+        start_ns, end_ns: experiment time; an end of None: the span continues.
+        by: the component or person that caused the state; empty if unknown.
     """
 
     label: str

@@ -42,7 +42,7 @@ class Peers:
     supervisors: SupervisorRegistry = field(default_factory=SupervisorRegistry)
 
     def dead_at_s(self, holder: str) -> float | None:
-        """Return when (real) control is revoked unless the holder comes back; None while it is connected."""
+        """Return when (real) control is revoked unless the holder comes back; None while the holder is connected."""
         over_since_s = self.supervisors.over_since_s(component_of(holder))
         return self.timeout.dead_at_s(holder, self.sessions, over_since_s)
 

@@ -114,7 +114,7 @@ def _read(run: Run, row: ScanRow) -> tuple[TopographyPicture, Array | None]:
 
 
 def is_topography(channel: str) -> bool:
-    """Return whether the name of a channel is one of heights."""
+    """Return whether the name of a channel is a name of heights."""
     return channel.lower().startswith(_TOPOGRAPHY)
 
 

@@ -207,7 +207,7 @@ class Transition:
         response: the answer to a request; None where the translator answers, or the event is not a request.
         why: the reason of the row. With a refusal it is sent to the client, with {who}, {holder}, {number}, {problem}
             and {problems} filled in.
-        cause: the reason why the holder loses control; None if it stays in control.
+        cause: the reason why the holder loses control; None if the holder stays in control.
     """
 
     when: Condition

@@ -1,4 +1,4 @@
-"""Timeouts of the holder of control: a lease while it is idle, a grace period while it is disconnected."""
+"""Timeouts of the holder of control: a lease for an idle holder, a grace period for a disconnected holder."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ class PacketCache:
         return out, kept
 
     def pass_over(self, packet: Packet) -> bool:
-        """Register a packet of the translator that is not published; return False if it is a duplicate."""
+        """Register a packet of the translator that is not published; return False for a duplicate."""
         if packet.time_ns is None:
             return True
         is_new = packet.time_ns not in self._sources and self._first_times.pop(packet.time_ns, None) != _NEVER_NS

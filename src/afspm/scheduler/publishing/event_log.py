@@ -50,7 +50,7 @@ _CUT_OFF = "the scheduler was restarted before the answer was written down"
 
 
 class AnsweredRequest(NamedTuple):
-    """A request with its answer, before it is put into words.
+    """A request with its answer, before the log entry is put into words.
 
     Attributes:
         took_s: real time from the request to its answer.
@@ -103,7 +103,7 @@ def _subject_of(request: Request) -> tuple[str, str, str]:
 
 @dataclass(frozen=True)
 class SentStart:
-    """The start of a measurement, saved before it is forwarded; its log entry holds the measurement's key.
+    """The request that starts a measurement, saved before forwarding; its log entry holds the measurement's key.
 
     Attributes:
         sent_ns: time of its first forwarding.
@@ -165,7 +165,7 @@ class EventLog:
         return next(known, now_ns)
 
     def sending(self, who: str, request: Request, sent_ns: int) -> EventLog:
-        """Remember a request that is forwarded, if it starts a measurement."""
+        """Remember a forwarded request that starts a measurement; ignore all other requests."""
         if request.kind != ControlRequest.ACTION or request.subject not in _STARTS:
             return self
         start = SentStart(who, str(request.subject), request.id, sent_ns)

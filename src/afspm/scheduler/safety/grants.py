@@ -266,7 +266,7 @@ class GrantChecker:
     # --- requests of an agent: at arrival ---
 
     def refused_at_arrival(self, who: str, request: Request, now_ns: int) -> str:
-        """Return the reason why an agent may not send a request; empty if it may be decided further."""
+        """Return the reason why an agent may not send a request; empty if the later checks decide."""
         if not self.rules.is_agent(who):
             return ""
         kind, subject = request.kind, request.subject

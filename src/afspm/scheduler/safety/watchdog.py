@@ -163,8 +163,8 @@ class Watchdog:
     def translator_answered(self) -> Watchdog:
         """Process the first answer since the restart: all requests of the killed scheduler are now done or lost.
 
-        A tip that is still owed a retract is retracted again, which does no harm. If a person has attended to it
-        meanwhile, it may have been withdrawn after that: the person is called again.
+        If a retract is still owed, the tip is retracted again, which does no harm. If a person has attended to the tip
+        meanwhile, the old retract may have come after that: the person is called again.
         """
         if not self.tip.may_come:
             return self
@@ -293,7 +293,7 @@ class Watchdog:
     # --- requests to the translator ---
 
     def next_action(self, microscope: MicroscopeStatus) -> tuple[Watchdog, str | None]:
-        """Return the action to send now, or None; it counts as sent."""
+        """Return the action to send now, which counts as sent; None: no action."""
         dog = self
         if dog.tip.for_feedback and microscope.risk.feedback_on is True:
             dog = dog.seen_to()
@@ -346,7 +346,7 @@ class Watchdog:
         """Schedule a retract that was put off, soon after a translator connects and sends its first packets."""
         return replace(self, due_s=now_s + _SOON_S) if self.put_off else self
 
-    # --- what does not come about ---
+    # --- expired waits ---
 
     def look_again(
         self, microscope: MicroscopeStatus, now_s: float, *, is_seen_to: bool
