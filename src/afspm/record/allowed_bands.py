@@ -29,7 +29,10 @@ AllowedBands = Mapping[str, tuple[WrittenBand, ...]]
 
 
 def allowed_bands(folder: Path) -> AllowedBands:
-    """Return the bands of the expanded experiment file in a run's folder; empty if there are none."""
+    """Return the bands with a lower or upper bound in the expanded experiment file of a run.
+
+    Empty without such bands, or if the file can't be read.
+    """
     try:
         document = tomllib.loads((folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -17,7 +17,7 @@ _NOT_OF_A_SCAN = frozenset({int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFU
 
 
 def read_verdict(message: Any) -> tuple[int, float] | None:
-    """Return (time of the scan in ns, score) of a verdict message; None if it is not about a scan."""
+    """Return (time of the scan in ns, score) of a verdict message; None for a verdict that is not about a scan."""
     if not message.spatials or not message.HasField("timestamp"):
         return None
     return message.timestamp.ToNanoseconds(), float(message.spatials[0].score)
@@ -31,8 +31,8 @@ def bad_scans(
 ) -> frozenset[int]:
     """Return the times of the bad scans.
 
-    A scan is bad if it was interrupted, or if the last verdict on it is bad. In a run without verdicts, the newest scan
-    is bad when a problem is flagged.
+    A scan is bad if it was interrupted, or if the last verdict on it is bad. In a run without verdicts on these scans,
+    the newest scan before each flagged problem is bad, except before thermal drift and device-malfunction.
 
     Args:
         times_ns: ends of scans, or their interruptions.

@@ -46,16 +46,16 @@ class RunSummary:
     Attributes:
         folder: relative to the folder of all runs, with "/".
         name: the name of the experiment.
-        began_ns, ended_ns: start and end (or last publication) in experiment time; None if nothing was published.
+        began_ns, ended_ns: first control state, and end or last publication, in experiment time; None if there is none.
         state: running, ended or cut off, in words.
         metadata: sample, person, project, technique … where known.
         scans: the number of complete scans; spectra: their number.
         problems: the names of all flagged problems.
         notes: the texts of all notes.
         scanned_m: the path of the probe in scans, trace and retrace, in metres.
-        treatments: the number of executions of each action that is not a measurement, by name.
+        treatments: the number of successful executions of each action beside the base actions, by name.
         judged: the number of scans with a verdict on the tip, and of scans with a good last verdict.
-        damage: the reason why the record can't be read; empty if it can.
+        damage: the reason why the record can't be read; empty for a readable record.
     """
 
     folder: str
@@ -101,9 +101,9 @@ def find_runs(
     """Return the runs under a folder whose texts contain all words, the newest first.
 
     Args:
-        root: the folder to search with all its subfolders; it gets the index `runs.sqlite` if it is writable.
+        root: the folder to search with all its subfolders. The index `runs.sqlite` is written there, if possible.
         words: each in any field, or as "sample:gold" in that field; case is ignored.
-        since, until: the first and last day (UTC) with publications.
+        since, until: days (UTC). Runs that ended before `since` or began after `until` are left out.
 
     Raises:
         FileError: there is no such folder.
@@ -145,7 +145,7 @@ def _midnight_ns(day: date) -> int:
     return int(datetime(day.year, day.month, day.day, tzinfo=UTC).timestamp()) * NS_PER_S
 
 
-# --- the index: what was read of each run, until it changes ---------------------------------------------------------
+# --- the index: the summary of each run, until the run changes ------------------------------------------------------
 
 
 def _up_to_date(root: Path) -> list[RunSummary]:

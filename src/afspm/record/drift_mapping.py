@@ -23,7 +23,7 @@ class OutcomeFields(Protocol):
 
 
 def drift_at(matrix: Array, center_m: Sequence[float]) -> Array:
-    """Return x_tip - x_sample in m, shape (2,): the displacement of the sample at the tip."""
+    """Return x_tip - x_sample in m, shape (2,): the displacement of the sample at `center_m` (tip coordinates, m)."""
     at = np.asarray(center_m, dtype=np.float64)
     drift: Array = at - (matrix[:2, :2] @ at + matrix[:2, 2])
     return drift

@@ -1,9 +1,9 @@
 """Scans of one place as a film aligned on the sample: `run.film()`, and `afspm export --to gif` or `mp4`.
 
-Theory of operation. Scans with one channel in common whose regions overlap by half or more, after the recorded drift is
-subtracted, are scans of one place. The first of them is the window of the film. Each scan is levelled as small pictures
-are, and sampled at the window's pixels in sample coordinates; pixels outside a scan stay NaN. All frames have one
-contrast, the widest robust range of any.
+Theory of operation. Scans of nearly the same size and angle show one place if their centres differ by at most half the
+size along each axis after the recorded drift is subtracted. The region of the first scan is the window of the film.
+Lines of each scan are levelled, and its values are sampled at the window's pixels in sample coordinates; pixels outside
+a scan stay NaN. All frames have one contrast: a range that contains the robust range of each frame.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ FORMATS: Final = (".gif", ".mp4")
 WIDTH_PX: Final = 480
 FRAMES_PER_S: Final = 8.0
 _MOST_OFFSET: Final = 0.5
-"""Largest offset of scans of one place, as a share of their width."""
+"""Largest offset of scans of one place along each axis, as a share of their size."""
 _SIZE_TOLERANCE: Final = 0.05
 _TURN_TOLERANCE_RAD: Final = math.radians(1.0)
 _FONT_PX: Final = 15
@@ -193,7 +193,7 @@ def film_of(
 
 
 def places(rows: Sequence[ScanRow], drift: Mapping[int, XY]) -> list[list[ScanRow]]:
-    """Return the scans of each place that was scanned at least twice, the place with most scans first."""
+    """Return the scans of each place that was scanned at least twice with the same channels, the most scans first."""
     groups: list[tuple[Region, list[ScanRow]]] = []
     for row in rows:
         if row.region is None or not row.file:

@@ -59,7 +59,7 @@ _DAMAGE = (sqlite3.DatabaseError, UnicodeDecodeError)  # SQLite quotes what it c
 
 
 def open_to_write(folder: Path) -> sqlite3.Connection:
-    """Open the journal in a run folder; create it if it is missing.
+    """Open the journal in a run folder; create a missing journal.
 
     Raises:
         FileError: the file is damaged, or of another kind.
@@ -84,7 +84,7 @@ def open_to_write(folder: Path) -> sqlite3.Connection:
 
 
 def open_to_read(folder: Path) -> sqlite3.Connection:
-    """Open the journal in a run folder for reading; another process may write it, and the disk may be read-only.
+    """Open the journal in a run folder for reading, also while another process writes, or from a read-only disk.
 
     Raises:
         FileError: the file is missing, damaged, or of another kind.
@@ -153,7 +153,7 @@ def check_format(connection: sqlite3.Connection, path: Path) -> None:
 
 
 class _OfCopy(sqlite3.Connection):
-    """A connection to a copy, which is removed when it is closed, collected, or (except on Windows) at exit."""
+    """A connection to a copy, removed when the connection is closed or collected, or (except on Windows) at exit."""
 
     remove: Callable[[], object] = staticmethod(lambda: None)
 

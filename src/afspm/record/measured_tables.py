@@ -43,7 +43,7 @@ _HAS_STARTS = "SELECT 1 FROM sqlite_master WHERE name = 'starts'"
 
 
 class KeyedTable(Table[R]):
-    """Rows of measurements; `table["tile-1"]` is the row of that key."""
+    """Rows of measurements; `table["tile-1"]` is the last row with that key."""
 
     @overload
     def __getitem__(self, index: int | str) -> R: ...

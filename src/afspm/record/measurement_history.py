@@ -76,7 +76,7 @@ class SpectrumSummary:
 
 @dataclass(frozen=True, slots=True)
 class FoundPlace:
-    """A place found by a component; `score` is None if the component gave none."""
+    """A place found by a component; `score` is None without a score."""
 
     xy_m: XY
     score: float | None = None
@@ -84,7 +84,7 @@ class FoundPlace:
 
 @dataclass(frozen=True, slots=True)
 class DriftPoint:
-    """The drift after one scan.
+    """The drift at one scan.
 
     Attributes:
         translation_m: (x, y) displacement of the sample under the tip since the start, in tip coordinates.

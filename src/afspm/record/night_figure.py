@@ -1,4 +1,4 @@
-"""A `NightRecord` as a figure: contact sheet, bands over the night, and a close-up of each repair."""
+"""A `NightRecord` as a figure: contact sheet, bands over the night, and close-ups of the first repairs."""
 
 from __future__ import annotations
 
@@ -232,7 +232,7 @@ def _lane(ax: Axes, lane: int, spans: Sequence[Span], limits: tuple[int, int], *
 
 
 def flagged_by(record: NightRecord, span: Span) -> str:
-    """Return the component whose verdict on a scan caused a flag; empty if there is none."""
+    """Return the author of the bad verdict nearest to a flag; empty without a bad verdict within `AROUND_NS` / 4."""
     near = [m for m in record.marks if m.score == BAD and abs(m.time_ns - span.start_ns) < AROUND_NS / 4]
     return min(near, key=lambda m: abs(m.time_ns - span.start_ns)).by if near else ""
 

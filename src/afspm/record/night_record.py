@@ -128,7 +128,7 @@ class NightRecord:
 
     @property
     def start_ns(self) -> int:
-        """The time of the first scan or the first control state."""
+        """The start of the first scan or of the first control, if earlier; `end_ns` without both."""
         times = [shot.start_ns or shot.time_ns for shot in self.shots] + [t for t, s in self.control if s.holder]
         return min(times, default=self.end_ns)
 

@@ -115,7 +115,7 @@ def _write_pattern(
 
 
 def _write_surroundings(sample: h5py.Group, readings: Sequence[PlainMapping]) -> None:
-    # NXsample has fields of its own for the two quantities that nearly every such experiment has
+    # NXsample has fields of its own for temperature, magnetic field and pressure
     if not readings:
         return
     environment = group(sample, "environment", "NXenvironment")

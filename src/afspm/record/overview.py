@@ -62,7 +62,7 @@ class ReadingCurve:
     """Values over time; NaN where the value was unknown.
 
     Attributes:
-        step_ns: the least time between two points; a nearer point replaces the last. It grows with the run.
+        step_ns: the least time between two points; a nearer point replaces the last. The step grows with the run.
     """
 
     unit: str = ""
@@ -158,10 +158,10 @@ class ProcessHistory:
 class Overview:
     """The present state and the history of an experiment, reduced from packets. Pure: no clock, socket or file.
 
-    A packet older than the newest of its envelope is ignored, so replayed packets may be given as they arrive.
+    A packet that is not newer than the last packet of its envelope is ignored, so replayed packets do no harm.
 
     Args:
-        problems: the names of problems, for the search in the journal for the component that flagged one.
+        problems: the names of the experiment's problems.
 
     Attributes:
         newest_ns: the time of the newest packet; 0 before the first.
@@ -221,7 +221,8 @@ class Overview:
     def is_routine(self, span: Span | None) -> bool:
         """Return whether a problem is flagged in the normal course of a run.
 
-        That is thermal-drift until the first scan of a run with drift correction was taken in both directions.
+        Routine is a flag of thermal-drift within a second of a request for a scan in the opposite direction: the first
+        scan of a run with drift correction is taken in both directions.
         """
         if span is None or span.label != self.problems.name(Problem.THERMAL_DRIFT):
             return False
@@ -252,7 +253,7 @@ class Overview:
 
     @property
     def ended_ns(self) -> int | None:
-        """The end of the experiment; None if it continues, was stopped, or was cut off."""
+        """The end of the experiment; None if the run continues, was stopped, or was cut off."""
         entries = reversed(self.entries)
         return next((one.time_ns for one in entries if one.event is ControlEvent.EXPERIMENT_ENDED), None)
 
@@ -264,7 +265,7 @@ class Overview:
 
     @property
     def control_since_ns(self) -> int | None:
-        """The time of the last change of control; in MANUAL, of the mode. None if it is unknown."""
+        """The time of the last change of control; in MANUAL, of the mode. None if no change is known."""
         is_manual = self.control is not None and self.control.mode is ControlMode.MANUAL
         return self.timelines.mode.changed_ns if is_manual else self.timelines.control.changed_ns
 
@@ -287,7 +288,7 @@ class Overview:
         """Process a published packet. Unknown messages are ignored.
 
         Args:
-            message: its name, e.g. "Scan2d".
+            message: the name of the message, e.g. "Scan2d".
             thing: the decoded message from `wire.decode`.
             time_ns: the time of the packet.
             envelope: the envelope of the packet; by default the name of the message.

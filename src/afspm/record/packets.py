@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from afspm.storage.formats.content import FileContent
 
 Query = Callable[[str, Sequence[object]], list[Row]]
-"""A function that runs a query on the journal; it raises FileError if the journal is damaged."""
+"""A function that runs a query on the journal. Raises FileError if the journal is damaged."""
 
 _AT_ONCE = 500
 _FILES_KEPT = 4
@@ -129,7 +129,7 @@ def _placed(thing: object, frame: Frame) -> object:
 
 
 class _Values:
-    """The values of packets, read from files; a few files stay open, since channels of a scan come together."""
+    """The values of packets, read from files; a few contents are kept, since channels of a scan come together."""
 
     def __init__(self, query: Query, folder: Path) -> None:
         self._query = query
@@ -139,7 +139,7 @@ class _Values:
     def of(
         self, scan: int | None, spectrum: int | None, channel: str | None, first_row: int | None, rows: int | None
     ) -> NDArray[np.float64] | None:
-        """Return the values of a packet, or None if it contains its values. Raises FileError: missing or damaged."""
+        """Return the values of a packet; None if the packet has them. Raises FileError: no file, or a damaged file."""
         if spectrum is not None:
             return self._content("spectra", spectrum).spectra[0].values
         if scan is None:

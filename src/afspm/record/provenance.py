@@ -71,7 +71,7 @@ def control_at_start(
 
 
 def drift(journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filenames: Collection[str]) -> Plain | None:
-    """Return the drift mapping published just before a scan; None if there was none.
+    """Return the drift mapping published just before a scan; None if there was none, or it is about another file.
 
     Args:
         filenames: the controller's files of the scan's channels.
@@ -100,7 +100,7 @@ def drift(journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filen
 
 
 def instruments(journal: sqlite3.Connection, time_ns: int, since_ns: int | None) -> list[Plain]:
-    """Return the last values of other instruments before the end of a measurement, and their ranges during it."""
+    """Return the last values of other instruments in the minute before `time_ns`, and their ranges since `since_ns`."""
     first_ns = time_ns - _READINGS_NS if since_ns is None else min(since_ns, time_ns - _READINGS_NS)
     rows = journal.execute(
         "SELECT time_ns, payload FROM packets WHERE message = 'InstrumentReadings' AND time_ns > ? AND time_ns <= ?"

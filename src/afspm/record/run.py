@@ -73,7 +73,9 @@ def open_run(path: str | Path = "runs") -> Run:
 
 
 class Run:
-    """The record of a run. Every access reads the files again, so a running experiment shows its newest data.
+    """The record of a run.
+
+    Every access except `experiment` reads the files again, so a running experiment shows its newest data.
 
     Attributes:
         folder: of the run.
@@ -83,7 +85,7 @@ class Run:
         self.folder = folder
         self._journal = journal.open_to_read(folder)
 
-    # --- what was measured ---
+    # --- measurements ---
 
     @property
     def scans(self) -> KeyedTable[ScanRow]:
@@ -157,7 +159,7 @@ class Run:
         rows = map(scan_row, self._query(near, (time_ns, _SAME_SCAN_NS, time_ns)))
         return next((row for row in rows if not channel or channel in dict(row.channels)), None)
 
-    # --- what happened ---
+    # --- events ---
 
     @property
     def notes(self) -> Table[NoteRow]:
@@ -165,7 +167,7 @@ class Run:
         return Table(map(self._note_row, self._notes()), NoteRow)
 
     def notes_on(self, row: ScanRow | SpectrumRow) -> Table[NoteRow]:
-        """Return the notes on a scan."""
+        """Return the notes on a scan; empty for a spectrum."""
         near = (one for one in self._notes() if one.scan_ns and abs(one.scan_ns - row.time_ns) <= _SAME_SCAN_NS)
         return Table(map(self._note_row, near), NoteRow).where(
             lambda note: isinstance(row, ScanRow) and note.scan == row.number
@@ -182,7 +184,7 @@ class Run:
 
     @property
     def journal(self) -> Table[JournalEntry]:
-        """Requests with their answers, changes of control and orders; oldest first."""
+        """Requests with their answers, changes of control, orders and notes; oldest first."""
         rows = self._query("SELECT payload FROM packets WHERE message = 'JournalEntries' ORDER BY time_ns, rowid")
         published = (self._decoded("JournalEntries", payload) for (payload,) in rows)
         entries = [entry for one in published if isinstance(one, JournalEntries) for entry in one.entries]
@@ -249,7 +251,7 @@ class Run:
 
     @property
     def drift(self) -> Table[DriftPoint]:
-        """The drift after each scan; empty without a Drift Compensated Scheduler."""
+        """The drift at each scan; empty without a Drift Compensated Scheduler."""
         from afspm.record.overview import DriftPoint
 
         return Table(self.overview(messages=("DriftMapping",)).drift, DriftPoint)
@@ -358,7 +360,7 @@ class Run:
 
     @property
     def newest_ns(self) -> int:
-        """The time of the last packet."""
+        """The time of the scheduler's last packet; 0 without packets."""
         return int(self._query("SELECT coalesce(max(time_ns), 0) FROM packets WHERE source = ?", (SCHEDULER,))[0][0])
 
     @property

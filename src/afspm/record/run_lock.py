@@ -32,7 +32,7 @@ def lock_run(folder: Path) -> Iterator[None]:
 
 
 def cut_off_message(folder: Path) -> str:
-    """Return a message about a run that was cut off; empty if it goes on, or has ended.
+    """Return a message about a run that was cut off; empty if the run goes on, or has ended.
 
     Only the computer that ran the run can know.
     """

@@ -49,7 +49,7 @@ class PointGrid:
 
 
 def grid(positions_m: Sequence[XY]) -> PointGrid:
-    """Return the rectangular grid of some positions; it may be rotated, and points may be missing.
+    """Return the rectangular grid of some positions; the grid may be rotated, and points may be missing.
 
     Raises:
         InvalidValue: the positions do not lie on a grid.

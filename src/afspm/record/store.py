@@ -112,7 +112,7 @@ class RecordStore:
                 self._take(packet, source)
 
     def flush(self) -> None:
-        """End the last scan. Raises as `take`."""
+        """End the last scan if a channel of it has arrived. Raises as `take`."""
         if not self.waiting():
             return
         with self._all_or_nothing():

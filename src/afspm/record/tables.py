@@ -113,7 +113,7 @@ class ControlRow:
 
 @dataclass(frozen=True, slots=True)
 class ProblemRow:
-    """One flag of a problem; `cleared_ns` is None while it is flagged. `by`: "" if unknown."""
+    """One flag of a problem; `cleared_ns` is None while it is flagged. `by`: the component that flagged it, or ""."""
 
     name: str
     number: int

@@ -14,8 +14,8 @@ class Span:
 
     Attributes:
         label: the state during the span.
-        start_ns, end_ns: experiment time; an end of None: it continues.
-        by: the component or person that caused it; empty if unknown.
+        start_ns, end_ns: experiment time; an end of None: the span continues.
+        by: the component or person that caused the state; empty if unknown.
     """
 
     label: str
@@ -42,7 +42,7 @@ class Timeline:
         return self.spans[-1] if self.spans and self.spans[-1].end_ns is None else None
 
     def change(self, label: str | None, time_ns: int, by: str = "") -> None:
-        """Start a span of this label at `time_ns`; None: a gap. Changes older than the last are ignored."""
+        """Start a span of this label at `time_ns`; None: a gap. Older changes and equal labels are ignored."""
         if self.changed_ns is not None and time_ns < self.changed_ns:
             return
         now = self.now

@@ -1,7 +1,8 @@
 """The Microscope Scheduler: decides which component controls the microscope, and which requests reach it.
 
-**Theory of operation.** One pure function decides everything: `step(state, event, now) -> (state, effects)`
-(`scheduler_core`). The shell around it (`shell`) turns messages into events. It writes the effects to disk
+**Theory of operation.** One function without input or output decides everything (`scheduler_core`):
+`step(state, event, env, now_s, now_ns) -> (state, effects)`. Only the packet cache in `env` changes in
+place. The shell around the function (`shell`) turns messages into events. It writes the effects to disk
 (`write_ahead`), and then carries them out.
 
     comes in      requests of components; packets and answers of the translator; connections; time

@@ -31,7 +31,7 @@ class MappedRequest:
     """A request in the coordinates of the microscope.
 
     Attributes:
-        request: is sent in place of the original, with the same id.
+        request: the request sent in place of the original, with the same id.
         names: the parameters that the client sets; the others change by the mapping alone.
         places_text: the place in both coordinate systems, for the text of a refusal.
     """

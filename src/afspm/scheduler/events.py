@@ -203,7 +203,7 @@ Input = (
 
 @dataclass(slots=True)
 class Reply:
-    """The effect that answers the peer `name` over `connection`, its newest open connection.
+    """The effect that sends an answer to the peer `name` over `connection`.
 
     Attributes:
         asked: the kind of the answered request.
@@ -258,7 +258,7 @@ class SaveState:
 
 @dataclass(slots=True)
 class Log:
-    """The effect that logs a line; `level` is a name of `logging`: "INFO", "WARNING", "ERROR"."""
+    """The effect that logs a line; `level` is the name of a level of `logging`, such as "INFO"."""
 
     level: str
     text: str

@@ -40,7 +40,7 @@ class SavedState:
         recent: (translator's time, published time) of the last packets.
         frame: `CoordinateFrame.saved()`; read from a file, the same as plain data.
         instrument_units: the first unit of each parameter of an instrument.
-        instrument_orders: the number of the newest order.
+        instrument_orders: the number of the newest order or token.
     """
 
     control: ArbitrationState = field(default_factory=ArbitrationState)

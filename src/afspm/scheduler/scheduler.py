@@ -37,8 +37,8 @@ class Coordinates:
     """The coordinate frame of a scheduler.
 
     Attributes:
-        frame: its state at a first start.
-        worker: takes the frame's jobs; None: it has none.
+        frame: the frame at a first start.
+        worker: the worker for the frame's jobs; None: the frame has no jobs.
     """
 
     frame: CoordinateFrame = TIP_FRAME
@@ -48,7 +48,7 @@ class Coordinates:
 class Scheduler:
     """The arbiter that lets one component at a time command the microscope, and republishes all packets.
 
-    It continues after a kill and a restart. Mode, holder, problems and packets are on disk before they are published.
+    A restarted scheduler continues the run. Mode, holder, problems and packets are on disk before they are published.
 
     Args:
         control: the section [control] of the experiment file: `ControlSettings` as plain data.

@@ -193,7 +193,7 @@ class SchedulerCore:
 
     @property
     def newest_source_ns(self) -> int:
-        """The time of the translator's newest packet in the cache, to subscribe from; -1 if there is none."""
+        """The translator's time of the packet that it sent last, to subscribe from; -1 if there is none."""
         return self._env.cache.newest_source_ns
 
     @property

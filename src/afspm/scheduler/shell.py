@@ -189,7 +189,7 @@ class SchedulerShell:
             self._worker.close()
         self._write_ahead.close()
 
-    # --- what comes in ---
+    # --- inputs ---
 
     def _step_with(self, event: events.Input) -> None:
         self._carry_out(self._decide(event))
@@ -267,7 +267,7 @@ class SchedulerShell:
             due_s = min(math.inf if due_s is None else due_s, self._clock.monotonic_s() + wait_s)
         return math.inf if due_s is None else due_s
 
-    # --- what goes out ---
+    # --- effects ---
 
     def _carry_out(self, effects: Iterable[events.Effect]) -> None:
         sockets = self._sockets

@@ -34,7 +34,7 @@ class Peers:
 
     Attributes:
         timeout: the grace period of a holder without a connection.
-        supervisors: report which processes have ended.
+        supervisors: the supervisors, whose reports name the processes that have ended.
     """
 
     sessions: SessionTable
@@ -42,7 +42,7 @@ class Peers:
     supervisors: SupervisorRegistry = field(default_factory=SupervisorRegistry)
 
     def dead_at_s(self, holder: str) -> float | None:
-        """Return when (real) control is revoked unless the holder comes back; None while it is connected."""
+        """Return when (real) control is revoked unless the holder comes back; None while the holder is connected."""
         over_since_s = self.supervisors.over_since_s(component_of(holder))
         return self.timeout.dead_at_s(holder, self.sessions, over_since_s)
 
@@ -232,7 +232,7 @@ def restored_state(
     """Return the state of a scheduler after a restart.
 
     Args:
-        frame: its state at a first start.
+        frame: the coordinate frame at a first start.
     """
     state = SchedulerState.initial(settings, frame.restored(saved.frame))
     sessions, supervisors = (

@@ -7,8 +7,9 @@ is a list:
 - ["step", event, now_s, now_ns, effects, state]: an input, or null for the start itself; `state` has a checksum of each
   part of the state that the step has changed.
 
-Measured values decide nothing, so scans, lines and spectra are kept with zeros in their place, compressed. The results
-of a coordinate frame's worker are inputs, too: a replay gets the recorded ones, and starts no worker.
+Measured values decide nothing, so large scans, lines and spectra are kept compressed, with zeros in place of values. Of
+other large packets only the length is kept. The results of a coordinate frame's worker are inputs, too: a replay gets
+the recorded results, and starts no worker.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The write-ahead log: state and packets are on disk before the scheduler publishes them.
 
-The state is a small file of JSON lines; the last one is valid.
+The small state file has a JSON line for each saved state; the last line counts.
 """
 
 from __future__ import annotations

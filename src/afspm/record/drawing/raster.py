@@ -40,7 +40,7 @@ class ValueRange:
 
 
 def value_range(values: Array, contrast: Contrast = Contrast.ROBUST) -> ValueRange:
-    """Return the range of the finite values; 0 to 1 if there are none, a range around a single value."""
+    """Return the shown range of the finite values; 0 to 1 without values, a range around a single value."""
     stride = max(1, values.size // _SAMPLED)
     # the stride shares no divisor with the width; otherwise it would sample a few columns only
     while stride > 1 and np.gcd(stride, max(values.shape[-1], 1)) != 1:
@@ -62,13 +62,13 @@ def value_range(values: Array, contrast: Contrast = Contrast.ROBUST) -> ValueRan
 
 
 def shared_range(pictures: Iterable[Array], contrast: Contrast = Contrast.ROBUST) -> ValueRange:
-    """Return one range for compared images: it contains the range of each."""
+    """Return one range for compared images, which contains the range of each image."""
     spans = [value_range(values, contrast) for values in pictures]
     return ValueRange(min(span.low for span in spans), max(span.high for span in spans))
 
 
 def pooled_range(pictures: Iterable[Array]) -> ValueRange:
-    """Return the range of all values of a series of images, so that a few odd images don't widen it."""
+    """Return the robust range of all values of a series of images: a few odd images do not widen the range."""
     return value_range(np.concatenate([values.ravel() for values in pictures])[None, :])
 
 

@@ -50,7 +50,7 @@ CSS = """
 
 
 class Interval(Protocol):
-    """An interval of time; an end of None means it continues."""
+    """An interval of time; an end of None: the interval continues."""
 
     @property
     def label(self) -> str: ...

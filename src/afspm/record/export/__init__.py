@@ -3,8 +3,8 @@
 An exporter is a module that a package declares by its format. `write(run, row)` yields (suffix, content) of each file
 of a scan or spectrum. Two functions are optional: `tables(run, scans, spectra)` yields (name, content) of files about
 the whole run, and `grid_file(stack, metadata)` returns the spectra of a grid as one file.
-A format that keeps everything in one file has `archive(run, scans, spectra, folder)` instead of `write`: it writes that
-file, which may be larger than memory, and yields its path.
+A format with one file for many measurements has `archive(run, scans, spectra, folder)` instead of `write`: it
+writes such files, which may be larger than memory, and yields their paths.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def export(
     Args:
         to: a format that a package declares an exporter for.
         folder: created if it is missing.
-        scans: numbers of scans, as for `chosen`; None: all scans and spectra.
+        scans: numbers of scans, as for `chosen`, without spectra; None: all scans and spectra.
         tell: called with a message for each omitted measurement; None: a damaged file of the record is an error.
 
     Raises:

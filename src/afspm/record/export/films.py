@@ -1,4 +1,4 @@
-"""Films (.gif, .mp4): a film of the first channel for each place that was scanned at least twice."""
+"""Films (.gif, .mp4): a film of the first channel for each place scanned at least twice with the same channels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gwyddion's own files (.gwy): all channels of a scan, or the curves of a spectrum, in one.
+"""Gwyddion's own files (.gwy): one file for all channels of a scan, or for the curves of a spectrum.
 
 The format: Gwyddion user guide, "Format of Gwyddion files". A file is "GWYP" and an object; an object is its name, the
 size of its components, and the components: name, type, value. Numbers are little-endian, texts end with a zero byte.
@@ -52,7 +52,7 @@ def scan_file(scans: Sequence[Scan], meta: Mapping[str, str]) -> bytes:
 
 
 def spectrum_file(spectrum: Spectrum, meta: Mapping[str, str]) -> bytes:
-    """Return the file of one spectrum: a graph of each variable over the first."""
+    """Return the file of one spectrum: a graph of each further variable over the first variable."""
     items: list[Item] = []
     swept, units = spectrum.values[:, 0] if spectrum.names else np.empty(0), spectrum.units
     for number, name in enumerate(spectrum.names[1:], 1):

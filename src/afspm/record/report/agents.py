@@ -57,7 +57,7 @@ class AgentWork:
 
 
 def read(run: Run) -> list[AgentWork]:
-    """Return the work of each agent that proposed a plan, had an approval, or stopped the run."""
+    """Return the work of each agent that proposed a plan, had an approval, was refused a request or stopped the run."""
     proposals: dict[str, set[str]] = {}
     plans: dict[str, set[tuple[str, int]]] = {}
     grants: dict[tuple[str, str, int], RecordedGrant] = {}

@@ -35,7 +35,7 @@ _log = logging.getLogger("afspm.report")
 
 @dataclass(frozen=True)
 class TopographyPicture:
-    """A scan with images of its topography; None if its values can't be read.
+    """A scan with images of its topography, which are None if no values can be read.
 
     Attributes:
         image: the levelled image in colour.
@@ -90,7 +90,7 @@ def bad_ns(run: Run, story: RunStory) -> frozenset[int]:
 
 
 def chosen(rows: Sequence[ScanRow], most: int = MOST, kept_ns: Collection[int] = ()) -> list[ScanRow]:
-    """Return at most `most` rows in order: the scans at the times `kept_ns`, and an even selection of the rest."""
+    """Return at most `most` rows in order: scans at `kept_ns` (at most half), and an even selection of the rest."""
     if len(rows) <= most:
         return list(rows)
     odd = [k for k, row in enumerate(rows) if row.time_ns in kept_ns][: most // 2]
@@ -114,7 +114,7 @@ def _read(run: Run, row: ScanRow) -> tuple[TopographyPicture, Array | None]:
 
 
 def is_topography(channel: str) -> bool:
-    """Return whether the name of a channel is one of heights."""
+    """Return whether the name of a channel is a name of heights."""
     return channel.lower().startswith(_TOPOGRAPHY)
 
 
@@ -170,7 +170,7 @@ def night_of(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -
 
 
 def of_figures(folder: Path) -> list[FigurePicture]:
-    """Return the figures for the page: the night first, then drift, then all others in the run folder."""
+    """Return the figures in the run folder except the report's own night: the night first, then drift, then others."""
     found = [path for path in folder.glob("*.png") if path.name != OWN_NIGHT]  # the page itself shows the same
     first = (NIGHT, OFFSET, OWN_OFFSET)
     found.sort(key=lambda path: (first.index(path.name) if path.name in first else len(first), path.name))

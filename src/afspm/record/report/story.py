@@ -58,7 +58,7 @@ class RunStory:
         ended: the state of the run as text: its end, running, or cut off.
         frame: the coordinate frame of all positions.
         problems: spans of all non-routine problems, in the order of time.
-        actions: treatments of the tip, e.g. pulses.
+        actions: successful treatments of the tip, e.g. pulses.
         seen_late: the first request to flag each problem that was only noticed after the end.
         ledger: totals of the treatments of tip and sample.
         comparisons: planned and measured work of each component with a plan.

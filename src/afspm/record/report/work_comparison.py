@@ -27,6 +27,7 @@ def compare(
     Args:
         planned: the planned work by component; None: no estimate.
         scans, spectra: all scans and spectra of the run; each counts for the component in control at its start.
+            Interrupted scans do not count.
     """
     all_scans, all_spectra = list(scans), list(spectra)
     return [

@@ -121,7 +121,7 @@ class ArbitrationState:
 
 @dataclass(frozen=True)
 class RoleTable:
-    """The components and people with a role. Without the key, everyone has the role.
+    """The components and people with a role. Without the key, everyone has the role, except `operate` and `approve`.
 
     A person who acts through a component ("dashboard:Ada") has the roles of the component and those given to that
     person there.
@@ -207,7 +207,7 @@ class Transition:
         response: the answer to a request; None where the translator answers, or the event is not a request.
         why: the reason of the row. With a refusal it is sent to the client, with {who}, {holder}, {number}, {problem}
             and {problems} filled in.
-        cause: the reason why the holder loses control; None if it stays in control.
+        cause: the reason why the holder loses control; None if the holder stays in control.
     """
 
     when: Condition

@@ -1,4 +1,4 @@
-"""Timeouts of the holder of control: a lease while it is idle, a grace period while it is disconnected."""
+"""Timeouts of the holder of control: a lease for an idle holder, a grace period for a disconnected holder."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Lease:
         return None if self.asked_s is None or self.holder is None else self.idle_since_s + self.asked_s
 
     def deadline_ns(self, *, is_free: bool) -> int | None:
-        """Return when the lease of the experiment file expires; None while the microscope is busy."""
+        """Return when the lease of the experiment file expires; None while busy, or without lease or holder."""
         if self.lease_ns is None or self.holder is None or not is_free:
             return None
         return self.idle_since_ns + self.lease_ns
@@ -75,10 +75,10 @@ class HolderTimeout:
     next_loss_log_s: float = -math.inf
 
     def dead_at_s(self, holder: str | None, sessions: SessionTable, over_since_s: float | None) -> float | None:
-        """Return when control is revoked unless the holder comes back; None while it is connected.
+        """Return when control is revoked unless the holder comes back; None if no holder is disconnected.
 
         Args:
-            over_since_s: real time since which its process has ended without a restart; None: no known end.
+            over_since_s: real time at which the holder's process ended for good; None: no known end.
         """
         if holder is None or sessions.connection_of(holder) is not None:
             return None

@@ -24,7 +24,7 @@ _OTHERS = ("scheduler", "translator")
 
 @dataclass(frozen=True)
 class StartupBarrier:
-    """A delay of the first control state, and of requests that may change it, until missed packets are published.
+    """A delay of the first control state until missed packets are published; after a restart, also of control requests.
 
     Without this delay, a repeated packet of the translator would get a time after the change, and look new.
 
@@ -53,7 +53,11 @@ class StartupBarrier:
         return self if self.until_s is None else replace(self, until_s=None, opened_s=now_s)
 
     def keep(self, event: RequestIn) -> StartupBarrier | None:
-        """Keep a request that arrives before the barrier opens; return None if the barrier is open."""
+        """Keep a request until the barrier opens.
+
+        Returns:
+            None if the request is not kept: the barrier is open, this is a first start, or too many requests are kept.
+        """
         if self.until_s is None or not self.is_restart or len(self.kept) >= _MOST_KEPT:
             return None
         return replace(self, kept=(*self.kept, event))
@@ -108,7 +112,7 @@ class ExperimentEnd:
         return ExperimentEnd(None, (), now_s + SHUTDOWN_GRACE_S, now_s + LONGEST_GRACE_S)
 
     def processes_reported(self, states: Iterable[ProcessState], now_s: float) -> ExperimentEnd:
-        """Stay longer while a supervisor reports that one of its processes still runs."""
+        """Stay longer while a supervisor reports that a process other than scheduler and translator still runs."""
         if self.leave_at_s == math.inf or not any(map(_is_at_work, states)):
             return self
         leave_at_s = max(self.leave_at_s, min(now_s + SHUTDOWN_GRACE_S, self.latest_s))

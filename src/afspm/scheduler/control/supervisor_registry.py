@@ -154,7 +154,11 @@ class Announcement:
 
 
 def announcement(event: RequestIn, codec: Codec) -> Announcement:
-    """Check a message of a process for publication: a sender may publish only about itself."""
+    """Check a message of a process for publication.
+
+    Progress, notes, proposals and settings must name their sender. With keys, only the supervisor's key may report
+    processes and log lines.
+    """
     subject = event.request.subject
     if not isinstance(subject, RelayedMessage):
         return Announcement("", "an empty announcement")

@@ -1,8 +1,8 @@
 """Other instruments: their last readings, and the conditions that they set for measuring.
 
 **Theory of operation.** Each instrument is a component that reports its values about twice a second (request 102). A
-parameter "cryo.temperature" belongs to the component `cryo`: a request for it is answered from the last report, or
-waits for the next one, whose answer carries it as an order. The report after that carries the outcome.
+parameter "cryo.temperature" belongs to the component `cryo`. A request to read it is answered from the last report. A
+request to set it waits for the next report, whose answer carries it as an order. A later report carries the outcome.
 
     comes in      reports with values and outcomes; requests for parameters of instruments; time
     state         `Instruments`: the last reading of each parameter, its first unit, open orders, since when each

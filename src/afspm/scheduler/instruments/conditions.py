@@ -35,7 +35,7 @@ class AllowedBand:
     unit: str = ""
 
     def reason_outside(self, reading: InstrumentReading) -> str:
-        """Return the reason why a reading is outside the band; empty if it is inside."""
+        """Return the reason why a reading is outside the band; empty for a reading inside."""
         if not reading.is_number or reading.value is None:
             return f"{reading.name} is not known: {reading.reason or 'not a number'}"
         try:
@@ -104,7 +104,7 @@ class ConditionState:
 
     Attributes:
         inside_since_ns: by parameter, the experiment time since which the value is inside its band.
-        reason: the reason why the condition does not hold; empty if it holds.
+        reason: the reason why the condition does not hold; empty while the condition holds.
     """
 
     inside_since_ns: Mapping[str, int] = field(default_factory=dict)

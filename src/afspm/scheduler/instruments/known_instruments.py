@@ -16,7 +16,7 @@ PUBLISH_CHANGED_S = 1.0
 """Least interval of publications of changed numbers, real."""
 _MOST_PARAMETERS = 100  # of one instrument: memory must stay bounded
 _NEVER_S = float("-inf")
-_JUST_AFTER_S = 1e-3  # a reading of exactly the oldest age is still one
+_JUST_AFTER_S = 1e-3  # a reading of exactly the oldest age still counts
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class Instruments:
         return self if states == self.states else replace(self, states=states)
 
     def refusal(self, action: str, now_s: float, now_ns: int) -> str:
-        """Return the reason why an action may not start now; empty if it may."""
+        """Return the reason why an action may not start now; empty if no condition forbids the start."""
         if not self.settings.conditions:
             return ""
         states = self.evaluated(now_s, now_ns).states
@@ -144,7 +144,7 @@ class Instruments:
         return "; ".join(reasons)
 
     def problems(self) -> dict[int, str]:
-        """Return the problems of the conditions that do not hold, with their reasons."""
+        """Return the problems of the conditions that do not hold, each with one reason."""
         wanted = dict[int, str]()
         for name, condition in self.settings.conditions.items():
             reason = self.states.get(name, ConditionState()).reason
@@ -178,7 +178,7 @@ class Instruments:
         return self._with(instrument, replace(known, open=rest))
 
     def found(self, instrument: str, outcome: OrderOutcome) -> OpenOrder | None:
-        """Return the open order that an outcome belongs to; None if it was settled before."""
+        """Return the open order that an outcome belongs to; None if the order was settled before."""
         for one in self._of(instrument).open:
             if one.order is not None and one.order.number == outcome.number:
                 return one

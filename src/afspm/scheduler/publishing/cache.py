@@ -39,7 +39,8 @@ class PacketCache:
 
     Args:
         envelopes: the envelope of each packet, and the number of packets kept for each envelope.
-        max_bytes: total size. Beyond it, the oldest packets are dropped whose envelope has a newer packet.
+        max_bytes: total size. Beyond it, the oldest packet whose envelope has a newer packet is dropped; without such a
+            packet, the oldest of all. A larger single packet is not cached.
     """
 
     def __init__(self, envelopes: Envelopes | None = None, max_bytes: int = 512 * 2**20) -> None:
@@ -61,7 +62,7 @@ class PacketCache:
 
     @property
     def newest_source_ns(self) -> int:
-        """The translator's time of its newest packet in the cache; -1 if there is none."""
+        """The translator's time of the packet that it sent last, cached or not; -1 if there is none."""
         return self._newest_source_ns
 
     @property
@@ -72,11 +73,12 @@ class PacketCache:
     def take(self, packet: Packet, header: PacketHeader, now_ns: int) -> tuple[Packet, int] | None:
         """Return the packet to publish, and how many packets of its envelope are kept (0: not this packet).
 
-        The packet keeps the translator's time. It gets a later time if that would not follow the newest published
-        time: a clock was set back or is far ahead, or the peer sent no time.
+        The packet keeps the translator's time. Without a time, or with a time more than 1 h ahead, it gets the present
+        time. Either time is moved to just after the newest published time if it is not later, as after a clock was set
+        back. A packet that was published before a restart gets its first time again.
 
         Returns:
-            None if the packet is a duplicate.
+            None if the packet is a duplicate, or was passed over before a restart.
         """
         source_ns = packet.time_ns
         if source_ns is not None:
@@ -99,7 +101,7 @@ class PacketCache:
         return out, kept
 
     def pass_over(self, packet: Packet) -> bool:
-        """Register a packet of the translator that is not published; return False if it is a duplicate."""
+        """Register a packet of the translator that is not published; return False for a duplicate."""
         if packet.time_ns is None:
             return True
         is_new = packet.time_ns not in self._sources and self._first_times.pop(packet.time_ns, None) != _NEVER_NS

@@ -62,7 +62,7 @@ class CacheRule:
         history: number of packets kept; without the key: the default.
 
     Raises:
-        InvalidValue: no packet could match, or no subscriber could read the envelope.
+        InvalidValue: the history is less than 1, no packet could match, or no subscriber could read the envelope.
     """
 
     message: str | None = None
@@ -151,7 +151,8 @@ class Envelopes:
 
     Args:
         rules: the rules, tried in order before the defaults.
-        mapping: a function of the user that names the envelope instead of rules and defaults.
+        mapping: a function of the user that names the envelope instead of rules and defaults; the rules still decide
+            how many packets are kept.
         history: the number of packets to keep, by message, instead of the number in the declaration.
     """
 

@@ -33,7 +33,7 @@ from afspm.scheduler.control.descriptions import request_text
 PERIOD_S = 0.1
 """Least real time between two publications."""
 MOST = 1000
-"""The largest number of requests logged within `PERIOD_S`; further requests are only counted."""
+"""The largest number of entries gathered within `PERIOD_S`; further requests are only counted."""
 LONGEST = 1000
 """The longest text of a request or a reason, in characters."""
 
@@ -50,7 +50,7 @@ _CUT_OFF = "the scheduler was restarted before the answer was written down"
 
 
 class AnsweredRequest(NamedTuple):
-    """A request with its answer, before it is put into words.
+    """A request with its answer, before the log entry is put into words.
 
     Attributes:
         took_s: real time from the request to its answer.
@@ -103,7 +103,7 @@ def _subject_of(request: Request) -> tuple[str, str, str]:
 
 @dataclass(frozen=True)
 class SentStart:
-    """The start of a measurement, saved before it is forwarded; its log entry holds the measurement's key.
+    """The request that starts a measurement, saved before forwarding; its log entry holds the measurement's key.
 
     Attributes:
         sent_ns: time of its first forwarding.
@@ -165,7 +165,7 @@ class EventLog:
         return next(known, now_ns)
 
     def sending(self, who: str, request: Request, sent_ns: int) -> EventLog:
-        """Remember a request that is forwarded, if it starts a measurement."""
+        """Remember a forwarded request that starts a measurement; ignore all other requests."""
         if request.kind != ControlRequest.ACTION or request.subject not in _STARTS:
             return self
         start = SentStart(who, str(request.subject), request.id, sent_ns)
@@ -210,7 +210,7 @@ def control_entries(
     row: Transition,
     problems: ProblemNames,
 ) -> list[JournalEntry]:
-    """Return a log entry, with author and reason, for each change of holder, mode and problems."""
+    """Return a log entry for each change of holder, mode and problems, and for the end of the experiment."""
     name, entry = problems.name, partial(JournalEntry, now_ns, CONTROL)
     entries = []
     if before.holder is not None and after.holder != before.holder:

@@ -97,7 +97,7 @@ def handle(draft: StateDraft, event: RequestIn) -> None:
 
 
 def admit(draft: StateDraft, event: RequestIn) -> bool:
-    """Return whether a request is new; a request that is not new was answered, or waits."""
+    """Return whether a request goes on to the next stage; otherwise it was answered or refused, or waits."""
     if event.request.kind in _CONTROL_EVENTS and (barrier := draft.barrier.keep(event)) is not None:
         draft.barrier = barrier
         return False
@@ -165,7 +165,7 @@ def _unknown(request: Request, why: str) -> Response:
 
 
 def authorise(draft: StateDraft, event: RequestIn) -> bool:
-    """Return whether to forward a request to the translator; if not, it was answered."""
+    """Return whether to forward a request; if not, the scheduler answers it, now or when the end is complete."""
     kind, subject = event.request.kind, event.request.subject
     if why := draft.grants.refused_at_arrival(event.name, event.request, draft.now_ns):
         answers.answer(draft, event, ControlResponse.FAILURE, why)

@@ -52,7 +52,7 @@ AGENT_LEASE_S = 60.0
 """Lease of an agent without a lease request, in s of real time."""
 LONGEST_AGENT_LEASE_S = 600.0
 STALE_S = 3600.0
-"""Experiment time after which a preflight is too old to be approved, and an approved plan to be begun."""
+"""Experiment time after which a preflight is too old to be approved."""
 _HOUR_NS = 3600 * 10**9
 _PROBE_M = 5e-9
 """Side of the square, in m, within which a probe counts as where it was set: controllers round."""
@@ -161,9 +161,9 @@ class GrantBook:
 
     Attributes:
         plans, grants: the approved plans and the grants, by agent.
-        spent: by agent, the requests of the last hour, oldest first.
+        spent: the requests of the last hour, oldest first, by agent or component with limits of its role.
         placed: the places set by the agent in control.
-        disturbed_ns: the last time at which a problem was flagged or MANUAL was set.
+        disturbed_ns: the last experiment time at which a problem was flagged or the mode changed.
     """
 
     plans: Mapping[str, HeldGrant] = field(default_factory=dict)
@@ -266,7 +266,7 @@ class GrantChecker:
     # --- requests of an agent: at arrival ---
 
     def refused_at_arrival(self, who: str, request: Request, now_ns: int) -> str:
-        """Return the reason why an agent may not send a request; empty if it may be decided further."""
+        """Return the reason why an agent may not send a request; empty if the later checks decide."""
         if not self.rules.is_agent(who):
             return ""
         kind, subject = request.kind, request.subject

@@ -1,6 +1,7 @@
 """The check of requests against the limits of an experiment.
 
-Nothing is clamped. A refusal names the parameter, the value, the limit and the place in the file where it was set.
+Nothing is clamped. A refusal by a range, a step or a rate names the parameter, the value, the limit and its place in
+the experiment file.
 
 A check is valid only at the moment when it is made: steps, rates and places are measured from the values in force. So a
 request is checked right before it is sent, after all earlier ones have settled. `depends_on` names the values to read

@@ -61,7 +61,10 @@ def numbers(values: list[ParameterValue]) -> list[tuple[str, float]]:
 
 
 def number_of(parameter: Parameter) -> float | None:
-    """Return the value of a parameter in SI; None if it is no finite number or of another dimension."""
+    """Return the value of a parameter; None if it is no finite number or its unit has another dimension.
+
+    The value of a base parameter is in SI. Any other value stays in the unit of the parameter.
+    """
     try:
         return _number(parameter, parameter.value or "", None)
     except ParameterValueError:

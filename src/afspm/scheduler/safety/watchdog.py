@@ -1,7 +1,7 @@
 """The watchdog: actions that the scheduler itself sends to the microscope when a holder loses control.
 
-It stops the running scan or spectrum. It retracts the tip if the holder lost control, rather than gave it back, and
-left the tip in a dangerous state: the holder can no longer mend that, and no other component knows of it.
+It stops the running scan or spectrum after the causes in `stop_when`. It retracts a tip that the holder left in a
+dangerous state, unless the holder gave control back or a person took over: no other component knows of the danger.
 """
 
 from __future__ import annotations
@@ -163,8 +163,8 @@ class Watchdog:
     def translator_answered(self) -> Watchdog:
         """Process the first answer since the restart: all requests of the killed scheduler are now done or lost.
 
-        A tip that is still owed a retract is retracted again, which does no harm. If a person has attended to it
-        meanwhile, it may have been withdrawn after that: the person is called again.
+        If a retract is still owed, the tip is retracted again, which does no harm. If a person has attended to the tip
+        meanwhile, the old retract may have come after that: the person is called again.
         """
         if not self.tip.may_come:
             return self
@@ -209,7 +209,10 @@ class Watchdog:
         return replace(self, tip=replace(self.tip, calls_people=False))
 
     def leave_to_people(self, microscope: MicroscopeStatus) -> Watchdog:
-        """Keep the duty towards a tip in danger when the run is stopped; the exiting translator retracts the tip."""
+        """Keep the duty towards a tip in danger when the run is stopped, and call a person.
+
+        The exiting translator retracts the tip.
+        """
         return (
             self._after(TipEvent.LEFT) if self.settings.retract is not None and microscope.danger is not None else self
         )
@@ -290,7 +293,7 @@ class Watchdog:
     # --- requests to the translator ---
 
     def next_action(self, microscope: MicroscopeStatus) -> tuple[Watchdog, str | None]:
-        """Return the action to send now, or None; it counts as sent."""
+        """Return the action to send now, which counts as sent; None: no action."""
         dog = self
         if dog.tip.for_feedback and microscope.risk.feedback_on is True:
             dog = dog.seen_to()
@@ -343,7 +346,7 @@ class Watchdog:
         """Schedule a retract that was put off, soon after a translator connects and sends its first packets."""
         return replace(self, due_s=now_s + _SOON_S) if self.put_off else self
 
-    # --- what does not come about ---
+    # --- expired waits ---
 
     def look_again(
         self, microscope: MicroscopeStatus, now_s: float, *, is_seen_to: bool
