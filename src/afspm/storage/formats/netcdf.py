@@ -90,7 +90,7 @@ def _file(file: Any) -> File:
 def _netcdf_file(content: io.BytesIO, mode: Literal["r", "w"]) -> Any:
     from scipy.io import netcdf_file
 
-    # version 2 has 64-bit offsets: version 1 ends at 2 GB
+    # version 2 has 64-bit offsets: files of the first version end at 2 GB
     return netcdf_file(content, mode, mmap=False, version=2)
 
 
