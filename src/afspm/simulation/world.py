@@ -334,7 +334,7 @@ class World:
     def crash(self, position_m: tuple[float, float], depth_m: float, speed_m_s: float, t_s: float) -> str:
         """Drive the tip into the sample: a crash may cure or worsen the tip (`tip.crash_times`), and leaves a crater.
 
-        The crater is shallower than the indentation (`tip.indented_m`), of which a part springs back. Simulated:
+        The crater is shallower than the indentation (`tip.indented_m`), since a part springs back. Simulated:
         material is pushed aside over three times the radius of contact, about as far as plastic flow reaches around an
         indenter.
 
