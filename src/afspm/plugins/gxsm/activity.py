@@ -1,4 +1,4 @@
-"""State of GXSM, by polling: GXSM reports neither the start nor the end of a measurement."""
+"""State of GXSM, derived from polls: GXSM reports neither the start nor the end of a measurement."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from afspm.translator.result_files import SCAN, as_list
 from afspm.translator.state import Kept
 
 SETTLES_S: Final = 0.3
-"""GXSM's own work after the end of a scan; a file saved earlier has no end time."""
+"""Duration of GXSM's own work after the end of a scan; a file saved earlier has no end time."""
 SHOWS_S: Final = 1.0
 """Longest delay until a started measurement shows in the status bits; measured: up to 0.3 s."""
 _CHANNELS: Final = 40
@@ -33,9 +33,10 @@ class Saving:
     """The way of saving scans and spectra.
 
     Attributes:
-        by_us: True if the translator triggers the saving of its own scans. GXSM saves all others by itself.
-        scan_dir, probe_dir: folders of scans and spectra, if not the folder that GXSM reports for channels.
-        switches_autosave: True if Auto Save is switched off during the translator's own scans.
+        by_us: True if the translator triggers the saving of its own scans. GXSM saves all other scans by itself.
+        scan_dir: folder of scans; None: the folder that GXSM reports for channels.
+        probe_dir: folder of spectra; None: the folder of scans.
+        switches_autosave: True if the translator switches Auto Save: off for its own scans, on at other times.
     """
 
     by_us: bool
@@ -73,13 +74,13 @@ class ScanProgress:
     """The observed progress of the running scan.
 
     Attributes:
-        endings: endings of its channels' file names.
-        name: name of its first file, whose number rises with each scan; empty before the first poll.
-        watch: direction of its lines; None before the first poll.
+        endings: endings of the channels' file names; empty before the lines are read for the first time.
+        name: path of the first channel's file, whose number rises with each scan; empty before the first poll.
+        watch: direction of the lines; None before the first poll.
         goes_up: True if the top row of the picture is scanned last; None: unknown.
         settles_until_s, ended_ns: end of GXSM's own work after the scan, and end of the scan.
         y_before, y_moved: last line of the previous scan, and whether GXSM has reported another line since.
-        follows: True if it started before the end of the previous scan was observed.
+        follows: True if the scan started before a poll showed the end of the previous scan.
     """
 
     endings: list[str] = field(default_factory=list)
@@ -98,8 +99,8 @@ class ConnectedGxsm:
     """A connected GXSM.
 
     Attributes:
-        ask: calls its functions.
-        hardware: kind of its driver, which defines the meaning of the status bits.
+        ask: link with type-checked answers.
+        hardware: kind of hardware driver, which defines the meaning of the status bits.
         frame: frame of the next scan.
     """
 
@@ -111,7 +112,7 @@ class ConnectedGxsm:
         """Return the state that GXSM reports.
 
         Raises:
-            BadReply: the value is no set of bits.
+            BadReply: the value is not a set of bits.
         """
         return decoded(self.hardware, self.ask.numbers("rtquery", STATUS))
 
@@ -140,7 +141,7 @@ class GxsmActivity(Activity):
         gxsm: the connection.
         set_frame: returns the frame of the next scan as it was set, and (rows, columns).
         kept: persistent, JSON-able: arrival time of the tip.
-        shows_s: longest delay until a started measurement is seen running, experiment time.
+        shows_s: longest delay until a poll shows a started measurement, experiment time.
     """
 
     program: ClassVar[str] = "GXSM"
@@ -185,13 +186,14 @@ class GxsmActivity(Activity):
         self.gxsm.ask.call("startscan")
 
     def start_curve(self, kind: str, position_m: tuple[float, float], way_s: float) -> None:
-        """Move the tip, then take a spectrum.
+        """Start to move the tip; `status` starts the spectrum once the tip has arrived.
 
         Args:
+            position_m: (x, y).
             way_s: longest duration of the move, experiment time.
 
         Raises:
-            Refused: the position is out of the tip's reach.
+            Refused: the position is outside the scan frame.
         """
         self.gxsm.frame.move_tip(position_m)
         self.sets_out(way_s)
@@ -203,7 +205,7 @@ class GxsmActivity(Activity):
         self.stopped()
 
     def stop_curve(self) -> None:
-        """Stop the spectrum, or the move before it."""
+        """Stop the spectrum; before its start, cancel the spectrum and let the tip finish its move."""
         if not self.curve_awaited:
             self.gxsm.ask.call("action", ABORT)
         self.stopped()
@@ -213,7 +215,11 @@ class GxsmActivity(Activity):
         self._way.sets_out(way_s, after_last_way=True)
 
     def next_change_s(self) -> float | None:
-        """Return the time of the next expected change: arrival, visible start, end of settling, or missing files."""
+        """Return the time of the next expected change, in experiment time; None: no change is expected.
+
+        Changes are the arrival of the tip, the deadline of a visible start, the end of settling, and the deadline of
+        awaited files.
+        """
         now_s = self._clock.now_s()
         times = (self._way.arrives_s, self._shows_until_s, self._scan.settles_until_s, self._files.next_s() or 0.0)
         return min((at_s for at_s in times if at_s > now_s), default=None)
@@ -223,7 +229,7 @@ class GxsmActivity(Activity):
     def endings(self) -> list[str]:
         """Return the endings of the running scan's file names.
 
-        Empty before the scan is seen running: GXSM still reports the names of the previous scan.
+        Empty until a poll shows the scan: up to then, GXSM still reports the names of the previous scan.
         """
         if self._files.what != SCAN or self._shows_until_s > 0.0:
             return []
@@ -232,7 +238,10 @@ class GxsmActivity(Activity):
         return self._scan.endings
 
     def lines_done(self) -> int:
-        """Return the number of complete lines of the running scan."""
+        """Return the index of GXSM's current line: at least as many lines of the running scan are complete.
+
+        0 until GXSM reports another line than the previous scan's last.
+        """
         y = int(self.gxsm.ask.number("y_current"))
         if self._scan.y_before is None:
             self._scan.y_before = y
@@ -240,7 +249,7 @@ class GxsmActivity(Activity):
         return y if self._scan.y_moved else 0
 
     def status(self) -> ScopeStatus:
-        """Return the present state; register measurements that have ended, whose files are then awaited."""
+        """Return the present state; register starts and ends of measurements, and start an awaited spectrum."""
         doing, now_s = self.gxsm.doing(), self._clock.now_s()
         # RPSPMC has one bit for scans, spectra and its own vector programs, which also move the tip
         led = self.gxsm.hardware is Hardware.RPSPMC and self._way.is_on
@@ -283,8 +292,8 @@ class GxsmActivity(Activity):
         return ScopeStatus(ScopeState.SPEC if curve else ScopeState.SCANNING, doing.paused or None)
 
     def _is_another(self) -> bool:
-        # A repeated scan starts sooner than the next poll, so its predecessor is never seen to end. Two facts reveal
-        # it: a new number in the file names, and lines that start from the beginning.
+        # A repeated scan starts sooner than the next poll, so no poll shows the end of its predecessor. Two facts
+        # reveal the new scan: a new number in the file names, and lines that start from the beginning.
         before, name = self._scan.name, self.gxsm.ask.text("chfname", 0)
         self._scan.name = name
         # after saving, GXSM reports the next free number if the first one was taken: no sign of another scan
@@ -312,7 +321,7 @@ class GxsmActivity(Activity):
         self._seen_last = (0, 0), None
 
     def _look_at_memory(self) -> None:
-        # Not near the last row: GXSM may have scanned it already, and overwritten the previous scan there.
+        # Near its last row the scan may already have overwritten the previous scan there: no comparison is possible.
         rows, columns = self._files.scanning[1]
         found = looked_at(self.gxsm.ask, len(self._channels()), (0, rows - 1), columns)
         line = int(self.gxsm.ask.number("y_current"))

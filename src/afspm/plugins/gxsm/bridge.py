@@ -44,7 +44,11 @@ def packed(value):  # type: ignore[no-untyped-def]
 
 
 def secret() -> bytes:
-    """Return the secret; create it at the first run."""
+    """Return the secret; create its file at the first run.
+
+    Raises:
+        PermissionError: other users can read the file. ValueError: the file is damaged.
+    """
     path = Path(SECRET).expanduser()
     path.parent.mkdir(mode=0o700, exist_ok=True)
     if not path.exists():
@@ -158,7 +162,7 @@ class Client:
 
     @property
     def events(self) -> int:
-        """The events to wait for. Nothing is read until the client has received the last answer."""
+        """The events to wait for. No call is received until the last answer is sent completely."""
         return selectors.EVENT_WRITE if self._unsent else selectors.EVENT_READ
 
     def exchange(self, now_s: float) -> None:
@@ -289,7 +293,7 @@ class Bridge:
 
 
 def run() -> None:
-    """Listen until script-control is 0."""
+    """Set `script-control` to 1, and serve clients until the entry is 0."""
     known = secret()
     if gxsm is not None:
         gxsm.set("script-control", "1")

@@ -34,9 +34,9 @@ class _Raw:
     """The needed parts of a file, for both kinds of NetCDF.
 
     Attributes:
-        values: FloatField, (time, value, y, x).
-        attributes: attributes of FloatField.
-        numbers, texts: other variables.
+        values: FloatField, in NetCDF-3 also H: (time, value, y, x), top row first, without the factor dz.
+        attributes: attributes of this variable.
+        numbers, texts: other variables, with a single number or a text.
         about: global attributes, such as the program's version.
     """
 

@@ -43,7 +43,9 @@ _LOOKS_SOON: Final = 20
 
 
 class SharedMemoryLink:
-    """The block of a running Gxsm4. For one thread.
+    """A link through the block of a running Gxsm4. Not thread-safe.
+
+    A request left in the block of an ended GXSM is withdrawn: the next instance would never answer the request.
 
     Args:
         block: name of the shared memory.
@@ -52,7 +54,8 @@ class SharedMemoryLink:
         monotonic_s: returns real time.
 
     Raises:
-        ControllerLost: no block, or no process serves it. ConfigError: the system is not Linux.
+        ControllerLost: there is no block, or not exactly one process that serves the block.
+        ConfigError: the system is not Linux.
     """
 
     def __init__(self, block: str, process: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
@@ -116,7 +119,7 @@ class SharedMemoryLink:
     def _transaction(self, method: str, arguments: tuple[str | int | float, ...]) -> object:
         until_s = self._monotonic_s() + self._timeout_s
         self._see_alive()
-        # of a caller that has given up waiting: its answer would be taken for the next one's
+        # left by a caller that has stopped waiting: its answer would be taken for the answer to this call
         if self._status() == _REQUEST:
             before = self._memory[:_NAME_BYTES].split(b"\0", 1)[0].decode("latin-1")
             self._wait(until_s, f"GXSM is busy with an earlier call of {before!r} for more than {self._timeout_s:g} s")
@@ -161,7 +164,7 @@ class SharedMemoryLink:
             self._closed.wait(_SOON_S if looks < _LOOKS_SOON else _LATER_S)
 
     def _see_alive(self) -> None:
-        # A request left in the block of an ended GXSM would stay there for the next instance, which never answers it.
+        # A request left in the block of an ended GXSM would stay there: the next instance never answers old requests.
         if not self._process.lives():
             self._withdraw_request()
             raise ControllerLost("Gxsm4 has ended", where=self._where)

@@ -84,7 +84,7 @@ class GxsmEntries:
             return 0
         value = self._atof(text) * self._factor(entry)
         value = (float(np.trunc(value)) if entry.whole else value) or entry.zero
-        # the real one keeps its value, returns 0, and shows a dialog on the screen
+        # GXSM keeps the old value, returns 0, and shows a dialog on the screen
         if not entry.low <= value <= entry.high:
             self._dialogs(f"Valid Range of {ref}: {entry.low} to {entry.high}")
             return 0
@@ -107,7 +107,7 @@ class GxsmEntries:
         return -math.inf
 
     def gets(self, ref: str) -> str:
-        """Return the first entry whose name starts with `ref`, as text with its unit."""
+        """Return the first entry whose name starts with `ref`, as text with its unit; "ERROR" if there is none."""
         found = [entry for name, entry in self._entries.items() if name.startswith(ref)]
         if not found:
             return "ERROR"
@@ -133,7 +133,12 @@ class GxsmEntries:
 
 
 def lengths(reach: float, on_change: Callable[[str], Callable[[float], None]]) -> dict[str, GxsmEntry]:
-    """Return the entries of the scan frame that every GXSM has, in ångström, up to `reach` from the centre."""
+    """Return the entries that every GXSM has: scan frame, tip position, `script-control`.
+
+    Args:
+        reach: highest offset from the scanner's centre, in ångström.
+        on_change: returns the callback of an entry.
+    """
 
     def length(ref: str, value: float, low: float, high: float) -> GxsmEntry:
         return GxsmEntry(value, low, high, _ANGSTROM, "{:.1f}", on_change=on_change(ref))

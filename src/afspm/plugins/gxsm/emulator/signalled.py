@@ -45,7 +45,7 @@ def passed_on(memory: mmap.mmap) -> bool:
 
 
 def answered(memory: mmap.mmap) -> None:
-    """Write an answer to the block, its status last."""
+    """Copy an answer from standard input to the block, with the status last."""
     answer = read(struct.unpack(">I", read(4))[0])
     memory[CONTENT : CONTENT + len(answer) - 16] = answer[16:]
     memory[LENGTH : LENGTH + 8] = answer[8:16]
