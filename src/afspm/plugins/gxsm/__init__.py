@@ -6,12 +6,12 @@ values are read back, and states are derived from polls of status bits, line num
 
     inputs        results of calls (`link`: `shared_memory` or `bridge_client`); new files, which appear late, one by
                   one, and half written (`result_files`)
-    state         the running and the ended measurement, rows of GXSM's memory before it (`scan_memory`), the target
+    state         the running and the ended measurement, rows of GXSM's memory before a scan (`scan_memory`), the target
                   position of the tip: all persistent
     outputs       calls; scans and spectra from files; lines of the running scan from memory
-    invariants    one call at a time; a blocking call is never made, as it would block GXSM forever; a scan whose first
-                  or last row still holds the previous scan is not published; a file is read only once it has stopped
-                  growing
+    invariants    one call at a time; no call that waits for the end of a scan, as such a call blocks GXSM forever; a
+                  scan whose first or last row still holds the previous scan is not published; a file is read only once
+                  two polls have found the same size
 """
 
 from __future__ import annotations

@@ -139,7 +139,7 @@ class GxsmActivity(Activity):
 
     Args:
         gxsm: the connection.
-        set_frame: returns the frame of the next scan as it was set, and (rows, columns).
+        set_frame: returns the set frame of the next scan, and (rows, columns).
         kept: persistent, JSON-able: arrival time of the tip.
         shows_s: longest delay until a poll shows a started measurement, experiment time.
     """
@@ -174,7 +174,7 @@ class GxsmActivity(Activity):
     # --- start and stop ---
 
     def start_scan(self) -> None:
-        self._autosave.on = None  # unknown: a person may have switched it at the panel
+        self._autosave.on = None  # unknown: a person may have switched Auto Save at the panel
         self._autosave.switch(on=False)
         self._begin_scan(self._clock.now_ns(), own=True)
         self._scan.y_before = int(self.gxsm.ask.number("y_current"))
@@ -182,7 +182,7 @@ class GxsmActivity(Activity):
         # a scan that is stopped or does not start is recognised by rows that still hold the previous scan
         self._files.looked(looked_at(self.gxsm.ask, len(self._channels()), (0, rows - 1), columns), None)
         self._shows_until_s = self._clock.now_s() + self._shows_s
-        # returns 0 at once, even if no scan starts (no channel set, or one running)
+        # returns 0 at once, even if no scan starts (no channel is set, or a scan is running)
         self.gxsm.ask.call("startscan")
 
     def start_curve(self, kind: str, position_m: tuple[float, float], way_s: float) -> None:
@@ -263,7 +263,7 @@ class GxsmActivity(Activity):
             return self._measuring(doing)
         self._looked_ns = self._clock.now_ns()
         moving = doing.moving or self._way.is_on
-        # the stopped spectrum may not have started yet: the tip is still moving to its place
+        # the spectrum may have been stopped before its start, while the tip was still moving
         if self._stopping and (moving or (self._autosave.on is False and not self._is_settled(now_s))):
             return ScopeStatus(ScopeState.INTERRUPTED)
         self._stopping = False
@@ -296,7 +296,7 @@ class GxsmActivity(Activity):
         # reveal the new scan: a new number in the file names, and lines that start from the beginning.
         before, name = self._scan.name, self.gxsm.ask.text("chfname", 0)
         self._scan.name = name
-        # after saving, GXSM reports the next free number if the first one was taken: no sign of another scan
+        # after saving, GXSM reports the next free number if the first number was taken: no sign of another scan
         is_another = bool(before) and name != before and not self._files.is_written(Path(self._absolute(name)))
         if self._files.is_own:  # Repeat is off: no scan follows by itself
             return is_another
@@ -392,7 +392,7 @@ class GxsmActivity(Activity):
         is_whole = self._is_whole()
         if is_whole and not self._files.is_saved_by_gxsm:
             try:
-                # its return value is the line, not a path; calling it twice would save the scan twice
+                # `autosave` returns the line, not a path; a second call would save the scan again
                 self.gxsm.ask.call("autosave")
             except GxsmError as error:
                 self._log.error("the scan can't be saved: %s", error)
@@ -401,7 +401,7 @@ class GxsmActivity(Activity):
         self._files.end(self._scan.ended_ns, self._clock.now_ns(), channels, folder, is_whole=is_whole)
 
     def _is_whole(self) -> bool | None:
-        # None: the scan followed another one at once, and was seen too late to know the rows of the previous scan.
+        # None: the scan followed another scan at once, and no poll came early enough to read the previous rows.
         before, (_, shape) = self._before(), self._files.scanning
         if before is None and self._seen_last[0] == shape:  # a short scan from the panel
             before = self._seen_last[1]
@@ -413,7 +413,7 @@ class GxsmActivity(Activity):
         return not is_unfinished(before, after)
 
     def _folder(self) -> Path | None:
-        # Before its first scan GXSM reports no folder: it saves to the folder in which it was started.
+        # Before the first scan GXSM reports no folder, and saves to the folder in which it was started.
         if self._saving.scan_dir:
             return self._saving.scan_dir
         channels = self._channels(1)
@@ -422,7 +422,7 @@ class GxsmActivity(Activity):
     def _channels(self, most: int = _CHANNELS) -> list[str]:
         found: list[str] = []
         for channel in range(most):
-            # GXSM has no list of channels: the first number without one is answered with "EE: invalid channel"
+            # GXSM has no list of channels: the first unused number is answered with "EE: invalid channel"
             path = self.gxsm.ask.text("chfname", channel)
             if path.startswith(_NO_CHANNEL):
                 break

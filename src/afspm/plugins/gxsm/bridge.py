@@ -4,7 +4,7 @@ The bridge listens on the loopback interface, and passes on only calls of the fu
 bridge first prove to each other that they know a secret, which is in a file that only this user can read. The secret
 itself is never sent, so a program that listens here in place of the bridge learns nothing (`Introduction`). A line that
 is neither a proof nor a call ends its connection, so that no page in a browser can command GXSM. Several clients are
-served, one call at a time. Set `script-control` to 0 to end the bridge. It needs the standard library only.
+served, one call at a time. Set `script-control` to 0 to end the bridge. This file needs only the standard library.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ HOST, PORT = "127.0.0.1", globals().get("PORT", 65431)  # if in use: choose anot
 SECRET = "~/.afspm/gxsm-bridge-secret"
 FOLDER = globals().get("FOLDER", str(Path.cwd()))
 WELCOME = "afspm bridge 2"
-# waitscan is missing on purpose: it blocks, and wedges Gxsm4 until it is restarted.
+# waitscan is missing on purpose: a call blocks Gxsm4 until a restart.
 METHODS = {
     *("set", "get", "gets", "list_refnames", "list_actions", "action", "rtquery", "y_current"),
     *("startscan", "stopscan", "autosave", "chfname", "moveto_scan_xy"),
@@ -237,7 +237,7 @@ class Bridge:
     def _accept(self) -> None:
         try:
             client = Client(self._listener.accept()[0], self._known, time.monotonic())
-        except OSError:  # the client has disconnected before it was accepted
+        except OSError:  # the client has disconnected before the connection was accepted
             return
         self._clients.append(client)
         self._selector.register(client.connection, client.events, client)

@@ -53,7 +53,7 @@ class BridgeLink:
         return reply["value"]
 
     def working_folder(self) -> Path | None:
-        """Return the folder in which GXSM was started: the folder of its files until the user chooses another."""
+        """Return the folder in which GXSM was started: the folder of its files until the user changes it."""
         return Path(str(self.call("getcwd")))
 
     def _introduce(self) -> None:

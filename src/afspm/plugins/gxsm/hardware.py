@@ -46,7 +46,7 @@ class Doing:
     """The state that GXSM reports.
 
     Attributes:
-        scanning, probing: both True on RPSPMC during either, as its single bit does not distinguish scan and spectrum.
+        scanning, probing: both True on RPSPMC during a scan or a spectrum, as this hardware has one bit for both.
         moving, approaching: always False on RPSPMC, which has no such bits.
     """
 
@@ -63,7 +63,7 @@ class Doing:
 
 
 def recognised(refnames: Collection[str], actions: Collection[str]) -> Hardware:
-    """Return the kind of hardware by the names that its driver adds to GXSM's lists; SRanger if there are none."""
+    """Return the kind of hardware by the names that its driver adds to GXSM's lists; without any, SRanger."""
     if any(name.startswith("dsp-GVP-") for name in refnames) or any(name.startswith("GVP_CMD_") for name in actions):
         return Hardware.RPSPMC
     if any(name.startswith(("sim-", "template-")) for name in refnames):

@@ -88,7 +88,7 @@ def loads(content: bytes) -> object:
 
 
 class _Values:
-    """A converter of stand-ins to arrays; its limit on parts ends the work on a list that contains itself."""
+    """A converter of stand-ins to arrays, with a limit on parts: a list may contain itself."""
 
     def __init__(self) -> None:
         self._left = _MOST_PARTS

@@ -60,7 +60,7 @@ class GxsmFiles(ResultFiles):
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._before: set[int] = set()
         self._whole: dict[Path, FileContent] = {}
-        self._outcome: bool | None = None  # of a measurement directly followed by another one
+        self._outcome: bool | None = None  # of a measurement directly followed by the next
         self.upwards = False
         kept.setdefault("absent", [])
         kept.setdefault("channels", {})
@@ -117,10 +117,10 @@ class GxsmFiles(ResultFiles):
         """Register the start of a measurement. Unread files of the ended measurement are still awaited.
 
         Args:
-            folder: folder of its files; None: unknown yet.
+            folder: folder of the measurement's files; None: unknown yet.
             begun_ns: earliest start; 0: not known, or a spectrum, whose file has no start time.
             taken: settings of the measurement: "frame" and "shape" of a scan, "position" of a spectrum.
-            own: True if started by the translator.
+            own: True if the translator started the measurement.
             by_gxsm: True if GXSM saves by itself: files may appear before the end, and be written again.
         """
         self._hurry(begun_ns / NS_PER_S)

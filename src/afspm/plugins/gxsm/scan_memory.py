@@ -1,7 +1,7 @@
 """GXSM's memory of a scan: lines of the running scan, and the check for completeness.
 
 GXSM keeps the values of the previous scan in rows not yet scanned, and does not mark new rows. A complete scan has
-rewritten the first and the last row of each channel; a stopped one has left at least one of them bit-identical.
+rewritten the first and the last row of each channel; a stopped scan has left at least one of both bit-identical.
 """
 
 from __future__ import annotations

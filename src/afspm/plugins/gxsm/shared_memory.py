@@ -1,4 +1,4 @@
-"""Link to Gxsm4 through the shared memory that it serves to other programs of the same user (Linux).
+"""Link to Gxsm4 through its shared memory for other programs of the same user (Linux).
 
 A call is written into the block and announced by a signal; the answer appears in the block. A caller holds the lock
 that GXSM's own tools also take: two callers at once would receive each other's answers.
@@ -65,7 +65,7 @@ class SharedMemoryLink:
         self._timeout_s = timeout_s
         self._monotonic_s = monotonic_s
         self._where = f"shm:{block}"
-        # waits in polls of the memory: nothing but `close` could wake them
+        # set by `close`, which so ends a wait between two polls of the memory
         self._closed = Event()
         path = _FOLDER / block
         try:
@@ -78,7 +78,7 @@ class SharedMemoryLink:
                 self.close()
             raise
         self._memory = self._mapped(path)
-        # traced in the form of the bridge's calls: one form for both, which can be replayed on any system
+        # traced in the form of the bridge's calls, so that a trace can be replayed on any system
         self._trace = TRACE.connection(TCP)
 
     def _mapped(self, path: Path) -> mmap.mmap:

@@ -43,7 +43,7 @@ class GxsmEmulator(Emulator):
 
     Attributes:
         unanswered: received calls without an answer yet, oldest first.
-        silent: True after a call that blocks GXSM until it is restarted.
+        silent: True after a call that blocks GXSM until a restart.
     """
 
     vendor = "GXSM"
@@ -177,7 +177,7 @@ class GxsmEmulator(Emulator):
                 found = SystemError(str(error)) if self._block is None else error.value
             except (NameError, SystemError) as error:  # errors of the real module, for the script
                 found = error
-            except Exception as error:  # an error of the emulator must not end it: the script sees one, too
+            except Exception as error:  # the emulator must survive its own errors: the script gets them
                 self.log.exception("%s failed", call.method)
                 found = SystemError(str(error))
             call.answered(found)

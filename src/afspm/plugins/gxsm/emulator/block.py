@@ -31,7 +31,7 @@ _NO_SUCH_FUNCTION, _NOT_PASSED_ON = -4, -1
 
 
 class SharedMemoryBlock:
-    """The shared memory and the process that serves it. Call `take` when `fileno` is readable.
+    """The shared memory with its serving process. Call `take` when `fileno` is readable.
 
     Args:
         name: name of the memory.
@@ -141,7 +141,7 @@ class SharedMemoryBlock:
 
 
 class _MaliciousPickle:
-    """An object whose pickle creates a folder `evil` when an unrestricted unpickler loads it."""
+    """An object whose pickle makes an unrestricted unpickler create a folder `evil`."""
 
     def __reduce__(self) -> tuple[object, ...]:
         return os.mkdir, ("evil",)

@@ -64,7 +64,7 @@ class NoAnswer(Exception):
 
 
 class WrongArguments(SystemError):
-    """The error that the number of arguments is wrong, or that they can't be converted to C types.
+    """The error that a call has a wrong number of arguments, or arguments that can't be converted to C types.
 
     Attributes:
         value: result that Gxsm4 returns instead through its shared memory.

@@ -94,7 +94,7 @@ class ScriptConsole:
         """Return the address at which the script listens; None until the script has printed the address.
 
         Raises:
-            the exception that ended the script before it listened.
+            the exception that ended the script before the script had printed its address.
         """
         return self._address.result() if self._address.done() else None
 

@@ -71,7 +71,7 @@ class GxsmPanel:
     Attributes:
         auto_save, probe_auto_save: automatic saving of scans, of spectra.
         repeats: True if each complete scan is followed by another scan.
-        behind_s: lag of the clock of GXSM's computer, whose times are in files; it may be set at any time.
+        behind_s: lag of the clock of GXSM's computer, whose times are in files; that clock may be set at any time.
     """
 
     auto_save: bool

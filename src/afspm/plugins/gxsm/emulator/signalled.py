@@ -1,11 +1,12 @@
-"""Owner process of Gxsm4's shared memory: it receives the signals, and passes calls to the emulator.
+"""Owner process of Gxsm4's shared memory, which receives the signals and passes calls to the emulator.
 
-`block.py` starts this file as a separate script, with the name of the block and of the process; it ends when standard
-input ends. Frames have a length and a content. Calls go to standard output: the function's name in 64 bytes, and the
-pickled arguments. Answers come from standard input: a status of 8 bytes, a length of 8 bytes, and the pickled result.
+`block.py` starts this file as a separate script, with the name of the block and of the process; the process ends when
+standard input ends. Frames have a length and a content. Calls go to standard output: the function's name in 64 bytes,
+and the pickled arguments. Answers come from standard input: a status of 8 bytes, a length of 8 bytes, and the pickled
+result.
 
-An existing block is reused unchanged, with an unanswered request in it. One call is passed on at a time: a request that
-overwrites another one receives the answer to the earlier one.
+An existing block is reused unchanged, even with an unanswered request. One call is passed on at a time: a request that
+overwrites an earlier request receives the answer to the earlier request.
 """
 
 from __future__ import annotations
