@@ -57,7 +57,7 @@ class LineWatch:
     step: int = 0
 
     def turned(self, line: int, rows: int) -> bool:
-        """Register a line; return True if it reverses the direction."""
+        """Register a reported line; return True if this line reverses the direction."""
         # Gxsm4's simulator reports line -296 at the start of its first scan
         if line == self.line or not 0 <= line < rows:
             return False
@@ -96,7 +96,7 @@ class ScanProgress:
 
 @dataclass(frozen=True)
 class ConnectedGxsm:
-    """A connected GXSM.
+    """A connected GXSM: link, kind of hardware, frame.
 
     Attributes:
         ask: link with type-checked answers.
@@ -118,7 +118,7 @@ class ConnectedGxsm:
 
 
 class AutosaveSwitch:
-    """GXSM's Auto Save: on for scans from its panel, off for the translator's own scans.
+    """The switch of GXSM's Auto Save: on for scans from the panel, off for the translator's own scans.
 
     Attributes:
         on: state set by this translator; None: unknown.
@@ -139,9 +139,11 @@ class GxsmActivity(Activity):
 
     Args:
         gxsm: the connection.
+        files: the files of measurements.
         set_frame: returns the set frame of the next scan, and (rows, columns).
         kept: persistent, JSON-able: arrival time of the tip.
         shows_s: longest delay until a poll shows a started measurement, experiment time.
+        saving: folders, and the use of Auto Save.
     """
 
     program: ClassVar[str] = "GXSM"

@@ -52,6 +52,7 @@ def secret() -> bytes:
     path = Path(SECRET).expanduser()
     path.parent.mkdir(mode=0o700, exist_ok=True)
     if not path.exists():
+        # created with its final mode, so that other users can't read the file at any moment
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
             file.write(secrets.token_hex(32).encode())
     if os.name == "posix" and path.stat().st_mode & 0o077:
@@ -106,7 +107,7 @@ class Introduction:
 
 
 def parsed(line: bytes):  # type: ignore[no-untyped-def]
-    """Parse a call, ["method", arguments…] in JSON; return None for anything else."""
+    """Parse a call in JSON, ["method", arguments…] with texts and numbers; return None for anything else."""
     try:
         call = json.loads(line)
     except (ValueError, RecursionError):
@@ -116,7 +117,7 @@ def parsed(line: bytes):  # type: ignore[no-untyped-def]
 
 
 def answer(method, arguments) -> str:  # type: ignore[no-untyped-def]
-    """Execute a call; return its value or error as JSON."""
+    """Execute a call; return the value or the error as JSON."""
     try:
         if method == "getcwd":
             return json.dumps({"value": FOLDER})
@@ -130,7 +131,7 @@ def answer(method, arguments) -> str:  # type: ignore[no-untyped-def]
 
 
 def wanted() -> bool:
-    """Return True while the script should run."""
+    """Return True while `script-control` is set, so that the script has to run."""
     return gxsm is not None and gxsm.get("script-control") > 0.5
 
 
@@ -139,7 +140,7 @@ class Client:
 
     Attributes:
         until_s: deadline for the proof, later for receiving an answer.
-        active_s: time of the last received bytes.
+        active_s: time of the last received bytes, at first of the connection.
         is_open: False once the connection has to end.
     """
 

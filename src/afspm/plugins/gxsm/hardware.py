@@ -17,7 +17,7 @@ AUTOSAVE: Final = {True: "CHECK-MainAutoSave", False: "UNCHECK-MainAutoSave"}
 """Actions that switch Auto Save on (True) and off (False)."""
 REPEAT_OFF: Final = "UNCHECK-SCAN-REPEAT"
 _MODES: Final = {"force": "FZ"}  # other kinds have GXSM's own names
-_MOST_BITS: Final = 1 << 24
+_MOST_BITS: Final = 1 << 24  # larger and fractional numbers come from GXSM's uninitialised memory
 
 
 class Hardware(Enum):

@@ -1,4 +1,4 @@
-"""The GXSM process that receives signals. A signal would end a wrong process. Linux only."""
+"""The GXSM process that receives SIGUSR1. This signal would end most other processes. Linux only."""
 
 from __future__ import annotations
 

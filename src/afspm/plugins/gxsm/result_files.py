@@ -30,7 +30,7 @@ _PRECISION: Final = FilePrecision(part=1e-5, angle_rad=1e-6)
 _CLOCK_NS: Final = 2 * NS_PER_S
 """Resolution of the start times in files, which have whole seconds, with a margin."""
 LATE_S: Final = 20.0
-"""Longest difference between the start delays of two scans: from the request to the start time in the file."""
+"""Longest difference between the start delays of two scans; a start delay ends at the start time in the file."""
 SOON_S: Final = 1.0
 """Longest wait for the file of a channel that the previous scan did not save either; measured: up to 0.3 s."""
 
@@ -84,7 +84,7 @@ class GxsmFiles(ResultFiles):
 
     @property
     def before(self) -> tuple[Rows, int | None] | None:
-        """Rows that GXSM's memory held before the running scan, and the scan's line at the time of reading.
+        """Digests of rows in GXSM's memory before the running scan, and the scan's line at the time of reading.
 
         The line is None if the scan had not started. None: no rows were read.
         """

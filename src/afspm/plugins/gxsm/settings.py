@@ -115,7 +115,8 @@ class FrameSettings(SettingsGroup):
     """The frame of the next scan, as a group of settings.
 
     Args:
-        is_led: True if a change of the frame moves the tip, which GXSM does not report as a move.
+        tip: receives the length of each move of the tip with the frame.
+        is_led: True if the tip follows a change of the frame, and GXSM does not report this move.
     """
 
     names = FRAME

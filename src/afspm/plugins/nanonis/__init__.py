@@ -10,8 +10,8 @@ sends nothing unrequested.
                   (`result_files`, `activity`); the target of the tip, not persistent (`geometry`)
     outputs       requests; scans and spectra from files (`result_files`), or from Nanonis' memory (`fetched`)
     invariants    a reply that does not fit its request ends the connection; a value of a getter is converted before
-                  it goes into a setter, since both count differently; a scan that no poll has shown running is
-                  published only from a file, because Nanonis' memory may still hold the previous scan
+                  it goes into a setter, since both count differently; a scan that Nanonis never reported as running
+                  is published only from a file, because Nanonis' memory may still hold the previous scan
 """
 
 from __future__ import annotations
@@ -247,7 +247,7 @@ class Nanonis(Driver):
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
-        """Switch the z controller on, which also ends a withdrawal by `x-retract` or the safe tip."""
+        """Switch the z controller on; this also brings back a tip withdrawn by `x-retract` or the safe tip."""
         on = 1
         self._ask("ZCtrl.OnOffSet", on)
 

@@ -63,14 +63,14 @@ class NanonisFiles(ResultFiles):
 
     @property
     def was_seen(self) -> bool:
-        """True if `seen` was called for the running scan; before that, Nanonis' memory may hold the previous scan.
+        """True if Nanonis has reported the present scan as running; before, its memory may hold the previous scan.
 
         Always True during a spectrum, False without a measurement.
         """
         return self._kept["running"] is not None and bool(self._kept["running"].get("seen", True))
 
     def seen(self) -> None:
-        """Record that a poll has shown the measurement running."""
+        """Record that Nanonis has reported the measurement as running."""
         if self._kept["running"] is not None:
             self._kept["running"]["seen"] = True
 

@@ -67,7 +67,7 @@ class Link:
 
 
 class Session:
-    """Two verified connections to Nanonis, with the modules for spectra and approach open.
+    """Two connections to the same Nanonis, with the modules for spectra and approach open.
 
     Args:
         driver: driver that uses the connections.

@@ -25,7 +25,8 @@ class GxsmEntry:
     """An entry of GXSM's panel.
 
     Attributes:
-        value: lengths in ångström, independent of the panel's unit.
+        value: present value; lengths in ångström, independent of the panel's unit.
+        low, high: limits of accepted values, in the unit of `value`.
         unit: unit that `gets` shows, replaced by the user's unit for lengths.
         shown: format of the number in `gets`.
         zero: value that replaces 0.
@@ -70,11 +71,11 @@ class GxsmEntries:
         return ref in self._entries
 
     def __getitem__(self, ref: str) -> float:
-        """Return a value, lengths in ångström."""
+        """Return the value of an entry; lengths are in ångström."""
         return self._entries[ref].value
 
     def put(self, ref: str, value: float) -> None:
-        """Set an entry without checks or side effects, lengths in ångström."""
+        """Set an entry without checks or side effects; lengths are in ångström."""
         self._entries[ref].value = value
 
     def set(self, ref: str, text: str) -> int:

@@ -1,4 +1,4 @@
-"""Writing of GXSM's files: late, one after the other, in two parts, and numbered."""
+"""Writing of GXSM's files, which have numbers and appear late, one after the other, and in two parts."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ CHANNELS: Final = {
 
 @dataclass(frozen=True)
 class GxsmScanFile:
-    """One channel of a scan.
+    """The content of the file of one channel of a scan.
 
     Attributes:
         raw: stored values, rows from the top; multiplied by `dz`, they are in `unit`.
@@ -233,7 +233,7 @@ def _describe(node: h5py.Dataset, **attributes: str) -> None:
 
 @dataclass(frozen=True)
 class GxsmSpectrumFile:
-    """A spectrum.
+    """The content of a spectrum's file.
 
     Attributes:
         columns: values by label with unit; the swept column comes first.

@@ -47,7 +47,7 @@ _MIXERS: Final = {
     "current": ("dsp-fbs-mx0-current-set", "nA", 1e-9),
     "frequency-shift": ("dsp-fbs-mx1-freq-set", "Hz", 1.0),
 }
-"""By the mode of the feedback: entry of the setpoint, unit, and SI value of this unit."""
+"""Entry of the setpoint, unit, and SI value of this unit, by the mode of the feedback."""
 _COLUMNS: Final = {"Bias": "Bias-mon", "Z": "Z-mon", "Current": "CurrentSim1"}
 
 
@@ -116,7 +116,7 @@ class GxsmProgram:
     """The emulated GXSM without its transports: panel, measurements and files.
 
     Attributes:
-        panel: switches of its panel.
+        panel: switches of GXSM's panel.
         channels: channels that a scan records.
         dialogs: texts of dialogs on the screen.
         scan: the last started scan.
@@ -306,7 +306,7 @@ class GxsmProgram:
         return f"./{path.name}" if path.parent == self.folder else str(path)
 
     def image(self, channel: GxsmChannel) -> np.ndarray:
-        """Return a channel of GXSM's memory: rows not yet scanned hold the previous scan."""
+        """Return a channel of GXSM's memory as stored values; rows not yet scanned hold the previous scan."""
         if self.scan.activity is None or channel not in self.scan.memory:
             return np.zeros((0, 0), np.float32)
         now_s = self.clock.now_s()

@@ -35,7 +35,7 @@ def read(count: int) -> bytes:
 
 
 def passed_on(memory: mmap.mmap) -> bool:
-    """Pass on a request; return False if there is none."""
+    """Pass on the request in the block to the emulator; return False without a request."""
     if struct.unpack_from("<q", memory, STATUS)[0] != 1:
         return False
     length = struct.unpack_from("<I", memory, LENGTH)[0]

@@ -20,7 +20,7 @@ from afspm.simulation.emulation.tcp_server import ClientConnection, TcpServer
 from afspm.simulation.instrument import InstrumentBusy
 
 RELEASES: Final = {"2021": 10862, "2022": 11798, "2023": 13742, "2024": 14429, "2025": 14573}
-"""By the year of the software: the first release with this version of the protocol."""
+"""The first release with each version of the protocol, by the year of the software."""
 _ACTS: Final = ("Start", "Action", "Set", "Pulse", "Withdraw", "StartMove", "Home")
 _LOGS_EVERY_S: Final = 0.005
 """Real time between two polls of the TCP Logger."""

@@ -51,7 +51,7 @@ Handler = Callable[..., Answer]
 
 
 def answers(*names: str) -> Callable[[Handler], Handler]:
-    """Mark a method as the handler of functions; its parameter `name` receives the called function's name."""
+    """Mark a method as the handler of functions. An optional parameter `name` receives the function's name."""
 
     def marked(handler: Handler) -> Handler:
         handler.answered_functions = names  # type: ignore[attr-defined]

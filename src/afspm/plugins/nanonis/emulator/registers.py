@@ -55,7 +55,7 @@ _OTHER_NAMES: Final = {"AtomTrack.StatusGet": "AtomTrack.Ctrl"}
 
 
 class Registers:
-    """Stored values by the name of their function without `…Set`, and by item (number of a modulator, an output …)."""
+    """Values set by clients, by function name without the suffix "Set" and by item (number of a modulator …)."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple[str, Values], Values] = {}

@@ -126,8 +126,8 @@ class ScanModule:
 
     Attributes:
         frame: x, y, width, height in m, angle clockwise in degrees.
-        speed: forward and backward speed in m/s; forward and backward time in s per line; 1 if the time is kept
-            instead of the speed; speed ratio.
+        speed: forward and backward speed in m/s; forward and backward time per line in s; 1 if a change of the frame
+            keeps the times, 0 if it keeps the speeds; ratio of the speeds.
         running: the running scan; None without a scan.
         last: the last started scan; None before the first.
         ends: number of ended scans, completed or stopped.

@@ -28,8 +28,8 @@ class SweepSettings:
 
     Attributes:
         points: number of points; None: as in the simulated spectrum.
-        limits: first and last value of the sweep; None: the limits of the simulated spectrum. Beyond these, its
-            outermost values continue.
+        limits: first and last value of the sweep; None: the limits of the simulated spectrum. Beyond the limits of
+            the simulated spectrum, its outermost values continue.
         sweeps: number of averaged sweeps.
         channels: indexes of recorded signals; None: all signals of the simulated spectrum.
         backward: True if the spectrum is also swept backwards.
