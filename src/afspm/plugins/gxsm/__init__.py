@@ -1,17 +1,17 @@
 """Driver of GXSM 3 and 4, over Gxsm4's shared memory or a script in its console. See the README in this folder.
 
-**Theory of operation.** GXSM reports no errors, no events, and no end of a measurement: `set` and `action` return 0 for
-anything. So names are checked against GXSM's own lists at the start, values are read back, and states are derived from
-polls of status bits, line numbers and file names (`activity`).
+**Theory of operation.** GXSM reports no events and no end of a measurement, and hides most errors: `set` and `action`
+return no error for an unknown name or a refused value. So names are checked against GXSM's own lists at the start,
+values are read back, and states are derived from polls of status bits, line numbers and file names (`activity`).
 
     inputs        results of calls (`link`: `shared_memory` or `bridge_client`); new files, which appear late, one by
                   one, and half written (`result_files`)
-    state         the running and the ended measurement, rows of GXSM's memory before it (`scan_memory`), the target
+    state         the running and the ended measurement, rows of GXSM's memory before a scan (`scan_memory`), the target
                   position of the tip: all persistent
     outputs       calls; scans and spectra from files; lines of the running scan from memory
-    invariants    one call at a time; a blocking call is never made, as it would block GXSM forever; a scan whose first
-                  or last row still holds the previous scan is not published; a file is read only once it has stopped
-                  growing
+    invariants    one call at a time; no call that waits for the end of a scan, as such a call blocks GXSM forever; a
+                  scan whose first or last row still holds the previous scan is not published; a file is read only once
+                  two polls have found the same size
 """
 
 from __future__ import annotations
@@ -62,16 +62,17 @@ _SAVERS: Final = ("afspm", "gxsm")
 
 
 class Gxsm(Driver):
-    """The microscope behind GXSM.
+    """The driver of a microscope that GXSM controls.
 
     Args:
         address: "HOST:PORT" of `bridge.py` in GXSM's console; "shm" for the shared memory of a Gxsm4 on this computer,
             "shm:BLOCK@PROCESS" if the block or the process has another name.
-        saving: "afspm": Auto Save is off during this translator's scans, which are saved once at their end, and on at
-            other times. "gxsm": Auto Save is left on.
+        saving: "afspm": Auto Save is off during this translator's scans, and on at other times; a complete scan is
+            saved once, at its end. "gxsm": the driver does not switch Auto Save, which must be on.
         hardware: "SRanger", "RPSPMC" or "simulator", if detection is wrong.
-        scan_dir, probe_dir: folders of scans and spectra, if not the folder that GXSM reports for channels.
-        feedback_actions: names of the actions that switch the feedback on and off, if the hardware has them.
+        scan_dir: folder of scans. Default: the folder that GXSM reports for channels.
+        probe_dir: folder of spectra. Default: the folder of scans.
+        feedback_actions: names of the actions that switch the feedback on and off, in this order.
         secret_file: a copy of the bridge's `~/.afspm/gxsm-bridge-secret`, if GXSM runs on another computer.
         reply_timeout_s: longest wait for a reply, real time.
         common: settings of every driver.
@@ -121,7 +122,7 @@ class Gxsm(Driver):
 
     @classmethod
     def excused(cls, controller: str) -> Mapping[str, str]:
-        """Return the conformance checks that GXSM's own simulator fails, with the reason."""
+        """Return the conformance checks that GXSM's own simulator fails, with the reason; empty for real hardware."""
         if not controller.endswith(f"({Hardware.SIMULATOR.value})"):
             return {}
         return {
@@ -129,12 +130,12 @@ class Gxsm(Driver):
         }
 
     def connect(self) -> None:
-        """Open the link, and detect the hardware, the unit of lengths and the way of saving."""
+        """Open the link; detect the hardware, the panel's unit of lengths, and whether Auto Save can be switched."""
         self.close()
         address = Address.parse(self.controller_at)
         ask = self._asking = Asking(self._open(address, monotonic_s=self.clock.monotonic_s))
         self.prove()
-        # the only way to know: neither `set`, `get` nor `action` reports an unknown name
+        # the lists are the only proof that a name exists: neither `set`, `get` nor `action` reports an unknown name
         refnames, actions = ask.names("list_refnames"), ask.names("list_actions")
         missing = [ref for ref in REFNAMES if ref not in refnames]
         if missing:
@@ -257,7 +258,7 @@ class Gxsm(Driver):
             return ()
         done = self._activity.lines_done()
         found = new_lines(self._ask, endings, self._files.channels, self._files.scanning, start, done)
-        # a stopped scan reports its last line, as if all were complete
+        # after a stop GXSM reports the frame's last line, as if all lines were complete
         return found if self._activity.gxsm.doing().measuring else ()
 
     # --- actions ---
@@ -265,7 +266,7 @@ class Gxsm(Driver):
     @action(names.START_SCAN)
     def start_scan(self) -> None:
         """Scan the frame once, with the channels and direction set on GXSM's panel."""
-        # a repeated scan never ends
+        # with Repeat on, the scan would never end
         if REPEAT_OFF in self._offered.actions:
             self._ask.call("action", REPEAT_OFF)
         self._activity.start_scan()

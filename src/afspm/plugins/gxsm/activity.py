@@ -1,4 +1,4 @@
-"""State of GXSM, by polling: GXSM reports neither the start nor the end of a measurement."""
+"""State of GXSM, derived from polls: GXSM reports neither the start nor the end of a measurement."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from afspm.translator.result_files import SCAN, as_list
 from afspm.translator.state import Kept
 
 SETTLES_S: Final = 0.3
-"""GXSM's own work after the end of a scan; a file saved earlier has no end time."""
+"""Duration of GXSM's own work after the end of a scan; a file saved earlier has no end time."""
 SHOWS_S: Final = 1.0
 """Longest delay until a started measurement shows in the status bits; measured: up to 0.3 s."""
 _CHANNELS: Final = 40
@@ -33,9 +33,10 @@ class Saving:
     """The way of saving scans and spectra.
 
     Attributes:
-        by_us: True if the translator triggers the saving of its own scans. GXSM saves all others by itself.
-        scan_dir, probe_dir: folders of scans and spectra, if not the folder that GXSM reports for channels.
-        switches_autosave: True if Auto Save is switched off during the translator's own scans.
+        by_us: True if the translator triggers the saving of its own scans. GXSM saves all other scans by itself.
+        scan_dir: folder of scans; None: the folder that GXSM reports for channels.
+        probe_dir: folder of spectra; None: the folder of scans.
+        switches_autosave: True if the translator switches Auto Save: off for its own scans, on at other times.
     """
 
     by_us: bool
@@ -56,7 +57,7 @@ class LineWatch:
     step: int = 0
 
     def turned(self, line: int, rows: int) -> bool:
-        """Register a line; return True if it reverses the direction."""
+        """Register a reported line; return True if this line reverses the direction."""
         # Gxsm4's simulator reports line -296 at the start of its first scan
         if line == self.line or not 0 <= line < rows:
             return False
@@ -73,13 +74,13 @@ class ScanProgress:
     """The observed progress of the running scan.
 
     Attributes:
-        endings: endings of its channels' file names.
-        name: name of its first file, whose number rises with each scan; empty before the first poll.
-        watch: direction of its lines; None before the first poll.
+        endings: endings of the channels' file names; empty before the lines are read for the first time.
+        name: path of the first channel's file, whose number rises with each scan; empty before the first poll.
+        watch: direction of the lines; None before the first poll.
         goes_up: True if the top row of the picture is scanned last; None: unknown.
         settles_until_s, ended_ns: end of GXSM's own work after the scan, and end of the scan.
         y_before, y_moved: last line of the previous scan, and whether GXSM has reported another line since.
-        follows: True if it started before the end of the previous scan was observed.
+        follows: True if the scan started before a poll showed the end of the previous scan.
     """
 
     endings: list[str] = field(default_factory=list)
@@ -95,11 +96,11 @@ class ScanProgress:
 
 @dataclass(frozen=True)
 class ConnectedGxsm:
-    """A connected GXSM.
+    """A connected GXSM: link, kind of hardware, frame.
 
     Attributes:
-        ask: calls its functions.
-        hardware: kind of its driver, which defines the meaning of the status bits.
+        ask: link with type-checked answers.
+        hardware: kind of hardware driver, which defines the meaning of the status bits.
         frame: frame of the next scan.
     """
 
@@ -111,13 +112,13 @@ class ConnectedGxsm:
         """Return the state that GXSM reports.
 
         Raises:
-            BadReply: the value is no set of bits.
+            BadReply: the value is not a set of bits.
         """
         return decoded(self.hardware, self.ask.numbers("rtquery", STATUS))
 
 
 class AutosaveSwitch:
-    """GXSM's Auto Save: on for scans from its panel, off for the translator's own scans.
+    """The switch of GXSM's Auto Save: on for scans from the panel, off for the translator's own scans.
 
     Attributes:
         on: state set by this translator; None: unknown.
@@ -138,9 +139,11 @@ class GxsmActivity(Activity):
 
     Args:
         gxsm: the connection.
-        set_frame: returns the frame of the next scan as it was set, and (rows, columns).
+        files: the files of measurements.
+        set_frame: returns the set frame of the next scan, and (rows, columns).
         kept: persistent, JSON-able: arrival time of the tip.
-        shows_s: longest delay until a started measurement is seen running, experiment time.
+        shows_s: longest delay until a poll shows a started measurement, experiment time.
+        saving: folders, and the use of Auto Save.
     """
 
     program: ClassVar[str] = "GXSM"
@@ -173,7 +176,7 @@ class GxsmActivity(Activity):
     # --- start and stop ---
 
     def start_scan(self) -> None:
-        self._autosave.on = None  # unknown: a person may have switched it at the panel
+        self._autosave.on = None  # unknown: a person may have switched Auto Save at the panel
         self._autosave.switch(on=False)
         self._begin_scan(self._clock.now_ns(), own=True)
         self._scan.y_before = int(self.gxsm.ask.number("y_current"))
@@ -181,17 +184,18 @@ class GxsmActivity(Activity):
         # a scan that is stopped or does not start is recognised by rows that still hold the previous scan
         self._files.looked(looked_at(self.gxsm.ask, len(self._channels()), (0, rows - 1), columns), None)
         self._shows_until_s = self._clock.now_s() + self._shows_s
-        # returns 0 at once, even if no scan starts (no channel set, or one running)
+        # returns 0 at once, even if no scan starts (no channel is set, or a scan is running)
         self.gxsm.ask.call("startscan")
 
     def start_curve(self, kind: str, position_m: tuple[float, float], way_s: float) -> None:
-        """Move the tip, then take a spectrum.
+        """Start to move the tip; `status` starts the spectrum once the tip has arrived.
 
         Args:
+            position_m: (x, y).
             way_s: longest duration of the move, experiment time.
 
         Raises:
-            Refused: the position is out of the tip's reach.
+            Refused: the position is outside the scan frame.
         """
         self.gxsm.frame.move_tip(position_m)
         self.sets_out(way_s)
@@ -203,7 +207,7 @@ class GxsmActivity(Activity):
         self.stopped()
 
     def stop_curve(self) -> None:
-        """Stop the spectrum, or the move before it."""
+        """Stop the spectrum; before its start, cancel the spectrum and let the tip finish its move."""
         if not self.curve_awaited:
             self.gxsm.ask.call("action", ABORT)
         self.stopped()
@@ -213,7 +217,11 @@ class GxsmActivity(Activity):
         self._way.sets_out(way_s, after_last_way=True)
 
     def next_change_s(self) -> float | None:
-        """Return the time of the next expected change: arrival, visible start, end of settling, or missing files."""
+        """Return the time of the next expected change, in experiment time; None: no change is expected.
+
+        Changes are the arrival of the tip, the deadline of a visible start, the end of settling, and the deadline of
+        awaited files.
+        """
         now_s = self._clock.now_s()
         times = (self._way.arrives_s, self._shows_until_s, self._scan.settles_until_s, self._files.next_s() or 0.0)
         return min((at_s for at_s in times if at_s > now_s), default=None)
@@ -223,7 +231,7 @@ class GxsmActivity(Activity):
     def endings(self) -> list[str]:
         """Return the endings of the running scan's file names.
 
-        Empty before the scan is seen running: GXSM still reports the names of the previous scan.
+        Empty until a poll shows the scan: up to then, GXSM still reports the names of the previous scan.
         """
         if self._files.what != SCAN or self._shows_until_s > 0.0:
             return []
@@ -232,7 +240,10 @@ class GxsmActivity(Activity):
         return self._scan.endings
 
     def lines_done(self) -> int:
-        """Return the number of complete lines of the running scan."""
+        """Return the index of GXSM's current line: at least as many lines of the running scan are complete.
+
+        0 until GXSM reports another line than the previous scan's last.
+        """
         y = int(self.gxsm.ask.number("y_current"))
         if self._scan.y_before is None:
             self._scan.y_before = y
@@ -240,7 +251,7 @@ class GxsmActivity(Activity):
         return y if self._scan.y_moved else 0
 
     def status(self) -> ScopeStatus:
-        """Return the present state; register measurements that have ended, whose files are then awaited."""
+        """Return the present state; register starts and ends of measurements, and start an awaited spectrum."""
         doing, now_s = self.gxsm.doing(), self._clock.now_s()
         # RPSPMC has one bit for scans, spectra and its own vector programs, which also move the tip
         led = self.gxsm.hardware is Hardware.RPSPMC and self._way.is_on
@@ -254,7 +265,7 @@ class GxsmActivity(Activity):
             return self._measuring(doing)
         self._looked_ns = self._clock.now_ns()
         moving = doing.moving or self._way.is_on
-        # the stopped spectrum may not have started yet: the tip is still moving to its place
+        # the spectrum may have been stopped before its start, while the tip was still moving
         if self._stopping and (moving or (self._autosave.on is False and not self._is_settled(now_s))):
             return ScopeStatus(ScopeState.INTERRUPTED)
         self._stopping = False
@@ -283,11 +294,11 @@ class GxsmActivity(Activity):
         return ScopeStatus(ScopeState.SPEC if curve else ScopeState.SCANNING, doing.paused or None)
 
     def _is_another(self) -> bool:
-        # A repeated scan starts sooner than the next poll, so its predecessor is never seen to end. Two facts reveal
-        # it: a new number in the file names, and lines that start from the beginning.
+        # A repeated scan starts sooner than the next poll, so no poll shows the end of its predecessor. Two facts
+        # reveal the new scan: a new number in the file names, and lines that start from the beginning.
         before, name = self._scan.name, self.gxsm.ask.text("chfname", 0)
         self._scan.name = name
-        # after saving, GXSM reports the next free number if the first one was taken: no sign of another scan
+        # after saving, GXSM reports the next free number if the first number was taken: no sign of another scan
         is_another = bool(before) and name != before and not self._files.is_written(Path(self._absolute(name)))
         if self._files.is_own:  # Repeat is off: no scan follows by itself
             return is_another
@@ -312,7 +323,7 @@ class GxsmActivity(Activity):
         self._seen_last = (0, 0), None
 
     def _look_at_memory(self) -> None:
-        # Not near the last row: GXSM may have scanned it already, and overwritten the previous scan there.
+        # Near its last row the scan may already have overwritten the previous scan there: no comparison is possible.
         rows, columns = self._files.scanning[1]
         found = looked_at(self.gxsm.ask, len(self._channels()), (0, rows - 1), columns)
         line = int(self.gxsm.ask.number("y_current"))
@@ -383,7 +394,7 @@ class GxsmActivity(Activity):
         is_whole = self._is_whole()
         if is_whole and not self._files.is_saved_by_gxsm:
             try:
-                # its return value is the line, not a path; calling it twice would save the scan twice
+                # `autosave` returns the line, not a path; a second call would save the scan again
                 self.gxsm.ask.call("autosave")
             except GxsmError as error:
                 self._log.error("the scan can't be saved: %s", error)
@@ -392,7 +403,7 @@ class GxsmActivity(Activity):
         self._files.end(self._scan.ended_ns, self._clock.now_ns(), channels, folder, is_whole=is_whole)
 
     def _is_whole(self) -> bool | None:
-        # None: the scan followed another one at once, and was seen too late to know the rows of the previous scan.
+        # None: the scan followed another scan at once, and no poll came early enough to read the previous rows.
         before, (_, shape) = self._before(), self._files.scanning
         if before is None and self._seen_last[0] == shape:  # a short scan from the panel
             before = self._seen_last[1]
@@ -404,7 +415,7 @@ class GxsmActivity(Activity):
         return not is_unfinished(before, after)
 
     def _folder(self) -> Path | None:
-        # Before its first scan GXSM reports no folder: it saves to the folder in which it was started.
+        # Before the first scan GXSM reports no folder, and saves to the folder in which it was started.
         if self._saving.scan_dir:
             return self._saving.scan_dir
         channels = self._channels(1)
@@ -413,7 +424,7 @@ class GxsmActivity(Activity):
     def _channels(self, most: int = _CHANNELS) -> list[str]:
         found: list[str] = []
         for channel in range(most):
-            # GXSM has no list of channels: the first number without one is answered with "EE: invalid channel"
+            # GXSM has no list of channels: the first unused number is answered with "EE: invalid channel"
             path = self.gxsm.ask.text("chfname", channel)
             if path.startswith(_NO_CHANNEL):
                 break

@@ -4,7 +4,7 @@ The bridge listens on the loopback interface, and passes on only calls of the fu
 bridge first prove to each other that they know a secret, which is in a file that only this user can read. The secret
 itself is never sent, so a program that listens here in place of the bridge learns nothing (`Introduction`). A line that
 is neither a proof nor a call ends its connection, so that no page in a browser can command GXSM. Several clients are
-served, one call at a time. Set `script-control` to 0 to end the bridge. It needs the standard library only.
+served, one call at a time. Set `script-control` to 0 to end the bridge. This file needs only the standard library.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ HOST, PORT = "127.0.0.1", globals().get("PORT", 65431)  # if in use: choose anot
 SECRET = "~/.afspm/gxsm-bridge-secret"
 FOLDER = globals().get("FOLDER", str(Path.cwd()))
 WELCOME = "afspm bridge 2"
-# waitscan is missing on purpose: it blocks, and wedges Gxsm4 until it is restarted.
+# waitscan is missing on purpose: a call blocks Gxsm4 until a restart.
 METHODS = {
     *("set", "get", "gets", "list_refnames", "list_actions", "action", "rtquery", "y_current"),
     *("startscan", "stopscan", "autosave", "chfname", "moveto_scan_xy"),
@@ -44,10 +44,15 @@ def packed(value):  # type: ignore[no-untyped-def]
 
 
 def secret() -> bytes:
-    """Return the secret; create it at the first run."""
+    """Return the secret; create its file at the first run.
+
+    Raises:
+        PermissionError: other users can read the file. ValueError: the file is damaged.
+    """
     path = Path(SECRET).expanduser()
     path.parent.mkdir(mode=0o700, exist_ok=True)
     if not path.exists():
+        # created with its final mode, so that other users can't read the file at any moment
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
             file.write(secrets.token_hex(32).encode())
     if os.name == "posix" and path.stat().st_mode & 0o077:
@@ -102,7 +107,7 @@ class Introduction:
 
 
 def parsed(line: bytes):  # type: ignore[no-untyped-def]
-    """Parse a call, ["method", arguments…] in JSON; return None for anything else."""
+    """Parse a call in JSON, ["method", arguments…] with texts and numbers; return None for anything else."""
     try:
         call = json.loads(line)
     except (ValueError, RecursionError):
@@ -112,7 +117,7 @@ def parsed(line: bytes):  # type: ignore[no-untyped-def]
 
 
 def answer(method, arguments) -> str:  # type: ignore[no-untyped-def]
-    """Execute a call; return its value or error as JSON."""
+    """Execute a call; return the value or the error as JSON."""
     try:
         if method == "getcwd":
             return json.dumps({"value": FOLDER})
@@ -126,7 +131,7 @@ def answer(method, arguments) -> str:  # type: ignore[no-untyped-def]
 
 
 def wanted() -> bool:
-    """Return True while the script should run."""
+    """Return True while `script-control` is set, so that the script has to run."""
     return gxsm is not None and gxsm.get("script-control") > 0.5
 
 
@@ -135,7 +140,7 @@ class Client:
 
     Attributes:
         until_s: deadline for the proof, later for receiving an answer.
-        active_s: time of the last received bytes.
+        active_s: time of the last received bytes, at first of the connection.
         is_open: False once the connection has to end.
     """
 
@@ -158,7 +163,7 @@ class Client:
 
     @property
     def events(self) -> int:
-        """The events to wait for. Nothing is read until the client has received the last answer."""
+        """The events to wait for. No call is received until the last answer is sent completely."""
         return selectors.EVENT_WRITE if self._unsent else selectors.EVENT_READ
 
     def exchange(self, now_s: float) -> None:
@@ -233,7 +238,7 @@ class Bridge:
     def _accept(self) -> None:
         try:
             client = Client(self._listener.accept()[0], self._known, time.monotonic())
-        except OSError:  # the client has disconnected before it was accepted
+        except OSError:  # the client has disconnected before the connection was accepted
             return
         self._clients.append(client)
         self._selector.register(client.connection, client.events, client)
@@ -289,7 +294,7 @@ class Bridge:
 
 
 def run() -> None:
-    """Listen until script-control is 0."""
+    """Set `script-control` to 1, and serve clients until the entry is 0."""
     known = secret()
     if gxsm is not None:
         gxsm.set("script-control", "1")

@@ -26,7 +26,7 @@ _HINT: Final = "is bridge.py running in GXSM's console? Nothing is answered whil
 
 
 class BridgeLink:
-    """A connection to the bridge; the other arguments are those of `TcpConnection`.
+    """A connection to the bridge; the first call performs the handshake. For other arguments, see `TcpConnection`.
 
     Args:
         secret_file: copy of the bridge's secret. Default: the bridge's own file in this user's home.
@@ -53,7 +53,7 @@ class BridgeLink:
         return reply["value"]
 
     def working_folder(self) -> Path | None:
-        """Return the folder in which GXSM was started, where it saves until its user chooses another one."""
+        """Return the folder in which GXSM was started: the folder of its files until the user changes it."""
         return Path(str(self.call("getcwd")))
 
     def _introduce(self) -> None:
@@ -115,7 +115,7 @@ def _read(receiver: Receiver) -> dict[str, object]:
 
 @lru_cache(256, typed=True)  # few different calls, often repeated: reading the frame takes seven
 def message(method: str, *arguments: str | int | float) -> bytes:
-    """Encode the call of a function as a line."""
+    """Encode the call of a function as a line of JSON."""
     return json.dumps([method, *arguments]).encode() + b"\n"
 
 
@@ -125,7 +125,7 @@ def value_line(value: object) -> bytes:
 
 
 def value_of(line: bytes) -> object:
-    """Return the value in a line. Raises BadReply: it has none."""
+    """Return the value in the bridge's reply. Raises BadReply: a malformed line; KeyError: an error, not a value."""
     return _reply(line)["value"]
 
 

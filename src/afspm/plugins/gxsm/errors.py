@@ -7,12 +7,12 @@ from afspm.translator.driver_base import ControllerLost
 
 
 class GxsmError(AfspmError):
-    """An error of a call, reported by GXSM or by the script in its console."""
+    """The error that a single call failed; the link stays usable."""
 
     code = "gxsm"
 
 
 class BadReply(ControllerLost):
-    """A malformed reply: the link can't be trusted any more."""
+    """The error that a reply is malformed: the link can't be trusted any more."""
 
     code = "gxsm-bad-reply"

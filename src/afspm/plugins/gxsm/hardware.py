@@ -14,10 +14,10 @@ STATUS: Final = "s"
 ABORT: Final = "DSP_VP_ABORT_EXECUTE"
 APPROACH: Final = "DSP_CMD_AUTOAPP"
 AUTOSAVE: Final = {True: "CHECK-MainAutoSave", False: "UNCHECK-MainAutoSave"}
-"""Actions that switch Auto Save on and off."""
+"""Actions that switch Auto Save on (True) and off (False)."""
 REPEAT_OFF: Final = "UNCHECK-SCAN-REPEAT"
 _MODES: Final = {"force": "FZ"}  # other kinds have GXSM's own names
-_MOST_BITS: Final = 1 << 24
+_MOST_BITS: Final = 1 << 24  # larger and fractional numbers come from GXSM's uninitialised memory
 
 
 class Hardware(Enum):
@@ -30,7 +30,7 @@ class Hardware(Enum):
 
 @dataclass(frozen=True)
 class Offered:
-    """The names that a running GXSM offers, and the kind of its hardware."""
+    """The parameters and actions that a running GXSM lists, and the kind of its hardware."""
 
     refnames: frozenset[str]
     actions: frozenset[str]
@@ -46,7 +46,8 @@ class Doing:
     """The state that GXSM reports.
 
     Attributes:
-        scanning, probing: both True where GXSM does not distinguish them.
+        scanning, probing: both True on RPSPMC during a scan or a spectrum, as this hardware has one bit for both.
+        moving, approaching: always False on RPSPMC, which has no such bits.
     """
 
     feedback_on: bool
@@ -62,7 +63,7 @@ class Doing:
 
 
 def recognised(refnames: Collection[str], actions: Collection[str]) -> Hardware:
-    """Return the kind of hardware, recognised by the names that it adds to GXSM's lists."""
+    """Return the kind of hardware by the names that its driver adds to GXSM's lists; without any, SRanger."""
     if any(name.startswith("dsp-GVP-") for name in refnames) or any(name.startswith("GVP_CMD_") for name in actions):
         return Hardware.RPSPMC
     if any(name.startswith(("sim-", "template-")) for name in refnames):
@@ -74,7 +75,7 @@ def decoded(hardware: Hardware, slots: list[float]) -> Doing:
     """Decode the result of `rtquery("s")`; only the first of its three numbers is initialised.
 
     Raises:
-        BadReply: the number is no set of bits.
+        BadReply: the number is missing or not a set of bits.
     """
     value = slots[0] if slots else math.nan
     if not (0.0 <= value < _MOST_BITS and value == int(value)):
@@ -99,7 +100,9 @@ def execute(kind: str) -> str:
 
 
 def available(vendors: Mapping[str, str], refnames: Collection[str]) -> dict[str, str]:
-    """Return the available name of each parameter, by generic name; parameters without one are left out.
+    """Return the first available vendor's name of each parameter, by generic name.
+
+    Parameters without an available name are left out.
 
     Args:
         vendors: alternative names by generic name, e.g. "dsp-fbs-bias | sim-stm-bias".

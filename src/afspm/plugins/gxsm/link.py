@@ -24,12 +24,12 @@ class Link(Protocol):
         """Call a function.
 
         Raises:
-            GxsmError: GXSM reports an error; the link stays usable.
-            ControllerLost: no answer, or an untrustworthy one; the link is closed.
+            GxsmError: GXSM reports an error, or the call is too long; the link stays usable.
+            ControllerLost: no answer, or a malformed answer; the link is closed.
         """
 
     def working_folder(self) -> Path | None:
-        """Return the folder in which GXSM was started; None: unknown. Raises: see `call`."""
+        """Return the folder in which GXSM was started; None: unknown. Raises the errors of `call`."""
 
     def close(self) -> None:
         """Close the link."""
@@ -40,8 +40,8 @@ class Address:
     """The address of GXSM: a bridge, or shared memory.
 
     Attributes:
-        host, port: address of the bridge.
-        block, process: name of the shared memory; name or number of its process.
+        host, port: address of the bridge; empty for shared memory.
+        block, process: name of the shared memory, name or number of its process; empty for a bridge.
     """
 
     host: str = ""
@@ -51,7 +51,7 @@ class Address:
 
     @classmethod
     def parse(cls, text: str) -> Address:
-        """Parse "HOST:PORT" or "shm[:BLOCK[@PROCESS]]". Raises ConfigError: neither."""
+        """Parse "HOST:PORT" or "shm[:BLOCK[@PROCESS]]". Raises ConfigError: another form, or a "/" in BLOCK."""
         kind, _, rest = text.partition(":")
         if kind == "shm":
             block, _, process = rest.partition("@")
@@ -70,10 +70,11 @@ def open_link(
     Args:
         timeout_s: longest wait for an answer, real time.
         monotonic_s: returns real time.
-        secret_file: the bridge's secret, if not at its default place.
+        secret_file: copy of the bridge's secret. Default: the bridge's own file in this user's home.
 
     Raises:
-        ControllerLost: GXSM does not answer. ConfigError: shared memory without Linux.
+        ControllerLost: no program listens at the address, or no single GXSM serves the shared memory.
+        ConfigError: shared memory on another system than Linux.
     """
     if address.block:
         from afspm.plugins.gxsm.shared_memory import SharedMemoryLink
@@ -93,28 +94,28 @@ class Asking:
         self.close = link.close
 
     def number(self, method: str, *arguments: str | int | float) -> float:
-        """Call a function that returns a number. Raises BadReply: it returned something else. See `Link.call`."""
+        """Call a function that returns a number. Raises BadReply: the answer is no number. See `Link.call`."""
         value = self.call(method, *arguments)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise BadReply(f"GXSM replied {value!r:.100} to {method}{arguments}, which is not a number")
         return float(value)
 
     def text(self, method: str, *arguments: str | int | float) -> str:
-        """Call a function that returns text. Raises BadReply: it returned something else. See `Link.call`."""
+        """Call a function that returns text. Raises BadReply: the answer is no text. See `Link.call`."""
         value = self.call(method, *arguments)
         if not isinstance(value, str):
             raise BadReply(f"GXSM replied {value!r:.100} to {method}{arguments}, which is not a text")
         return value
 
     def numbers(self, method: str, *arguments: str | int | float) -> list[float]:
-        """Call a function that returns numbers. Raises BadReply: it returned something else. See `Link.call`."""
+        """Call a function that returns numbers. Raises BadReply: the answer is no list of numbers. See `Link.call`."""
         value = self.call(method, *arguments)
         if not isinstance(value, tuple | list) or not all(isinstance(one, int | float) for one in value):
             raise BadReply(f"GXSM replied {value!r:.100} to {method}{arguments}, which are not numbers")
         return [float(one) for one in value]
 
     def names(self, method: str) -> frozenset[str]:
-        """Call a function that returns names. Raises BadReply: it returned something else. See `Link.call`."""
+        """Call a function that returns names. Raises BadReply: the answer is no list of names. See `Link.call`."""
         value = self.call(method)
         if not isinstance(value, tuple | list) or not all(isinstance(one, str) for one in value):
             raise BadReply(f"GXSM replied {value!r:.100} to {method}, which are not names")

@@ -1,7 +1,8 @@
 """Restricted unpickler for Gxsm4's results: numbers, texts, bytes, containers and numpy arrays of numbers.
 
-Nothing is imported, and only the stand-ins for numpy's types below are called. The unpickler is Python's own one
-written in Python: the one in C allocates as much memory as a damaged pickle announces.
+No name in a pickle is imported, and only the stand-ins for numpy's types below are called. The base class is the
+standard library's unpickler in pure Python: the faster version in C allocates as much memory as a damaged pickle
+announces.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def loads(content: bytes) -> object:
     """Return the value of a pickle.
 
     Raises:
-        BadReply: malformed, or a type that GXSM does not send.
+        BadReply: the pickle is malformed or too large, or has a type that GXSM does not send.
     """
     try:
         return _Values().of(_Unpickler(io.BytesIO(content), encoding="latin-1").load())
@@ -87,7 +88,7 @@ def loads(content: bytes) -> object:
 
 
 class _Values:
-    """The replacement of stand-ins by arrays; a limit on parts stops it for a list that contains itself."""
+    """A converter of stand-ins to arrays, with a limit on parts: a list may contain itself."""
 
     def __init__(self) -> None:
         self._left = _MOST_PARTS

@@ -1,4 +1,4 @@
-"""The GXSM process that receives signals. A signal to the wrong process would end it. Linux only."""
+"""The GXSM process that receives SIGUSR1. This signal would end most other processes. Linux only."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class GxsmProcess:
     started: str | None
 
     def lives(self) -> bool:
-        """Return True if the process still runs. psutil would be ten times slower, and each poll checks."""
+        """Return True if the process still runs. Each poll calls this method; psutil would be ten times slower."""
         return self.started is not None and _started(self.pid) == self.started
 
     def working_folder(self) -> Path | None:
-        """Return the folder in which it runs; None: not accessible."""
+        """Return the current folder of the process; None: not accessible."""
         try:
             return Path(psutil.Process(self.pid).cwd())
         except psutil.Error:
@@ -51,10 +51,11 @@ class GxsmProcess:
 
 
 def find(process: str) -> GxsmProcess:
-    """Find the process with a name or number that handles the signal.
+    """Return the process with this name or number, which must handle or wait for SIGUSR1.
 
     Raises:
-        NoProcess: none. ControllerLost: several, or it does not handle the signal.
+        NoProcess: there is no such process.
+        ControllerLost: several processes have the name, or the process would be ended by SIGUSR1.
     """
     named = (one.pid for one in psutil.process_iter(["name"]) if process in (str(one.pid), one.info["name"]))
     found = [one for one in (GxsmProcess(pid, _started(pid)) for pid in named) if one.lives()]

@@ -1,4 +1,4 @@
-"""Results of measurements: GXSM's files, one per channel, which appear late and one after the other."""
+"""Results of measurements: GXSM's files, one per channel of a scan, which appear late and one after the other."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from afspm.translator.result_files import (
 _NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+\.nc)$")
 _PRECISION: Final = FilePrecision(part=1e-5, angle_rad=1e-6)
 _CLOCK_NS: Final = 2 * NS_PER_S
-"""Resolution of start times in files, with a margin: they have whole seconds."""
+"""Resolution of the start times in files, which have whole seconds, with a margin."""
 LATE_S: Final = 20.0
-"""Longest difference of start delays between two scans."""
+"""Longest difference between the start delays of two scans; a start delay ends at the start time in the file."""
 SOON_S: Final = 1.0
-"""Longest wait for a channel that the previous scan did not save; measured: up to 0.3 s."""
+"""Longest wait for the file of a channel that the previous scan did not save either; measured: up to 0.3 s."""
 
 
 class GxsmFiles(ResultFiles):
@@ -41,7 +41,7 @@ class GxsmFiles(ResultFiles):
     Args:
         patience_s: longest wait for all files, experiment time.
         soon_s: longest wait for files of channels that the previous scan did not save, experiment time.
-        late_s: longest difference of start delays between two scans, experiment time.
+        late_s: longest difference between the start delays of two scans (`LATE_S`), experiment time.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class GxsmFiles(ResultFiles):
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._before: set[int] = set()
         self._whole: dict[Path, FileContent] = {}
-        self._outcome: bool | None = None  # of a measurement directly followed by another one
+        self._outcome: bool | None = None  # of a measurement directly followed by the next
         self.upwards = False
         kept.setdefault("absent", [])
         kept.setdefault("channels", {})
@@ -84,7 +84,7 @@ class GxsmFiles(ResultFiles):
 
     @property
     def before(self) -> tuple[Rows, int | None] | None:
-        """Rows in GXSM's memory before the running scan, and the line being scanned when the rows were read.
+        """Digests of rows in GXSM's memory before the running scan, and the scan's line at the time of reading.
 
         The line is None if the scan had not started. None: no rows were read.
         """
@@ -92,16 +92,16 @@ class GxsmFiles(ResultFiles):
         return None if found is None else (found["rows"], found["line"])
 
     def looked(self, rows: Rows, line: int | None) -> None:
-        """Store rows for `before`."""
+        """Store rows and line for `before`."""
         self._kept["running"]["before"] = {"rows": rows, "line": line}
 
     def is_written(self, file: Path) -> bool:
-        """Return True if the file is newer than the start of the running measurement."""
+        """Return True if the file is newer than all files in the folder at the start of the running measurement."""
         return modified_ns(file) > int(self._kept["running"]["newest_ns"])
 
     @property
     def channels(self) -> dict[str, list[str]]:
-        """Name and unit of the channels of earlier scans, by the ending of their files."""
+        """Name and unit of each channel of earlier scans, by the ending of its file's name."""
         found: dict[str, list[str]] = self._kept["channels"]
         return found
 
@@ -114,13 +114,13 @@ class GxsmFiles(ResultFiles):
     def begin(
         self, what: str, folder: Path | None, begun_ns: int, taken: Entry, *, own: bool = False, by_gxsm: bool = False
     ) -> None:
-        """Register the start of a measurement. An ended one whose files were not read yet is still awaited.
+        """Register the start of a measurement. Unread files of the ended measurement are still awaited.
 
         Args:
-            folder: folder of its files; None: unknown yet.
-            begun_ns: earliest start; 0: unknown, as it was found running.
-            taken: "frame" and "shape" of a scan, "position" of a spectrum.
-            own: True if started by the translator.
+            folder: folder of the measurement's files; None: unknown yet.
+            begun_ns: earliest start; 0: not known, or a spectrum, whose file has no start time.
+            taken: settings of the measurement: "frame" and "shape" of a scan, "position" of a spectrum.
+            own: True if the translator started the measurement.
             by_gxsm: True if GXSM saves by itself: files may appear before the end, and be written again.
         """
         self._hurry(begun_ns / NS_PER_S)
@@ -130,7 +130,7 @@ class GxsmFiles(ResultFiles):
         facts = {"folder": place, "newest_ns": newest, "begun_ns": begun_ns, "before": None}
         self._begins(what, {**facts, "own": own, "by_gxsm": by_gxsm, **taken})
         if followed is not None:
-            # GXSM saves a scan before it starts the next: all present files belong to the ended one
+            # GXSM saves a scan before it starts the next: all new files belong to the ended scan
             there = _files(_folder(followed), followed["what"])
             names = [str(file) for file in there if modified_ns(file) > followed["newest_ns"]]
             self._kept["ended"] = {**followed, "names": sorted(names)}
@@ -150,8 +150,9 @@ class GxsmFiles(ResultFiles):
         Args:
             channels: path of each channel's file as reported by GXSM.
             folder: folder of the files, which may have changed since the start.
-            is_whole: True if a scan reached its last row; None: unknown until its files are compared with `before`.
-            before: rows of the previous scan.
+            is_whole: True if a scan reached its last row; False: the scan has no result; None: unknown until its files
+                are compared with `before`.
+            before: rows of the previous scan, for `is_whole` None; without rows the scan has no result.
         """
         order = [next(iter(endings([Path(path)])), "") for path in channels]
         now_s = now_ns / NS_PER_S
@@ -179,7 +180,7 @@ class GxsmFiles(ResultFiles):
         return self._kept["ended"] is not None and "names" in self._kept["ended"]
 
     def followed(self) -> bool | None:
-        """Return once whether a measurement that another one directly followed was complete; else None."""
+        """Return once whether a measurement directly followed by the next has a result; None: nothing to report."""
         found, self._outcome = self._outcome, None
         return found
 
@@ -191,12 +192,12 @@ class GxsmFiles(ResultFiles):
         super().forget()
 
     def next_s(self) -> float | None:
-        """Return the time of the next necessary poll."""
+        """Return the deadline of awaited files, in experiment time; None: no files are awaited."""
         ended = self._kept["ended"]
         return None if ended is None else float(ended["until_s"])
 
     def results(self, now_s: float) -> list[str]:
-        """Return the last results, oldest first, each named by one of its files and its end."""
+        """Look for awaited files; return the last results, oldest first, named by one file and the end time in ns."""
         self.broken_off = False
         ended = self._kept["ended"]
         if ended is not None:
@@ -252,7 +253,7 @@ class GxsmFiles(ResultFiles):
             content = self._whole.get(file)
             if content is not None and not self._is_of_before(content, ended["begun_ns"]):
                 found[file] = content
-        if ended["what"] == SCAN:  # one for each channel: a person may save it again
+        if ended["what"] == SCAN:  # one file for each channel: a person may save the scan again
             return {file: found[file] for file in endings(found).values()}
         return {file: found[file] for file in sorted(found, key=lambda file: file.stat().st_mtime_ns)[-1:]}
 
@@ -337,7 +338,7 @@ class GxsmFiles(ResultFiles):
 
 
 def endings(files: Iterable[Path]) -> dict[str, Path]:
-    """Return the last file of each channel, by the part of its name after the number."""
+    """Return the last file of each channel, by the part of its name after the number; other files are left out."""
     named = ((_NUMBERED.search(file.name), file) for file in files)
     return {match[1]: file for match, file in named if match}
 

@@ -34,9 +34,9 @@ class _Raw:
     """The needed parts of a file, for both kinds of NetCDF.
 
     Attributes:
-        values: FloatField, (time, value, y, x).
-        attributes: attributes of FloatField.
-        numbers, texts: other variables.
+        values: FloatField, in NetCDF-3 also H: (time, value, y, x), top row first, without the factor dz.
+        attributes: attributes of this variable.
+        numbers, texts: other variables, with a single number or a text.
         about: global attributes, such as the program's version.
     """
 
@@ -119,7 +119,7 @@ def _ns(numbers: dict[str, float], key: str) -> int | None:
 
 def _unit(raw: _Raw) -> tuple[str, float]:
     # ZSrcUnit is the unit's name in GXSM's own list, where a second millivolt is "mV1". The unit is in `var_unit` in
-    # Gxsm4, whose `unit` has that name, too, and in `unit` in Gxsm3. A length by either one is in ångström.
+    # Gxsm4, whose `unit` has that name, too, and in `unit` in Gxsm3. A length by either name is in ångström.
     given = raw.attributes
     named = given.get("ZSrcUnit", "")
     unit = given.get("var_unit") or given.get("unit", "") or named
@@ -139,7 +139,7 @@ def _channel(raw: _Raw, path: Path) -> str:
 
 def _measured(image: NDArray[np.float64], upwards: bool | None) -> NDArray[np.float64]:
     # Rows that a stopped scan did not reach are zero, without any mark: whole rows of zeros at its end become NaN. If
-    # all rows are zero, they are values.
+    # all rows are zero, the zeros are values.
     rows = image[::-1].copy()
     zero = (rows == 0.0).all(axis=1)
     if zero.all():

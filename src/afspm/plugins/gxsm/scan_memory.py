@@ -1,7 +1,7 @@
 """GXSM's memory of a scan: lines of the running scan, and the check for completeness.
 
 GXSM keeps the values of the previous scan in rows not yet scanned, and does not mark new rows. A complete scan has
-rewritten the first and the last row of each channel; a stopped one has left at least one of them bit-identical.
+rewritten the first and the last row of each channel; a stopped scan has left at least one of both bit-identical.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ _MOST = 1 << 20
 
 
 class Rows(TypedDict):
-    """A few rows of GXSM's memory, JSON-able.
+    """Digests of a few rows of GXSM's memory, JSON-able.
 
     Attributes:
         columns: number of compared columns.
-        digests: digest by channel and row. The digest of a constant row, which proves nothing, starts with `_CONSTANT`.
+        digests: digest by channel and row. The digest of a constant row, which proves nothing, starts with "=".
     """
 
     columns: int
@@ -34,11 +34,11 @@ class Rows(TypedDict):
 
 
 def looked_at(ask: Asking, channels: int, rows: Collection[int], columns: int) -> Rows:
-    """Return the digests of rows in GXSM's memory.
+    """Return the digests of rows in GXSM's memory; rows and channels that the memory lacks are left out.
 
     Args:
         channels: number of channels, from 0 on.
-        columns: highest number of columns; the previous scan may have fewer.
+        columns: highest number of compared columns; the previous scan may have fewer.
     """
     facts = {channel: (ask.call("get_dimensions", channel), _factor(ask, channel)) for channel in range(channels)}
     there = {channel: (shape, dz) for channel, (shape, dz) in facts.items() if dz and _is_shape(shape)}
@@ -59,7 +59,7 @@ def looked_at(ask: Asking, channels: int, rows: Collection[int], columns: int) -
 
 
 def in_files(files: Mapping[int, FileContent], like: Rows) -> Rows:
-    """Return the digests of the same rows in files, by channel number."""
+    """Return the digests of the rows and channels in `like`, from files by channel number."""
     return Rows(
         columns=like["columns"],
         digests={
@@ -86,9 +86,9 @@ def only(rows: Rows, row: int) -> Rows:
 
 
 def is_unfinished(before: Rows, after: Rows) -> bool:
-    """Return True if a scan was stopped or never started: some rows are unchanged.
+    """Return True if unchanged rows prove that a scan was stopped or never started.
 
-    A channel with no changed row at all, beside channels with changes, is a constant signal.
+    A channel without any changed row counts as a constant signal if another channel has changed.
     """
     changed = unchanged = False
     for channel, rows in before["digests"].items():
@@ -128,9 +128,9 @@ def new_lines(
     start: int,
     done: int,
 ) -> list[ScanLines]:
-    """Return the lines from `start` to `done`, in scanning order.
+    """Return the lines from `start` up to but not including `done`, counted from the top row, of each known channel.
 
-    GXSM's memory has neither names nor units of channels: those of earlier files are used.
+    GXSM's memory has neither names nor units of channels: names and units come from the files of an earlier scan.
 
     Args:
         endings: endings of the channels' files, by channel number.
@@ -145,7 +145,7 @@ def new_lines(
     for channel, ending in enumerate(endings):
         if ending in known:
             found = ask.call("get_slice", channel, 0, 0, start, count)
-            # another shape: a person has changed the next frame, after this scan was found running
+            # another shape: the frame was changed at the panel, and the recorded shape is not this scan's
             if isinstance(found, np.ndarray) and found.shape == (count, shape[1]):
                 images[ending] = found.astype(np.float64)
     lines = []

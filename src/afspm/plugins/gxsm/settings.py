@@ -1,7 +1,8 @@
-"""Scan frame and tip position: GXSM has the centre, a clockwise angle, and lengths in the unit of its panel.
+"""Scan frame, tip position and feedback switch of GXSM.
 
-`get` and `set` use the unit that the user prefers; `moveto_scan_xy` and files are always in ångström. A range goes from
-the centre of the first pixel to the centre of the last, as in afspm.
+GXSM defines a frame by its centre and a clockwise angle. `get` and `set` use the panel's unit of lengths, which the
+user chooses; `moveto_scan_xy` and files are always in ångström. A range goes from the centre of the first pixel to the
+centre of the last, as in afspm.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ def user_unit_m(ask: Asking) -> float:
     """Return the unit of lengths on GXSM's panel, in m.
 
     Raises:
-        AfspmError: the unit is unknown, or a decimal comma would make GXSM read 12.5 as 12.
+        BadReply: the unit is unknown, or panel and `get` disagree about RangeX.
+        AfspmError: a decimal comma would make GXSM read 12.5 as 12.
     """
     shown, number = ask.text("gets", "RangeX").strip(), ask.number("get", "RangeX")
     digits, _, unit = shown.partition(" ")
@@ -62,7 +64,7 @@ class ScanFrame:
         self._unit_m = unit_m
 
     def read(self) -> dict[str, Value]:
-        """Return the frame as generic parameters in SI."""
+        """Return the frame and its pixels by generic parameter names, in SI."""
         columns, rows, width, height, x, y, clockwise_deg = (number(self._ask, ref) for ref in REFNAMES)
         center_m, size_m = (x * self._unit_m, y * self._unit_m), (width * self._unit_m, height * self._unit_m)
         angle_rad = 0.0 - math.radians(math.remainder(clockwise_deg, 720.0))
@@ -89,7 +91,7 @@ class ScanFrame:
         return frame(self.read())[0]
 
     def move_tip(self, xy_m: tuple[float, float]) -> None:
-        """Move the tip to a position within the frame. Raises Refused: PARAM_ERROR: outside the frame."""
+        """Move the tip to (x, y) in m. Raises Refused with PARAM_ERROR: the position is outside the frame."""
         region = self.region()
         u_m, v_m = in_frame(region, xy_m)
         if self._ask.number("moveto_scan_xy", u_m / ANGSTROM_M, v_m / ANGSTROM_M) != 0.0:
@@ -97,7 +99,7 @@ class ScanFrame:
             raise Refused(ControlResponse.PARAM_ERROR, reason)
 
     def tip(self) -> tuple[float, float]:
-        """Return the target of the tip in the frame, (x, y) in m; if unknown, the frame's centre."""
+        """Return GXSM's target of the tip, (x, y) in m; the frame's centre if GXSM returns no target."""
         region = self.region()
         try:
             u_m, v_m = (number(self._ask, ref) * self._unit_m for ref in ("ScanX", "ScanY"))
@@ -113,7 +115,8 @@ class FrameSettings(SettingsGroup):
     """The frame of the next scan, as a group of settings.
 
     Args:
-        is_led: True if a change of the frame moves the tip, which GXSM does not report as a move.
+        tip: receives the length of each move of the tip with the frame.
+        is_led: True if the tip follows a change of the frame, and GXSM does not report this move.
     """
 
     names = FRAME
@@ -135,11 +138,11 @@ class FrameSettings(SettingsGroup):
 
 
 class TipPlace(SettingsGroup):
-    """The target position of the tip, which GXSM's files of spectra lack.
+    """The target position of the tip, stored because GXSM's files of spectra lack the position.
 
     Args:
-        kept: persistent, JSON-able.
-        on_move: called with the length of a move at its start.
+        kept: persistent, JSON-able: the last set position.
+        on_move: called with the length of a move in m, at its start.
     """
 
     names = POSITION
@@ -150,7 +153,7 @@ class TipPlace(SettingsGroup):
         self.on_move = on_move
 
     def xy_m(self) -> tuple[float, float]:
-        """Return the target position of the tip, (x, y) in m."""
+        """Return the last set position, (x, y) in m; before the first, GXSM's target of the tip."""
         sent = self._kept.get("probe")
         return self.frame.tip() if sent is None else (float(sent[0]), float(sent[1]))
 
@@ -166,10 +169,11 @@ class TipPlace(SettingsGroup):
 
 
 class FeedbackSwitch(SettingsGroup):
-    """The feedback switch, by actions that only some hardware has.
+    """The feedback switch, as a group of settings; only some hardware has actions that operate the switch.
 
     Args:
-        actions: names of the actions for on and off.
+        doing: returns the state that GXSM reports.
+        actions: names of the actions for on and off; empty: the switch can only be read.
     """
 
     names = (FEEDBACK_ON,)
@@ -188,7 +192,7 @@ class FeedbackSwitch(SettingsGroup):
 
 
 def number(ask: Asking, ref: str) -> float:
-    """Return the value of a parameter. Raises BadReply: GXSM has none."""
+    """Return the value of a parameter in GXSM's unit. Raises BadReply: GXSM returned no finite number."""
     value = ask.number("get", ref)
     if not math.isfinite(value):
         raise BadReply(f"GXSM returned {value} for {ref}")
@@ -196,22 +200,22 @@ def number(ask: Asking, ref: str) -> float:
 
 
 def send(ask: Asking, ref: str, value: float) -> None:
-    """Set a parameter. GXSM never reports a failure: the value must be read back.
+    """Set a parameter, in GXSM's unit. GXSM never reports a failure: the value must be read back.
 
-    GXSM takes text, and parses the longest numeric prefix with a decimal point.
+    GXSM takes a text, and parses its longest numeric prefix with a decimal point.
     """
     ask.call("set", ref, repr(value))
 
 
 def in_frame(region: Region, xy_m: tuple[float, float]) -> tuple[float, float]:
-    """Convert a position to the frame: from its centre, along its sides."""
+    """Convert (x, y) in m to coordinates in the frame: offsets from the centre along the sides, in m."""
     x, y = xy_m[0] - region.center_m[0], xy_m[1] - region.center_m[1]
     cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
     return cos * x + sin * y, cos * y - sin * x
 
 
 def in_space(region: Region, uv_m: tuple[float, float]) -> tuple[float, float]:
-    """Convert a position in the frame to (x, y); the reverse of `in_frame`."""
+    """Convert coordinates in the frame to (x, y) in m; the inverse of `in_frame`."""
     cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
     (u, v), (x, y) = uv_m, region.center_m
     return x + cos * u - sin * v, y + sin * u + cos * v

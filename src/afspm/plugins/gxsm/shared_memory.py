@@ -1,4 +1,4 @@
-"""Link to Gxsm4 through the shared memory that it serves to other programs of the same user (Linux).
+"""Link to Gxsm4 through its shared memory for other programs of the same user (Linux).
 
 A call is written into the block and announced by a signal; the answer appears in the block. A caller holds the lock
 that GXSM's own tools also take: two callers at once would receive each other's answers.
@@ -43,7 +43,9 @@ _LOOKS_SOON: Final = 20
 
 
 class SharedMemoryLink:
-    """The block of a running Gxsm4. For one thread.
+    """A link through the block of a running Gxsm4. Not thread-safe.
+
+    A request left in the block of an ended GXSM is withdrawn: the next instance would never answer the request.
 
     Args:
         block: name of the shared memory.
@@ -52,7 +54,8 @@ class SharedMemoryLink:
         monotonic_s: returns real time.
 
     Raises:
-        ControllerLost: no block, or no process serves it. ConfigError: the system is not Linux.
+        ControllerLost: there is no block, or not exactly one process that serves the block.
+        ConfigError: the system is not Linux.
     """
 
     def __init__(self, block: str, process: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
@@ -62,7 +65,7 @@ class SharedMemoryLink:
         self._timeout_s = timeout_s
         self._monotonic_s = monotonic_s
         self._where = f"shm:{block}"
-        # waits in polls of the memory: nothing but `close` could wake them
+        # set by `close`, which so ends a wait between two polls of the memory
         self._closed = Event()
         path = _FOLDER / block
         try:
@@ -75,7 +78,7 @@ class SharedMemoryLink:
                 self.close()
             raise
         self._memory = self._mapped(path)
-        # traced in the form of the bridge's calls: one form for both, which can be replayed on any system
+        # traced in the form of the bridge's calls, so that a trace can be replayed on any system
         self._trace = TRACE.connection(TCP)
 
     def _mapped(self, path: Path) -> mmap.mmap:
@@ -116,7 +119,7 @@ class SharedMemoryLink:
     def _transaction(self, method: str, arguments: tuple[str | int | float, ...]) -> object:
         until_s = self._monotonic_s() + self._timeout_s
         self._see_alive()
-        # of a caller that has given up waiting: its answer would be taken for the next one's
+        # left by a caller that has stopped waiting: its answer would be taken for the answer to this call
         if self._status() == _REQUEST:
             before = self._memory[:_NAME_BYTES].split(b"\0", 1)[0].decode("latin-1")
             self._wait(until_s, f"GXSM is busy with an earlier call of {before!r} for more than {self._timeout_s:g} s")
@@ -161,7 +164,7 @@ class SharedMemoryLink:
             self._closed.wait(_SOON_S if looks < _LOOKS_SOON else _LATER_S)
 
     def _see_alive(self) -> None:
-        # A request left in the block of an ended GXSM would stay there for the next instance, which never answers it.
+        # A request left in the block of an ended GXSM would stay there: the next instance never answers old requests.
         if not self._process.lives():
             self._withdraw_request()
             raise ControllerLost("Gxsm4 has ended", where=self._where)

@@ -19,10 +19,10 @@ _BEGIN, _END = "#C Data Table", "#C END."
 
 
 def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
-    """Read a spectrum; `kind` is in the file's name ("VP", "IV" …).
+    """Read a spectrum; its kind is the end of the file's name ("VP", "IV" …), by default "VP".
 
-    Its position is unknown: the file has the offset of the scan, not the place of the probe. Columns without a unit
-    (row number, block starts) and repeated columns are left out.
+    The position is None: the file has the offset of the scan, not the place of the probe. Columns without a unit (row
+    number, block starts) and repeated columns are left out; lengths are converted to m.
 
     Raises:
         FileError, ValueError: another format, or damaged.

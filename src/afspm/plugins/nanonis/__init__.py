@@ -1,17 +1,17 @@
 """Driver of Nanonis controllers (SPECS), over their TCP programming interface. See the README in this folder.
 
-**Theory of operation.** The first connection carries quick requests, the second one blocking call at a time, in its
-own thread (`session`): the wait for the end of a scan, or a spectrum with its data. Nanonis sends nothing
-unrequested.
+**Theory of operation.** The first connection carries quick requests. The second connection carries blocking calls,
+one at a time and in a separate thread (`session`): the wait for the end of a scan, or a spectrum with its data. Nanonis
+sends nothing unrequested.
 
     inputs        replies, decoded by the fields of the software's release (`protocol`); events of the second
                   connection; new files in the session folder
-    state         the running and the ended measurement, and the present occupation, all persistent (`activity`);
-                  the target of the tip (`settings`)
+    state         the running and the ended measurement, and the end of a pulse or tip shaping, all persistent
+                  (`result_files`, `activity`); the target of the tip, not persistent (`geometry`)
     outputs       requests; scans and spectra from files (`result_files`), or from Nanonis' memory (`fetched`)
     invariants    a reply that does not fit its request ends the connection; a value of a getter is converted before
-                  it goes into a setter, since both count differently; a scan that was never observed running is not
-                  published, because Nanonis' memory then holds the previous one
+                  it goes into a setter, since both count differently; a scan that Nanonis never reported as running
+                  is published only from a file, because Nanonis' memory may still hold the previous scan
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ _TRANSLATED: Final = tuple(name for group in _GROUPS for name in group.names)
 
 
 class Nanonis(Driver):
-    """The microscope behind a Nanonis controller.
+    """The driver of a microscope with a Nanonis controller.
 
     Args:
-        address: "host:port,port": two of the ports at File > Settings > TCP; each serves one client. One is enough for
-            an emulator.
-        session_dir: local path of Nanonis' session folder. Default: Nanonis runs on this computer. Data in unreachable
+        address: "host:port,port": two of the ports at File > Settings > TCP; each port serves one client. An emulator
+            needs a single port.
+        session_dir: local path of Nanonis' session folder. Default: the path that Nanonis reports. Data in unreachable
             files is fetched over TCP.
-        release: release of Nanonis' software (Help > Info), if it reports none or a wrong one.
+        release: release of Nanonis' software (Help > Info), if the software reports none or a wrong release.
         reply_timeout_s: longest wait for a reply, real time.
         autosave: True switches on saving of every scan; False leaves the panel's setting alone.
         grabbed_rows, grabbed_backward: see `fetched.Grabbing`.
@@ -192,7 +192,7 @@ class Nanonis(Driver):
         except protocol.NanonisError:
             self._activity.forget()
             raise
-        if self._ask("Scan.StatusGet")[0]:  # it may be over before the next poll
+        if self._ask("Scan.StatusGet")[0]:  # the scan may be over before the next poll
             self._files.seen()
 
     @action(names.STOP_SCAN)
@@ -237,7 +237,7 @@ class Nanonis(Driver):
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
         """Withdraw the tip by its piezo, even if the running measurement can't be stopped."""
-        # the approach first: going on, it would bring the withdrawn tip back
+        # the approach first: a running approach would bring the withdrawn tip back
         for stop in (self._activity.stop_approach, self._activity.stop_measuring):
             try:
                 stop()
@@ -247,7 +247,7 @@ class Nanonis(Driver):
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
-        """Switch the z controller on, which also ends a withdrawal by `x-retract` or the safe tip."""
+        """Switch the z controller on; this also brings back a tip withdrawn by `x-retract` or the safe tip."""
         on = 1
         self._ask("ZCtrl.OnOffSet", on)
 
@@ -264,7 +264,7 @@ class Nanonis(Driver):
 
     def _prepare_panel(self) -> None:
         # Set only if the panel differs: one scan, not continuous, saved. PropsGet and PropsSet count differently (in
-        # Get, autosave 0 is "all"; in Set, 0 is "no change"), so nothing is passed from one to the other as it is.
+        # Get, autosave 0 is "all"; in Set, 0 is "no change"), so no value of Get is passed to Set unchanged.
         continuous, bouncy, autosave, series, comment, *rest = self._ask("Scan.PropsGet")
         save = self._autosave and autosave != 0
         if continuous or bouncy or save:

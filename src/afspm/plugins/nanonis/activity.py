@@ -1,4 +1,4 @@
-"""State of Nanonis, from events and replies of both connections."""
+"""State of Nanonis, derived from replies of the first connection and events of the second."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from afspm.translator.setting_groups import frame
 from afspm.translator.state import Kept
 
 _SHOWS_S: Final = 10.0
-"""Real time until a started scan shows as running: the tip may first have to move to its first line."""
+"""Longest real time until a poll shows a started scan: the tip may first have to move to the first line."""
 _LATEST_S: Final = 10.0
-"""Experiment time after the expected arrival of the tip at which it counts as failed."""
+"""Experiment time from the expected arrival of the tip until the move counts as failed."""
 _SAFE_TIP, _WITHDRAWING = 5, 6
 
 
 class NanonisActivity(Activity):
-    """Measurements, moves and pauses of one controller.
+    """Measurements, moves, pulses and tip shaping of one controller.
 
     Args:
-        kept: persistent, JSON-able: present occupation.
+        kept: persistent, JSON-able: state and end time of the last pulse or tip shaping.
 
     Attributes:
-        curve: data of the last ended spectrum.
+        curve: data of the last ended spectrum; None before the end, and after the data was taken over.
     """
 
     program: ClassVar[str] = "Nanonis"
@@ -65,17 +65,17 @@ class NanonisActivity(Activity):
     # --- start and stop ---
 
     def begin_scan(self, region: Region) -> None:
-        """Register a scan that starts, or that was found running."""
+        """Register a scan that is started, or that a poll has shown running."""
         self._stopping = False
         self._listener.scan()
         self._files.begin(SCAN, self._session_folder(), {"frame": as_list(region)})
         self._shows_until_s = self._clock.monotonic_s() + _SHOWS_S
 
     def start_curve(self, kind: str) -> None:
-        """Take a spectrum; its data arrive over the second connection.
+        """Start a spectrum; the second connection receives its data.
 
         Raises:
-            Refused: ACTION_ERROR: Nanonis reports an error.
+            Refused: with ACTION_ERROR: Nanonis reports an error within `settles_s`.
         """
         self._stopping = False
         self.begin(kind)
@@ -139,9 +139,9 @@ class NanonisActivity(Activity):
         """Register that the action in the `with` block occupies the controller for `lasts_s`, experiment time.
 
         Nanonis does not report the end of such an action. The occupation persists if the answer, the connection or this
-        process is lost.
+        process is lost; an error reported by Nanonis clears the occupation.
         """
-        # kept before the action starts: it may go on although the answer, or this process, is lost
+        # stored before the action starts: the action may go on although the answer, or this process, is lost
         self._kept["occupied"] = [state.name, self._clock.now_s() + lasts_s]
         try:
             yield
@@ -155,7 +155,10 @@ class NanonisActivity(Activity):
         return ScopeState[name], float(until_s)
 
     def next_change_s(self) -> float | None:
-        """Return the end of a move, a pulse or the wait for a file."""
+        """Return the time of the next expected change, in experiment time; None: no change is expected.
+
+        Changes are the arrival of the tip, the end of a pulse or tip shaping, and the deadline of an awaited file.
+        """
         now_s = self._clock.now_s()
         times = (self._occupied[1], self._probe.arrives_s, self._files.next_s() or 0.0)
         return min((at_s for at_s in times if at_s > now_s), default=None)
@@ -163,7 +166,7 @@ class NanonisActivity(Activity):
     # --- state ---
 
     def status(self) -> ScopeStatus:
-        """Return the present state; register measurements that have ended, whose files are then awaited.
+        """Return the present state; register starts and ends of measurements.
 
         Raises:
             ControllerLost: a connection failed.
@@ -175,7 +178,7 @@ class NanonisActivity(Activity):
         if scanning:
             return self._scanning(path)
         if self._files.what == SCAN and not self._files.was_seen and not self._files.has_file():
-            # It may still be moving to its first line; until it is seen, Nanonis' memory holds the previous scan.
+            # The tip may still be moving to the first line; until then, Nanonis' memory holds the last scan.
             if self._clock.monotonic_s() < self._shows_until_s:
                 self._listener.scan()  # an earlier event belonged to the scan before
                 return ScopeStatus(ScopeState.SCANNING)
@@ -191,7 +194,7 @@ class NanonisActivity(Activity):
             raise Refused(ControlResponse.ACTION_ERROR, reason)
 
     def _scanning(self, path: str | None) -> ScopeStatus:
-        if path:  # a continuous scan: one frame has ended, the next one runs
+        if path:  # a continuous scan: one frame has ended, the next is running
             self.end(path)
         self.follow(SCAN)
         if not self._stopping:

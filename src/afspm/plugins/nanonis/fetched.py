@@ -25,11 +25,11 @@ _UP: Final = 1
 
 @dataclass(frozen=True)
 class Grabbing:
-    """The layout of scans from Nanonis' memory, which its specification does not define.
+    """The layout of images from Nanonis' memory, which the maker's specification does not define.
 
     Attributes:
-        rows: "top-first" for both scan directions, or as "recorded".
-        backward: "mirrored": backward lines run from right to left; or "as-seen".
+        rows: "top-first": the top row first in both scan directions; "recorded": upward scans lowest row first.
+        backward: "mirrored": backward lines run from right to left; "as-seen": from left to right.
     """
 
     rows: str = "top-first"
@@ -55,7 +55,7 @@ class Image:
     """One channel of the scan in Nanonis' memory.
 
     Attributes:
-        name: as in its files, e.g. "Z Forward".
+        name: channel and direction as in Nanonis' files, e.g. "Z Forward".
         values: [y, x], both ascending; lines not scanned are NaN.
         upwards: True if the lowest row was scanned first.
     """
@@ -81,9 +81,9 @@ def images(ask: Ask, how: Grabbing) -> list[Image]:
 
 
 def new_lines(found: Sequence[Image], region: Region, start: int) -> list[ScanLines]:
-    """Return the complete lines after the first `start`, in scanning order."""
+    """Return the complete lines of each channel after the first `start` lines, counted in scanning order."""
     lines = []
-    # Lines not yet scanned are NaN; channels may differ by the line being scanned.
+    # Lines not yet scanned are NaN; the channels, fetched one after the other, may differ by the present line.
     done = min((int(np.isfinite(image.values).all(axis=1).sum()) for image in found), default=0)
     for image in found if done > start else ():
         shape = (image.values.shape[0], image.values.shape[1])
@@ -103,7 +103,7 @@ def spectrum(curve: CurveEnded, kind: str, position_m: tuple[float, float]) -> S
 
 
 def name_and_unit(text: str) -> tuple[str, str]:
-    """Split "Current (A)" into name and unit."""
+    """Split "Current (A)" into name and unit; without parentheses, the unit is empty."""
     unit = re.search(r" ?\(([^()]*)\)", text)
     return (text, "") if unit is None else ((text[: unit.start()] + text[unit.end() :]).strip(), unit[1])
 

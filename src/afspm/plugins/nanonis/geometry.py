@@ -1,7 +1,7 @@
 """Conversion of the scan frame and the tip's position between Nanonis' geometry and afspm's.
 
-Nanonis has the centre, a clockwise angle in degrees, and a range from edge to edge of the pixels; afspm has the corner
-or centre, a counter-clockwise angle in rad, and a size from centre to centre.
+Nanonis defines a frame by its centre, a clockwise angle in degrees, and a range from edge to edge of the outer pixels;
+afspm by corner or centre, a counter-clockwise angle in rad, and a size from centre to centre of the outer pixels.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from afspm.translator.setting_groups import FRAME, POSITION, frame, frame_values
 _PIXELS_AT_ONCE: Final = 16
 _DIGITS: Final = 1e-6  # relative precision of float32, with a margin
 _ADDED_UP: Final = frozenset(FRAME) - {names.SCAN_ANGLE, names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y}
-"""Parameters calculated from centre and size: their absolute error is the largest one's."""
+"""Parameters calculated from centre and size: the rounding error of the largest value applies to each."""
 
 
 class ScanFrame(Group):
-    """The scan frame; Nanonis uses the centre, a clockwise angle in degrees, and N pixels of range / N."""
+    """The scan frame, with its number of pixels."""
 
     names = FRAME
 
@@ -40,7 +40,7 @@ class ScanFrame(Group):
 
     def write(self, values: Mapping[str, Value]) -> None:
         region, (rows, columns) = frame(self.merged(values))
-        # Nanonis would round the number of pixels without a word
+        # Nanonis would round the number of pixels silently
         if columns % _PIXELS_AT_ONCE:
             below = max(columns // _PIXELS_AT_ONCE, 1) * _PIXELS_AT_ONCE
             raise refuse_value(
@@ -66,7 +66,7 @@ def _share(pixels: int) -> float:
 
 
 class Probe(Group):
-    """The position of the tip; during a move its target, during a scan the position before.
+    """The position of the tip: during a move the target, during a scan the position before the scan.
 
     Args:
         now_s: returns experiment time.
@@ -88,7 +88,7 @@ class Probe(Group):
         self._range_m: tuple[float, ...] = (math.inf, math.inf)
 
     def xy_m(self) -> tuple[float, float]:
-        """Return the position of the tip, (x, y) in m."""
+        """Return the position of the tip, (x, y) in m; for moves and scans, see the class."""
         if self._goal_m is not None:
             return self._goal_m
         if self._seen_m is not None and self._ask("Scan.StatusGet")[0]:
@@ -120,16 +120,17 @@ class Probe(Group):
         self.arrives_s = self._now_s() + (math.dist(before_m, (x, y)) / speed_m_s if speed_m_s > 0.0 else 0.0)
 
     def arrived(self) -> bool:
-        """Return True if the tip has reached its target, which then counts as its exact position."""
+        """Return True if no move is pending, or if the tip has reached the target."""
         if self._goal_m is None:
             return True
         if not self._near(self._numbers("FolMe.XYPosGet", 0), self._goal_m):
             return False
+        # the target counts from now on: the measured position is rounded by the converters
         self._seen_m, self._goal_m = self._goal_m, None
         return True
 
     def give_up(self) -> None:
-        """Give up the target, and use the measured position."""
+        """Discard the target, so that the measured position counts."""
         self._goal_m = self._seen_m = None
 
     def _near(self, a: tuple[Any, ...], b: tuple[float, float]) -> bool:
@@ -143,7 +144,7 @@ def same_float32(name: str, got: Value, other: Value, among: Mapping[str, Value]
     """Return True if two values are equal for a controller that stores most values as float32.
 
     Args:
-        among: values read together with it: for a frame, all of its values.
+        among: values read together with `got`; for a frame, all values of the frame.
     """
     if not (isinstance(got, float) and isinstance(other, float)):
         return got == other

@@ -1,7 +1,7 @@
-"""Parameters that Nanonis groups, scales or signs in ways that a table can't express (except `geometry`).
+"""Parameters that Nanonis groups, scales or signs in ways that a table can't express; frame and tip: see `geometry`.
 
-A group is read by one request and written by one command, by generic names, in SI. Where `…Get` and `…Set` count
-differently, values are converted (the table of `protocol`, "Traps" in the README).
+Values of a group are read together and written together, by generic names, in SI. Where `…Get` and `…Set` count
+differently, values are converted ("Traps" in the README).
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ DRIFT_RATE_X: Final = "x-drift-rate-x"
 DRIFT_RATE_Y: Final = "x-drift-rate-y"
 
 _ON, _OFF = 1, 2
-"""In `…Set`; `…Get` returns 1 and 0 instead."""
+"""Values of a switch in `…Set`; `…Get` returns 1 and 0 instead."""
 
 
 class Group(SettingsGroup):
-    """Parameters read by one request and written by one command."""
+    """A group of parameters that Nanonis reads and writes together."""
 
     def __init__(self, ask: Ask) -> None:
         self._ask = ask
@@ -35,10 +35,10 @@ class Group(SettingsGroup):
 
 
 def numbers(ask: Ask, name: str, *arguments: object) -> tuple[Any, ...]:
-    """Return the numbers in a function's reply.
+    """Return the results of a function whose numbers must be finite.
 
     Raises:
-        BadReply: a number is not finite, so that nothing can be set by it.
+        BadReply: a number is infinite or NaN.
     """
     found = ask(name, *arguments)
     for value in found:
@@ -48,7 +48,10 @@ def numbers(ask: Ask, name: str, *arguments: object) -> tuple[Any, ...]:
 
 
 class ScanSpeed(Group):
-    """The forward scan speed. The backward speed keeps its ratio; both are kept when the frame changes."""
+    """The forward scan speed in m/s. The backward speed keeps its ratio to the forward speed.
+
+    After a setting, Nanonis keeps both speeds when the frame changes, instead of the time per line.
+    """
 
     names = (names.SCAN_SPEED,)
 
@@ -65,7 +68,7 @@ class ScanSpeed(Group):
                 names.SCAN_SPEED,
                 f"the speeds forward and backward must be above 0, not {forward_m_s:g} and {backward_m_s:g} m/s",
             )
-        keep_speed = 1  # SpeedGet returns 0 for it
+        keep_speed = 1  # SpeedGet returns 0 for this choice
         times_s = width_m / forward_m_s, width_m / backward_m_s
         self._ask("Scan.SpeedSet", forward_m_s, backward_m_s, *times_s, keep_speed, ratio)
 
@@ -89,7 +92,7 @@ class Gains(Group):
 
 
 class FeedbackOn(Group):
-    """The switch of the z controller, as its real-time part reports it with a delay.
+    """The switch of the z controller, as reported by its real-time part, which follows a setting with a delay.
 
     Args:
         wait_for: waits for a condition, up to a time limit.
@@ -112,7 +115,7 @@ class FeedbackOn(Group):
 
 
 class MoveSpeed(Group):
-    """The speed of the tip between scans, independent of the scan speed."""
+    """The speed of the tip between scans; a setting makes this speed independent of the scan speed."""
 
     names = (names.MOVE_SPEED,)
 
@@ -127,7 +130,7 @@ class MoveSpeed(Group):
 
 
 class Slope(Group):
-    """The compensation of the sample's tilt, as slopes; Nanonis has angles."""
+    """The compensation of the sample's tilt as slopes, converted from Nanonis' angles in degrees."""
 
     names = (names.SAMPLE_SLOPE_X, names.SAMPLE_SLOPE_Y)
 
@@ -141,7 +144,10 @@ class Slope(Group):
 
 
 class DriftRate(Group):
-    """The controller's own drift compensation, off if all velocities are 0. The z velocity is kept."""
+    """The velocities in x and y of the controller's drift compensation, which is off if all velocities are 0.
+
+    The z velocity is kept.
+    """
 
     names = (DRIFT_RATE_X, DRIFT_RATE_Y)
     _usual_limit_percent: ClassVar[float] = 10.0

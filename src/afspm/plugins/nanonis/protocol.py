@@ -1,7 +1,7 @@
 """Nanonis' TCP protocol: encoding of requests and decoding of results. No sockets here.
 
-A header of 40 bytes (name, size of the body), then the body; every reply ends with an error block. `functions.txt`
-lists the functions; some fields exist only from a release of the software on.
+A message has a header of 40 bytes (name, size of the body) and a body; every reply ends with an error block.
+`functions.txt` lists the functions; some fields exist only from a release of the software on.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ HEADER_BYTES: Final = 40
 NEWEST: Final = 1 << 31
 """A release with all fields."""
 LARGEST_BODY: Final = 1 << 28
-"""Bytes; eight channels of the largest scan are less, so a longer body is no reply."""
+"""Longest body in bytes that is accepted as a reply; a larger announced size counts as garbage."""
 
 # Big-endian: name padded with zeros, size of the body, 1 to request a reply, zero.
 _HEADER: Final = struct.Struct(">32sihh")
@@ -47,7 +47,7 @@ class Function:
     """One function of the protocol.
 
     Attributes:
-        arguments, results: codes of the fields, each with the first release that has it.
+        arguments, results: fields in order, each as (type code, first release that has the field).
     """
 
     name: str
@@ -55,11 +55,11 @@ class Function:
     results: tuple[tuple[str, int], ...]
 
     def argument_codes(self, release: int) -> tuple[str, ...]:
-        """Return the fields of a request to a release."""
+        """Return the type codes of the fields in a request to a release."""
         return tuple(code for code, since in self.arguments if since <= release)
 
     def result_codes(self, release: int) -> tuple[str, ...]:
-        """Return the fields of a reply of a release."""
+        """Return the type codes of the fields in a reply of a release."""
         return tuple(code for code, since in self.results if since <= release)
 
 
@@ -80,7 +80,7 @@ def functions() -> Mapping[str, Function]:
 
 
 def function(name: str) -> Function:
-    """Return a function by name. Raises InvalidValue: unknown."""
+    """Return a function by name. Raises InvalidValue: `functions.txt` has no such function."""
     if name not in functions():
         raise InvalidValue(f"Nanonis has no function {name[:50]!r}")
     return functions()[name]
@@ -90,7 +90,7 @@ def request(name: str, arguments: Sequence[object], release: int = NEWEST) -> by
     """Encode a request; arguments that the release lacks are left out.
 
     Raises:
-        InvalidValue: the arguments do not fit the function.
+        InvalidValue: the function is unknown, or the arguments do not fit.
     """
     fields = function(name).arguments
     if len(arguments) != len(fields):
@@ -110,7 +110,7 @@ def body_bytes(header: bytes, asked: str) -> int:
     """Return the number of bytes after the header of a reply to `asked`.
 
     Raises:
-        BadReply: malformed, or the reply to another function.
+        BadReply: the size is impossible, or the reply belongs to another function.
     """
     raw_name, size, _, _ = _HEADER.unpack(header)
     name = text_of(raw_name.split(b"\0", 1)[0])
@@ -124,14 +124,14 @@ def body_bytes(header: bytes, asked: str) -> int:
 def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[object, ...]:
     """Decode the results in a reply's body.
 
-    The specification does not define if results are present after an error: both are accepted.
+    The specification does not define whether an error follows results or replaces them: both forms are accepted.
 
     Raises:
         NanonisError: Nanonis reports an error.
         BadReply: the body does not fit the function.
     """
     try:
-        # The fields depend on the release: wrong ones leave bytes over, or need more than there are.
+        # The fields depend on the release: a wrong release leaves bytes over, or needs more bytes than received.
         found, status, text = _parsed(body, function(name).result_codes(release))
     except BadReply as whole:
         try:

@@ -22,7 +22,7 @@ from afspm.translator.result_files import (
 )
 
 _PRECISION: Final = FilePrecision(part=2e-6, angle_rad=1e-3, positions=True)
-"""Files have seven digits of a position, and angles to 0.001 degrees."""
+"""Scan files have seven digits of a length, and four digits of an angle in degrees: errors of up to 0.05 degrees."""
 
 Fetch = Callable[[Entry], Content]
 
@@ -31,7 +31,7 @@ class NanonisFiles(ResultFiles):
     """The running or just ended measurement, and the results.
 
     Args:
-        session_dir: local path of the session folder; None: Nanonis runs on this computer.
+        session_dir: local path of the session folder; None: the path on Nanonis' computer.
         own_folder: folder for fetched data.
         patience_s: longest wait for a file before the data is fetched, experiment time.
     """
@@ -54,8 +54,8 @@ class NanonisFiles(ResultFiles):
         """Register the start of a measurement.
 
         Args:
-            session: Nanonis' session folder.
-            taken: "frame" of a scan, "position" of a spectrum.
+            session: path of the session folder on Nanonis' computer.
+            taken: settings of the measurement: "frame" of a scan, "position" of a spectrum.
         """
         folder = self._session_dir or Path(session)
         newest_ns, _ = newest(_files(folder, what))
@@ -63,19 +63,22 @@ class NanonisFiles(ResultFiles):
 
     @property
     def was_seen(self) -> bool:
-        """True if the running measurement was observed; otherwise Nanonis' memory still holds the previous scan."""
+        """True if Nanonis has reported the present scan as running; before, its memory may hold the previous scan.
+
+        Always True during a spectrum, False without a measurement.
+        """
         return self._kept["running"] is not None and bool(self._kept["running"].get("seen", True))
 
     def seen(self) -> None:
-        """Record that a poll has shown the measurement running."""
+        """Record that Nanonis has reported the measurement as running."""
         if self._kept["running"] is not None:
             self._kept["running"]["seen"] = True
 
     def end(self, now_ns: int, now_s: float, path: str | None = None) -> None:
-        """Register the end of the measurement, or its file.
+        """Register the end of the running measurement, and the reported file of the ended measurement.
 
         Args:
-            path: file path reported by Nanonis; empty: not saved; None: not reported.
+            path: file path reported by Nanonis; empty: not saved, so the data is fetched at once; None: not reported.
         """
         running = self._kept["running"]
         if running is not None:
@@ -94,15 +97,15 @@ class NanonisFiles(ResultFiles):
         return running is not None and self._file({**running, "reported": None}) is not None
 
     def next_s(self) -> float | None:
-        """Return the time of the next necessary poll."""
+        """Return the time from which awaited data is fetched instead, in experiment time; None: no data is awaited."""
         ended = self._kept["ended"]
         return None if ended is None else float(ended["fetch_at_s"])
 
     def results(self, now_s: float, fetch: Fetch) -> list[str]:
-        """Return the last results, oldest first.
+        """Look for the awaited file, or fetch its data; return the last results, oldest first, by their files' paths.
 
         Args:
-            fetch: fetches data without a file from Nanonis.
+            fetch: fetches the data of a measurement from Nanonis' memory.
         """
         self.broken_off = False
         ended = self._kept["ended"]

@@ -25,7 +25,7 @@ _DIRECTIONS = {"both": ("Forward", "Backward"), "forward": ("Forward",), "backwa
 
 
 def read_scan(path: Path, zone: tzinfo | None) -> FileContent:
-    """Read all channels, named e.g. "Z Forward" and "Z Backward". Raises FileError, ValueError: damaged."""
+    """Read all channels, named e.g. "Z Forward" and "Z Backward". Raises FileError, KeyError, ValueError: damaged."""
     head, found, rest = path.read_bytes().partition(_END)
     start = rest.find(_DATA)
     if not found or start < 0:

@@ -20,7 +20,7 @@ from afspm.translator.tcp import Receiver, TcpConnection
 MODULES: Final = {"IV": "BiasSpectr", "force": "ZSpectr"}
 APPROACH: Final = "AutoApproach"
 _WITHOUT_VERSION: Final = 10862
-"""The release to assume if the software can't report its own: it lacks Util.VersionGet."""
+"""The release to assume if the software refuses Util.VersionGet, and can't report its release."""
 _WAIT_MS: Final = 1000
 _LONGEST_CURVE_S: Final = 24 * 3600.0
 _HINTS: Final = (
@@ -30,7 +30,7 @@ _HINTS: Final = (
 
 
 class Link:
-    """A TCP connection to Nanonis; the arguments are those of `TcpConnection`.
+    """A TCP connection to Nanonis; for arguments, see `TcpConnection`.
 
     Attributes:
         release: release of the controller's software, set once known.
@@ -55,11 +55,11 @@ class Link:
 
         Raises:
             NanonisError: Nanonis reports an error. InvalidValue: the arguments can't be sent.
-            ControllerLost, BadReply: no answer, or an untrustworthy one; the connection is closed.
+            ControllerLost, BadReply: no answer, or a malformed answer; the connection is closed.
         """
 
         def read(receiver: Receiver) -> tuple[object, ...]:
-            # A reply may exceed one segment of TCP: 128 names of signals, or a scan, do.
+            # A reply may exceed one segment of TCP, e.g. 128 names of signals, or a scan.
             size = protocol.body_bytes(bytes(receiver.exactly(protocol.HEADER_BYTES)), name)
             return protocol.results(name, receiver.exactly(size), self.release)
 
@@ -67,21 +67,21 @@ class Link:
 
 
 class Session:
-    """Two verified connections to Nanonis, with all available modules open.
+    """Two connections to the same Nanonis, with the modules for spectra and approach open.
 
     Args:
-        driver: the driver that uses them.
-        addresses: addresses of both; equal only if a port serves several clients.
+        driver: driver that uses the connections.
+        addresses: addresses of the first and the second connection; a single address serves both.
         timeout_s: longest wait for an answer, real time.
         release: release of the software; None: query Nanonis.
 
     Attributes:
-        controller: name and version, for people.
-        opened: available modules: Nanonis has the purchased ones, which answer only once open.
-        listener: user of the second connection.
+        controller: name and release of the software, for people.
+        opened: names of the opened modules; a module that was not purchased can't be opened.
+        listener: thread that uses the second connection.
 
     Raises:
-        ControllerLost.
+        ControllerLost: a connection can't be opened, or fails.
     """
 
     def __init__(self, driver: Driver, addresses: list[tuple[str, int]], timeout_s: float, release: int | None) -> None:
@@ -142,11 +142,11 @@ class ScanEnded:
 
 @dataclass(frozen=True)
 class CurveEnded:
-    """The event that a spectrum was completed.
+    """The event that a spectrum was completed or stopped.
 
     Attributes:
-        names: channel names with units.
-        values: [channels, points].
+        names: channel names with units, "Current (A)".
+        values: [channels, points], in these units.
     """
 
     names: tuple[str, ...]
@@ -154,7 +154,7 @@ class CurveEnded:
 
 
 ListenerEvent = ScanEnded | CurveEnded | AfspmError
-"""An error means that the wait failed."""
+"""An event of the second connection; an error means that its blocking call failed."""
 
 
 class Listener:
@@ -173,13 +173,13 @@ class Listener:
         Thread(target=self._work, name="Nanonis' second connection", daemon=True).start()
 
     def scan(self) -> None:
-        """Wait for the end of a scan, unless already waiting for it."""
+        """Let the thread wait for the end of a scan, unless it already waits."""
         if not self._for_scan:
             self._for_scan = True
             self._jobs.put(self._next_end_of_scan)
 
     def curve(self, module: str, base_name: str) -> None:
-        """Take a spectrum with a module, and wait for its data."""
+        """Let the thread start a spectrum with a module, and wait for its data instead of the end of a scan."""
         self._for_scan = False
         self._jobs.put(lambda: self._curve(module, base_name))
 
@@ -191,7 +191,7 @@ class Listener:
         return found
 
     def close(self) -> None:
-        """End the thread at once."""
+        """Close the connection, which ends the thread and its blocking call."""
         self._closed = True
         self._link.close()
         self._jobs.put(None)

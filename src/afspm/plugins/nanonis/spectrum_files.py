@@ -18,9 +18,9 @@ _LAYOUT = "%d.%m.%Y %H:%M:%S"
 
 
 def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
-    """Read a spectrum with one column per sweep; `kind` is Nanonis' own, e.g. "bias spectroscopy".
+    """Read a spectrum with all columns of its table; `kind` is Nanonis' name, e.g. "bias spectroscopy".
 
-    A file truncated between two lines can't be distinguished from a shorter one.
+    A file truncated between two lines can't be distinguished from a shorter file.
 
     Raises:
         FileError, ValueError: another format, or damaged.

@@ -29,20 +29,21 @@ class GxsmEmulator(Emulator):
 
     Args:
         version: 3 or 4.
-        card: its hardware: "SRanger", "RPSPMC" or GXSM's own "simulator".
-        transport: "bridge": a script runs in its console; "shm": the shared memory of Gxsm4, on Linux.
-        script: script to run in its console. Default: afspm's bridge.
-        block, process: names of the shared memory and of its process. Default: a unique name.
-        user_unit: unit of lengths on its panel: "Å", "nm" or "µm".
+        card: hardware of GXSM: "SRanger", "RPSPMC" or GXSM's own "simulator".
+        transport: "bridge": a script runs in the console; "shm": the shared memory of Gxsm4, on Linux.
+        script: path of the script for the console. Default: afspm's bridge.
+        block: name of the shared memory. Default: a unique name.
+        process: name of the process that serves the shared memory.
+        user_unit: unit of lengths on the panel: "Å", "nm" or "µm".
         decimal_comma: True for a locale with decimal commas, 12,5.
-        auto_save, probe_auto_save: switches of its panel at the start.
+        auto_save, probe_auto_save: Auto Save of scans and of spectra at the start.
         feedback_actions: names of the actions that switch the feedback on and off. Default: none.
         reach_m: reach of the scanner in x and y, from the centre.
         seed, faults, and the simulated world: settings of every emulator.
 
     Attributes:
-        unanswered: received calls.
-        silent: True after a call that blocks GXSM until it is restarted.
+        unanswered: received calls without an answer yet, oldest first.
+        silent: True after a call that blocks GXSM until a restart.
     """
 
     vendor = "GXSM"
@@ -110,7 +111,7 @@ class GxsmEmulator(Emulator):
         return self.run_script()
 
     def run_script(self) -> str:
-        """Run the script in the console, as a user does; return its address."""
+        """Run the script in the console, as a user does; return the address at which the script listens."""
         self.take_button_away()
         before = self._console
         if before is not None:
@@ -126,7 +127,7 @@ class GxsmEmulator(Emulator):
         return address
 
     def serve(self, timeout_s: float) -> None:
-        """Answer the received calls."""
+        """Wait up to `timeout_s` real seconds for a call, and answer the received calls."""
         watched: list[Any] = [self.woken] if self._block is None else [self.woken, self._block]
         ready = select.select(watched, [], [], timeout_s)[0]
         if self._block is not None and self._block in ready:
@@ -176,7 +177,7 @@ class GxsmEmulator(Emulator):
                 found = SystemError(str(error)) if self._block is None else error.value
             except (NameError, SystemError) as error:  # errors of the real module, for the script
                 found = error
-            except Exception as error:  # an error of the emulator must not end it: the script sees one, too
+            except Exception as error:  # the emulator must survive its own errors: the script gets them
                 self.log.exception("%s failed", call.method)
                 found = SystemError(str(error))
             call.answered(found)

@@ -31,13 +31,16 @@ _NO_SUCH_FUNCTION, _NOT_PASSED_ON = -4, -1
 
 
 class SharedMemoryBlock:
-    """The shared memory and its process.
+    """The shared memory with its serving process. Call `take` when `fileno` is readable.
 
     Args:
         name: name of the memory.
         process: name that the process gives itself.
         folder: folder in which the process starts.
-        post: receives the calls. `take` must be called when `fileno` is readable.
+        post: receives the calls.
+
+    Raises:
+        ConfigError: the system is not Linux.
     """
 
     def __init__(
@@ -66,7 +69,7 @@ class SharedMemoryBlock:
         return self._process.stdout.fileno()
 
     def take(self) -> None:
-        """Post a received call.
+        """Post a received call; answer malformed arguments with an error.
 
         Raises:
             Crashed: the process was killed.
@@ -138,7 +141,7 @@ class SharedMemoryBlock:
 
 
 class _MaliciousPickle:
-    """A pickle that makes a folder `evil` when a careless reader loads it."""
+    """An object whose pickle makes an unrestricted unpickler create a folder `evil`."""
 
     def __reduce__(self) -> tuple[object, ...]:
         return os.mkdir, ("evil",)

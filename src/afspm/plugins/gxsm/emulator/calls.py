@@ -1,4 +1,4 @@
-"""Functions of the module `gxsm`, with the effects and answers that other programs see."""
+"""The functions of GXSM's Python module `gxsm`: effects on the emulated program, and answers to callers."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class NoAnswer(Exception):
 
 
 class WrongArguments(SystemError):
-    """The error that arguments can't be converted to C types.
+    """The error that a call has a wrong number of arguments, or arguments that can't be converted to C types.
 
     Attributes:
         value: result that Gxsm4 returns instead through its shared memory.
@@ -80,9 +80,10 @@ class Uninitialised:
 
 
 class GxsmFunctions:
-    """The functions, for one thread.
+    """The functions of the module `gxsm`, executed by the emulated program. Not thread-safe.
 
     Args:
+        program: the emulated program.
         feedback_actions: names of the actions that switch the feedback on and off; empty: none.
     """
 
@@ -95,8 +96,8 @@ class GxsmFunctions:
         """Call a function.
 
         Raises:
-            NoAnswer: GXSM is blocked permanently. NameError: no such function.
-            WrongArguments, SystemError: errors that a script receives.
+            NoAnswer: GXSM is blocked until a restart. NameError: there is no such function.
+            WrongArguments: the arguments do not fit. SystemError: the instrument is busy, or an emulated error is due.
         """
         if method not in _FUNCTIONS:
             raise NameError(method)

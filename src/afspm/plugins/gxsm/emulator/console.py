@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Final
 
 SCRIPT: Final = Path(__file__).parents[1] / "bridge.py"
-"""The default script: the file that a user runs, which is not imported as a module."""
+"""The default script, executed from its file as in GXSM's console, instead of imported."""
 _LISTENS: Final = re.compile(r"listening at (\S+):(\d+)")
 
 
 class ConsoleClosed(BaseException):
-    """The error of a script that runs while GXSM is closed."""
+    """The error that ends a script when GXSM is closed; `except Exception` in the script does not catch this error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,13 @@ class ScriptCall:
 
 
 class GxsmModule:
-    """The module `gxsm` for a script in the console."""
+    """The object that a console script uses as the module `gxsm`. Each attribute is a function of GXSM.
+
+    A call is posted to the emulator; the script's thread waits for the result.
+
+    Args:
+        post: receives the calls, from the script's thread.
+    """
 
     def __init__(self, post: Callable[[ScriptCall], None]) -> None:
         self._post = post
@@ -56,7 +62,7 @@ class GxsmModule:
         return call
 
     def end(self) -> None:
-        """End every thread that waits for an answer or makes another call later."""
+        """Raise `ConsoleClosed` in every call that waits for its answer, and in all later calls."""
         self._gone = True
         for answer in list(self._waiting):
             if not answer.done():
@@ -67,10 +73,11 @@ class ScriptConsole:
     """A console that runs a script.
 
     Args:
-        script: listens at a port, and prints the address.
-        folder: folder in which GXSM was started.
-        post: receives its calls, from the script's thread.
-        ended: called from the script's thread at its end.
+        script: path of a script that listens at a port, and prints the address.
+        port: the script's variable `PORT`; 0: any free port.
+        folder: folder in which GXSM was started, the script's variable `FOLDER`.
+        post: receives the script's calls, from its thread.
+        ended: called from the script's thread when the script has ended.
     """
 
     def __init__(
@@ -84,10 +91,10 @@ class ScriptConsole:
         self._thread.start()
 
     def poll(self) -> str | None:
-        """Return the address at which the script listens; None before.
+        """Return the address at which the script listens; None until the script has printed the address.
 
         Raises:
-            the exception that ended the script before it listened.
+            the exception that ended the script before the script had printed its address.
         """
         return self._address.result() if self._address.done() else None
 

@@ -25,7 +25,8 @@ class GxsmEntry:
     """An entry of GXSM's panel.
 
     Attributes:
-        value: lengths in ångström, independent of the panel's unit.
+        value: present value; lengths in ångström, independent of the panel's unit.
+        low, high: limits of accepted values, in the unit of `value`.
         unit: unit that `gets` shows, replaced by the user's unit for lengths.
         shown: format of the number in `gets`.
         zero: value that replaces 0.
@@ -70,11 +71,11 @@ class GxsmEntries:
         return ref in self._entries
 
     def __getitem__(self, ref: str) -> float:
-        """Return a value, lengths in ångström."""
+        """Return the value of an entry; lengths are in ångström."""
         return self._entries[ref].value
 
     def put(self, ref: str, value: float) -> None:
-        """Set an entry without checks or side effects, lengths in ångström."""
+        """Set an entry without checks or side effects; lengths are in ångström."""
         self._entries[ref].value = value
 
     def set(self, ref: str, text: str) -> int:
@@ -84,7 +85,7 @@ class GxsmEntries:
             return 0
         value = self._atof(text) * self._factor(entry)
         value = (float(np.trunc(value)) if entry.whole else value) or entry.zero
-        # the real one keeps its value, returns 0, and shows a dialog on the screen
+        # GXSM keeps the old value, returns 0, and shows a dialog on the screen
         if not entry.low <= value <= entry.high:
             self._dialogs(f"Valid Range of {ref}: {entry.low} to {entry.high}")
             return 0
@@ -107,7 +108,7 @@ class GxsmEntries:
         return -math.inf
 
     def gets(self, ref: str) -> str:
-        """Return the first entry whose name starts with `ref`, as text with its unit."""
+        """Return the first entry whose name starts with `ref`, as text with its unit; "ERROR" if there is none."""
         found = [entry for name, entry in self._entries.items() if name.startswith(ref)]
         if not found:
             return "ERROR"
@@ -133,7 +134,12 @@ class GxsmEntries:
 
 
 def lengths(reach: float, on_change: Callable[[str], Callable[[float], None]]) -> dict[str, GxsmEntry]:
-    """Return the entries of the scan frame that every GXSM has, in ångström, up to `reach` from the centre."""
+    """Return the entries that every GXSM has: scan frame, tip position, `script-control`.
+
+    Args:
+        reach: highest offset from the scanner's centre, in ångström.
+        on_change: returns the callback of an entry.
+    """
 
     def length(ref: str, value: float, low: float, high: float) -> GxsmEntry:
         return GxsmEntry(value, low, high, _ANGSTROM, "{:.1f}", on_change=on_change(ref))

@@ -1,4 +1,4 @@
-"""Writing of GXSM's files: late, one after the other, in two parts, and numbered."""
+"""Writing of GXSM's files, which have numbers and appear late, one after the other, and in two parts."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class GxsmFileWriter:
     """A writer of files to one folder.
 
     Attributes:
-        folder: folder of scans and spectra; a person may choose another one at the panel.
+        folder: folder of scans and spectra, which a person may change at the panel.
         done_s: time at which all files are written, without faults.
     """
 
@@ -38,7 +38,7 @@ class GxsmFileWriter:
         self._faults = faults
         self._writes: list[_Write] = []
         self.counter = 1
-        """Number of the next scan: 1 at each start of GXSM, even if files have it."""
+        """Number of the next scan: 1 at each start of GXSM, even if files with this number exist."""
         self.done_s = 0.0
 
     def next_number(self) -> int:
@@ -51,19 +51,19 @@ class GxsmFileWriter:
         return self.folder / f"scan{counter:03d}-{ending}"
 
     def free(self, ending: str, number: int) -> Path:
-        """Return the path with the first free number from `number` on; each channel has separate numbers."""
+        """Return the path with the channel's first free number from `number` on, among existing and due files."""
         counter = number
         while (path := self.named(ending, counter)).exists() or any(write.path == path for write in self._writes):
             counter += 1
         return path
 
     def counted(self, files: list[Path]) -> None:
-        """Set the counter to the number after the saved files' numbers."""
+        """Raise the counter above the numbers of saved files."""
         numbers = (int(file.name.removeprefix("scan").partition("-")[0]) for file in files)
         self.counter = max(self.counter, *(number + 1 for number in numbers))
 
     def write(self, contents: list[tuple[Path, bytes]], now_s: float) -> None:
-        """Start writing files, in reverse order, as GXSM does."""
+        """Schedule the writing of files in reverse order, as GXSM does."""
         for k, (path, content) in enumerate(reversed(contents)):
             at_s = now_s + _FIRST_S + k * _APART_S
             self.done_s = at_s + _HALF_S
@@ -75,7 +75,7 @@ class GxsmFileWriter:
             self._writes.append(_Write(at_s + (half.duration_s if half else _HALF_S), path, content))
 
     def advance(self, now_s: float) -> float | None:
-        """Write the files that are due; return the time of the next write."""
+        """Write the files that are due; return the time of the next write, None if there is none."""
         due = sorted((write for write in self._writes if write.at_s <= now_s), key=lambda write: write.at_s)
         self._writes = [write for write in self._writes if write.at_s > now_s]
         for write in due:

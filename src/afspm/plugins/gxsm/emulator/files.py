@@ -40,7 +40,7 @@ class GxsmChannel:
     dz: float
 
     def ending(self, *, master: bool) -> str:
-        """Return the part of the file's name after the number."""
+        """Return the part of the file's name after the number; `master` marks the first channel."""
         return f"{'M-' if master else ''}{self.direction}-{self.label.replace('-', 'm')}.nc"
 
     def raw(self, values: np.ndarray) -> np.ndarray:
@@ -73,7 +73,7 @@ CHANNELS: Final = {
 
 @dataclass(frozen=True)
 class GxsmScanFile:
-    """One channel of a scan.
+    """The content of the file of one channel of a scan.
 
     Attributes:
         raw: stored values, rows from the top; multiplied by `dz`, they are in `unit`.
@@ -93,7 +93,7 @@ class GxsmScanFile:
     bias_v: float
 
     def numbers(self) -> dict[str, float]:
-        """Return the variables with one number."""
+        """Return the variables with one floating-point number."""
         x, y, width, height, angle_deg = self.frame
         rows, columns = self.raw.shape
         return {
@@ -116,7 +116,7 @@ class GxsmScanFile:
         }
 
     def times(self) -> dict[str, int]:
-        """Return the variables in whole seconds."""
+        """Return the integer variables: start and end in whole seconds, and the view mode."""
         return {"t_start": int(self.start_s), "t_end": int(self.end_s), "viewmode": 2}
 
     def texts(self) -> dict[str, str]:
@@ -233,7 +233,7 @@ def _describe(node: h5py.Dataset, **attributes: str) -> None:
 
 @dataclass(frozen=True)
 class GxsmSpectrumFile:
-    """A spectrum.
+    """The content of a spectrum's file.
 
     Attributes:
         columns: values by label with unit; the swept column comes first.

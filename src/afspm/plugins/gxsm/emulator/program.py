@@ -1,4 +1,4 @@
-"""The program GXSM: settings, measurements with the simulated instrument, and saving of files."""
+"""The emulated program GXSM: settings, measurements with the simulated instrument, and saving of files."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ SHOWS_S: Final = 0.15
 NAMED_S: Final = 0.04
 """Time after the start of a scan during which the previous scan's file names are reported."""
 IGAIN: Final = 10.0
-"""Simulated integral gain for a gain of 1 in GXSM, whose range is 0 to 200."""
+"""Integral gain of the simulated feedback that corresponds to an integral gain of 1 in GXSM."""
 UNFINISHED_S: Final = 0.25
-"""GXSM's own work after the end of a scan; a file saved during it has no end time."""
+"""Duration of GXSM's own work after the end of a scan; a file saved meanwhile has no end time."""
 _PIXELS_S: Final = 0.045
-"""Duration of a line in GXSM's own simulator, in addition to its pixels."""
+"""Duration of a line in GXSM's own simulator, in addition to the duration of the line's pixels."""
 _NEVER_WRITTEN: Final = -296
 """The line that Gxsm4's simulator reports at the start of its first scan."""
 _PULSE_S: Final = 1.0
@@ -47,13 +47,13 @@ _MIXERS: Final = {
     "current": ("dsp-fbs-mx0-current-set", "nA", 1e-9),
     "frequency-shift": ("dsp-fbs-mx1-freq-set", "Hz", 1.0),
 }
-"""By the mode of the feedback: entry of the setpoint, unit, and SI value of this unit."""
+"""Entry of the setpoint, unit, and SI value of this unit, by the mode of the feedback."""
 _COLUMNS: Final = {"Bias": "Bias-mon", "Z": "Z-mon", "Current": "CurrentSim1"}
 
 
 @dataclass(frozen=True)
 class GxsmSettings:
-    """Settings of the emulated program; the arguments of `GxsmEmulator`."""
+    """Settings of the emulated program; see the arguments of `GxsmEmulator`."""
 
     version: int
     card: str
@@ -70,8 +70,8 @@ class GxsmPanel:
 
     Attributes:
         auto_save, probe_auto_save: automatic saving of scans, of spectra.
-        repeats: True if each complete scan is followed by another one.
-        behind_s: lag of the clock of GXSM's computer, whose times are in files; it may be set at any time.
+        repeats: True if each complete scan is followed by another scan.
+        behind_s: lag of the clock of GXSM's computer, whose times are in files; that clock may be set at any time.
     """
 
     auto_save: bool
@@ -85,17 +85,17 @@ class GxsmScan:
     """The last scan that was started, and GXSM's memory of its values.
 
     Attributes:
-        activity: None before the first scan.
-        frame: offset, range and rotation at its start.
-        runs: True until GXSM has seen its end.
-        saved: True if it has been saved since.
-        shows_s: delay between its start and the scanning bit.
+        activity: the simulated scan; None before the first scan.
+        frame: OffsetX, OffsetY, RangeX, RangeY in ångström and Rotation in degrees, at the start of the scan.
+        runs: True until GXSM has registered the end of the scan.
+        saved: True if the scan has been saved.
+        shows_s: delay of the scanning bit after the start of the scan.
         next_follows: True if another scan is due to start.
-        follows: True if that scan starts without a pause.
-        number, own: number in its file names; the file names, once saved.
-        before: file names reported at first, those of the previous scan; None: its own from the start.
-        y_before: line reported until its first line is complete.
-        memory: rows of the previous scan, by channel.
+        follows: True if the due scan is a repetition, which shows at once in the scanning bit and the file names.
+        number, own: number in the scan's file names; paths of its files, empty until they are saved.
+        before: file names of the previous scan, reported at first; None: own file names from the start.
+        y_before: line reported until the first line of the scan is complete.
+        memory: image of stored values before the scan, by channel.
     """
 
     activity: ScanActivity | None = None
@@ -113,10 +113,10 @@ class GxsmScan:
 
 
 class GxsmProgram:
-    """The emulated program.
+    """The emulated GXSM without its transports: panel, measurements and files.
 
     Attributes:
-        panel: switches of its panel.
+        panel: switches of GXSM's panel.
         channels: channels that a scan records.
         dialogs: texts of dialogs on the screen.
         scan: the last started scan.
@@ -205,7 +205,7 @@ class GxsmProgram:
     # --- what happens by itself ---
 
     def advance(self, now_s: float) -> float | None:
-        """Advance to now; return the time of the next change."""
+        """Advance scans, spectra and files to now; return the time of the next change, None if there is none."""
         if self.scan.runs and self.faults.strikes("panel-stop", now_s):
             self.rig.stop_scan(now_s)
         if self.scan.runs and self.scan.activity is not None and not self.scan.activity.running(now_s):
@@ -224,19 +224,19 @@ class GxsmProgram:
 
     @property
     def is_between_repeats(self) -> bool:
-        """True between repeated scans, where GXSM's scanning bit stays set."""
+        """True during and between repeated scans, so that GXSM's scanning bit stays set."""
         is_whole = self.scan.activity is not None and self.scan.activity.stopped_s is None
         return self.panel.repeats and is_whole and (self.scan.runs or self.scan.next_follows)
 
     def stop_scan(self) -> None:
-        """Stop the running scan, or the one due to start."""
+        """Stop the running scan, and cancel the scan that is due to start."""
         self.scan.next_follows = False
         self.rig.stop_scan(self.clock.now_s())
 
     # --- scans ---
 
     def start_scan(self) -> None:
-        """Start a scan if possible. GXSM reports no failure, and is blocked while it writes files."""
+        """Start a scan if possible, at the earliest when all files are written. GXSM reports no failure."""
         now_s = self.clock.now_s()
         self.scan.next_follows = now_s < self.saving.done_s
         if self.scan.next_follows:
@@ -273,7 +273,11 @@ class GxsmProgram:
         self.scan.runs, self.scan.saved = True, False
 
     def y_current(self, now_s: float) -> int:
-        """Return the last complete line; before the first, the previous scan's; after a stop, the last line."""
+        """Return the index of the last complete line.
+
+        Before the first line is complete, that is the previous scan's last line; after the end or a stop, the last line
+        of the frame.
+        """
         scan = self.scan.activity
         if scan is None:
             return 0
@@ -302,7 +306,7 @@ class GxsmProgram:
         return f"./{path.name}" if path.parent == self.folder else str(path)
 
     def image(self, channel: GxsmChannel) -> np.ndarray:
-        """Return a channel of GXSM's memory: rows not yet scanned hold the previous scan."""
+        """Return a channel of GXSM's memory as stored values; rows not yet scanned hold the previous scan."""
         if self.scan.activity is None or channel not in self.scan.memory:
             return np.zeros((0, 0), np.float32)
         now_s = self.clock.now_s()

@@ -1,11 +1,12 @@
-"""Owner process of Gxsm4's shared memory: it receives the signals, and passes calls to the emulator.
+"""Owner process of Gxsm4's shared memory, which receives the signals and passes calls to the emulator.
 
-`block.py` starts this file as a separate script, with the name of the block and of the process; it ends when standard
-input ends. Frames have a length and a content. Calls go to standard output: the function's name in 64 bytes, and the
-pickled arguments. Answers come from standard input: a status of 8 bytes, a length of 8 bytes, and the pickled result.
+`block.py` starts this file as a separate script, with the name of the block and of the process; the process ends when
+standard input ends. Frames have a length and a content. Calls go to standard output: the function's name in 64 bytes,
+and the pickled arguments. Answers come from standard input: a status of 8 bytes, a length of 8 bytes, and the pickled
+result.
 
-An existing block is reused unchanged, with an unanswered request in it. One call is passed on at a time: a request that
-overwrites another one receives the answer to the earlier one.
+An existing block is reused unchanged, even with an unanswered request. One call is passed on at a time: a request that
+overwrites an earlier request receives the answer to the earlier request.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ def read(count: int) -> bytes:
 
 
 def passed_on(memory: mmap.mmap) -> bool:
-    """Pass on a request; return False if there is none."""
+    """Pass on the request in the block to the emulator; return False without a request."""
     if struct.unpack_from("<q", memory, STATUS)[0] != 1:
         return False
     length = struct.unpack_from("<I", memory, LENGTH)[0]
@@ -45,7 +46,7 @@ def passed_on(memory: mmap.mmap) -> bool:
 
 
 def answered(memory: mmap.mmap) -> None:
-    """Write an answer to the block, its status last."""
+    """Copy an answer from standard input to the block, with the status last."""
     answer = read(struct.unpack(">I", read(4))[0])
     memory[CONTENT : CONTENT + len(answer) - 16] = answer[16:]
     memory[LENGTH : LENGTH + 8] = answer[8:16]

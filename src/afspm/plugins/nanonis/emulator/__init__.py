@@ -20,7 +20,7 @@ from afspm.simulation.emulation.tcp_server import ClientConnection, TcpServer
 from afspm.simulation.instrument import InstrumentBusy
 
 RELEASES: Final = {"2021": 10862, "2022": 11798, "2023": 13742, "2024": 14429, "2025": 14573}
-"""By the year of the software: the first release with this version of the protocol."""
+"""The first release with each version of the protocol, by the year of the software."""
 _ACTS: Final = ("Start", "Action", "Set", "Pulse", "Withdraw", "StartMove", "Home")
 _LOGS_EVERY_S: Final = 0.005
 """Real time between two polls of the TCP Logger."""
@@ -67,15 +67,15 @@ class NanonisEmulator(Emulator):
     r"""The emulated controller of an STM with a qPlus sensor, unless `feedback` has another mode.
 
     Args:
-        release: release of its software: a year of `RELEASES`, or the number itself.
+        release: release of the software: a year of `RELEASES`, or the number itself.
         port: first port to listen on; 0: any free port.
         ports: number of ports, consecutive unless `port` is 0.
         logger_port: port of the TCP Logger's stream; 0: any free port.
-        one_each: True if a port serves one client at a time, as real ones do.
-        session_path: its own path of the session folder, e.g. "D:\\Data". Default: the local path.
-        range_m: range of its scanner in x and y.
+        one_each: True if a port serves one client at a time, like a real controller's port.
+        session_path: path of the session folder on the controller's computer, e.g. "D:\\Data". Default: the local path.
+        range_m: range of the scanner in x and y.
         bare_errors: True if replies with an error have no results; False: results of zeros.
-        grabbed_rows: order of rows of scans from its memory: "top-first" or as "recorded".
+        grabbed_rows: order of rows of scans in `Scan.FrameDataGrab`: "top-first" or as "recorded".
         seed, faults, and the simulated world: settings of every emulator.
     """
 
@@ -161,11 +161,11 @@ class NanonisEmulator(Emulator):
         return f"{LOOPBACK}:{','.join(map(str, self._server.ports))}"
 
     def serve(self, timeout_s: float) -> None:
-        """Answer the received requests."""
+        """Wait up to `timeout_s` real seconds for clients, and answer the received requests."""
         self._server.poll(timeout_s)
 
     def tick(self, now_s: float) -> float | None:
-        """Advance scans and files, and send the replies that waited for them."""
+        """Advance scans, files and the TCP Logger; send the replies that are due, and answer waiting requests."""
         times = [self.software.advance(now_s), self._log_signals(now_s)]
         for connection in self._server.connections:
             times.append(self._go_on(connection, now_s))
@@ -243,7 +243,7 @@ class NanonisEmulator(Emulator):
             self._refuse(connection, asked, str(error))
         except Crashed:
             raise
-        except Exception as error:  # an error of the emulator must not end it: the client sees one, too
+        except Exception as error:  # an error of the emulator must not end the emulator: the client gets an error, too
             self.log.exception("%s failed", asked.name)
             self._refuse(connection, asked, str(error))
 

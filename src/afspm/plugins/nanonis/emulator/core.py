@@ -27,10 +27,10 @@ class NanonisCore:
     """The state shared by all modules.
 
     Attributes:
-        range_m: range of the scanner in x, y and z.
+        range_m: range of the scanner in x, y and z, from end to end.
         release: release of the software.
-        client: memory of the client whose request is being answered.
-        opened: modules opened by clients.
+        client: values stored for the client whose request is being answered.
+        opened: names of the modules that clients have opened.
     """
 
     rig: SimulatedInstrument
@@ -62,7 +62,7 @@ class NanonisCore:
         return real_s / self.clock.real_s(1.0)
 
     def deadline_s(self, timeout_ms: int) -> float:
-        """Convert a client's timeout, real time, to a deadline in experiment time."""
+        """Convert a client's timeout in real time to a deadline in experiment time; negative: no deadline."""
         return math.inf if timeout_ms < 0 else self.now_s + self.experiment_s(timeout_ms / 1000)
 
     def until_free(self, wait: int, timeout_ms: int = -1) -> Answer:

@@ -36,7 +36,7 @@ class DeferredResult:
         ready: returns the results after the event, None before.
         until_s: deadline in experiment seconds, with `timed_out` as the results.
         gave_up: called when the deadline passes first.
-        next_s: time of the next check, if nothing else triggers it.
+        next_s: returns the time of the next check, if no event triggers a check before.
     """
 
     ready: Callable[[float], Results | None]
@@ -51,7 +51,7 @@ Handler = Callable[..., Answer]
 
 
 def answers(*names: str) -> Callable[[Handler], Handler]:
-    """Mark a method as the handler of functions; its parameter `name` receives the called function's name."""
+    """Mark a method as the handler of functions. An optional parameter `name` receives the function's name."""
 
     def marked(handler: Handler) -> Handler:
         handler.answered_functions = names  # type: ignore[attr-defined]
@@ -61,7 +61,7 @@ def answers(*names: str) -> Callable[[Handler], Handler]:
 
 
 class Dispatcher:
-    """The handlers of all modules, with registers behind all other functions."""
+    """The handlers of all modules; registers store the values of settings without a handler."""
 
     def __init__(self, registers: Registers, modules: Iterable[object]) -> None:
         self._registers = registers
@@ -75,7 +75,8 @@ class Dispatcher:
         """Execute a function; return its results.
 
         Raises:
-            FunctionRefused, InstrumentBusy, InvalidValue.
+            FunctionRefused: no such module or function, or a value is not allowed. InstrumentBusy, InvalidValue: errors
+                of the handler.
         """
         handler = self._handlers.get(name)
         _refuse_nan(name, arguments, keeps_nan=handler is None or name in _KEEPS_NAN)
@@ -99,7 +100,10 @@ def _bound(handler: Handler, name: str) -> Handler:
 
 
 def chosen(number: int, *choices: object) -> Any:
-    """Return the choice with a number; 0 usually means no change."""
+    """Return the choice with this number. Raises FunctionRefused: there is no such choice.
+
+    In most functions 0 means no change: the first choice is then the present value.
+    """
     if not 0 <= number < len(choices):
         raise FunctionRefused(f"{number} is none of the choices")
     return choices[number]

@@ -16,9 +16,10 @@ class SxmContent:
     """The content of a scan's file.
 
     Attributes:
-        center_m, range_m: frame from edge to edge of its pixels.
-        angle_deg: clockwise.
+        center_m, range_m: frame, from edge to edge of its outer pixels.
+        angle_deg: angle, clockwise.
         line_s: duration of a line forward, backward.
+        z_controller: name, True if on, setpoint, its unit, proportional and integral gain.
         channels: index, name, unit, and images forward and backward, both [y, x] with both axes ascending.
         settings: header lines `module>name`, in order.
     """
@@ -94,7 +95,7 @@ class DatContent:
 
 
 def read_dat(content: bytes) -> DatContent:
-    """Parse the result of `dat`. Raises ValueError: no such table."""
+    """Parse the result of `dat`. Raises ValueError: there is no table, or a value is not a number."""
     head, found, table = content.decode("latin-1").partition("[DATA]")
     names, *rows = table.strip().splitlines() or [""]
     if not found or not names:
@@ -105,7 +106,7 @@ def read_dat(content: bytes) -> DatContent:
 
 
 def moment(time_s: float) -> str:
-    """Format a time by the clock of the controller's computer."""
+    """Format a time (seconds since the Unix epoch) as local time, "31.12.2025 23:59:59"."""
     return f"{_local(time_s):%d.%m.%Y %H:%M:%S}"
 
 

@@ -10,14 +10,14 @@ from typing import Final
 USUAL_PORT: Final = 6590
 LARGEST_OVERSAMPLING: Final = 1000
 MOST_WAITING: Final = 1 << 20
-"""Highest number of unread bytes of a reader, which receives nothing more until it has read."""
+"""Highest number of unread bytes of a reader; until they are read, no further frame is sent."""
 _RATE_HZ: Final = 2000.0
 _MOST_AT_ONCE: Final = 20
 _DISCONNECTED, _IDLE, _RUNNING, _OVERFLOW = 0, 1, 4, 7
 
 
 class TcpLogger:
-    """The TCP Logger: selected slots, and frames.
+    """The TCP Logger: its settings, and the frames that are due.
 
     Attributes:
         slots: streamed slots of the Signals Manager.
@@ -34,7 +34,7 @@ class TcpLogger:
 
     @property
     def running(self) -> bool:
-        """True while frames are sent."""
+        """True while the logger is started and has readers."""
         return self._started_s is not None and bool(self.unread)
 
     def start(self, now_s: float) -> None:
@@ -53,7 +53,7 @@ class TcpLogger:
         return _OVERFLOW if max(self.unread) >= MOST_WAITING else _RUNNING
 
     def due(self, now_s: float) -> range:
-        """Return the counters of the frames due now; frames beyond the limit are lost, as their counters show."""
+        """Return the counters of the frames due now, at most the last 20; gaps in the counters show lost frames."""
         if self._started_s is None:
             return range(0)
         until = math.floor((now_s - self._started_s) / self._period_s + 1e-9)
@@ -62,7 +62,7 @@ class TcpLogger:
         return found
 
     def next_s(self) -> float:
-        """Return the time of the next frame."""
+        """Return the time of the next frame; infinite if the logger is stopped."""
         return math.inf if self._started_s is None else self._started_s + self._period_s * (self._counter + 1)
 
     def frame(self, counter: int, values: Sequence[float]) -> bytes:

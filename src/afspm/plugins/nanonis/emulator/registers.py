@@ -45,16 +45,17 @@ _KEYED_OTHERWISE: Final[dict[str, tuple[tuple[int, ...], tuple[int, ...]]]] = {
     "APRFGen.Freq": ((), (1,)),
     "APRFGen.Power": ((), (1,)),
 }
-"""Positions of arguments of `…Set`: the ones that name the item, and the ones that `…Get` returns.
+"""Positions of arguments of `…Set`: arguments that name the item, and arguments that `…Get` returns.
 
-Usually the first arguments are those of `…Get` and name the item, and all others are returned in their order."""
+For other registers, the first arguments are the arguments of `…Get`, which name the item; all further arguments are
+returned in order."""
 
 _OTHER_NAMES: Final = {"AtomTrack.StatusGet": "AtomTrack.Ctrl"}
 """Getters and setters with different names."""
 
 
 class Registers:
-    """The registers, by name and by item (number of a modulator, an output …)."""
+    """Values set by clients, by function name without the suffix "Set" and by item (number of a modulator …)."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple[str, Values], Values] = {}
@@ -84,7 +85,7 @@ class Registers:
         return self._kept.get((register, tuple(belongs_to)), AT_FIRST.get(register, ()))
 
     def got(self, name: str, arguments: Sequence[object]) -> Values:
-        """Return the results of a function `…Get` with all fields, zero if unknown."""
+        """Return the results of a function `…Get`, one for each field; fields without a value are zero or empty."""
         kept = self.get(_OTHER_NAMES.get(name, name.removesuffix("Get")), arguments)
         codes = [field.code for field in wire.functions()[name].results]
         zeros = tuple(wire.ZEROS[code] for code in codes)

@@ -22,7 +22,7 @@ Image = tuple[str, str, np.ndarray, np.ndarray]
 """Name, unit, values forward and backward [y, x]."""
 _PIXELS_AT_ONCE: Final = 16
 _WAITED: Final = "waited"
-"""Key in a client's memory: number of ended scans, and time, when it started to wait for the next end."""
+"""Key in a client's memory: (number of ended scans, time) at its last start of a scan, or at its last timeout."""
 _PASTES: Final = (0, 1, 2)
 _SMALLEST_M: Final = 2e-12
 """Smallest side of a frame: half of it is the shortest line distance of the simulated scanner."""
@@ -31,7 +31,7 @@ _AUTOSAVE: Final = ("all", "next", "off")
 
 @dataclass
 class StartedScan:
-    """A scan with the settings at its start."""
+    """A scan with the frame, line durations forward and backward in s, and channels at its start."""
 
     scan: ScanActivity
     frame: tuple[float, float, float, float, float]
@@ -59,7 +59,10 @@ class ScanFiles:
         self._core, self._signals = core, signals
 
     def images(self, started: StartedScan, until_s: float | None) -> dict[int, Image]:
-        """Return the image of each channel; lines not yet scanned are NaN."""
+        """Return the image of each recorded channel at a time; lines not yet scanned are NaN.
+
+        A channel that the simulated instrument lacks is zero.
+        """
         drawn = started.scan.channels(until_s)
         found: dict[int, Image] = {}
         for channel, (unit, values) in drawn.items():
@@ -73,7 +76,7 @@ class ScanFiles:
         return {index: found[index] for index in started.channels}
 
     def save(self, ended: StartedScan, properties: ScanProperties, now_s: float) -> str:
-        """Save a scan; return the path that the controller reports."""
+        """Save a scan; return the path that the controller reports, empty if no file can be written."""
         session, scan, feedback = self._core.session, ended.scan, ended.scan.feedback
         name = session.next_name(properties.series, 3, ".sxm")
         path = session.path_of(name)
@@ -116,18 +119,18 @@ class ScanFiles:
 
 
 class ScanModule:
-    """The Scan module.
+    """The functions of the Scan module, and the running scan.
 
     Args:
         rows_as_recorded: True if `Scan.FrameDataGrab` returns rows as recorded, False for the top row first.
 
     Attributes:
         frame: x, y, width, height in m, angle clockwise in degrees.
-        speed: forward and backward speed in m/s; forward and backward time in s per line; 1 if the time is kept
-            instead of the speed; speed ratio.
-        running: the running scan.
-        last: the last started scan.
-        ends: number of ended scans.
+        speed: forward and backward speed in m/s; forward and backward time per line in s; 1 if a change of the frame
+            keeps the times, 0 if it keeps the speeds; ratio of the speeds.
+        running: the running scan; None without a scan.
+        last: the last started scan; None before the first.
+        ends: number of ended scans, completed or stopped.
     """
 
     def __init__(self, core: NanonisCore, signals: Signals, *, rows_as_recorded: bool) -> None:
@@ -146,7 +149,7 @@ class ScanModule:
     # --- the running scan ---
 
     def advance(self, now_s: float) -> float | None:
-        """Start and end due scans; return the start of a delayed one."""
+        """Start and end due scans; return the start time of a delayed scan, None without a delayed scan."""
         if self.running is not None and self._core.faults.strikes("panel-stop", now_s):
             self._core.rig.stop_scan(now_s)
         if self._delayed_start is not None and now_s >= self._delayed_start[0]:
@@ -305,7 +308,8 @@ class ScanModule:
 
     @answers("Scan.SpeedSet")
     def _set_speed(self, *speed: Any) -> Answer:
-        # In SpeedSet, keep 1 is the speed and 2 the time, in SpeedGet 0 and 1. The kept one is the one that counts now.
+        # The quantity to keep: in SpeedSet 1 is the speed and 2 the time, in SpeedGet 0 and 1. The kept quantity
+        # determines the other.
         *speeds, keep, ratio = speed
         if not min(speeds) > 0.0 or keep > 2:
             raise FunctionRefused("no such speed")

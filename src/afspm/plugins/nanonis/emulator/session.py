@@ -29,7 +29,7 @@ class SessionFolder:
         self._late: list[tuple[float, Path, bytes]] = []
 
     def change(self, path: str) -> None:
-        """Change to a subfolder of the initial folder. Raises InvalidValue: another folder."""
+        """Change to the initial folder or a folder in it. Raises InvalidValue: another folder, or an invalid name."""
         root = self._root_path.rstrip("\\/")
         if path.rstrip("\\/") != root and not path.startswith((f"{root}/", f"{root}\\")):
             raise InvalidValue(f"Session Path not valid: {path!r}", hint=f"{root}, or a folder in it")
@@ -64,14 +64,18 @@ class SessionFolder:
         return late is not None or self._write(path, content[: len(content) // 2] if half else content)
 
     def read(self, path: str) -> bytes:
-        """Read a file by its path on the controller's computer. Raises OSError, InvalidValue."""
+        """Read a file by its path on the controller's computer.
+
+        Raises:
+            InvalidValue: the path is not in the session folder. OSError: the file can't be read.
+        """
         name = PureWindowsPath(path).name
         if path != self.path_of(name):
             raise InvalidValue(f"{path!r} is not in the session folder", hint=self.path)
         return (self.folder / checked_name(name)).read_bytes()
 
     def write_late(self, now_s: float) -> float | None:
-        """Write the late files that are due; return the time of the next one."""
+        """Write the late files that are due; return the time of the next late file, None if there is none."""
         due = [late for late in self._late if late[0] <= now_s]
         self._late = [late for late in self._late if late[0] > now_s]
         for _, path, content in due:
@@ -88,7 +92,7 @@ class SessionFolder:
 
 
 def checked_name(text: str) -> str:
-    """Check a part of a file name. Raises InvalidValue: Windows, the controller's system, does not allow it."""
+    """Return a part of a file name unchanged. Raises InvalidValue: Windows, the controller's system, forbids it."""
     if not _NO_FILE_NAME.isdisjoint(text) or len(text) > _LONGEST_NAME or text.strip(". ") != text:
         raise InvalidValue(f"{text!r} can't be part of a file's name")
     return text

@@ -25,7 +25,7 @@ _ADDITIONAL: Final = ["Counter 1 (Hz)", "Counter 2 (Hz)"]
 
 
 class Signals:
-    """The signals, and the functions that read them.
+    """The signals, and the functions for signals, current, bias range, PLL and TCP Logger.
 
     Attributes:
         names: names with units of the 128 signals.

@@ -27,12 +27,12 @@ _BUSY: Final = "pattern"
 
 
 class NanonisSoftware:
-    """The software.
+    """The emulated Nanonis software: all its modules, with one simulated instrument.
 
     Args:
         session_path: session folder's path on the controller's computer; empty: the path of `folder`.
         range_m: range of the scanner in x and y.
-        rows_as_recorded: True if images are returned as recorded, False for the top row first.
+        rows_as_recorded: see `ScanModule`.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class NanonisSoftware:
         self.functions = Dispatcher(self.core.registers, modules)
 
     def advance(self, now_s: float) -> float | None:
-        """Advance to now; return the time of the next change."""
+        """Advance faults, scans, spectra and files; return the time of the next delayed scan or file, None without."""
         self.z_controller.go_wrong(now_s)
         starts_s = self.scans.advance(now_s)
         self.spectra.advance(now_s)
@@ -75,7 +75,7 @@ class NanonisSoftware:
 
 
 class PatternModule:
-    """Grids of spectra: only their duration is emulated, no data is saved."""
+    """Patterns of spectra (grid, line, cloud): only their duration is emulated, no data is saved."""
 
     def __init__(self, core: NanonisCore) -> None:
         self._core = core

@@ -28,11 +28,11 @@ class SweepSettings:
 
     Attributes:
         points: number of points; None: as in the simulated spectrum.
-        limits: first and last value of the sweep; None: the limits of the simulated spectrum, whose last values
-            continue beyond.
+        limits: first and last value of the sweep; None: the limits of the simulated spectrum. Beyond the limits of
+            the simulated spectrum, its outermost values continue.
         sweeps: number of averaged sweeps.
         channels: indexes of recorded signals; None: all signals of the simulated spectrum.
-        backward: True if also swept backwards.
+        backward: True if the spectrum is also swept backwards.
         saves: True if a file is written.
         saves_all, dialog: stored without effect.
     """
@@ -66,12 +66,12 @@ class SweepSettings:
 
 
 class SpectroscopyModules:
-    """Both spectroscopy modules.
+    """The functions of both spectroscopy modules, and the running spectrum.
 
     Attributes:
-        sweeps: settings by module.
-        running: the running spectrum.
-        ended: number of ended spectra.
+        sweeps: sweep settings by module.
+        running: the running spectrum; None without a spectrum.
+        ended: number of ended spectra, completed or stopped.
     """
 
     def __init__(self, core: NanonisCore, signals: Signals) -> None:
@@ -82,7 +82,7 @@ class SpectroscopyModules:
         self._base_names = dict(_FILE_NAMES)
 
     def advance(self, now_s: float) -> None:
-        """End and save the spectrum once it is over."""
+        """End and save the spectrum once its duration has passed."""
         curve = self.running
         if curve is None or curve.running(now_s):
             return
@@ -95,7 +95,7 @@ class SpectroscopyModules:
             session.save(session.next_name(self._base_names[module], 5, ".dat"), content, now_s)
 
     def start(self, module: str, base_name: str) -> None:
-        """Start a spectrum. Raises InstrumentBusy."""
+        """Start a spectrum. Raises InstrumentBusy; InvalidValue: `base_name` can't be part of a file's name."""
         self._base_names[module] = checked_name(base_name) or self._base_names[module]
         sweep = self.sweeps[module]
         curve = sweep.resample(self._core.rig.start_spectrum(_KINDS[module], self._core.now_s, sweep.sweeps))

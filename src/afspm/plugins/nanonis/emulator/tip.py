@@ -24,8 +24,8 @@ class ZController:
     """The z controller and the auto-approach.
 
     Attributes:
-        state: "off", "on" or "safe" (after the safe tip).
-        pulse_holds: True if a pulse holds the controller.
+        state: "off", "on", or "safe" after the safe tip has withdrawn the tip.
+        pulse_holds: True if a bias pulse puts the controller on hold.
     """
 
     def __init__(self, core: NanonisCore, scans: ScanModule, signals: Signals) -> None:
@@ -35,7 +35,7 @@ class ZController:
         self._follows_s = 0.0
 
     def go_wrong(self, now_s: float) -> None:
-        """Withdraw the tip by the safe tip, if a fault is configured to do so."""
+        """Let the safe tip withdraw the tip if such a fault is due."""
         faults, rig = self._core.faults, self._core.rig
         if faults.strikes("safe-tip", now_s):
             rig.withdraw(now_s)
@@ -45,7 +45,10 @@ class ZController:
             self.state = "safe"
 
     def switch(self, now_s: float, *, on: bool, off_delay_s: float = 0.0) -> None:
-        """Switch after the delay. Switching on brings back a withdrawn tip."""
+        """Switch at once; after switching off, report "switching off" for `off_delay_s`.
+
+        Switching on brings back a withdrawn tip.
+        """
         rig = self._core.rig
         self.state = "on" if on else "off"
         self._follows_s = now_s + (0.0 if on else off_delay_s)
@@ -94,7 +97,7 @@ class ZController:
 
     @answers("ZCtrl.Home")
     def _home(self) -> Answer:
-        # (!) It is unknown if the real one refuses this while its controller is on; here it is switched off.
+        # (!) It is unknown if the real software refuses this while the z controller is on; here that is switched off.
         relative, home_m = (*self._core.registers.get("ZCtrl.HomeProps"), 0, 0.0)[:2]
         z_m = self._signals.z_m(self._core.now_s)
         self.switch(self._core.now_s, on=False)
@@ -160,7 +163,7 @@ class ZController:
 
 
 class TipModules:
-    """Position, bias, tip shaper, piezos, atom tracking and coarse motor."""
+    """The functions for position, bias, tip shaper, piezos, atom tracking and coarse motor."""
 
     def __init__(self, core: NanonisCore, scans: ScanModule, z_controller: ZController) -> None:
         self._core, self._scans, self._z_controller = core, scans, z_controller
@@ -286,7 +289,7 @@ class TipModules:
 
     @answers("Motor.StartMove")
     def _start_motor(self, direction: int, steps: int, group: int, wait: int) -> Answer:
-        # (!) It is unknown if the real one refuses this during a scan or a withdrawal; here it does.
+        # (!) It is unknown if the real software refuses this during a scan or a withdrawal; the emulator does.
         if direction > 5:
             raise FunctionRefused(f"{direction} is not a direction")
         now_s = self._core.now_s

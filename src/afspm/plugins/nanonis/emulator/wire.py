@@ -56,7 +56,7 @@ class WireField:
 
     Attributes:
         code: type code, see `functions.txt`.
-        since, until: first release with the field, first one without it.
+        since, until: first release with the field, first later release without the field.
         mark: relation between values in `…Set` and `…Get`, see `functions.txt`.
     """
 
@@ -109,7 +109,7 @@ def _by_lower_case() -> Mapping[str, str]:
 
 
 def known_as(name: str) -> str | None:
-    """Return the spelling of a name in the table, ignoring case; None if unknown."""
+    """Return a function's name in the spelling of `functions.txt`, ignoring case; None if unknown."""
     return _by_lower_case().get(name.lower())
 
 
@@ -118,12 +118,12 @@ def _fields(column: str) -> tuple[WireField, ...]:
 
 
 def split(received: bytearray) -> tuple[str, bool, bytes] | None:
-    """Remove one request from the received bytes; return name, whether an answer is wanted, and body.
+    """Remove one request from the received bytes; return its name, True if an answer is wanted, and its body.
 
-    None: the request is incomplete.
+    Return None if the request is incomplete.
 
     Raises:
-        MalformedRequest: not a request.
+        MalformedRequest: the announced size is impossible.
     """
     if len(received) < HEADER_BYTES:
         return None
@@ -194,7 +194,7 @@ def _items(code: str, count: int, body: bytes, at: int) -> tuple[list[Any], int]
 
 
 def reply(name: str, body: bytes) -> bytes:
-    """Encode a reply from its header's name and its body."""
+    """Encode a reply from the name for its header and the body."""
     return name.encode("ascii", "replace")[:32].ljust(32, b"\0") + struct.pack(">i", len(body)) + bytes(4) + body
 
 
@@ -238,7 +238,7 @@ def _packed(code: str, value: Any, encoding: str) -> bytes:
         return b"".join(_packed(code[1], one, encoding) for one in value)
     if code == "f" and abs(value) > _LARGEST_SINGLE:
         return struct.pack(">f", math.copysign(math.inf, value))
-    if code in "BHIin":  # a value set as a signed field may be returned as an unsigned one
+    if code in "BHIin":  # a value set as a signed field may be returned as an unsigned field
         size = _SIZES[code.replace("n", "i")]
         return (int(value) % (1 << 8 * size)).to_bytes(size, "big")
     return struct.pack(f">{code}", value)
