@@ -1,4 +1,4 @@
-"""NSID files (.h5, pycroscopy's format): images [x, y], both ascending, with notes in files of Asylum."""
+"""NSID files (.h5, pycroscopy's format): images [x, y] with ascending axes, with the note in files of Asylum."""
 
 from __future__ import annotations
 
@@ -21,7 +21,11 @@ if TYPE_CHECKING:
 
 
 def read_nsid(path: Path, zone: tzinfo | None) -> FileContent:
-    """Read all images of a file. Raises FileError: no image, or damaged. UnitError: axes are not lengths."""
+    """Read all images of a file.
+
+    Raises:
+        FileError: the file has no image or is damaged. UnitError: the axes are not lengths.
+    """
     with hdf5.opened(path) as file:
         nodes: list[h5py.Dataset | h5py.Group] = []
         file.visititems(lambda _, node: nodes.append(node))

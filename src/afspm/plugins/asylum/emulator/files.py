@@ -20,7 +20,7 @@ _FLOAT32: Final = 2
 
 Entries = Mapping[str, float | str]
 Made = Callable[[str], bytes]
-"""Encodes a file, given the name of its wave."""
+"""A function that encodes a file, given the name of its wave."""
 
 
 def image(name: str, scan: ScanActivity, values: IgorValues, now_s: float) -> bytes:
