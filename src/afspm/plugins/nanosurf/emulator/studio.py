@@ -109,7 +109,7 @@ PANEL: Final[dict[str, PanelValue]] = {
     "device.scan_head.serial_number": PanelValue("SIMULATED", read_only=True),
     "device.scan_head.connected": PanelValue(at_first=True, read_only=True),
 }
-"""Below `root.workflow`."""
+"""Values of the panels by their paths below `root.workflow`."""
 
 FRAMES: Final = {
     "frame": ("imaging.frame_center_offset_x", "imaging.frame_center_offset_y", "imaging.scan_range_fast_axis",
@@ -146,7 +146,8 @@ class CurveGrid:
     """A running measurement of a grid of curves.
 
     Attributes:
-        points_m: remaining points.
+        shape: (rows, columns) of the grid.
+        points_m: remaining points, (x, y).
         curves: curves taken so far.
         at_point: True if the tip is at the next curve's point, or on its way there.
     """
@@ -268,7 +269,14 @@ class StudioProgram(MakerProgram):
         self._start_grid(CurveGrid((rows, columns), [(px, py) for px, py in points.tolist()]), now_s)
 
     def measure_at(self, kind: str, name: str, place: Sequence[Any], now_s: float) -> None:
-        """Measure a workspace item: a frame, a grid or a point. Raises InstrumentBusy, InvalidValue."""
+        """Start measuring a workspace item: a frame, a grid or a point.
+
+        Args:
+            place: centre (x, y), width, height, columns, rows and rotation, as in `FRAMES`.
+
+        Raises:
+            InstrumentBusy. InvalidValue: a value is out of bounds.
+        """
         self._item_name = name
         for path, value in zip(FRAMES.get(kind, ()), place, strict=False):
             self.put(path, value)
@@ -313,12 +321,12 @@ class StudioProgram(MakerProgram):
         self.values |= self._cantilever
 
     def load_mode(self, name: str) -> None:
-        """Load a measurement mode. Raises InstrumentBusy: a measurement is running."""
+        """Load a measurement mode. Raises InstrumentBusy."""
         self._refuse_busy()
         self.values["mode.name"] = name
 
     def select_cycle(self, cycle: str | float) -> None:
-        """Select a spectroscopy cycle by its id or number. Raises InvalidValue: unknown."""
+        """Select a spectroscopy cycle by its id or number. Raises InvalidValue: the cycle is unknown."""
         number = CYCLES.index(cycle) if cycle in CYCLES else cycle
         if not (isinstance(number, int | float) and number in range(len(CYCLES))):
             raise InvalidValue(f"there is no cycle {cycle!r}", hint=f"{', '.join(CYCLES)}, or 0 to {len(CYCLES) - 1}")
@@ -333,14 +341,17 @@ class StudioProgram(MakerProgram):
             self.rig.scan.resume(now_s)
 
     def move(self) -> None:
-        """Move the tip to the target. Raises InstrumentBusy, InvalidValue."""
+        """Start moving the tip to the target. Raises InstrumentBusy, InvalidValue."""
         self.rig.setup.move_speed_m_s = self.values["scanner.move_speed_xy_on_surface"]
         self.rig.move_probe(
             (self.values["scanner.offset_x_target"], self.values["scanner.offset_y_target"]), self.now_s
         )
 
     def lines(self, channel: int) -> tuple[str, str, list[float]]:
-        """Return name, unit and the complete lines of the running scan, flattened in scanning order."""
+        """Return name, unit and the complete lines of the last started scan, flattened in scanning order.
+
+        Empty before the first scan.
+        """
         scan = self.rig.scan
         if scan is None:
             return "", "", []
