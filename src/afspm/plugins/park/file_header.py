@@ -1,6 +1,6 @@
 """Layout of Park's TIFF files: private tags that contain a header of an image, or of curves.
 
-From pspylib 0.1.2, the maker's own reader; images were compared with Gwyddion, curves with AtomicJ.
+The layout comes from pspylib 0.1.2, the maker's own reader; images were compared with Gwyddion, curves with AtomicJ.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ HEADER: Final = np.dtype(
     + [("z_gain", "<f8"), ("z_range", "<f8"), ("xy_voltage", "V16"), ("z_voltage", "V16"), ("xy_servo", "V16")]
     + [("numbers", "<u4")]
 )
-"""Beginning of a header. The first version ends before `z_gain`, and its numbers are <i2."""
+"""Beginning of a header. The fields from `z_gain` on belong to the second version; in the first, numbers are <i2."""
 
 CHANNELS: Final = 8
 CURVE_KINDS: Final = {1: "indentation", 2: "force", 3: "IV", 4: "indentation", 5: "photo-current"} | {
@@ -69,6 +69,6 @@ def text(raw: np.void) -> str:
 
 
 def in_si(unit: str) -> tuple[str, float]:
-    """Return the unit without its prefix, and the prefix as a factor."""
+    """Return the unit without its prefix, and the prefix as a factor; an unknown unit unchanged, and 1."""
     found = _UNIT.fullmatch(unit)
     return (found[2], _PREFIX[found[1]]) if found else (unit, 1.0)

@@ -1,7 +1,7 @@
 """Frame, speed, gains and tip position: conversion between SmartScan's values and generic parameters.
 
 SmartScan has the centre of a frame in µm, its angle in degrees, and lines per second; a line is forward and backward
-(!).
+(!). The mark (!) stands for an unconfirmed fact.
 """
 
 from __future__ import annotations
