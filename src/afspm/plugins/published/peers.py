@@ -1,4 +1,4 @@
-"""Bridge for components of the published implementation in an afspm experiment, or for their scheduler."""
+"""Bridge for components of the published implementation in an afspm experiment, or for a published scheduler."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ _NAMELESS = b"a client without a name: set the socket's identity to the componen
 
 
 class PublishedPeers:
-    """The scheduler that components of the published implementation expect: their entry to an afspm experiment.
+    """The scheduler that components of the published implementation ("peers") expect in an afspm experiment.
 
-    In the afspm scheduler each of them is a client with its own name.
+    In the afspm scheduler each peer is a client with its own name.
 
     Args:
         serve: address for the control clients of the peers.
@@ -58,7 +58,7 @@ class PublishedPeers:
     """
 
     opens_plain: ClassVar[bool] = True
-    """Programs without keys can command the microscope through it, so the experiment file has to allow it."""
+    """Programs without keys can command the microscope through this class: the experiment file must allow its use."""
 
     def __init__(self, serve: str, publish: str, *, as_translator: bool = False) -> None:
         self._serve, self._publish = serve, publish
@@ -160,7 +160,7 @@ class _PeersPort(BasePort[Incoming]):
         return f"{name}/{self._session}/{next(self._numbers)}"
 
     def due_in_s(self) -> float | None:
-        """Return the longest time to wait for messages; None: no limit."""
+        """Return the longest time to wait for messages, in s; None: no limit."""
         due_s = min(self._outlet.due_s, self._ends_s)
         return None if due_s == math.inf else due_s - self._clock.monotonic_s()
 
@@ -348,7 +348,7 @@ class _Outlet:
 
     @property
     def due_s(self) -> float:
-        """Return the time of the next publication; infinity if none is due."""
+        """The time of the next publication; infinity without waiting packets or replay."""
         return min(self.pacing.due_s, self._replay_s)
 
     def subscriptions(self) -> list[str]:
@@ -378,7 +378,7 @@ class _Outlet:
         now_s = self._clock.monotonic_s()
         if now_s >= self._replay_s:
             prefixes, self._joined, self._replay_s = tuple(self._joined), set(), math.inf
-            # like the published cache, the last of each: a peer that asserts one packet fails at two
+            # like the published cache, the last packet of each envelope: a peer that asserts one packet fails at two
             for packet in self._history.last(prefixes):
                 self._send(packet)
         for packet in self.pacing.take(now_s):
