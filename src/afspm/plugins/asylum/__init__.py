@@ -202,6 +202,7 @@ class Asylum(Driver):
         try:
             accepted = self._igor().do(function, button)
         except XopError:
+            # if the measurement has started all the same, the next poll registers its start
             self._activity.forget()
             raise
         if not accepted:
@@ -212,12 +213,17 @@ class Asylum(Driver):
         """Stop the scan. Asylum also withdraws the tip."""
         self._igor().do("DoScanFunc", "StopScan")
         self._activity.stopped()
-        # StopScan also stops the feedback and withdraws the tip: a person should know
+        # a warning, since a withdrawn tip may surprise the user: StopScan stops more than the scan
         self.log.warning("Asylum withdrew the tip, as it does whenever a scan is stopped")
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
-        """Take a force curve at the target spot of the tip; without a target, at the tip's present position."""
+        """Take a force curve at the target spot of the tip; without a target, at the tip's present position.
+
+        Raises:
+            Refused: ACTION_ERROR: Igor lacks ARGetStatus, the folder does not exist, or Asylum refuses a curve at the
+                present position.
+        """
         # ScanStatus and FMapStatus do not show single force curves
         if self._igor().doing().bits is None:
             reason = "Igor lacks ARGetStatus, without which the end of a force curve can't be detected"

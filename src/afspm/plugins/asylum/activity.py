@@ -20,7 +20,7 @@ from afspm.translator.state import Kept
 FORCE: Final = "force"
 
 _SAVED_TO: Final = {SCAN: "SaveImage", FORCE: "SaveForce"}
-"""Each name is a number (2: measurements are saved) and, in GS, a text (the folder)."""
+"""Asylum's name for saving, by kind of measurement: for GV a number (2: results are saved), for GS the folder."""
 _SAVE: Final = 2.0
 
 
@@ -105,7 +105,7 @@ class AsylumActivity(Activity):
         """Register the start of a scan, or of a force curve at the panel, whose position is then read from its file."""
         taken: dict[str, object] = {"position": None}
         if what == SCAN:
-            # only if the tip was ever sent to a spot: else a force curve stays where it is
+            # only if the tip was ever sent to a spot: else a force curve is taken at the present position
             if "led_away" in self._kept:
                 self._kept["led_away"] = True
             taken = {"frame": as_list(self._frame_in_force())}

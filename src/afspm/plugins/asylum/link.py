@@ -56,7 +56,7 @@ class Link:
 
         def parse(payload: bytes) -> xop.Reply | None:
             found = xop.reply(payload)
-            # errors 3 to 7, found before Igor is asked, have no id: they belong to the only request in flight
+            # errors 3 to 7, which the XOP finds without Igor, have no id: they belong to the only request in flight
             is_ours = found.message_id == message_id or (found.message_id is None and found.error is not None)
             return found if is_ours else None
 

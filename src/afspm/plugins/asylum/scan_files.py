@@ -25,7 +25,7 @@ Note = PlainMapping
 
 CONTROLLER = "Asylum"
 _IGOR_EPOCH = datetime(1904, 1, 1)  # noqa: DTZ001  (local time of the controller)
-# By the beginning of a channel's name, without the "Nap" of a second pass: a wave has one unit for all its channels.
+# Units by the beginning of a channel's name, without the "Nap" of a second pass: a wave has only one unit.
 _UNITS = {
     "Height": "m", "ZSensor": "m", "RawZSensor": "m", "Amplitude": "m", "Deflection": "m", "Phase": "deg",
     "Frequency": "Hz", "Current": "A", "UserIn": "V", "BackPackIn": "V", "Lateral": "V", "Potential": "V",

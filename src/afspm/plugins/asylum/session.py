@@ -46,7 +46,7 @@ class Doing:
 
     @property
     def engaged(self) -> bool:
-        """True if the tip is at the sample, or may be there, since this release lacks ARGetStatus."""
+        """True if the tip is at the sample, or if its place is unknown for lack of ARGetStatus."""
         return self.bits is None or bool(self.bits & (_ENGAGED | _SCANNING)) or self.scanning
 
 
@@ -120,7 +120,7 @@ class Session:
             self.ask("PV", name, float(value))
 
     def _look(self, names: Sequence[str]) -> tuple[float, list[float]]:
-        # Without `afspm.ipf`, each value is one request. Its absence is remembered until the next connection.
+        # Without `afspm.ipf`, each value is one request. Its absence is remembered: each attempt would cost a request.
         if self.at_once:
             try:
                 bits, values = math.nan, list[float]()

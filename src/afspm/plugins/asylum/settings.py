@@ -105,6 +105,7 @@ class FrameSettings(SettingsGroup):
         wanted = asylums(values, self._in_force())
         there = self._igor().values(list(wanted))
         for name, value in wanted.items():
+            # each PV is a request of its own, and takes Igor some ten milliseconds
             if there[name] != value:
                 self._igor().put(name, value)
 

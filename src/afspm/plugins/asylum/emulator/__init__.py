@@ -24,7 +24,7 @@ _NOT_COMPILED, _ABORTED, _UNKNOWN = 100, 107, 1
 
 @dataclass(frozen=True)
 class DelayedMessage:
-    """A reply with the time at which it is sent."""
+    """A reply with its time of sending, experiment time."""
 
     client: bytes
     payload: bytes
@@ -42,7 +42,8 @@ class AsylumEmulator(Emulator):
             experiment time.
         save_path: Igor's name of the data folder, "C:Users:Me:Data:". Default: the folder's own path.
         base_name: base name of the files.
-        procedures: included procedure files: "afspm" (afspm.ipf), "spots" (those of the published afspm) or "none".
+        procedures: included procedure files: "afspm" (afspm.ipf), "spots" (procedures of the published afspm) or
+            "none".
         has_status: True if this release has the function ARGetStatus.
         image_open: True if a window shows an image with spots.
         saves_partial: True if stopped images are saved.
@@ -115,7 +116,7 @@ class AsylumEmulator(Emulator):
         return AsylumFunctions(self.controller, self.clock.now_s, self._settings).table()
 
     def serve(self, timeout_s: float) -> None:
-        """Receive requests; execute queued calls while Igor is idle, but only one call for each `idle_s`."""
+        """Receive requests, and execute one queued call at each idle moment of Igor (see `idle_s`)."""
         if self._server.queue and not self._busy():
             timeout_s = min(timeout_s, max(0.0, self._idle_at_s - self.clock.monotonic_s()))
         self._server.poll(timeout_s, locked=self._locked())

@@ -34,7 +34,7 @@ _SCANNING, _ENGAGED, _FORCE = 0x1, 0x2, 0x10
 _MOST_POINTS: Final = 8192
 _PULSE_S: Final = 60.0
 _INDENTS_M: Final = 1e-6
-"""A longer force curve drives the tip into the sample."""
+"""Longest force curve that does not drive the tip into the sample."""
 _REACH_M: Final = 1e-3
 """Limit of all distances: far beyond any scanner."""
 _LONGEST_NAME: Final = 17
@@ -83,7 +83,7 @@ class AsylumController:
         self._starts_at_s = math.inf
         self._bias_since_s = -math.inf
         self._curve_running = self._engages = False
-        # as after a scan whose image is still open: the first spot is in its middle
+        # as after a scan whose image is still open: the first spot is in the middle of the image
         self._image = self._frame()
         fast, slow = values.size()
         self.spots_m: list[tuple[float, float]] = [(fast / 2, slow / 2)]
@@ -101,7 +101,7 @@ class AsylumController:
     # --- what goes on ---
 
     def advance(self, now_s: float) -> float | None:
-        """Advance to now; return the time of the next start or file, or None. The rig has the end of its activity."""
+        """Advance to `now_s`; return the time of the next event, apart from events of the rig."""
         if self._engages and not self.rig.busy(now_s):
             self._engages = False
             self.rig.engage(now_s)
@@ -172,7 +172,7 @@ class AsylumController:
         self.values.put("ScanStatus;FMapStatus", 0)
 
     def _start_or_interrupt(self, now_s: float) -> None:
-        # A scan with impossible parameters ends like one stopped at the panel.
+        # A scan with impossible parameters ends like a scan that is stopped at the panel.
         try:
             if not self._can_be_scanned():
                 raise InvalidValue("no scan is possible with these parameters")
@@ -285,7 +285,7 @@ class AsylumController:
     # --- files ---
 
     def check_suffix(self) -> None:
-        """Raise BaseSuffix to the next number without a file."""
+        """Increase BaseSuffix to the next number without a file."""
         base, suffix = self._base_name(), self._suffix()
         while (self._folder / f"{base}{suffix:04d}.ibw").exists():
             suffix += 1

@@ -1,4 +1,4 @@
-"""ZeroMQ-XOP as a process within Igor: its socket, its immediate replies, and the queue of calls for Igor.
+"""ZeroMQ-XOP within Igor: its socket, its immediate replies, and the queue of calls for Igor.
 
 A thread of the XOP answers malformed requests at once; valid requests wait until Igor is idle. Times are real seconds.
 """
@@ -28,7 +28,7 @@ class XopServer:
     """The XOP's socket and queue.
 
     Args:
-        port: 0: any free port.
+        port: listening port; 0: any free port.
         wakes: object with a `fileno` that ends `poll`.
     """
 
