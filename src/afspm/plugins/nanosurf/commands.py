@@ -21,7 +21,7 @@ APPROACH, WITHDRAW = "approach.approach", "approach.withdraw"
 TAKE_CURVE, STOP_CURVE = "spectroscopy.acquire", "spectroscopy.stop"
 MOVE: Final = "scanner.move_to_target_offsets"
 GRID: Final = tuple(f"spectroscopy.grid_{name}" for name in ("center_offset_x", "center_offset_y", "columns", "rows"))
-"""Values of the grid of curves: centre, columns and rows."""
+"""Paths of the values of the grid of curves: centre, columns and rows."""
 
 _ALWAYS: Final = (START, STOP, APPROACH, WITHDRAW, TAKE_CURVE, STOP_CURVE, MOVE, *GRID)
 _SIGNALS: Final = (f"{STARTED}.connect", f"{STARTED}.empty", f"{FINISHED}.connect")

@@ -40,7 +40,8 @@ def read_nhf(path: Path, zone: tzinfo | None) -> FileContent:
     """Read all images and curves of a file.
 
     Raises:
-        FileError: the file has another format, is damaged, or has neither images nor curves.
+        FileError: the file has another format, inconsistent sizes, or neither images nor curves.
+        OSError: the file is damaged.
     """
     with hdf5.opened(path) as file:
         version = int(file.attrs.get("nsf_file_version_major", 0))

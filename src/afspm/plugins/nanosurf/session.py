@@ -128,7 +128,7 @@ class Session:
         link = self._open_link()
         try:
             self._select(link)
-            # A long command blocks its connection: the first one stays free for polls and stops.
+            # A long command blocks its connection: the first connection stays free for polls and stops.
             link.begin(f"{first} return {WORKFLOW}.{command}()")
         except BaseException:  # Ctrl-C, too: nothing else closes this connection
             link.close()
@@ -162,7 +162,7 @@ class Session:
 
     def _select(self, link: Link) -> None:
         try:
-            # The selection of a session belongs to a connection: each one needs its own.
+            # The selection of a session belongs to a connection: each connection needs its own selection.
             link.run(f"return root.session.select({written(self._name)}, {self._level})")
         except StudioError as error:
             raise ControllerLost(f"Studio's session {self._name!r} can't be selected: {error}") from error
@@ -190,7 +190,7 @@ def new_lines(
     Returns:
         one item for each channel, all with the same lines, rows ascending in y; empty without new lines.
     """
-    # (!) which buffer holds the image, and that its values are the lines as they were scanned, is not known
+    # (!) the number of the image's buffer, and the order of the lines in the buffer (as scanned), are unconfirmed
     found = session.run(commands.BUFFER_LINES % buffer)[0]
     channels = [_buffered_channel(one, shape[1]) for one in found.values()]
     done = min((len(values) for _, _, values in channels), default=0)

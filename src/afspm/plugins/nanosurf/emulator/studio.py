@@ -23,7 +23,7 @@ _INTEGRAL_GAIN: Final = 0.5
 _GAIN_SHARE: Final = 0.4
 """Result of the Gain Finder, as a share of the gain at which the simulated feedback oscillates."""
 _NOMINAL: Final = 1.2
-"""The maker's nominal cantilever values, as a multiple of the true ones."""
+"""The maker's nominal cantilever values, as a multiple of the true values."""
 _REACH_M: Final = 50e-6
 _MOST_PIXELS: Final = 8192
 _MOST_GAIN: Final = 100000
@@ -40,7 +40,7 @@ class PanelValue:
         at_first: initial value; its type is fixed.
         low, high: bounds of a number.
         enum: names and numbers of the choices.
-        read_only: True if it can't be set.
+        read_only: True if the value can't be set.
     """
 
     at_first: float | int | str | bool
@@ -135,7 +135,7 @@ MODES: Final = {
     "static_mode": ("load",),
     **dict.fromkeys(("dynamic_mode", "wavemode", "wavemode_nma"), ("load", "update")),
 }
-"""The modes of measurement with the commands of each; (!) all measure as the mode of the emulator does."""
+"""The modes of measurement with the commands of each; (!) every mode measures like the emulator's feedback mode."""
 
 CYCLES: Final = ("force_distance_z_z",)
 """The ids of spectroscopy cycles."""
@@ -228,7 +228,7 @@ class StudioProgram(MakerProgram):
         return value
 
     def put(self, path: str, value: object) -> None:
-        """Set a value of a panel. Raises InvalidValue: read-only, out of bounds, or another type."""
+        """Set a value of a panel. Raises InvalidValue: the value is read-only, out of bounds or of another type."""
         row = PANEL[path]
         if row.read_only:
             raise InvalidValue(f"{path} can't be set")
@@ -262,7 +262,7 @@ class StudioProgram(MakerProgram):
         return self.scanning or self.measuring_curve or self.engages or self.rig.busy(now_s)
 
     def start_curves(self, now_s: float) -> None:
-        """Take the curves of the grid. Raises InstrumentBusy."""
+        """Start taking the curves of the grid. Raises InstrumentBusy."""
         x, y, width, height, columns, rows, rotation_deg = (self.values[path] for path in FRAMES["grid"])
         region = Region((x, y), (max(width, 1e-12), max(height, 1e-12)), math.radians(rotation_deg))
         points = np.stack([of.ravel() for of in region.pixels_m((rows, columns))], axis=1)

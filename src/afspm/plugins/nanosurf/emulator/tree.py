@@ -96,7 +96,7 @@ class CommandTree:
 
     @contextmanager
     def _bounded(self) -> Iterator[None]:
-        # Scripts of any client share the memory: one that stores too much would end the emulator.
+        # Scripts of all clients share the memory: a script that stores too much would end the emulator.
         from lupa import lua54
 
         try:
@@ -151,7 +151,7 @@ class CommandTree:
         self._level_chosen(int(level))
 
     def _session(self, workflow: Nested, level: int) -> Nested:
-        # A licence of a higher level adds commands to the application's own ones.
+        # A licence of a higher level adds commands to the application's own commands.
         imaging = workflow["imaging"]
         # The real tree has the old commands at the highest level only.
         if level == ALL_LEVELS and self._release <= LAST_WITH_OLD_COMMANDS:

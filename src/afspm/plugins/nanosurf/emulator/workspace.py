@@ -79,7 +79,11 @@ class Workspace:
         return next((item_id for item_id, item in self._items.items() if item.name == name), NO_ITEM)
 
     def change(self, item_id: str, **values: Any) -> None:
-        """Change an item. Raises InvalidValue: the id is unknown, or a size or number is not above 0."""
+        """Change an item.
+
+        Raises:
+            InvalidValue: the id is unknown, the name is too long, or a size or number is not above 0.
+        """
         before = self[item_id]
         changed = WorkspaceItem(**{**asdict(before), **values})
         sizes = changed.width_m, changed.height_m, changed.columns, changed.rows
@@ -174,7 +178,7 @@ class MeasurementQueue:
         """Start measuring items, each as often as its entry demands.
 
         Raises:
-            InstrumentBusy: a measurement is running. InvalidValue: an item is unknown.
+            InstrumentBusy: the queue or the instrument is busy. InvalidValue: an item is unknown.
         """
         for item_id, _ in entries:
             self._workspace[item_id]
