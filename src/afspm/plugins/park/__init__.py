@@ -181,7 +181,7 @@ class Park(Driver):
         self._doing.approach()
 
     def command(self, text: str) -> None:
-        """Evaluate an expression, e.g. `spm.ncm.sweepAutoFullRange()`. After 0.5 s it keeps the microscope busy."""
+        """Evaluate an expression, e.g. `spm.ncm.sweepAutoFullRange()`. After 0.5 s the microscope counts as busy."""
         try:
             self._doing.evaluate(text)
         except SmartScanError as error:

@@ -91,7 +91,7 @@ class SmartScanActivity(Activity):
     def start_curve(self, kind: str, place_m: XY) -> None:
         """Move the tip to `place_m`, (x, y) in m, where `status` takes a curve of this kind on arrival."""
         self._stopping = False
-        # The scanner is where the scan has left it: the curve needs a move first.
+        # A scan leaves the scanner away from the target: the curve needs a move first.
         self.watch(self._session.begin(kind, way_to(place_m)))
         self.curve_awaited, self._curve_at = kind, place_m
 
@@ -119,6 +119,7 @@ class SmartScanActivity(Activity):
         """Stop scan, curve and approach, and withdraw the tip: by the scanner, then by the stage if `lift_um` > 0."""
         self.stopped()
         self.close()
+        # an error of a stop must not prevent the withdrawal
         ended = " ".join(f"try {{ spm.{one}(); }} catch (ignored) {{}}" for one in _ENDED_FIRST)
         away = f"spm.zscanner.retractAll(); if ({lift_um!r} > 0) {{ spm.zstage.move({lift_um!r}, 1); }}"
         self.watch(self._session.begin("withdrawal", f"(function() {{ {ended} {away} return 0; }})()"))

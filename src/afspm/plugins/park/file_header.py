@@ -59,12 +59,12 @@ CURVES: Final = np.dtype(
     + [("of_kind", "<f4", 13), ("numbers", "<i4"), ("setpoint", "<f4"), ("setpoint_unit", "<f4"), ("unused", "<i4", 22)]
 )
 OLD_CURVES: Final = CURVES.fields["grid_columns"][1] if CURVES.fields else 0
-"""Shortest header of curves, in older files, in bytes; points follow the newer header only."""
+"""Shortest header of curves, in older files, in bytes; the positions of curves follow only the newer header."""
 POINT: Final = np.dtype([("x_um", "<f4"), ("y_um", "<f4"), ("time_s", "<f4")])
 
 
 def text(raw: np.void) -> str:
-    """Return a text of a header: two bytes a character, padded with zeros."""
+    """Return a text of a header, which has two bytes for each character and zeros at its end."""
     return raw.tobytes().decode("utf-16-le", "replace").partition("\0")[0].strip()
 
 

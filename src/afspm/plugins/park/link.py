@@ -20,6 +20,7 @@ RUN_SCRIPT, SCRIPT_RUNS, IS_CONNECTED, SCAN_STATUS, GEOMETRY = (
     "geometry_query",
 )
 _NO_PARAMETERS: Final = "None"
+# one id for all requests: one request is pending at a time, and a missing reply closes the connection
 _ID: Final = 1
 _SHOWN: Final = 60
 _HINTS: Final = (
@@ -59,7 +60,7 @@ class Link:
             ControllerLost: no reply, or a malformed reply; the connection is closed.
         """
         reply = self._connection.ask(shown(expression), _request(RUN_SCRIPT, wrapped(expression)), _fields)
-        # `wrapped` always returns a text: without one the script did not run to its end.
+        # the script of `wrapped` always returns a text: without a text the script did not run to its end
         if not reply.get("value"):
             raise self._bad(f"SmartScan gave no value of {shown(expression)}")
         return self._outcome(reply)

@@ -41,7 +41,7 @@ class Session:
         self._open_link, self._scanning, self._idle = open_link, scanning, idle
         self._link = open_link()
         try:
-            # An unknown word in an answer must show now, not during the first scan.
+            # an unknown word in an answer must be found now, not during the first scan
             self._link.ask(IS_CONNECTED)
             self.scanning()
         except SmartScanError as error:

@@ -40,9 +40,9 @@ class Wait:
 
 
 Ask = Callable[[str, str, list[Any]], object]
-"""Executes a script's request: "get", "set" or "call", a path below `spm`, arguments; "now" returns ms.
+"""A function that executes a script's request: "get", "set" or "call", a path below `spm`, and the arguments.
 
-Raises AfspmError."""
+The request "now" returns the experiment time in ms. Raises AfspmError."""
 
 
 class Script:

@@ -113,8 +113,8 @@ def curve(spectrum: SpectrumActivity, now_s: float, mode: str) -> bytes:
 
 
 def _tiff(header: Any, data: Mapping[int, bytes], shown: Picture, now_s: float) -> bytes:
-    # The maker's own reader (pspylib) needs a picture with a palette, in several strips: it does not parse the tags of
-    # a single strip.
+    # The maker's own reader, pspylib, needs a picture with a palette, in several strips: the tags of a single strip are
+    # not parsed.
     from PIL import Image, TiffImagePlugin
 
     tags = TiffImagePlugin.ImageFileDirectory_v2()

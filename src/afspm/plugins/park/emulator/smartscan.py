@@ -50,7 +50,7 @@ _TOUCHES_UM: Final = 0.02
 _SWEEP_S: Final = 3.0
 _LINE_SCAN: Final = "line scan"
 _LINE_SCAN_S: Final = 1e9
-"""A line is scanned repeatedly until stopped."""
+"""Duration of a line scan, experiment time: SmartScan repeats the line until the scan is stopped."""
 _SETPOINT, _ENABLE, _RATE, _BIAS = "zservo.setpoint.value", "zservo.enable", "scan.rate", "bias.tip"
 _GAIN: Final = "zservo.gain"
 _PROPORTIONAL, _INTEGRAL = 0.2, 3000.0
