@@ -47,7 +47,7 @@ Becomes = Callable[[object, Table], Settings]
 
 @dataclass(frozen=True)
 class PublishedSetting:
-    """One setting of a published class.
+    """A setting of a published class.
 
     Attributes:
         becomes: returns the afspm settings (dotted names for tables) for a value and its table.
@@ -224,7 +224,7 @@ def _gone(why: str, *names: str) -> dict[str, PublishedSetting]:
 
 
 def _paper(ours: str) -> PublishedSetting:
-    # the paper's queue holds the scans that the published scheduler caches
+    # the queue of the paper's tracker holds the scans that the published scheduler caches
 
     def becomes(value: object, table: Table) -> Settings:
         settings = {"drift.tracker.class": "paper", f"drift.tracker.{ours}": value}
@@ -452,7 +452,7 @@ class _Conversion:
     def component(self, name: str, table: Settings, written: Table) -> Settings | None:
         """Return a component in afspm's form; None if afspm runs no process in its place.
 
-        That is so for a class without counterpart, which is an error in the document, and for a second dashboard.
+        No process is run for a class without counterpart, which is an error in the document, or for a second dashboard.
 
         Args:
             written: the component before its intermediaries were converted.

@@ -225,7 +225,7 @@ class _PeersPort(BasePort[Incoming]):
         key = b"" if self._as_translator else identity
         client = self._clients.get(key)
         if client is not None:
-            client.leaves = False  # it is back
+            client.leaves = False  # the peer is back
         else:
             # a client for each peer, so that the scheduler arbitrates control between them
             client = self._clients[key] = _PeerClient(self, self._name_inside(identity))
@@ -259,9 +259,9 @@ class _PeersPort(BasePort[Incoming]):
         identity = self._identities.pop(descriptor, None)
         client = None if identity is None or self._as_translator else self._clients.get(identity)
         if client is None or identity in self._identities.values():
-            return  # it has a newer connection
+            return  # the peer has a newer connection
         if client.asked:
-            client.leaves = True  # its last request is still carried out
+            client.leaves = True  # the last request is still carried out
         else:
             self._leave(client)
 
@@ -274,7 +274,7 @@ class _PeersPort(BasePort[Incoming]):
 
     def _subscriptions(self) -> list[Incoming]:
         for prefix in self._outlet.subscriptions():
-            # a peer gets messages unknown to version 1 if it subscribes by their names
+            # a peer that subscribes by name also gets messages unknown to version 1
             if prefix == wire.KILL.decode() or prefix.startswith(tuple(self._listened)):
                 continue
             if len(self._listened) < MOST_EXTRA:
@@ -309,7 +309,7 @@ class _PeersPort(BasePort[Incoming]):
                 state = wire.decode(message, packet.payload).state
             elif message == CONTROL_STATE.name:
                 if self._as_translator:
-                    return  # the scheduler outside publishes its own
+                    return  # the published scheduler publishes a control state of its own
                 packet = self._with_names_outside(packet)
         except WireError as error:
             self.warnings.warning(f"dropped a packet of the scheduler: {error}")

@@ -96,6 +96,7 @@ class _ClientOutside:
         self._bridge = bridge
         self._network = version_1.outside(bridge.launch)
         self.socket = self._network.socket(zmq.DEALER)
+        # the published scheduler knows a client only by its socket's identity
         self.socket.setsockopt(zmq.ROUTING_ID, name.encode())
         self.monitor = Monitor(self._network, self.socket, CONNECTED | DISCONNECTED)
         self._network.connect(self.socket, bridge.serve_outside)
@@ -290,7 +291,7 @@ class _SchedulerPort(BasePort[Incoming]):
         self._poller.forget(client.monitor.socket)
         client.close()
 
-    # --- outside: their scheduler ---
+    # --- outside: the published scheduler ---
 
     def _connected(self) -> list[Incoming]:
         if self._monitor.drain() and self._router is None:

@@ -142,7 +142,7 @@ class _Stop:
 def _started(
     program: Sequence[str], context: ProcessContext, sockets: Sockets, stop: _Stop
 ) -> Iterator[subprocess.Popen[bytes]]:
-    # under the guard that also runs commands in other languages
+    # under the guard that also runs commands in other languages; without keys, which version 1 does not have
     own = (sys.executable,) if program[0] == "python" else program[:1]
     line = replace(context.launch, class_="", settings={}, sockets=sockets, keys=None).to_json()
     child = subprocess.Popen([*python_command(GUARD), "--", *own, *program[1:]], stdin=subprocess.PIPE)
@@ -205,9 +205,8 @@ class _TranslatorPort(ZmqServerPort):
         self._commander = b""
         self._in_hand: Request | None = None
         self._number = 0
-        self._memory = (
-            memory  # saved: after a restart, a request that their side may have carried out is not sent again
-        )
+        # saved: after a restart, a request that the published translator may have carried out is not sent again
+        self._memory = memory
         self._outcomes = RequestOutcomes(memory.setdefault("requests", {}), all_or_nothing=False)
         self._state = ScopeState.UNDEFINED
         self._ends_s = math.inf
@@ -290,7 +289,7 @@ class _TranslatorPort(ZmqServerPort):
             frames = version_1.request_frames(Request(int(ControlRequest.ACTION), stop))
             send_frames(self._dealer, [_OWN, b"", *frames])
 
-    # --- outside: their translator ---
+    # --- outside: the published translator ---
 
     def _answers(self) -> list[Served]:
         while frames := receive_frames(self._dealer):

@@ -138,7 +138,7 @@ class Pacing:
 
     @property
     def due_s(self) -> float:
-        """Return the time of the next packet; infinity if none is waiting."""
+        """The time of the next packet, in real seconds; infinity without waiting packets."""
         if not self._waiting:
             return math.inf
         _, message, state = self._waiting[0]
