@@ -102,7 +102,10 @@ class AsylumActivity(Activity):
             self._kept["image"] = frame
 
     def begin(self, what: str) -> None:
-        """Register the start of a scan, or of a force curve at the panel, whose position is then read from its file."""
+        """Register the start of a scan, or of a force curve at the panel.
+
+        The position of such a curve is later read from its file.
+        """
         taken: dict[str, object] = {"position": None}
         if what == SCAN:
             # only if the tip was ever sent to a spot: else a force curve is taken at the present position

@@ -25,8 +25,9 @@ NAMES: Final = frozenset({*FRAME, names.SCAN_SPEED})
 
 _OUR_SPOT: Final = 1.0
 PATH_OF_A_LINE: Final = 2.5
-"""Path of the tip in a line, in widths of the frame: ScanSpeed / (FastScanSize · ScanRate) in the notes of all real
-files."""
+"""Path of the tip in a line, in widths of the frame.
+
+The notes of all real files have this value of ScanSpeed / (FastScanSize · ScanRate)."""
 
 
 def generic(found: Mapping[str, float]) -> dict[str, Value]:

@@ -92,8 +92,10 @@ for channel = 0, acquisition.lu_data_buffer_channel_count(buffer) - 1 do
 end
 return found
 """
-"""Returns name, unit, range and values of each channel of a low-level buffer; nothing while the buffer is not
-synchronized. The values are integers: the largest 32-bit integer stands for the range."""
+"""Returns name, unit, range and values of each channel of a low-level buffer.
+
+Nothing is returned while the buffer is not synchronized. The values are integers: the largest signed 32-bit integer
+stands for the range."""
 
 STOP_ALL: Final = f"""
 local imaging, spectroscopy, approach = {WORKFLOW}.imaging, {WORKFLOW}.spectroscopy, {WORKFLOW}.approach

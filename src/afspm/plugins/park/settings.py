@@ -89,7 +89,7 @@ class Gains(SettingsGroup):
 
 
 class TipPlace(KeptSettings):
-    """The target position of the tip; SmartScan reports only its stage's position (!)."""
+    """The target position of the tip, (0, 0) before the first move; SmartScan reports only the stage's position (!)."""
 
     def __init__(self, session: Callable[[], Session], begun: Callable[[LongCall], None]) -> None:
         super().__init__(dict.fromkeys(POSITION, 0.0))
