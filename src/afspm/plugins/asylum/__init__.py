@@ -43,7 +43,7 @@ _AT_FIRST: Final[dict[str, Value]] = {
 }
 _SPOTS: Final = ("image", "scanner", "none")
 _NAME: Final = "[A-Za-z][A-Za-z0-9_]{0,16}"
-"""Base name of waves and files: Igor's limit for wave names, less four digits."""
+"""Form of the base names that Asylum takes; Asylum appends a number of four digits."""
 
 
 class Asylum(Driver):
@@ -53,11 +53,11 @@ class Asylum(Driver):
         address: the endpoint passed to `zeromq_server_bind` in Igor.
         folders: Igor's folder prefixes, "C:Users:Me:", mapped to mount points on this computer. Default: Asylum runs on
             this computer.
-        base_name: base name of the files that Asylum saves. Default: the name set on its panel.
+        base_name: base name of the files that Asylum saves. Default: the name set on Asylum's panel.
         spots: origin of SpotX and SpotY: "image" is the lower left corner of the last image, along its axes; "scanner"
             is the middle of the scanner; "none" disables moving the tip.
         move_s: longest duration of a move to a spot, experiment time. Asylum does not report the end of a move.
-        reply_timeout_s: longest wait for a reply of Igor, real time.
+        reply_timeout_s: longest wait for a reply of Igor, and for the feedback to reach a new state, real time.
         poll_period_s, common: settings of every driver.
     """
 
@@ -164,7 +164,7 @@ class Asylum(Driver):
             self._igor().put(vendor, value)
 
     def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
-        """Return values of the parameter table, all numbers with one request."""
+        """Return values of the parameter table; numbers are read together, in one request if Igor has `afspm.ipf`."""
         numbers = [name for name in wanted if self.table[name].type != "text" and name != names.ENGAGED]
         values = self._igor().values([self.table[name].vendor for name in numbers]) if numbers else {}
         found = {name: self.table[name].from_vendor(values[self.table[name].vendor]) for name in numbers}
@@ -182,6 +182,7 @@ class Asylum(Driver):
     def start_scan(self) -> None:
         """Scan the frame once, in the direction `x-scan-direction`."""
         self._activity.saves(SCAN)
+        # before the start: the spot still counts from the corner of the image that the scan will replace
         probe_m = self._place.xy_m() if self._spots == "image" else None
         self._activity.begin(SCAN)
         up = self._kept[names.SCAN_DIRECTION] == names.UP
@@ -201,6 +202,7 @@ class Asylum(Driver):
         try:
             accepted = self._igor().do(function, button)
         except XopError:
+            # if the measurement has started all the same, the next poll registers its start
             self._activity.forget()
             raise
         if not accepted:
@@ -211,12 +213,17 @@ class Asylum(Driver):
         """Stop the scan. Asylum also withdraws the tip."""
         self._igor().do("DoScanFunc", "StopScan")
         self._activity.stopped()
-        # StopScan also stops the feedback and withdraws the tip: a person should know
+        # a warning, since a withdrawn tip may surprise the user: StopScan stops more than the scan
         self.log.warning("Asylum withdrew the tip, as it does whenever a scan is stopped")
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
-        """Take a force curve at the tip's target spot; without one, at its present position."""
+        """Take a force curve at the target spot of the tip; without a target, at the tip's present position.
+
+        Raises:
+            Refused: ACTION_ERROR: Igor lacks ARGetStatus, the folder does not exist, or Asylum refuses a curve at the
+                present position.
+        """
         # ScanStatus and FMapStatus do not show single force curves
         if self._igor().doing().bits is None:
             reason = "Igor lacks ARGetStatus, without which the end of a force curve can't be detected"

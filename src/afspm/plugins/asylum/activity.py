@@ -20,7 +20,7 @@ from afspm.translator.state import Kept
 FORCE: Final = "force"
 
 _SAVED_TO: Final = {SCAN: "SaveImage", FORCE: "SaveForce"}
-"""Each name is a number (2: measurements are saved) and, in GS, a text (the folder)."""
+"""Asylum's name for saving, by kind of measurement: for GV a number (2: results are saved), for GS the folder."""
 _SAVE: Final = 2.0
 
 
@@ -29,11 +29,11 @@ class AsylumActivity(Activity):
 
     Args:
         files: collects the results.
-        kept: persistent, JSON-able: frame of the image whose corner is the origin of spots, arrival time of the tip,
-            and whether a scan has moved the tip since.
+        kept: a JSON dict on disk: frame of the image whose corner is the origin of spots, arrival time of the tip, and
+            whether a scan has moved the tip away from its spot.
         folders: Igor's folder prefixes; see `local`.
         frame_in_force: returns the frame as it was set.
-        spot_m: returns the spot to which the tip was sent; None: moving the tip is disabled.
+        spot_m: returns the target position of the tip, (x, y) in m; None: moving the tip is disabled.
         take_curve: starts a force curve.
     """
 
@@ -63,7 +63,7 @@ class AsylumActivity(Activity):
         self.way = TipWay(kept, clock)
 
     def status(self) -> ScopeStatus:
-        """Return the present state; register measurements that have ended, whose files are then awaited."""
+        """Return the present state. Register measurements that began or ended, and take a curve that awaits the tip."""
         state = self._session.doing().state
         if self.curve_awaited:
             return self._arriving(state)
@@ -88,31 +88,34 @@ class AsylumActivity(Activity):
 
     @property
     def image(self) -> Region:
-        """Return the frame of the last image, whose lower left corner is the origin of Asylum's spots."""
+        """The frame of the last image, whose lower left corner is the origin of Asylum's spots."""
         return as_region(self._kept["image"])
 
     def find_image(self) -> None:
-        """Use the present frame as the open image's frame, unless an earlier run has stored one."""
+        """Use the present frame as the open image's frame, unless a frame is already stored."""
         self._kept.setdefault("image", as_list(self._frame_in_force()))
 
     def _image_begins(self) -> None:
-        # Only once the scan is seen running: a scan that does not start leaves the previous image open, and its spots
-        # valid.
+        # only once a poll shows the scan running: a scan that does not start leaves the previous image open, and its
+        # spots valid
         if (frame := self._files.frame) is not None:
             self._kept["image"] = frame
 
     def begin(self, what: str) -> None:
-        """Register the start of a measurement. The position of a panel's force curve comes from its file."""
+        """Register the start of a scan, or of a force curve at the panel.
+
+        The position of such a curve is later read from its file.
+        """
         taken: dict[str, object] = {"position": None}
         if what == SCAN:
-            # only if the tip was ever sent to a spot: else a force curve stays where it is
+            # only if the tip was ever sent to a spot: else a force curve is taken at the present position
             if "led_away" in self._kept:
                 self._kept["led_away"] = True
             taken = {"frame": as_list(self._frame_in_force())}
         self._files.begin_at(what, self._target(what), taken)
 
     def begin_curve(self) -> None:
-        """Register the start of a force curve at the tip's target spot."""
+        """Register the start of a requested force curve at the tip's target spot."""
         spot_m = None if self._spot_m is None else list(self._spot_m())
         self._files.begin_at(FORCE, self._target(FORCE), {"position": spot_m})
 
@@ -123,7 +126,7 @@ class AsylumActivity(Activity):
         """Switch on saving, and check that the folder is reachable.
 
         Raises:
-            Refused: ACTION_ERROR: the folder does not exist on this computer.
+            Refused: ACTION_ERROR: the folder does not exist on this computer. ConfigError: see `folder`.
         """
         name = _SAVED_TO[what]
         # the file is the only result: no function used here returns images or curves
@@ -136,11 +139,11 @@ class AsylumActivity(Activity):
             raise Refused(ControlResponse.ACTION_ERROR, reason)
 
     def folder(self, what: str) -> Path:
-        """Return Asylum's folder as a path on this computer. Raises ConfigError: `folders` has no prefix for it."""
+        """Return Asylum's folder for images or curves, as a path on this computer. Raises ConfigError: see `local`."""
         return local(self._session.text("GS", _SAVED_TO[what]), self._folders)
 
     def call_files(self, base: str) -> None:
-        """Set the files' base name, and a number above all existing ones, since Asylum overwrites files."""
+        """Set the files' base name, and a number above all existing files of this name: Asylum overwrites files."""
         self._session.do("SetBaseName", base)
         self._session.put("BaseSuffix", max(free_suffix(self.folder(what), base) for what in _SAVED_TO))
         try:
@@ -154,14 +157,14 @@ class AsylumActivity(Activity):
         """Wait until the measurement is running or has a file.
 
         Raises:
-            Refused
+            Refused: ACTION_ERROR: neither happened within `settles_s`.
         """
         state = ScopeState.SCANNING if what == SCAN else ScopeState.SPEC
         self.settle(what, lambda: self._session.doing().state is state or self._files.has_file())
         self._image_begins()
 
     def refuse(self, what: str) -> Refused:
-        """Discard the measurement, and return the refusal for a request that Asylum declined."""
+        """Discard the measurement, and return the refusal (ACTION_ERROR) for a request that Asylum declined."""
         self.forget()
         return Refused(
             ControlResponse.ACTION_ERROR, f"Asylum refused to begin the measurement ({what}): see its history window"

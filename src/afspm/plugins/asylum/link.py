@@ -16,7 +16,7 @@ _HINTS = (
 
 
 class Link:
-    """A connection for one thread, closed after any failure other than an error reported by Igor.
+    """A connection for one thread, closed by a missing reply and by a malformed reply.
 
     Args:
         address: e.g. "tcp://127.0.0.1:5555".
@@ -34,7 +34,11 @@ class Link:
         self._connection = ZmqConnection(address, timeout_s, monotonic_s, _HINTS)
 
     def ask(self, name: str, *parameters: xop.Parameter) -> xop.Result:
-        """Call an Igor function that has one result. Raises: see `call`."""
+        """Call an Igor function that has one result.
+
+        Raises:
+            BadReply: another number of results; the connection stays open. Also the errors of `call`.
+        """
         results = self.call(name, *parameters).results
         if len(results) != 1:
             raise xop.BadReply(f"{name} returned {len(results)} results instead of one", where=self._address)
@@ -45,14 +49,14 @@ class Link:
 
         Raises:
             XopError: Igor reports an error. InvalidValue: the arguments can't be sent.
-            ControllerLost, BadReply: no reply, or an untrustworthy one; the connection is closed.
+            ControllerLost: no reply. BadReply: a malformed reply. Both close the connection.
         """
         message_id = str(next(self._numbers))
         message = xop.request(name, parameters, message_id)
 
         def parse(payload: bytes) -> xop.Reply | None:
             found = xop.reply(payload)
-            # errors 3 to 7, found before Igor is asked, have no id: they belong to the only request in flight
+            # errors 3 to 7, which the XOP finds without Igor, have no id: they belong to the only request in flight
             is_ours = found.message_id == message_id or (found.message_id is None and found.error is not None)
             return found if is_ours else None
 
@@ -66,14 +70,14 @@ class Link:
 
 
 def text(result: object) -> str:
-    """Return a result as text. Raises BadReply: it has another type."""
+    """Return a result as text. Raises BadReply: the result has another type."""
     if isinstance(result, str):
         return result
     raise xop.BadReply(f"Igor returned {result!r} instead of a text")
 
 
 def number(result: object) -> float:
-    """Return a result as a number, possibly NaN. Raises BadReply: it has another type."""
+    """Return a result as a number, possibly NaN. Raises BadReply: the result has another type."""
     if isinstance(result, float):
         return result
     raise xop.BadReply(f"Igor returned {result!r} instead of a number")

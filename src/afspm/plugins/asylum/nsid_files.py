@@ -1,4 +1,7 @@
-"""NSID files (.h5, pycroscopy's format): images [x, y], both ascending, with notes in files of Asylum."""
+"""NSID files (.h5, pycroscopy's format): images are indexed [x, y], and their axes ascend.
+
+A file that was converted from Asylum's format contains Asylum's note, with the position, the angle and the time.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,12 @@ if TYPE_CHECKING:
 
 
 def read_nsid(path: Path, zone: tzinfo | None) -> FileContent:
-    """Read all images of a file. Raises FileError: no image, or damaged. UnitError: axes are not lengths."""
+    """Read all images of a file.
+
+    Raises:
+        FileError: the file is not HDF5, or has no image. UnitError: the axes are not lengths.
+        OSError: the file is damaged.
+    """
     with hdf5.opened(path) as file:
         nodes: list[h5py.Dataset | h5py.Group] = []
         file.visititems(lambda _, node: nodes.append(node))
@@ -64,7 +72,7 @@ def _axis_m(axis: h5py.Dataset, unit: str) -> NDArray[np.float64]:
 def _scan(image: h5py.Dataset, note: dict[str, object], end_ns: int | None, path: Path) -> Scan:
     channel = hdf5.text(image.attrs["quantity"])
     values = hdf5.array(image).T
-    # the writer of Asylum's files gave axes the unit of their channel, but they are in m
+    # the program that converts Asylum's files gives axes the unit of the channel, but their values are in m
     x, y = (_axis_m(image.parent[axis], "m" if note else "") for axis in "xy")
     if values.shape != (len(y), len(x)) or not ((np.diff(x) > 0).all() and (np.diff(y) > 0).all()):
         raise FileError(f"the axes of {channel} do not fit an image of {values.shape[1]} x {values.shape[0]} pixels")
@@ -72,6 +80,6 @@ def _scan(image: h5py.Dataset, note: dict[str, object], end_ns: int | None, path
     if note:
         center_m, angle_rad = asylum.center_and_angle(note)
     region = Region(center_m, (x[-1] - x[0], y[-1] - y[0]), angle_rad)
-    # the writer gave "m" to channels that it did not know
+    # the program that converts the files gives the unit "m" to unknown channels
     unit = (asylum.unit_of(channel) if note else "") or hdf5.text(image.attrs.get("units", ""))
     return Scan(region, channel, unit, np.ascontiguousarray(values), end_ns, str(path))

@@ -39,7 +39,7 @@ class Target:
 
 
 class AsylumFiles(FolderFiles):
-    """The measurement that is running or has just ended, and the results."""
+    """The running or just ended measurement, and the results with their files."""
 
     precision = FilePrecision(part=1e-4, angle_rad=1e-4 * math.tau)
     """Numbers in a note have five digits."""
@@ -49,17 +49,21 @@ class AsylumFiles(FolderFiles):
         kept.setdefault("taken", 0)
 
     def begin_at(self, what: str, target: Target, taken: PlainMapping) -> None:
-        """Register the start of a measurement whose file is expected at `target`."""
+        """Register the start of a measurement whose file is expected at `target`.
+
+        Args:
+            taken: the place of the measurement: "frame" of a scan, "position" of a force curve.
+        """
         place = {"base": target.base, "suffix": target.suffix, "there_ns": modified_ns(target.path)}
         self.begin(what, target.folder, {**place, **taken})
 
     def result_name(self, path: Path) -> str:
-        """Return a unique name; its number distinguishes a file from a later one with the same name."""
+        """Return a unique name, numbered, since a later file may have the same name."""
         self._kept["taken"] += 1
         return f"{self._kept['taken']}: {path.name}"
 
     def check(self, path: Path, one: Scan | Spectrum, measured: Entry) -> None:
-        """Log a warning if the frame in the file differs from the set frame; the file's frame is kept."""
+        """Log a warning if the file's frame differs from the set frame beyond `precision`; the file's frame is kept."""
         if isinstance(one, Scan) and one.region != (wanted := as_region(measured["frame"])):
             self._log.warning(
                 "%s has the frame %s instead of %s, which was set; it is published with the file's frame",

@@ -1,8 +1,8 @@
 """Asylum Research: Igor binary waves (.ibw) and the meaning of their notes.
 
-From real files: XOffset and YOffset are the centre of the scan; images are [x, y, channel] with both axes ascending for
-either scan direction, FastScanSize from first to last pixel; `Seconds` is the local time of saving, since 1904; the
-unit of a wave applies to its first channel only.
+Real files show: XOffset and YOffset are the centre of the scan; images are [x, y, channel] with both axes ascending for
+either scan direction; FastScanSize is the distance from the first to the last pixel; `Seconds` is the local time of
+saving, since 1904; the unit of a wave applies to its first channel only.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Note = PlainMapping
 
 CONTROLLER = "Asylum"
 _IGOR_EPOCH = datetime(1904, 1, 1)  # noqa: DTZ001  (local time of the controller)
-# By the beginning of a channel's name, without the "Nap" of a second pass: a wave has one unit for all its channels.
+# Units by the beginning of a channel's name, without the "Nap" of a second pass: a wave has only one unit.
 _UNITS = {
     "Height": "m", "ZSensor": "m", "RawZSensor": "m", "Amplitude": "m", "Deflection": "m", "Phase": "deg",
     "Frequency": "Hz", "Current": "A", "UserIn": "V", "BackPackIn": "V", "Lateral": "V", "Potential": "V",
@@ -33,7 +33,7 @@ _UNITS = {
 
 
 def read_igor(path: Path, zone: tzinfo | None) -> FileContent:
-    """Read an image with its channels, or a force curve. Raises FileError: neither, or damaged."""
+    """Read an image with its channels, or a force curve. Raises FileError: the file has neither, or is damaged."""
     wave = igor.read_wave(path.read_bytes())
     note = parsed_note(wave.note)
     first = wave.dimension_units[0]
@@ -67,8 +67,7 @@ def center_and_angle(note: Note) -> tuple[tuple[float, float], float]:
 def counter_clockwise(scan_angle_deg: float) -> float:
     """Convert ScanAngle (degrees, clockwise) to radians counter-clockwise.
 
-    Asylum turns the fast axis to (cos, -sin) of the angle about the unrotated centre, in its code for scans and
-    lithography.
+    Asylum's code for scans and lithography turns the fast axis to (cos, -sin) of the angle, about the unrotated centre.
     """
     return 0.0 - math.radians(scan_angle_deg)
 
@@ -79,7 +78,7 @@ def clockwise(angle_rad: float) -> float:
 
 
 def number(note: Note, key: str) -> float | None:
-    """Return a finite number of a note; None if missing."""
+    """Return a number of a note; None if the number is missing or not finite."""
     try:
         value = float(note[key])
     except (KeyError, TypeError, ValueError):
@@ -88,19 +87,22 @@ def number(note: Note, key: str) -> float | None:
 
 
 def upwards(note: Note) -> bool | None:
-    """Return True if the lowest row was scanned first; None: unknown."""
+    """Return True if the row of smallest y was scanned first; None: unknown."""
     down = number(note, "ScanDown")
     return None if down is None else down == 0.0
 
 
 def end_ns(note: Note, zone: tzinfo | None) -> int | None:
-    """Return the time of saving."""
+    """Return the time of saving in ns since the Unix epoch; None: unknown. `zone` is the zone of the controller."""
     seconds = number(note, "Seconds")
     return None if seconds is None else clock_ns(_IGOR_EPOCH + timedelta(seconds=seconds), zone)
 
 
 def start_ns(note: Note, rows: int, zone: tzinfo | None) -> int | None:
-    """Return the start of the first row: end minus the duration of the lines, doubled with a second pass (NapMode)."""
+    """Return the start of the first row in ns since the Unix epoch; None: unknown.
+
+    The start is the time of saving minus the duration of all lines, doubled by a second pass (NapMode).
+    """
     rate_hz, end = number(note, "ScanRate"), end_ns(note, zone)
     if end is None or rate_hz is None or rate_hz <= 0.0:
         return None

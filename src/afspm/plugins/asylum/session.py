@@ -26,7 +26,7 @@ class Doing:
     """The state that the controller reports.
 
     Attributes:
-        bits: result of ARGetStatus; None if this release lacks it.
+        bits: result of ARGetStatus; None if this release of Asylum's software lacks the function.
         scanning, mapping: the values behind Asylum's panels, ScanStatus and FMapStatus.
     """
 
@@ -36,7 +36,7 @@ class Doing:
 
     @property
     def state(self) -> ScopeState:
-        """Return the state from both sources; a measurement reported by either counts as running."""
+        """Return the state from both sources; a measurement reported by either source counts as running."""
         bits = self.bits or 0
         if self.mapping or bits & _FORCE:
             return ScopeState.SPEC
@@ -46,7 +46,7 @@ class Doing:
 
     @property
     def engaged(self) -> bool:
-        """True if the tip is at the sample, or if unknown, so that the tip is treated with care."""
+        """True if the tip is at the sample, or if its place is unknown for lack of ARGetStatus."""
         return self.bits is None or bool(self.bits & (_ENGAGED | _SCANNING)) or self.scanning
 
 
@@ -54,10 +54,10 @@ class Session:
     """A connection to Igor, and the features of the installation.
 
     Args:
-        link: connected.
+        link: the open connection.
 
     Attributes:
-        at_once: True if Igor includes `afspm.ipf`, which returns many values with one request.
+        at_once: True until a request shows that Igor lacks `afspm.ipf`, which returns many values with one request.
     """
 
     def __init__(self, link: Link) -> None:
@@ -76,7 +76,8 @@ class Session:
     def do(self, name: str, *parameters: xop.Parameter) -> bool:
         """Call a function for its effect; return False if it reports a refusal.
 
-        Asylum's own functions return 1 for a refusal. Functions without a result return NaN, which has no meaning.
+        Asylum's functions return 1 for a refusal, except DoForceFunc: a refused curve returns 0 and shows only in the
+        state. Functions without a result return NaN, which has no meaning.
         """
         return self.ask(name, *parameters) != 1.0
 
@@ -102,7 +103,7 @@ class Session:
         """Return Asylum's numbers by name.
 
         Raises:
-            Refused: PARAM_NOT_SUPPORTED: Asylum has no number of this name.
+            Refused: PARAM_NOT_SUPPORTED: Asylum has no number of this name in its present mode.
         """
         found = dict(zip(names, self._look(names)[1], strict=True))
         for name, value in found.items():
@@ -119,7 +120,7 @@ class Session:
             self.ask("PV", name, float(value))
 
     def _look(self, names: Sequence[str]) -> tuple[float, list[float]]:
-        # Without `afspm.ipf`, each value is one request. Its absence is remembered until the next connection.
+        # Without `afspm.ipf`, each value is one request. Its absence is remembered: each attempt would cost a request.
         if self.at_once:
             try:
                 bits, values = math.nan, list[float]()

@@ -1,7 +1,8 @@
 """Frame, speed and tip position: conversion between Asylum's values and generic parameters; lengths in m.
 
-Asylum's XOffset and YOffset are the centre of the frame (seen in images zoomed into). ScanSize is the longer side; two
-ratios define the other one; FastScanSize and SlowScanSize are the result. Angles are in degrees, clockwise.
+Asylum's XOffset and YOffset are the centre of the frame, as files of zoomed images show. ScanSize is the longer side;
+two ratios define the shorter side; FastScanSize and SlowScanSize are the result. Asylum's angles are in degrees,
+clockwise.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ NAMES: Final = frozenset({*FRAME, names.SCAN_SPEED})
 
 _OUR_SPOT: Final = 1.0
 PATH_OF_A_LINE: Final = 2.5
-"""Path of the tip in a line, in widths of the frame: ScanSpeed / (FastScanSize · ScanRate) in all real notes."""
+"""Path of the tip in a line, in widths of the frame.
+
+The notes of all real files have this value of ScanSpeed / (FastScanSize · ScanRate)."""
 
 
 def generic(found: Mapping[str, float]) -> dict[str, Value]:
@@ -43,7 +46,7 @@ def asylums(wanted: Mapping[str, Value], before: Mapping[str, Value]) -> dict[st
     which is set so that the speed is kept when the width changes.
 
     Raises:
-        InvalidValue: the parameters describe no frame.
+        InvalidValue: the parameters describe no frame, or the speed is not above 0.
     """
     values = {**before, **wanted}
     region, (rows, columns) = frame(values)
@@ -83,7 +86,7 @@ def from_image(spot_m: tuple[float, float], image: Region) -> tuple[float, float
 
 
 class FrameSettings(SettingsGroup):
-    """Frame and speed.
+    """The frame and the speed of scans. A write sends only values that differ from Asylum's.
 
     Args:
         igor: returns the session.
@@ -103,6 +106,7 @@ class FrameSettings(SettingsGroup):
         wanted = asylums(values, self._in_force())
         there = self._igor().values(list(wanted))
         for name, value in wanted.items():
+            # each PV is a request of its own, and takes Igor some ten milliseconds
             if there[name] != value:
                 self._igor().put(name, value)
 
@@ -138,13 +142,13 @@ class TipPlace(SettingsGroup):
         self.go()
 
     def put(self, xy_m: tuple[float, float]) -> None:
-        """Set the spot without moving the tip. Raises Refused."""
+        """Set the spot, for a position (x, y) in m, without moving the tip. Raises Refused: PARAM_ERROR."""
         x, y = xy_m if self._image is None else on_image(xy_m, self._image())
         if not (self._igor().do("SetProbePosX", x) and self._igor().do("SetProbePosY", y)):
             raise Refused(ControlResponse.PARAM_ERROR, "Asylum refused the spot")
 
     def go(self) -> None:
-        """Move the tip to the spot. Raises Refused."""
+        """Start moving the tip to the spot. Raises Refused: PARAM_ERROR."""
         self._igor().put("ForceSpotNumber", _OUR_SPOT)  # a person may have chosen another spot at the panel
         if not self._igor().do("DoForceFunc", "Go"):
             raise Refused(ControlResponse.PARAM_ERROR, "Asylum refused to move the tip")
@@ -152,10 +156,10 @@ class TipPlace(SettingsGroup):
 
 
 class FeedbackSwitch(SettingsGroup):
-    """The z feedback switch. A write waits until the feedback is in the new state, as the tip may have to travel.
+    """The z feedback switch. A write waits for the new state of the feedback, as the tip may have to travel.
 
     Args:
-        wait_for: waits for a condition, up to a time limit.
+        wait_for: waits for a condition, up to a time limit; the write succeeds even after the limit.
     """
 
     names = (FEEDBACK_ON,)

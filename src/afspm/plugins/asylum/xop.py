@@ -1,6 +1,7 @@
-"""Requests to ZeroMQ-XOP and its replies: calls of Igor functions as JSON. Pure.
+"""Requests to ZeroMQ-XOP and its replies: calls of Igor functions as JSON, without input or output.
 
-After the source and specification of ZeroMQ-XOP (byte physics and the Allen Institute), first version of the interface.
+The forms follow the source and specification of ZeroMQ-XOP (byte physics and the Allen Institute), first version of the
+interface.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from afspm.basics.plain_data import PlainMapping
 from afspm.translator.driver_base import ControllerLost
 
 LONGEST_REQUEST: Final = 1024
-"""Bytes. At a longer request the XOP drops the connection without a reply."""
+"""Length of the longest request, in bytes. At a longer request the XOP drops the connection without a reply."""
 
 MISSING: Final = 101
 """Error number for a function that Igor does not have."""
@@ -62,23 +63,23 @@ class XopError(AfspmError):
 
 
 class BadReply(ControllerLost):
-    """Received bytes that are not a valid reply: the peer can't be trusted."""
+    """The error that a reply is malformed or has an unexpected result: the peer can't be trusted."""
 
     code = "igor-bad-reply"
 
 
 Result = float | str | None
-"""None: a wave, which no function used here returns."""
+"""The result of an Igor function. None: a wave, which no function used here returns."""
 
 
 @dataclass(frozen=True)
 class Reply:
-    """A reply.
+    """A parsed reply of ZeroMQ-XOP.
 
     Attributes:
-        message_id: id of the request; None if the XOP could not read it.
+        message_id: id of the request; None if the reply has no id, as for a request that the XOP could not read.
         error: number and message of an error; None: success.
-        results: one or several results of the function.
+        results: the results of the function; empty after an error.
     """
 
     message_id: str | None
@@ -90,7 +91,7 @@ def request(name: str, parameters: Sequence[Parameter], message_id: str) -> byte
     """Encode the call of a function.
 
     Raises:
-        InvalidValue: longer than 1024 bytes, or a number that is not finite.
+        InvalidValue: the request is longer than 1024 bytes, a number is not finite, or a text is not Unicode.
     """
     for value in parameters:
         if isinstance(value, float) and not math.isfinite(value):
@@ -108,7 +109,7 @@ def request(name: str, parameters: Sequence[Parameter], message_id: str) -> byte
 
 
 def reply(message: bytes) -> Reply:
-    """Parse a reply. Raises BadReply: it is malformed."""
+    """Parse a reply. Raises BadReply: the reply is malformed."""
     try:
         return _reply(json.loads(message.decode("utf-8")))
     except BadReply:

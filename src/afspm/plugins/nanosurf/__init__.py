@@ -1,6 +1,6 @@
 """Driver of Nanosurf microscopes, over the scripting interface of Nanosurf Studio. See the README in this folder.
 
-**Theory of operation.** Every request is a Lua script, and its value the reply (`link`, `lua_values`). Quick scripts
+**Theory of operation.** Every request is a Lua script, and the reply is its value (`link`, `lua_values`). Quick scripts
 share the first connection; each long command (approach, withdrawal, curve) has a separate connection (`session`).
 
     inputs        values of scripts; new .nhf files in Studio's gallery
@@ -40,9 +40,9 @@ class Nanosurf(Driver):
     """The microscope behind Nanosurf Studio.
 
     Args:
-        address: "host:port" of its scripting interface.
+        address: "host:port" of Studio's scripting interface.
         release: release of Studio (Help > About), 17 or later, which decides the commands to use.
-        session: name of the measurement session, such as "91-21-004". Default: the only open one.
+        session: name of the measurement session, such as "91-21-004". Default: the only open session.
         gallery_dir: local path of Studio's gallery folder. Default: Studio runs on this computer.
         image_buffer: number of the low-level buffer with the running scan, for its lines. Default: no lines are read.
         reply_timeout_s: longest wait for a reply, real time.
@@ -160,7 +160,7 @@ class Nanosurf(Driver):
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
-        """Stop everything and withdraw the tip."""
+        """Stop scan, curve and approach, and withdraw the tip."""
         self._doing.withdraw()
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)

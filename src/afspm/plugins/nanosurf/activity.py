@@ -25,7 +25,7 @@ FORCE: Final = "force"
 
 
 class NanosurfFiles(FolderFiles):
-    """Studio's files: one for each measurement."""
+    """Studio's files: one file for each measurement."""
 
     pattern = "*.nhf"
     precision = FilePrecision(part=1e-9, angle_rad=1e-9)
@@ -58,7 +58,7 @@ class StudioActivity(Activity):
         self._folder, self._frame_in_force = folder, frame_in_force
 
     def status(self) -> ScopeStatus:
-        """Return the present state; register measurements that have ended, whose files are then awaited."""
+        """Return the present state. Register measurements that began or ended, and take a curve that awaits the tip."""
         scanning = self._session.scanning().running
         call = self._running_call()
         curve = call is not None and call.what == FORCE
@@ -87,7 +87,11 @@ class StudioActivity(Activity):
         self._files.end(self._clock.now_ns())
 
     def start_scan(self) -> None:
-        """Scan the frame. Raises Refused: Studio reports an error, or no scan is seen."""
+        """Start a scan of the frame.
+
+        Raises:
+            Refused: ACTION_ERROR: Studio reports an error, or shows no scan within `settles_s`.
+        """
         # A short scan may be over before the next poll: then the count of started scans has risen.
         before = self._session.scanning().started
 
@@ -98,10 +102,10 @@ class StudioActivity(Activity):
         self.started(SCAN, lambda: self._session.do(commands.START), is_seen)
 
     def start_curve(self) -> None:
-        """Take a force curve at the tip's target position, after moving back there if a scan moved the tip.
+        """Move the tip to its target position, where `status` takes a force curve on arrival.
 
         Raises:
-            Refused
+            Refused: ACTION_ERROR: Studio does not move the tip.
         """
         self._stopping = False
         self._place.go()
@@ -122,7 +126,7 @@ class StudioActivity(Activity):
         self.watch(self._session.begin("approach", commands.APPROACH))
 
     def withdraw(self) -> None:
-        """Stop everything and withdraw the tip."""
+        """Stop scan, curve and approach, and withdraw the tip. Raises StudioError, ControllerLost."""
         self.stopped()
         self.close()
         try:

@@ -1,6 +1,6 @@
 """Commands of Nanosurf Studio that the driver uses, and the releases that have them.
 
-From the command tree in nanosurf-core 2.0.7 (MIT). Items marked (!) in the README are unconfirmed.
+The names come from the command tree in nanosurf-core 2.0.7 (MIT). The mark (!) stands for an unconfirmed fact.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from afspm.basics.errors import ConfigError
 
 FIRST_RELEASE: Final = 17
 _WITHOUT_OLD: Final = 19
-"""First release without the commands from before 17."""
+"""First release without the commands that are older than release 17."""
 
 WORKFLOW: Final = "root.workflow"
 START, STOP = "imaging.start", "imaging.stop"
@@ -21,7 +21,7 @@ APPROACH, WITHDRAW = "approach.approach", "approach.withdraw"
 TAKE_CURVE, STOP_CURVE = "spectroscopy.acquire", "spectroscopy.stop"
 MOVE: Final = "scanner.move_to_target_offsets"
 GRID: Final = tuple(f"spectroscopy.grid_{name}" for name in ("center_offset_x", "center_offset_y", "columns", "rows"))
-"""Values of the grid of curves: centre, columns and rows."""
+"""Paths of the values of the grid of curves: centre, columns and rows."""
 
 _ALWAYS: Final = (START, STOP, APPROACH, WITHDRAW, TAKE_CURVE, STOP_CURVE, MOVE, *GRID)
 _SIGNALS: Final = (f"{STARTED}.connect", f"{STARTED}.empty", f"{FINISHED}.connect")
@@ -37,7 +37,7 @@ if not afspm_seen then
 end
 return {WORKFLOW}.{STARTED}.empty()
 """
-"""Connects handlers that count scans; returns true if Studio has not connected them."""
+"""Connects handlers that count scans; returns true if Studio has not connected the handlers."""
 
 MISSING: Final = """
 local missing = {}
@@ -60,7 +60,7 @@ for i, path in ipairs({%s}) do
 end
 return units
 """
-"""Returns the units of a list of paths."""
+"""Returns the units of a list of paths; an empty text for a value without a unit."""
 
 PUT_ALL: Final = """
 local done = {}
@@ -76,7 +76,7 @@ if not fine then
 end
 return 0
 """
-"""Sets values; if Studio refuses one, restores the ones set before."""
+"""Sets values; if Studio refuses a value, restores the values set before and fails."""
 
 BUFFER_LEVEL: Final = 2
 """The lowest session level with low-level buffers."""
@@ -92,13 +92,16 @@ for channel = 0, acquisition.lu_data_buffer_channel_count(buffer) - 1 do
 end
 return found
 """
-"""Returns name, unit, range and values of each channel of a low-level buffer; nothing if it is not synchronized."""
+"""Returns name, unit, range and values of each channel of a low-level buffer.
+
+Nothing is returned while the buffer is not synchronized. The values are integers: the largest signed 32-bit integer
+stands for the range."""
 
 STOP_ALL: Final = f"""
 local imaging, spectroscopy, approach = {WORKFLOW}.imaging, {WORKFLOW}.spectroscopy, {WORKFLOW}.approach
 pcall(imaging.stop) pcall(spectroscopy.stop) pcall(approach.stop_approach)
 """
-"""Stops everything that can be stopped."""
+"""Stops scan, curve and approach; an error of one stop does not prevent the others."""
 
 
 def has_old_commands(release: int) -> bool:
@@ -119,5 +122,5 @@ def used(release: int) -> tuple[str, ...]:
 
 
 def level(release: int) -> int:
-    """Return the lowest session level with the used commands: the old ones need the highest level (!)."""
+    """Return the lowest session level with the used commands: the old commands need the highest level (!)."""
     return 5 if has_old_commands(release) else 1

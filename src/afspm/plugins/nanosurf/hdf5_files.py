@@ -1,7 +1,7 @@
 """Nanosurf Studio's files (.nhf): HDF5 of formats 1 (since 2023) and 2, with images and curves.
 
-From a file of the maker's examples and its reader (nanosurf-utils, MIT): rows and columns ascend, backward segments are
-not mirrored, integers are scaled to a range. Sense and unit of a rotation, taken as counter-clockwise in degrees, are
+A file of the maker's examples and the maker's reader (nanosurf-utils, MIT) show: rows and columns ascend, backward
+segments are not mirrored, integers are scaled to a range. A rotation is taken as counter-clockwise in degrees, which is
 unconfirmed (!).
 """
 
@@ -28,16 +28,21 @@ if TYPE_CHECKING:
 
 CONTROLLER: Final = "Nanosurf Studio"
 _TYPES: Final = {0: "int32", 1: "uint8", 2: "uint16", 3: "uint32", 4: "uint64", 5: "int16", 6: "int64", 7: "double"}
-"""Types by number, in format 1; format 2 names them."""
+"""Types of values by their numbers in format 1; format 2 has their names."""
 _SPECTROSCOPY: Final = ("spectroscopy", "spectroscopy_grid")
 _MEASUREMENTS: Final = (*_SPECTROSCOPY, "image_line_based", "wavemode_nma")
-"""Kinds of groups with measurements; format 2 has others, such as calibrations."""
+"""Kinds of groups with measurements; format 2 also has other groups, such as calibrations."""
 
 Array = NDArray[np.float64]
 
 
 def read_nhf(path: Path, zone: tzinfo | None) -> FileContent:
-    """Read all images and curves of a file. Raises FileError: another format, or damaged."""
+    """Read all images and curves of a file.
+
+    Raises:
+        FileError: the file has another format, inconsistent sizes, or neither images nor curves.
+        OSError: the file is damaged.
+    """
     with hdf5.opened(path) as file:
         version = int(file.attrs.get("nsf_file_version_major", 0))
         if version not in (1, 2):
@@ -139,7 +144,7 @@ def _channels(segment: h5py.Group) -> Iterator[tuple[str, str, h5py.Dataset]]:
 
 
 def _values(dataset: h5py.Dataset) -> Array:
-    # Integers span the range of their type; in format 2 one of them means no value.
+    # Integers span the range of their type; in format 2 one number stands for a missing value.
     raw = hdf5.array(dataset)
     attributes = dataset.attrs
     prefix = "signal" if "signal_name" in attributes else "base"

@@ -28,29 +28,33 @@ class StudioError(AfspmError):
 
 
 class Link:
-    """One connection. Raises ControllerLost: the port does not accept connections. ConfigError: malformed address."""
+    """A connection to Studio.
+
+    Raises:
+        ControllerLost: the port does not accept connections. ConfigError: the address is malformed.
+    """
 
     def __init__(self, address: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
         self._connection = TcpConnection(host_and_port(address), timeout_s, monotonic_s, _HINTS)
 
     def run(self, script: str) -> list[Any]:
-        """Run a script; return the values that it returns.
+        """Run a script and return its values.
 
         Raises:
             StudioError: the script failed.
-            ControllerLost: no reply, or an untrustworthy one; the connection is closed.
+            ControllerLost: no reply, or a malformed reply; the connection is closed.
         """
         self.begin(script)
         return self._values(_shown(script))
 
     def begin(self, script: str) -> None:
-        """Start a script; `reply` must be received before the next one. Raises ControllerLost."""
+        """Start a script; its `reply` must be received before the next script. Raises ControllerLost."""
         raw = script.encode()
         # Studio executes one script at a time on a connection, and replies at its end.
         self._connection.send(_shown(script), _LENGTH.pack(len(raw)) + raw)
 
     def reply(self, what: str) -> tuple[bool, list[Any]]:
-        """Return whether the reply has arrived, and its values. Raises: see `run`."""
+        """Return whether the reply has arrived, and its values (empty until then). Raises the errors of `run`."""
         return (True, self._values(what)) if self._connection.has_answer() else (False, [])
 
     def _values(self, what: str) -> list[Any]:

@@ -1,4 +1,4 @@
-"""Lua values in Studio's replies: tables, texts, numbers, booleans and nil. Pure."""
+"""Lua values in Studio's scripts and replies: tables, texts, numbers, booleans and nil."""
 
 from __future__ import annotations
 

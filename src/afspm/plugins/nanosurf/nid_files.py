@@ -1,8 +1,8 @@
 """Files of Nanosurf's older programs (.nid): a header with sections like an .ini, "#!", and the values of each channel.
 
-From ten files of the maker's examples (NSFopen, MIT), compared with Gwyddion: rows ascend, backward lines are not
-mirrored, integers are scaled to a range. A rotation is taken as counter-clockwise (!). A map of curves does not say
-which curve is where, so curves have no position.
+Ten files of the maker's examples (NSFopen, MIT), compared with Gwyddion, show: rows ascend, backward lines are not
+mirrored, integers are scaled to a range. A rotation is taken as counter-clockwise, which is unconfirmed (!). Curves
+have no position, since a map of curves does not contain the positions.
 """
 
 from __future__ import annotations
@@ -32,7 +32,11 @@ Array = NDArray[np.float64]
 
 
 def read_nid(path: Path, zone: tzinfo | None) -> FileContent:
-    """Read all images and curves of a file. Raises FileError: another format, or damaged."""
+    """Read all images and curves of a file.
+
+    Raises:
+        FileError: the file has another format, is cut off, or has neither images nor curves.
+    """
     head, found, data = path.read_bytes().partition(_DATA)
     sections = _sections(head.decode("utf-8", "replace"))
     if not found or "DataSet" not in sections:

@@ -43,11 +43,12 @@ class Session:
     Args:
         open_link: opens a new connection.
         release: release of Studio.
-        name: name of the session; empty: the only open one.
-        level: level of its commands; None: the lowest sufficient one.
+        name: name of the session; empty: the only open session.
+        level: level of the session's commands; None: the lowest sufficient level.
 
     Raises:
-        ControllerLost. ConfigError: another release, or missing commands.
+        ControllerLost: no connection, or no such session.
+        ConfigError: Studio has another release, lacks commands, or does not report scans to scripts.
     """
 
     def __init__(self, open_link: Callable[[], Link], release: int, name: str, level: int | None = None) -> None:
@@ -64,11 +65,11 @@ class Session:
             raise
 
     def run(self, script: str) -> list[Any]:
-        """Run a script; return the values that it returns. Raises StudioError, ControllerLost."""
+        """Run a script and return its values. Raises StudioError, ControllerLost."""
         return self._link.run(script)
 
     def do(self, command: str) -> None:
-        """Call a command. Raises Refused: Studio reports an error."""
+        """Call a command. Raises Refused: ACTION_ERROR: Studio reports an error."""
         try:
             self.run(f"{WORKFLOW}.{command}() return 0")
         except StudioError as error:
@@ -78,7 +79,7 @@ class Session:
         """Return values of panels by path.
 
         Raises:
-            ControllerLost: a value is missing or not finite, so that the reply can't be trusted.
+            ControllerLost: the script fails, or a value is missing or not finite: the reply can't be trusted.
         """
         # One request for all values: they belong to the same moment, and a poll stays short.
         script = ", ".join(f"{WORKFLOW}.{path}.{_field(path)}_get()" for path in paths)
@@ -90,7 +91,7 @@ class Session:
         return found
 
     def put(self, values: Mapping[str, Value]) -> None:
-        """Set values of panels, all or none. Raises Refused: Studio rejects one of them."""
+        """Set values of panels, all or none. Raises Refused: PARAM_ERROR: Studio rejects a value."""
         puts = " ".join(
             f"put({WORKFLOW}.{path}, {written(_field(path))}, {written(value)})" for path, value in values.items()
         )
@@ -110,7 +111,7 @@ class Session:
         return [str(one) for one in self.run(commands.MISSING % ", ".join(map(written, paths)))[0].values()]
 
     def scanning(self) -> Scanning:
-        """Return whether a scan runs, and how many were started. Raises ControllerLost."""
+        """Return whether a scan runs, and the number of started scans. Raises ControllerLost."""
         # Newer releases have no is_scanning: handlers of their signals count scans instead.
         script = f"{WORKFLOW}.{commands.IS_SCANNING}(), 0" if self._old else "afspm_seen.scanning, afspm_seen.started"
         found = self._returned(script)
@@ -127,7 +128,7 @@ class Session:
         link = self._open_link()
         try:
             self._select(link)
-            # A long command blocks its connection: the first one stays free for polls and stops.
+            # A long command blocks its connection: the first connection stays free for polls and stops.
             link.begin(f"{first} return {WORKFLOW}.{command}()")
         except BaseException:  # Ctrl-C, too: nothing else closes this connection
             link.close()
@@ -140,7 +141,7 @@ class Session:
     # --- inside ---
 
     def _returned(self, script: str) -> list[Any]:
-        # Any session can run these scripts: an error means that this one was closed or replaced.
+        # Any session can run these scripts: an error means that this session was closed or replaced.
         try:
             return self.run(f"return {script}")
         except StudioError as error:
@@ -161,7 +162,7 @@ class Session:
 
     def _select(self, link: Link) -> None:
         try:
-            # The selection of a session belongs to a connection: each one needs its own.
+            # The selection of a session belongs to a connection: each connection needs its own selection.
             link.run(f"return root.session.select({written(self._name)}, {self._level})")
         except StudioError as error:
             raise ControllerLost(f"Studio's session {self._name!r} can't be selected: {error}") from error
@@ -184,8 +185,12 @@ def _field(path: str) -> str:
 def new_lines(
     session: Session, buffer: int, region: Region, shape: tuple[int, int], start: int, *, upwards: bool
 ) -> list[ScanLines]:
-    """Return the complete lines after the first `start` that all channels have, in scanning order."""
-    # (!) which buffer holds the image, and that its values are the lines as they were scanned, is not known
+    """Return the complete lines of all channels after the first `start` lines of the scan.
+
+    Returns:
+        one item for each channel, all with the same lines, rows ascending in y; empty without new lines.
+    """
+    # (!) the number of the image's buffer, and the order of the lines in the buffer (as scanned), are unconfirmed
     found = session.run(commands.BUFFER_LINES % buffer)[0]
     channels = [_buffered_channel(one, shape[1]) for one in found.values()]
     done = min((len(values) for _, _, values in channels), default=0)

@@ -1,6 +1,7 @@
 """Frame, speed and tip position: conversion between Studio's values and generic parameters.
 
-Studio has the centre of a frame, its angle, and lines per second; a line is forward and backward (!).
+Studio has the centre of a frame, its angle, and lines per second; a line is forward and backward (!). The mark (!)
+stands for an unconfirmed fact.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ UNITS: Final[dict[str, tuple[str, ...]]] = {
     **dict.fromkeys((_ANGLE, *_SLOPES), ("°", "deg")),
     _RATE: ("Hz", "1/s"),
 }
-"""Accepted units of Studio's values: the conversions here are right for these only."""
+"""Accepted units of Studio's values: the conversions here are right for these units only."""
 SPEED_PATH: Final = 2.0
 """Path of the tip in a line, in widths of the frame: forward and backward (!)."""
 
@@ -105,12 +106,16 @@ class TipPlace(SettingsGroup):
         return x, y
 
     def go(self) -> None:
-        """Move the tip to the target. Raises Refused."""
+        """Start moving the tip to the target. Raises Refused: ACTION_ERROR."""
         self._session().do(commands.MOVE)
         self._moving = True
 
     def arrived(self) -> bool:
-        """Return whether the tip is within 1 nm of the target, or 0.1 % of its distance from the origin."""
+        """Return whether the last move by `go` has ended; True without a move.
+
+        A move has ended once the tip is within 1 nm of the target, or within 0.1 % of the target's distance from the
+        origin.
+        """
         if self._moving:
             x, y, to_x, to_y = (float(value) for value in self._session().values((*_PLACE, *_TARGET)).values())
             self._moving = math.dist((x, y), (to_x, to_y)) > max(1e-9, 1e-3 * math.hypot(to_x, to_y))

@@ -1,8 +1,8 @@
 """Driver of Park microscopes, over SmartScan's SmartRemote. See the README in this folder.
 
-**Theory of operation.** Every request is a JavaScript expression in JSON-RPC over ZeroMQ (`link`), wrapped so that it
-returns its own error. Each long script has a separate connection (`session`). Several answers of SmartScan are
-unconfirmed: the driver accepts each plausible form, and refuses unknown words instead of guessing.
+**Theory of operation.** A request is a query or a JavaScript expression in JSON-RPC over ZeroMQ (`link`). An expression
+is wrapped in a function that returns its error. Each long script has a separate connection (`session`). Several answers
+of SmartScan are unconfirmed: the driver accepts each plausible form, and refuses unknown words instead of guessing.
 
     inputs        replies; new TIFF files below SmartScan's base folder, one for each channel and direction
     state         the running and the ended measurement, the target position of the tip: persistent; the running
@@ -172,7 +172,7 @@ class Park(Driver):
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
-        """Stop everything and withdraw the tip: by the scanner, then by the stage if `lift` is set."""
+        """Stop scan, curve and approach, and withdraw the tip: by the scanner, then by the stage if `lift` is set."""
         self._doing.withdraw(self._lift_m / MICROMETRE)
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
@@ -181,7 +181,7 @@ class Park(Driver):
         self._doing.approach()
 
     def command(self, text: str) -> None:
-        """Evaluate an expression, e.g. `spm.ncm.sweepAutoFullRange()`. A long one keeps the microscope busy."""
+        """Evaluate an expression, e.g. `spm.ncm.sweepAutoFullRange()`. After 0.5 s the microscope counts as busy."""
         try:
             self._doing.evaluate(text)
         except SmartScanError as error:

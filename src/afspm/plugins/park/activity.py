@@ -26,7 +26,7 @@ APPROACH: Final = '(spm.approach.start("q+s"), 0)'
 _ENDED_FIRST: Final = ("scan.stop", "spect.stop", "approach.stop")
 _STATES: Final = {MOVE: ScopeState.MOVING, **dict.fromkeys(CURVES, ScopeState.SPEC)}
 _ANSWERS_S: Final = 0.5
-"""Real time after which an expression counts as a long one; an error arrives earlier."""
+"""Real time after which an expression counts as a long command; an error is expected earlier."""
 
 
 class SmartScanActivity(Activity):
@@ -56,7 +56,7 @@ class SmartScanActivity(Activity):
         self._curve_at: XY = (0.0, 0.0)
 
     def status(self) -> ScopeStatus:
-        """Return the present state; register measurements that have ended, whose files are then awaited."""
+        """Return the present state. Register measurements that began or ended, and take a curve that awaits the tip."""
         call = self._running_call()
         curve = call is not None and call.what in CURVES  # scan_query may report a curve as a scan (!)
         scanning = not curve and self._session.scanning()
@@ -81,13 +81,17 @@ class SmartScanActivity(Activity):
         self._files.end(self._clock.now_ns())
 
     def start_scan(self) -> None:
-        """Scan the frame. Raises Refused: SmartScan reports an error, or no scan is seen."""
+        """Start a scan of the frame.
+
+        Raises:
+            Refused: ACTION_ERROR: SmartScan reports an error, or shows no scan within `settles_s`.
+        """
         self.started(SCAN, lambda: self._session.do(START), lambda: self._session.scanning() or self._files.has_file())
 
     def start_curve(self, kind: str, place_m: XY) -> None:
-        """Take a curve at the tip's target position, after moving back there if a scan moved the tip."""
+        """Move the tip to `place_m`, (x, y) in m, where `status` takes a curve of this kind on arrival."""
         self._stopping = False
-        # The scanner is where the scan has left it: the curve needs a move first.
+        # A scan leaves the scanner away from the target: the curve needs a move first.
         self.watch(self._session.begin(kind, way_to(place_m)))
         self.curve_awaited, self._curve_at = kind, place_m
 
@@ -95,10 +99,10 @@ class SmartScanActivity(Activity):
         self.watch(self._session.begin("approach", APPROACH))
 
     def evaluate(self, expression: str) -> None:
-        """Evaluate an expression; if it takes longer than 0.5 s, it keeps the microscope busy.
+        """Evaluate an expression. An expression that takes longer than 0.5 s keeps the microscope busy.
 
         Raises:
-            SmartScanError
+            SmartScanError: the expression failed within 0.5 s. ControllerLost.
         """
         call = self._session.begin("command", f"({expression}, 0)", _ANSWERS_S)
         try:
@@ -112,9 +116,10 @@ class SmartScanActivity(Activity):
             call.close()
 
     def withdraw(self, lift_um: float) -> None:
-        """Stop everything and withdraw the tip: by the scanner, then by the stage."""
+        """Stop scan, curve and approach, and withdraw the tip: by the scanner, then by the stage if `lift_um` > 0."""
         self.stopped()
         self.close()
+        # an error of a stop must not prevent the withdrawal
         ended = " ".join(f"try {{ spm.{one}(); }} catch (ignored) {{}}" for one in _ENDED_FIRST)
         away = f"spm.zscanner.retractAll(); if ({lift_um!r} > 0) {{ spm.zstage.move({lift_um!r}, 1); }}"
         self.watch(self._session.begin("withdrawal", f"(function() {{ {ended} {away} return 0; }})()"))

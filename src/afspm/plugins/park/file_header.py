@@ -1,6 +1,6 @@
 """Layout of Park's TIFF files: private tags that contain a header of an image, or of curves.
 
-From pspylib 0.1.2, the maker's own reader; images were compared with Gwyddion, curves with AtomicJ.
+The layout comes from pspylib 0.1.2, the maker's own reader; images were compared with Gwyddion, curves with AtomicJ.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ HEADER: Final = np.dtype(
     + [("z_gain", "<f8"), ("z_range", "<f8"), ("xy_voltage", "V16"), ("z_voltage", "V16"), ("xy_servo", "V16")]
     + [("numbers", "<u4")]
 )
-"""Beginning of a header. The first version ends before `z_gain`, and its numbers are <i2."""
+"""Beginning of a header. The fields from `z_gain` on belong to the second version; in the first, numbers are <i2."""
 
 CHANNELS: Final = 8
 CURVE_KINDS: Final = {1: "indentation", 2: "force", 3: "IV", 4: "indentation", 5: "photo-current"} | {
@@ -59,16 +59,16 @@ CURVES: Final = np.dtype(
     + [("of_kind", "<f4", 13), ("numbers", "<i4"), ("setpoint", "<f4"), ("setpoint_unit", "<f4"), ("unused", "<i4", 22)]
 )
 OLD_CURVES: Final = CURVES.fields["grid_columns"][1] if CURVES.fields else 0
-"""Shortest header of curves, in older files, in bytes; points follow the newer header only."""
+"""Shortest header of curves, in older files, in bytes; the positions of curves follow only the newer header."""
 POINT: Final = np.dtype([("x_um", "<f4"), ("y_um", "<f4"), ("time_s", "<f4")])
 
 
 def text(raw: np.void) -> str:
-    """Return a text of a header: two bytes a character, padded with zeros."""
+    """Return a text of a header, which has two bytes for each character and zeros at its end."""
     return raw.tobytes().decode("utf-16-le", "replace").partition("\0")[0].strip()
 
 
 def in_si(unit: str) -> tuple[str, float]:
-    """Return the unit without its prefix, and the prefix as a factor."""
+    """Return the unit without its prefix, and the prefix as a factor; an unknown unit unchanged, and 1."""
     found = _UNIT.fullmatch(unit)
     return (found[2], _PREFIX[found[1]]) if found else (unit, 1.0)

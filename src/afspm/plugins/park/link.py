@@ -1,4 +1,4 @@
-"""Connection to SmartScan: JSON-RPC over ZeroMQ, with scripts that return their outcome in afspm's own form."""
+"""Connection to SmartScan: JSON-RPC over ZeroMQ, with scripts that return a value or an error in afspm's own form."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ RUN_SCRIPT, SCRIPT_RUNS, IS_CONNECTED, SCAN_STATUS, GEOMETRY = (
     "geometry_query",
 )
 _NO_PARAMETERS: Final = "None"
+# one id for all requests: one request is pending at a time, and a missing reply closes the connection
 _ID: Final = 1
 _SHOWN: Final = 60
 _HINTS: Final = (
@@ -37,25 +38,29 @@ class SmartScanError(AfspmError):
 
 
 class Link:
-    """One connection for one thread. Raises ControllerLost: no connection. ConfigError: malformed address."""
+    """A connection for one thread.
+
+    Raises:
+        ControllerLost: no program listens at the address. ConfigError: the address is malformed.
+    """
 
     def __init__(self, address: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
         self._address = address
         self._connection = ZmqConnection(address, timeout_s, monotonic_s, _HINTS)
 
     def ask(self, method: str) -> Any:
-        """Call a method without parameters; return its result. Raises SmartScanError, ControllerLost."""
+        """Call a method without parameters and return its result. Raises SmartScanError, ControllerLost."""
         return self._connection.ask(method, _request(method, _NO_PARAMETERS), _fields)["result"]
 
     def run(self, expression: str) -> Any:
-        """Evaluate a JavaScript expression; return its value.
+        """Evaluate a JavaScript expression and return its value.
 
         Raises:
-            SmartScanError: the script failed. ControllerLost: no reply, or an untrustworthy one; the connection is
-                closed.
+            SmartScanError: the script failed.
+            ControllerLost: no reply, or a malformed reply; the connection is closed.
         """
         reply = self._connection.ask(shown(expression), _request(RUN_SCRIPT, wrapped(expression)), _fields)
-        # `wrapped` always returns a text: without one the script did not run to its end.
+        # the script of `wrapped` always returns a text: without a text the script did not run to its end
         if not reply.get("value"):
             raise self._bad(f"SmartScan gave no value of {shown(expression)}")
         return self._outcome(reply)
@@ -69,7 +74,7 @@ class Link:
         self._connection.wait(within_s)
 
     def reply(self, what: str) -> tuple[bool, Any]:
-        """Return whether the reply has arrived, and its value, None without one.
+        """Return whether the reply has arrived, and its value; None for a reply without a value.
 
         Raises:
             SmartScanError: the script failed. ControllerLost.

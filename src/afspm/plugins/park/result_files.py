@@ -1,4 +1,4 @@
-"""SmartScan's files: a TIFF for each channel and direction of a scan, one for a curve."""
+"""SmartScan's files: a TIFF for each channel and direction of a scan, and one TIFF for a curve."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ParkFiles(FolderFiles):
         self._seen: tuple[list[tuple[str, int]], float] = ([], 0.0)
 
     def files_of(self, measured: Entry) -> list[tuple[str, int]]:
-        """Return all new files once no further file appears; before that an empty list."""
+        """Return all new files once no file has appeared or changed for `SETTLE_S`; an empty list until then."""
         listed = [(str(path), modified_ns(path)) for path in self._files(Path(measured["folder"]))]
         # By time and not by name: SmartScan's names can be chosen freely.
         files = sorted(one for one in listed if one[1] > measured["newest_ns"])

@@ -1,10 +1,10 @@
 """Park's TIFF files: each has one channel of a scan in one direction, or curves.
 
-Images: rows ascend, lengths are in µm, and a value is gain · (number · scale + offset) in a unit of its own. Offsets
+Images: rows ascend, lengths are in µm, and a value is gain · (number · scale + offset) in the channel's unit. Offsets
 are taken as the centre of the frame, a rotation as counter-clockwise, and backward lines as not mirrored (!).
 
 Curves: the numbers of a channel follow each other, forward and then backward; a value is gain · number, as in pspylib
-and AtomicJ. Positions are taken as those of the scanner, in µm (!).
+and AtomicJ. Positions are taken as positions of the scanner, in µm (!). The mark (!) stands for an unconfirmed fact.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ Tags = dict[int, Any]
 
 
 def read_tiff(path: Path, zone: tzinfo | None) -> FileContent:
-    """Read the image or the curves of a file. Raises FileError: damaged, or another kind of TIFF."""
+    """Read the image or the curves of a file. Raises FileError: the file is damaged, or another kind of TIFF."""
     tags = _tags(path)
     version, raw = int(tags.get(VERSION_TAG, 0)), bytes(tags.get(HEADER_TAG, b""))
     if tags.get(MAGIC_TAG) != MAGIC:

@@ -27,18 +27,21 @@ _GEOMETRY: Final = ("pixelHeight", "pixelWidth", "width", "height", "offsetX", "
 
 
 class Session:
-    """SmartScan over one connection, with a further one for each long script. Not thread-safe.
+    """SmartScan over one connection, with a further connection for each long script. Not thread-safe.
 
     Args:
         open_link: opens a new connection.
         scanning, idle: words of `scan_query`, in lower case.
+
+    Raises:
+        ControllerLost: no connection, SmartScan is not ready, or `scan_query` returns an unknown word.
     """
 
     def __init__(self, open_link: Callable[[], Link], scanning: Collection[str], idle: Collection[str]) -> None:
         self._open_link, self._scanning, self._idle = open_link, scanning, idle
         self._link = open_link()
         try:
-            # An unknown word in an answer must show now, not during the first scan.
+            # an unknown word in an answer must be found now, not during the first scan
             self._link.ask(IS_CONNECTED)
             self.scanning()
         except SmartScanError as error:
@@ -49,7 +52,12 @@ class Session:
             raise
 
     def values(self, paths: Sequence[str]) -> dict[str, Value]:
-        """Return values by path below `spm`. Raises Refused: unknown path. ControllerLost: not a plain value."""
+        """Return values by path below `spm`.
+
+        Raises:
+            Refused: PARAM_ERROR: SmartScan reports an error.
+            ControllerLost: a value is missing, not finite or not plain.
+        """
         try:
             found = self._link.run(f"[{', '.join(f'spm.{path}' for path in paths)}]")
         except SmartScanError as error:
@@ -59,54 +67,58 @@ class Session:
         return dict(zip(paths, found, strict=True))
 
     def is_number(self, path: str) -> bool:
-        """Return True if there is a number at a path below `spm`. Raises ControllerLost."""
+        """Return True if a path below `spm` leads to a number. Raises ControllerLost."""
         try:
             return bool(self._link.run(f"typeof spm.{path}") == "number")
         except SmartScanError:
             return False
 
     def put(self, values: Mapping[str, Value]) -> None:
-        """Set values by path below `spm`. Raises Refused: SmartScan rejects one of them."""
+        """Set values by path below `spm`, in order.
+
+        Raises:
+            Refused: PARAM_ERROR: SmartScan rejects a value; the values before it stay set.
+        """
         given = ", ".join(f"spm.{path} = {json.dumps(value)}" for path, value in values.items())
         self._do(given, ", ".join(values), ControlResponse.PARAM_ERROR)
 
     def put_members(self, path: str, members: Mapping[str, Value]) -> None:
-        """Set members of an object, which SmartScan accepts only as a whole. Raises Refused."""
+        """Set members of an object, which SmartScan accepts only as a whole. Raises Refused: PARAM_ERROR."""
         # SmartScan's gains are one object: setting a member alone has no effect.
         given = "".join(f"all[{json.dumps(name)}] = {json.dumps(value)}; " for name, value in members.items())
         changed = f"spm.{path} = (function (all) {{ {given}return all; }})(spm.{path})"
         self._do(changed, path, ControlResponse.PARAM_ERROR)
 
     def do(self, command: str) -> None:
-        """Call a command, e.g. "scan.stop()". Raises Refused: SmartScan reports an error."""
+        """Call a command, e.g. "scan.stop()". Raises Refused: ACTION_ERROR: SmartScan reports an error."""
         self._do(f"spm.{command}", command, ControlResponse.ACTION_ERROR)
 
     def run(self, expression: str) -> object:
-        """Evaluate an expression; return its value. Raises SmartScanError, ControllerLost."""
+        """Evaluate an expression and return its value. Raises SmartScanError, ControllerLost."""
         return self._link.run(expression)
 
     def geometry(self) -> dict[str, float]:
-        """Return the frame, in µm and degrees. Raises ControllerLost."""
+        """Return the frame by SmartScan's names, in µm, degrees and pixels. Raises ControllerLost."""
         return dict(zip(_GEOMETRY, numbers(self._asked(GEOMETRY), len(_GEOMETRY)), strict=True))
 
     def set_geometry(self, wanted: Mapping[str, float]) -> None:
-        """Set the frame, in µm and degrees. Raises Refused."""
+        """Set the frame by SmartScan's names, in µm, degrees and pixels. Raises Refused: PARAM_ERROR."""
         self._do(f"spm.scan.setScanGeometry({json.dumps(dict(wanted))})", "the frame", ControlResponse.PARAM_ERROR)
 
     def scanning(self) -> bool:
-        """Return True while a scan runs. Raises ControllerLost: unknown word in the answer."""
+        """Return True while a scan runs. Raises ControllerLost: the answer is an unknown word."""
         hint = "note its answers during a scan and without one, and set scanning_words and idle_words"
         return self._word(SCAN_STATUS, self._scanning, self._idle, hint)
 
     def script_runs(self) -> bool:
-        """Return True while a script runs. Raises ControllerLost: unknown word in the answer."""
+        """Return True while a script runs. Raises ControllerLost: the answer is an unknown word."""
         return self._word(SCRIPT_RUNS, TRUE, FALSE, "report it, with a trace")
 
     def begin(self, what: str, expression: str, wait_s: float = 0.0) -> LongCall:
-        """Start a long script on a separate connection; wait up to `wait_s` for its reply.
+        """Start a long script on a separate connection; wait up to `wait_s` of real time for its reply.
 
         Whether the reply arrives at the end of a script, or at once without a value, is unconfirmed. After an early
-        reply SmartScan is polled for the end.
+        reply SmartScan is polled for the end of the script.
 
         Raises:
             ControllerLost

@@ -1,7 +1,7 @@
 """Frame, speed, gains and tip position: conversion between SmartScan's values and generic parameters.
 
 SmartScan has the centre of a frame in µm, its angle in degrees, and lines per second; a line is forward and backward
-(!).
+(!). The mark (!) stands for an unconfirmed fact.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class Gains(SettingsGroup):
 
 
 class TipPlace(KeptSettings):
-    """The target position of the tip; SmartScan reports only its stage's position (!)."""
+    """The target position of the tip, (0, 0) before the first move; SmartScan reports only the stage's position (!)."""
 
     def __init__(self, session: Callable[[], Session], begun: Callable[[LongCall], None]) -> None:
         super().__init__(dict.fromkeys(POSITION, 0.0))

@@ -17,10 +17,10 @@ from afspm.model import PacketHeader
 from afspm.scheduler.publishing.envelopes import default_envelope
 
 COMPONENTS: Final = "afspm.components."
-"""Where the published implementation has its components. Their modules moved between its versions."""
+"""Package of the published components, whose modules moved between versions."""
 GUIDE: Final = "see docs/how-to/from-the-published-implementation.md"
 WIRES: Final = "afspm.io."
-"""Where the published implementation has its intermediary classes. Their modules moved between its versions."""
+"""Package of the published intermediary classes, whose modules moved between versions."""
 _WIRES: Final = {
     "Publisher": "Publisher",
     "PubSubCache": "Cache",
@@ -38,7 +38,7 @@ _MEANINGLESS: Final = (
     "get_envelope_for_proto", "pub_get_envelope_for_proto", "sub_extract_proto", "extract_proto_kwargs",
     "update_cache", "update_cache_kwargs", "uuid",
 )  # fmt: skip
-"""Settings that only say how Python is to decode or to name packets: decoding is the wire's, naming is [cache]'s."""
+"""Settings for decoding and naming packets; left out, since afspm has one wire format, and names packets by [cache]."""
 CHANNEL: Final = "Height"
 """The simulated microscope's channel, in place of the channel of a published picture."""
 
@@ -47,7 +47,7 @@ Becomes = Callable[[object, Table], Settings]
 
 @dataclass(frozen=True)
 class PublishedSetting:
-    """One setting of a published class.
+    """A setting of a published class.
 
     Attributes:
         becomes: returns the afspm settings (dotted names for tables) for a value and its table.
@@ -60,7 +60,13 @@ class PublishedSetting:
 
 @dataclass(frozen=True)
 class PublishedClass:
-    """A published class with a counterpart in afspm."""
+    """A published class with a counterpart in afspm.
+
+    Attributes:
+        ours: name of afspm's class.
+        settings: settings that change, by their published names; all others are kept.
+        why: a remark on the counterpart, for the explanation of the file.
+    """
 
     ours: str
     settings: Mapping[str, PublishedSetting] = field(default_factory=dict)
@@ -77,7 +83,7 @@ def wire_of(table: object) -> str:
 
 
 def converted(value: object, channels: Mapping[str, str]) -> Any:
-    """Convert intermediaries within a value, and replace calls of published functions by the resulting envelope.
+    """Convert intermediaries within a value, and replace calls of the envelope functions by the resulting envelope.
 
     Args:
         channels: new names of the file's channels, by old name.
@@ -122,7 +128,10 @@ def with_channels(table: Table, channels: Mapping[str, str]) -> Settings:
 
 
 def cache_section(logic: object) -> Settings:
-    """Return the section [cache] for a published cache logic. Sizes without a unit are in nm, as in envelopes."""
+    """Return the section [cache] for a published cache logic; empty for any other table or value.
+
+    Sizes without a unit are in nm, as in envelopes.
+    """
     if wire_of(logic) not in CACHE_LOGIC or not isinstance(logic, Mapping):
         return {}
     count = logic.get("default_scan_history")
@@ -215,7 +224,7 @@ def _gone(why: str, *names: str) -> dict[str, PublishedSetting]:
 
 
 def _paper(ours: str) -> PublishedSetting:
-    # the paper's queue holds the scans that the published scheduler caches
+    # the queue of the paper's tracker holds the scans that the published scheduler caches
 
     def becomes(value: object, table: Table) -> Settings:
         settings = {"drift.tracker.class": "paper", f"drift.tracker.{ours}": value}
@@ -296,7 +305,7 @@ def _velocity(value: Any, table: Table) -> Settings:
 
 
 _LINES, _WIDTH_M = 128, 1e-6
-"""Of a scan with default settings."""
+"""Lines and width of a scan with default settings."""
 _PICTURES: Final = ("ImageTranslator", "DriftImageTranslator")
 _EVERY: Final[dict[str, PublishedSetting]] = {
     **_gone("a process waits for its next message and never sleeps", "loop_sleep_s", "poll_timeout_ms"),
@@ -375,7 +384,7 @@ CLASSES: Final[dict[str, PublishedClass]] = {
     "GxsmTranslator": PublishedClass("Gxsm", _EVERY | _HANDLERS | _GXSM),
     "NanonisTranslator": PublishedClass("Nanonis", _EVERY | _HANDLERS | _NANONIS),
 }
-"""By the name of the class, without its module, which varied between versions."""
+"""afspm's counterparts by the published name of the class, without its module, which varied between versions."""
 
 _OWN = "derive a class of your own from afspm.Component, with on_scan, on_state … or a `run`"
 _TRANSLATOR = 'derive a class of your own from afspm.translator.Driver: "afspm new driver"'
@@ -422,7 +431,7 @@ class _Conversion:
     document: Document
 
     def add_cache(self, table: Table) -> None:
-        """Copy a scheduler's cache settings into [cache], where [cache] does not set them."""
+        """Add a scheduler's cache settings to [cache]: histories that [cache] lacks, and rules after its own rules."""
         logic = _within(table, "pubsubcache", "update_cache_kwargs", "cache_logic")
         if isinstance(logic, Mapping) and isinstance(histories := logic.get("proto_with_history_list"), Mapping):
             logic = {**logic, "proto_with_history_list": with_channels(histories, self.channels)}
@@ -441,7 +450,9 @@ class _Conversion:
             self.parts.became[(name,)] = "[cache]"
 
     def component(self, name: str, table: Settings, written: Table) -> Settings | None:
-        """Return a component in afspm's form; None if afspm needs no process for it.
+        """Return a component in afspm's form; None if afspm runs no process in its place.
+
+        No process is run for a class without counterpart, which is an error in the document, or for a second dashboard.
 
         Args:
             written: the component before its intermediaries were converted.
@@ -470,7 +481,7 @@ class _Conversion:
         return {**settings, "class": ours.ours}
 
     def drop_rescanners(self, ours: dict[str, Settings]) -> None:
-        """Remove rescanners if no drift scheduler is there to request rescans."""
+        """Remove rescanners if the file has no drift scheduler, which requests rescans."""
         if any(table.get("class") == "DriftCompensatedScheduler" for table in ours.values()):
             return
         for name in [name for name in ours if self.parts.became.get((name, "class")) == 'class = "Rescanner"']:

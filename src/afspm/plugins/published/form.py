@@ -18,17 +18,17 @@ class PublishedForm:
     """File form of the published implementation; see `experiment.forms.FileForm`."""
 
     def convert(self, tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
-        """Return the components of a file in afspm's form."""
+        """Return the components of a file in afspm's form; see `files.convert`."""
         return convert(tables, parts, document)
 
     def explained(self, resolved: ResolvedExperiment) -> list[tuple[SourceLocation, str, str]]:
-        """Return the location, setting and result of each line of the file."""
+        """Return the location, the setting and afspm's equivalent of each line of the file."""
         from afspm.plugins.published.short_form import explained  # not needed to run a file
 
         return explained(resolved)
 
     def short(self, resolved: ResolvedExperiment) -> str:
-        """Return the experiment in the short form."""
+        """Return the experiment as a file in afspm's short form."""
         from afspm.plugins.published.short_form import short
 
         return short(resolved)

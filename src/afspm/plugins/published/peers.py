@@ -1,4 +1,4 @@
-"""Bridge for components of the published implementation in an afspm experiment, or for their scheduler."""
+"""Bridge for components of the published implementation in an afspm experiment, or for a published scheduler."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ _NAMELESS = b"a client without a name: set the socket's identity to the componen
 
 
 class PublishedPeers:
-    """The scheduler that components of the published implementation expect: their entry to an afspm experiment.
+    """The scheduler that components of the published implementation ("peers") expect in an afspm experiment.
 
-    In the afspm scheduler each of them is a client with its own name.
+    In the afspm scheduler each peer is a client with its own name.
 
     Args:
         serve: address for the control clients of the peers.
@@ -58,7 +58,7 @@ class PublishedPeers:
     """
 
     opens_plain: ClassVar[bool] = True
-    """Programs without keys can command the microscope through it, so the experiment file has to allow it."""
+    """Programs without keys can command the microscope through this class: the experiment file must allow its use."""
 
     def __init__(self, serve: str, publish: str, *, as_translator: bool = False) -> None:
         self._serve, self._publish = serve, publish
@@ -160,7 +160,7 @@ class _PeersPort(BasePort[Incoming]):
         return f"{name}/{self._session}/{next(self._numbers)}"
 
     def due_in_s(self) -> float | None:
-        """Return the longest time to wait for messages; None: no limit."""
+        """Return the longest time to wait for messages, in s; None: no limit."""
         due_s = min(self._outlet.due_s, self._ends_s)
         return None if due_s == math.inf else due_s - self._clock.monotonic_s()
 
@@ -225,7 +225,7 @@ class _PeersPort(BasePort[Incoming]):
         key = b"" if self._as_translator else identity
         client = self._clients.get(key)
         if client is not None:
-            client.leaves = False  # it is back
+            client.leaves = False  # the peer is back
         else:
             # a client for each peer, so that the scheduler arbitrates control between them
             client = self._clients[key] = _PeerClient(self, self._name_inside(identity))
@@ -259,9 +259,9 @@ class _PeersPort(BasePort[Incoming]):
         identity = self._identities.pop(descriptor, None)
         client = None if identity is None or self._as_translator else self._clients.get(identity)
         if client is None or identity in self._identities.values():
-            return  # it has a newer connection
+            return  # the peer has a newer connection
         if client.asked:
-            client.leaves = True  # its last request is still carried out
+            client.leaves = True  # the last request is still carried out
         else:
             self._leave(client)
 
@@ -274,7 +274,7 @@ class _PeersPort(BasePort[Incoming]):
 
     def _subscriptions(self) -> list[Incoming]:
         for prefix in self._outlet.subscriptions():
-            # a peer gets messages unknown to version 1 if it subscribes by their names
+            # a peer that subscribes by name also gets messages unknown to version 1
             if prefix == wire.KILL.decode() or prefix.startswith(tuple(self._listened)):
                 continue
             if len(self._listened) < MOST_EXTRA:
@@ -309,7 +309,7 @@ class _PeersPort(BasePort[Incoming]):
                 state = wire.decode(message, packet.payload).state
             elif message == CONTROL_STATE.name:
                 if self._as_translator:
-                    return  # the scheduler outside publishes its own
+                    return  # the published scheduler publishes a control state of its own
                 packet = self._with_names_outside(packet)
         except WireError as error:
             self.warnings.warning(f"dropped a packet of the scheduler: {error}")
@@ -348,7 +348,7 @@ class _Outlet:
 
     @property
     def due_s(self) -> float:
-        """Return the time of the next publication; infinity if none is due."""
+        """The time of the next publication; infinity without waiting packets or replay."""
         return min(self.pacing.due_s, self._replay_s)
 
     def subscriptions(self) -> list[str]:
@@ -378,7 +378,7 @@ class _Outlet:
         now_s = self._clock.monotonic_s()
         if now_s >= self._replay_s:
             prefixes, self._joined, self._replay_s = tuple(self._joined), set(), math.inf
-            # like the published cache, the last of each: a peer that asserts one packet fails at two
+            # like the published cache, the last packet of each envelope: a peer that asserts one packet fails at two
             for packet in self._history.last(prefixes):
                 self._send(packet)
         for packet in self.pacing.take(now_s):

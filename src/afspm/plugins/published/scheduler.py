@@ -27,20 +27,23 @@ if TYPE_CHECKING:
     from afspm.transport.process.context import ProcessContext
 
 CACHE_WITHIN_S: Final = 2.0
-"""Real time in which a scheduler of version 1 has sent its cache. It does not say when it is done."""
+"""Real time within which a scheduler of version 1 sends its cache; no message marks the end of the cache."""
 LINGER_S: Final = 1.0
 MOST_ANSWERS: Final = 256
 """Remembered answers per client, for repeated requests."""
 
 
 class PublishedScheduler:
-    """An afspm scheduler that passes all requests on to a scheduler of the published implementation.
+    """An afspm scheduler that passes requests on to a scheduler of the published implementation.
 
     Args:
         serve: address of the published scheduler's router.
         publish: address of the published scheduler's publisher.
         control, limits, cache: sections of the experiment file, which the published scheduler's own configuration
             replaces. Limits are refused, since nothing would enforce them.
+
+    Raises:
+        ConfigError: `limits` has parameters, actions or sets.
     """
 
     role: ClassVar[Role] = Role.SCHEDULER
@@ -93,6 +96,7 @@ class _ClientOutside:
         self._bridge = bridge
         self._network = version_1.outside(bridge.launch)
         self.socket = self._network.socket(zmq.DEALER)
+        # the published scheduler knows a client only by its socket's identity
         self.socket.setsockopt(zmq.ROUTING_ID, name.encode())
         self.monitor = Monitor(self._network, self.socket, CONNECTED | DISCONNECTED)
         self._network.connect(self.socket, bridge.serve_outside)
@@ -103,7 +107,7 @@ class _ClientOutside:
         self._is_sent = False
 
     def ask(self, request: Request) -> None:
-        """Send a request once earlier ones are answered; resend the known answer to a repeated request."""
+        """Send a request once earlier requests are answered; resend the known answer to a repeated request."""
         if request.id and request.id in self.answers:
             self._bridge.reply(self, self.answers[request.id])
         elif not request.id or all(request.id != one.id for one in self.asked):
@@ -127,7 +131,7 @@ class _ClientOutside:
     def follow(self) -> list[Incoming]:
         for event in self.monitor.drain():
             was_sent, self._is_open, self._is_sent = self._is_sent, event.kind == CONNECTED, False
-            if was_sent:  # repeated, it might be carried out twice
+            if was_sent:  # a repeated request might be carried out twice
                 why = "the connection to the scheduler was lost before it answered"
                 detail = ResponseDetail.OUTCOME_UNKNOWN
                 self._is_sent = True
@@ -178,7 +182,8 @@ class _SchedulerPort(BasePort[Incoming]):
         self._ends_s = math.inf
         self._outside = version_1.outside(launch)
         self._sub = self._outside.socket(zmq.SUB)
-        self._sub.setsockopt(zmq.SUBSCRIBE, b"")  # a single one: their scheduler processes one subscription per loop
+        # a single subscription: the published scheduler processes one subscription per loop
+        self._sub.setsockopt(zmq.SUBSCRIBE, b"")
         self._monitor = Monitor(self._outside, self._sub, CONNECTED)
         self._opens_s = math.inf
         self._outside.connect(self._sub, publish)
@@ -186,7 +191,7 @@ class _SchedulerPort(BasePort[Incoming]):
         self._poller.register(self._monitor.socket, self._connected)
 
     def due_in_s(self) -> float | None:
-        """Return the longest time to wait for messages; None: no limit."""
+        """Return the longest time to wait for messages, in s; None: no limit."""
         due_s = min(self._ends_s, self._opens_s)
         return None if due_s == math.inf else due_s - self._clock.monotonic_s()
 
@@ -195,7 +200,7 @@ class _SchedulerPort(BasePort[Incoming]):
         return self._clock.monotonic_s() >= self._ends_s
 
     def open_when_cached(self) -> None:
-        """Accept afspm's components once the published scheduler has had time to send its cache."""
+        """Accept afspm's components from `CACHE_WITHIN_S` after the connection to the published scheduler."""
         if self._clock.monotonic_s() >= self._opens_s and self.launch.sockets.serve is not None:
             self._opens_s = math.inf
             self._router = Router(self._network, self.launch.sockets.serve, self._warnings, self._clock)
@@ -207,11 +212,11 @@ class _SchedulerPort(BasePort[Incoming]):
         if not version_1.has_request(request.kind):
             return version_1.unknown_request(request.kind, "scheduler", request.id)
         if request.kind == ControlRequest.RMV_EXP_PRBLM and request.subject not in self._flagged | self._unpublished:
-            return Response(int(ControlResponse.SUCCESS))  # their scheduler ends if the problem is not set
+            return Response(int(ControlResponse.SUCCESS))  # the published scheduler ends if the problem is not set
         return None
 
     def note(self, request: Request, response: Response) -> None:
-        """Update the set of flagged problems after a successful request."""
+        """Update the set of flagged problems after a successful request that adds or removes a problem."""
         if response.ok and request.kind == ControlRequest.ADD_EXP_PRBLM:
             self._unpublished.add(int(request.subject))
         elif response.ok and request.kind == ControlRequest.RMV_EXP_PRBLM:
@@ -247,7 +252,7 @@ class _SchedulerPort(BasePort[Incoming]):
                 name = self._names.pop(connection, "")
                 client = self._clients.get(name)
                 if client is not None and client.connection == connection:
-                    # closed: their scheduler notices a client's end only by its connection
+                    # the published scheduler notices a client's end only by its connection
                     self._forget(name)
 
     def _asked(self, connection: int, name: str, user: str | None, frames: list[bytes]) -> None:
@@ -286,7 +291,7 @@ class _SchedulerPort(BasePort[Incoming]):
         self._poller.forget(client.monitor.socket)
         client.close()
 
-    # --- outside: their scheduler ---
+    # --- outside: the published scheduler ---
 
     def _connected(self) -> list[Incoming]:
         if self._monitor.drain() and self._router is None:

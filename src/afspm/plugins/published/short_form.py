@@ -1,4 +1,4 @@
-"""Short form of a published experiment file, and the result of each of its lines."""
+"""A published experiment file in afspm's short form, and the equivalent of each line of the file."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ _FILLED_IN: Final = "filled in: processes on one computer find each other"
 
 
 def explained(resolved: ResolvedExperiment) -> list[tuple[SourceLocation, str, str]]:
-    """Return the location, setting and result of each line of the file."""
+    """Return the location, the setting and afspm's equivalent of each line of the file."""
     return [(resolved.document.place(*path), _shown(path), became) for path, became in _lines(resolved)]
 
 
 def short(resolved: ResolvedExperiment) -> str:
-    """Return the experiment in the short form: components with their settings, and sections unlike the defaults.
+    """Return the experiment in the short form: the file's sections, and its components with their settings.
 
-    A component without counterpart is replaced by a substitute if its settings determine one, else by a comment with
-    advice.
+    Addresses on this computer are left out, and timeouts of components move to [control]. A component without
+    counterpart becomes a comment: with a `ScanSeries` below it if the settings determine one region, else with advice.
     """
     parts = resolved.parts
     kept = {name: parts.variables[name] for name in _VARIABLES if name in parts.variables}

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from afspm.transport.process.context import ProcessContext
 
 STOPPED_WITHIN_S: Final = 2.0
-"""Real time that their translator has to stop its measurement when the experiment ends."""
+"""Real time that the published translator has to stop its measurement when the experiment ends."""
 _STOPS: Final = {ScopeState.SCANNING: STOP_SCAN, ScopeState.SPEC: STOP_SPEC}
 _OWN = b"own"  # the id of this process's own requests, which clients' requests don't have
 
@@ -64,6 +64,9 @@ class PublishedTranslator:
         program: command that starts the translator; its standard input gets afspm's launch line with both addresses.
         spectra_by_variable: whether the translator sends the values of a spectrum variable by variable, as the
             published translators for Nanonis and Asylum do.
+
+    Raises:
+        ConfigError: neither a program nor both addresses are given, or a program and both addresses.
     """
 
     role: ClassVar[Role] = Role.TRANSLATOR
@@ -93,7 +96,8 @@ class PublishedTranslator:
         return child.returncode or ExitCode.CRASHED if stop.child_ended else code
 
     def _run(self, context: ProcessContext, stop: _Stop, serve: str, publish: str) -> int:
-        # inside, the translator exists only while theirs is connected, so that the scheduler sees a loss
+        # inside, a translator exists only while the published translator is connected, so that the scheduler sees a
+        # loss
         launch = context.launch
         memory = Memory(Path(launch.state_dir) / f"{launch.name}.json" if launch.state_dir else None, synced=False)
         while not stop.is_set and _is_connected(context.launch, serve, stop):
@@ -138,7 +142,7 @@ class _Stop:
 def _started(
     program: Sequence[str], context: ProcessContext, sockets: Sockets, stop: _Stop
 ) -> Iterator[subprocess.Popen[bytes]]:
-    # under the guard that also runs commands in other languages
+    # under the guard that also runs commands in other languages; without keys, which version 1 does not have
     own = (sys.executable,) if program[0] == "python" else program[:1]
     line = replace(context.launch, class_="", settings={}, sockets=sockets, keys=None).to_json()
     child = subprocess.Popen([*python_command(GUARD), "--", *own, *program[1:]], stdin=subprocess.PIPE)
@@ -154,7 +158,11 @@ def _started(
 
 
 def by_point(payload: bytes) -> bytes:
-    """Return a Spec1d with its values reordered from variable by variable to point by point. Raises WireError."""
+    """Return an encoded Spec1d with its values reordered from variable by variable to point by point.
+
+    Raises:
+        WireError: the payload is no Spec1d.
+    """
     spectrum = wire.decode(SPECTRUM.name, payload)
     points, variables = spectrum.values.shape
     return wire.encode(replace(spectrum, values=spectrum.values.reshape(variables, points).T))[1]
@@ -197,9 +205,8 @@ class _TranslatorPort(ZmqServerPort):
         self._commander = b""
         self._in_hand: Request | None = None
         self._number = 0
-        self._memory = (
-            memory  # saved: after a restart, a request that their side may have carried out is not sent again
-        )
+        # saved: after a restart, a request that the published translator may have carried out is not sent again
+        self._memory = memory
         self._outcomes = RequestOutcomes(memory.setdefault("requests", {}), all_or_nothing=False)
         self._state = ScopeState.UNDEFINED
         self._ends_s = math.inf
@@ -217,7 +224,7 @@ class _TranslatorPort(ZmqServerPort):
         self._poller.register(self._sub, self._packets)
 
     def run(self, stop: _Stop) -> bool:
-        """Run until the end of the experiment (True), a request to end, or the loss of the published translator."""
+        """Run until the experiment ends, and return True; return False at a request to end, or at a lost connection."""
         stop.bridge = self
         try:
             while not (stop.is_set or self._is_lost):
@@ -274,7 +281,7 @@ class _TranslatorPort(ZmqServerPort):
         self.reply(wire.encode_response(response))
 
     def _end(self) -> None:
-        # their translator goes on, to be stopped by hand; its running scan must not
+        # the published translator goes on until a person stops it; its running scan must not
         self._answer(Response(int(ControlResponse.SUCCESS)))
         self._ends_s = self._clock.monotonic_s()
         if stop := _STOPS.get(self._state):
@@ -282,7 +289,7 @@ class _TranslatorPort(ZmqServerPort):
             frames = version_1.request_frames(Request(int(ControlRequest.ACTION), stop))
             send_frames(self._dealer, [_OWN, b"", *frames])
 
-    # --- outside: their translator ---
+    # --- outside: the published translator ---
 
     def _answers(self) -> list[Served]:
         while frames := receive_frames(self._dealer):

@@ -1,6 +1,6 @@
 """Version 1 of the protocol: the messages that its programs can read, and the pace that they can follow.
 
-Its programs end on any other envelope or request number.
+Programs of version 1 end on any other envelope or request number.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ TOPICS: Final = (
 )
 """The messages that a cache of version 1 knows."""
 PAUSE_S: Final = 0.4
-"""Real time; the published implementation polls every 0.38 s."""
+"""Pause between two delayed packets, in real seconds; the published implementation polls every 0.38 s."""
 MOST_WAITING: Final = 1000
-"""Packets; an experiment that runs faster than real time produces more than can be spaced."""
+"""Largest number of delayed packets: an experiment faster than real time produces more packets than fit the pauses."""
 _PASSING = (ScopeState.MOVING, ScopeState.INTERRUPTED)
 _SETTINGS = (SCAN_PARAMETERS.name, FEEDBACK.name, PROBE_POSITION.name)
 _WITHOUT_OBJECT = (ControlRequest.RELEASE_CTRL, ControlRequest.END_EXPERIMENT)
@@ -57,13 +57,13 @@ def has_request(number: int) -> bool:
 
 
 def request_frames(request: Request) -> list[bytes]:
-    """Return a request as frames of version 1: its number, and its object (possibly empty) if the request takes one."""
+    """Return a request as frames of version 1: number, and object (possibly empty) if this request takes an object."""
     number = bytes([request.kind])
     return [number] if request.kind in _WITHOUT_OBJECT else [number, request.payload or encode_subject(request.subject)]
 
 
 def answer_frames(asked: int, response: Response, *, reason: bool = False) -> list[bytes]:
-    """Return a response as frames of version 1: number and object.
+    """Return a response as frames of version 1: number, and object if any.
 
     Args:
         asked: the number of the request; the answer to REQ_PARAM always has an object, possibly empty.
@@ -82,7 +82,9 @@ def unknown_request(number: int, whose: str, request_id: str) -> Response:
 
 
 def topics_meant(prefix: str) -> list[str]:
-    """Return the prefixes that a version 1 subscription stands for: all known messages that begin with it, or itself.
+    """Return the prefixes that a version 1 subscription stands for: all known messages that begin with `prefix`.
+
+    Without such a message, `prefix` itself is returned.
 
     >>> topics_meant("Scan")
     ['Scan2d', 'ScanParameters2d']
@@ -110,7 +112,7 @@ class Pacing:
         """Add a packet.
 
         Args:
-            message: the name of its message.
+            message: the name of the packet's message.
             state: the state in a ScopeStateMsg; None for other messages.
         """
         self._waiting.append((packet, message, state))
@@ -136,7 +138,7 @@ class Pacing:
 
     @property
     def due_s(self) -> float:
-        """Return the time of the next packet; infinity if none is waiting."""
+        """The time of the next packet, in real seconds; infinity without waiting packets."""
         if not self._waiting:
             return math.inf
         _, message, state = self._waiting[0]

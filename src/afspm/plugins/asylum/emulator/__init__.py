@@ -24,7 +24,7 @@ _NOT_COMPILED, _ABORTED, _UNKNOWN = 100, 107, 1
 
 @dataclass(frozen=True)
 class DelayedMessage:
-    """A reply with the time at which it is sent."""
+    """A reply with its time of sending, experiment time."""
 
     client: bytes
     payload: bytes
@@ -35,13 +35,15 @@ class AsylumEmulator(Emulator):
     """The emulated microscope.
 
     Args:
-        idle_s: real seconds between two idle moments of Igor, with one call executed at each; 0: calls are executed at
-            once.
+        idle_s: real seconds between two idle moments of Igor; one call is executed at each moment; 0: calls are
+            executed at once.
         start_s: duration of the ramp to the first line, experiment time.
-        file_s: delay between the end of a measurement and the first half of its file, and between both halves.
+        file_s: delay between the end of a measurement and the first half of its file, and between both halves,
+            experiment time.
         save_path: Igor's name of the data folder, "C:Users:Me:Data:". Default: the folder's own path.
         base_name: base name of the files.
-        procedures: included procedure files: "afspm" (afspm.ipf), "spots" (those of the published afspm) or "none".
+        procedures: included procedure files: "afspm" (afspm.ipf), "spots" (procedures of the published afspm) or
+            "none".
         has_status: True if this release has the function ARGetStatus.
         image_open: True if a window shows an image with spots.
         saves_partial: True if stopped images are saved.
@@ -114,7 +116,7 @@ class AsylumEmulator(Emulator):
         return AsylumFunctions(self.controller, self.clock.now_s, self._settings).table()
 
     def serve(self, timeout_s: float) -> None:
-        """Receive requests; execute one queued call if Igor is idle."""
+        """Receive requests, and execute one queued call at each idle moment of Igor (see `idle_s`)."""
         if self._server.queue and not self._busy():
             timeout_s = min(timeout_s, max(0.0, self._idle_at_s - self.clock.monotonic_s()))
         self._server.poll(timeout_s, locked=self._locked())
@@ -142,7 +144,7 @@ class AsylumEmulator(Emulator):
         return min((at_s for at_s in times if at_s is not None and at_s > now_s), default=None)
 
     def abandon(self) -> None:
-        """Also stop the scan or curve whose state Asylum's panels show as running."""
+        """Drop the present activity, and stop the scan or curve that Asylum's panels show as running."""
         super().abandon()
         self.controller.abandon()
 

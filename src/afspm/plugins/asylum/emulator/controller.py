@@ -1,4 +1,4 @@
-"""Asylum's software: the effects of its functions, and the running scans and curves."""
+"""Asylum's emulated software: the effects of its functions, and the running scans and curves."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _SCANNING, _ENGAGED, _FORCE = 0x1, 0x2, 0x10
 _MOST_POINTS: Final = 8192
 _PULSE_S: Final = 60.0
 _INDENTS_M: Final = 1e-6
-"""A longer force curve drives the tip into the sample."""
+"""Longest force curve that does not drive the tip into the sample."""
 _REACH_M: Final = 1e-3
 """Limit of all distances: far beyond any scanner."""
 _LONGEST_NAME: Final = 17
@@ -83,13 +83,13 @@ class AsylumController:
         self._starts_at_s = math.inf
         self._bias_since_s = -math.inf
         self._curve_running = self._engages = False
-        # as after a scan whose image is still open: the first spot is in its middle
+        # as after a scan whose image is still open: the first spot is in the middle of the image
         self._image = self._frame()
         fast, slow = values.size()
         self.spots_m: list[tuple[float, float]] = [(fast / 2, slow / 2)]
 
     def put(self, names: str, value: float, now_s: float) -> None:
-        """Execute PV. A bias voltage that is set for less than a minute counts as a bias pulse."""
+        """Execute PV. A bias voltage that is changed again within a minute counts as a bias pulse."""
         before_v = self.values.get("TipVoltage")
         self.values.put(names, value)
         if self.values.get("TipVoltage") == before_v:
@@ -101,7 +101,7 @@ class AsylumController:
     # --- what goes on ---
 
     def advance(self, now_s: float) -> float | None:
-        """Advance to now; return the time of the next change."""
+        """Advance to `now_s`; return the time of the next event, apart from events of the rig."""
         if self._engages and not self.rig.busy(now_s):
             self._engages = False
             self.rig.engage(now_s)
@@ -131,7 +131,7 @@ class AsylumController:
     # --- scans ---
 
     def scan(self, now_s: float, down: bool | None) -> None:
-        """Start a scan downwards, upwards or in the previous direction (None); it replaces a running scan."""
+        """Start a scan downwards, upwards or in the previous direction (None), in place of a running scan."""
         if self.faults.strikes("scan-refused", now_s):
             return
         if self.scanning:
@@ -157,7 +157,7 @@ class AsylumController:
         self.rig.withdraw(now_s)
 
     def engage(self, now_s: float) -> None:
-        """Approach the sample once a running withdrawal has ended."""
+        """Switch the feedback on, and approach the sample once the present activity has ended."""
         self._engages = True
         self.rig.switch_feedback(now_s, on=True)
 
@@ -172,7 +172,7 @@ class AsylumController:
         self.values.put("ScanStatus;FMapStatus", 0)
 
     def _start_or_interrupt(self, now_s: float) -> None:
-        # A scan with impossible parameters ends like one stopped at the panel.
+        # A scan with impossible parameters ends like a scan that is stopped at the panel.
         try:
             if not self._can_be_scanned():
                 raise InvalidValue("no scan is possible with these parameters")
@@ -265,8 +265,8 @@ class AsylumController:
         """Send the tip to the spot ForceSpotNumber of the last image.
 
         Raises:
-            InvalidValue: there is no such spot, or it is not a finite place.
-            InstrumentBusy: something is running.
+            InvalidValue: the spot does not exist, or a coordinate is not within 1 mm.
+            InstrumentBusy: an activity other than a move is running.
         """
         number = self._whole("ForceSpotNumber")
         if not 0 <= number < len(self.spots_m) or not all(abs(along) < _REACH_M for along in self.spots_m[number]):
@@ -285,7 +285,7 @@ class AsylumController:
     # --- files ---
 
     def check_suffix(self) -> None:
-        """Raise BaseSuffix to the next number without a file."""
+        """Increase BaseSuffix to the next number without a file."""
         base, suffix = self._base_name(), self._suffix()
         while (self._folder / f"{base}{suffix:04d}.ibw").exists():
             suffix += 1

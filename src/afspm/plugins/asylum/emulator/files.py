@@ -20,7 +20,7 @@ _FLOAT32: Final = 2
 
 Entries = Mapping[str, float | str]
 Made = Callable[[str], bytes]
-"""Encodes a file, given the name of its wave."""
+"""A function that encodes a file, given the name of its wave."""
 
 
 def image(name: str, scan: ScanActivity, values: IgorValues, now_s: float) -> bytes:
@@ -75,12 +75,12 @@ def _of_curve(spectrum: SpectrumActivity, distance_m: float, points: int, values
 def _note(values: IgorValues, now_s: float, more: Entries = MappingProxyType({})) -> bytes:
     local, seconds = igor_moment(now_s)
     texts = {
-        # not UTF-8 once encoded: readers that assume it fail at real notes, too
+        # not UTF-8 once encoded: a reader that assumes UTF-8 fails at real notes, too
         "StartHeadTemp": "32.125 °C",
         "Date": f"{local:%Y-%m-%d}",
         "Time": f"{local:%H:%M:%S}",
         "Seconds": f"{seconds:.3f}",
-        "SaveImage": values.text("SaveImage"),  # twice in a note, as in real ones: number and text
+        "SaveImage": values.text("SaveImage"),  # twice, as in real notes: number and text
         "MicroscopeModel": "afspm SIMULATED",
         "Version": "15.09.112",
         "BaseName": values.text("BaseName"),

@@ -15,7 +15,7 @@ _NOTHING: Final = math.nan
 
 
 class DialogOpen(Exception):
-    """The exception that a modal dialog blocks Igor; the function returns `result` after OK."""
+    """A modal dialog that blocks Igor; after OK the function returns `result`."""
 
     def __init__(self, text: str, result: float) -> None:
         super().__init__(text)

@@ -1,6 +1,6 @@
-"""ZeroMQ-XOP as a process within Igor: its socket, its immediate replies, and the queue of calls for Igor.
+"""ZeroMQ-XOP within Igor: its socket, its immediate replies, and the queue of calls for Igor.
 
-A thread of the XOP answers malformed requests at once; valid ones wait until Igor is idle. Times are real seconds.
+A thread of the XOP answers malformed requests at once; valid requests wait until Igor is idle. Times are real seconds.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class XopServer:
     """The XOP's socket and queue.
 
     Args:
-        port: 0: any free port.
+        port: listening port; 0: any free port.
         wakes: object with a `fileno` that ends `poll`.
     """
 
@@ -71,8 +71,8 @@ class XopServer:
         """Wait for requests and receive them.
 
         Args:
-            locked: a called function waits for a person: the queue is locked, and the receiving thread blocks with the
-                request that it wanted to queue.
+            locked: True while a dialog waits for a person: the queue is locked, and the receiving thread blocks at the
+                next valid request.
         """
         poller = zmq.Poller()
         poller.register(self._wakes, zmq.POLLIN)

@@ -49,7 +49,7 @@ class IgorValues:
             self._texts[name.lower()] = value
 
     def size(self) -> tuple[float, float]:
-        """Return (fast, slow) in m: ScanSize is the longer side, and the ratios scale the other one."""
+        """Return (fast, slow) in m: ScanSize is the longer side, and the ratios define the shorter side."""
         longer, fast, slow = self.get("ScanSize"), self.get("FastRatio"), self.get("SlowRatio")
         ratio = slow / fast if fast else math.nan
         return (longer / ratio, longer) if ratio > 1.0 else (longer, longer * ratio)

@@ -1,7 +1,7 @@
-"""Server side of the ZeroMQ-XOP protocol: decoding of requests and encoding of replies. Pure.
+"""Server side of the ZeroMQ-XOP protocol: decoding of requests and encoding of replies, without input or output.
 
-After the source and specification of ZeroMQ-XOP, first version of the interface. Independent of the translator's code,
-so that each checks the other.
+The forms follow the source and specification of ZeroMQ-XOP, first version of the interface. The translator's code is
+not used here: emulator and translator check each other.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def call(payload: bytes) -> FunctionCall:
     """Parse a request.
 
     Raises:
-        CallFailed: 3 to 7 or 106: the request is malformed.
+        CallFailed: 3 to 7 or 106: the request is malformed. 101: the name of the function is empty.
     """
     content = _parsed(payload)
     fields = content if isinstance(content, dict) else {}
@@ -133,7 +133,7 @@ def arguments(function: IgorFunction | None, parameters: Sequence[str]) -> list[
     """Convert the parameters for a function.
 
     Raises:
-        CallFailed: 101 to 106: unknown function, or wrong parameters.
+        CallFailed: 101: unknown function. 102, 103, 106: wrong parameters. 104, 105: types that can't be passed.
     """
     if function is None:
         raise CallFailed(101)
@@ -151,7 +151,7 @@ def success(function: IgorFunction, given_back: Any, message_id: str | None) -> 
     """Encode the reply with a function's result.
 
     Raises:
-        UnicodeEncodeError: text that is not UTF-8. The real XOP swallows this error and never replies.
+        UnicodeEncodeError: a text is not UTF-8. The real XOP swallows this error and never replies.
     """
     by_reference = [kind.lower() for kind in function.takes if kind.isupper()]
     results, passed = given_back if by_reference else (given_back, ())

@@ -18,7 +18,7 @@ from afspm.simulation.emulation.tcp_server import ClientConnection, TcpServer
 _LENGTH: Final = struct.Struct("<I")
 LONGEST_SCRIPT: Final = 1 << 20
 _MOST_UNREAD: Final = 64 << 20
-"""Highest number of unread bytes of a client, whose connection then ends."""
+"""Highest number of reply bytes that a client has not read; with more the connection ends."""
 
 
 class NanosurfEmulator(ScriptedEmulator):
@@ -28,7 +28,8 @@ class NanosurfEmulator(ScriptedEmulator):
         release: release of Studio; 19 lacks commands of 17 and 18.
         image_buffer: number of the low-level buffer with the lines of the running scan.
         start_s: duration of the ramp to the first line, experiment time.
-        file_s: delay between the end of a measurement and the first half of its file, and between both halves.
+        file_s: delay between the end of a measurement and the first half of its file, and between both halves,
+            experiment time.
         one_client: True if a further connection waits for the end of the first.
         seed, faults, and the simulated world: settings of every emulator.
     """

@@ -101,7 +101,7 @@ def _file(
 
 
 def _add(segment: Any, name: str, signal: str, unit: str, values: Array) -> None:
-    # Real files have integers over a range about zero, and NSFopen relies on it.
+    # Real files have integers over a range about zero, and NSFopen relies on this range.
     largest = float(np.max(np.abs(values), initial=0.0, where=np.isfinite(values))) or 1.0
     integers = np.where(np.isfinite(values), np.rint(values / largest * _LARGEST), _MISSING).astype(np.int32)
     dataset = segment.create_dataset(name, data=integers.ravel(), fillvalue=_MISSING)

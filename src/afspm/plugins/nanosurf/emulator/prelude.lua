@@ -1,5 +1,5 @@
--- Runs the scripts of clients, each in a coroutine, and writes what they return as Studio does. Called with Python's
--- functions; returns start(text, environment), step(script) and helpers.
+-- Runs the scripts of clients, each in a coroutine, and writes their values in Studio's form. Returns
+-- start(text, environment), step(script) and helpers.
 local fire_limit = 5000000
 local format, gsub, find, concat, pack = string.format, string.gsub, string.find, table.concat, table.pack
 
@@ -31,7 +31,7 @@ local safe = {}
 for _, name in ipairs({"pairs", "ipairs", "next", "type", "tostring", "tonumber", "select", "pcall", "error", "rawget"}) do
   safe[name] = _G[name]
 end
--- Copies: what a script does to them leaves alone what replies are written with.
+-- Copies: a script that changes a function must not affect the writing of replies.
 for _, name in ipairs({"math", "string", "table"}) do
   safe[name] = {}
   for key, value in pairs(_G[name]) do safe[name][key] = value end
@@ -83,7 +83,7 @@ local function as_function(call)
   return function(...) return call(...) end
 end
 
--- A function that returns when `waiting` is over, with what `outcome` says.
+-- A function that returns once `waiting()` is false, with the message of `outcome()`.
 local function blocking(call, waiting, outcome)
   return function(...)
     call(...)

@@ -23,7 +23,7 @@ _INTEGRAL_GAIN: Final = 0.5
 _GAIN_SHARE: Final = 0.4
 """Result of the Gain Finder, as a share of the gain at which the simulated feedback oscillates."""
 _NOMINAL: Final = 1.2
-"""The maker's nominal cantilever values, as a multiple of the true ones."""
+"""The maker's nominal cantilever values, as a multiple of the true values."""
 _REACH_M: Final = 50e-6
 _MOST_PIXELS: Final = 8192
 _MOST_GAIN: Final = 100000
@@ -40,7 +40,7 @@ class PanelValue:
         at_first: initial value; its type is fixed.
         low, high: bounds of a number.
         enum: names and numbers of the choices.
-        read_only: True if it can't be set.
+        read_only: True if the value can't be set.
     """
 
     at_first: float | int | str | bool
@@ -109,7 +109,7 @@ PANEL: Final[dict[str, PanelValue]] = {
     "device.scan_head.serial_number": PanelValue("SIMULATED", read_only=True),
     "device.scan_head.connected": PanelValue(at_first=True, read_only=True),
 }
-"""Below `root.workflow`."""
+"""Values of the panels by their paths below `root.workflow`."""
 
 FRAMES: Final = {
     "frame": ("imaging.frame_center_offset_x", "imaging.frame_center_offset_y", "imaging.scan_range_fast_axis",
@@ -135,7 +135,7 @@ MODES: Final = {
     "static_mode": ("load",),
     **dict.fromkeys(("dynamic_mode", "wavemode", "wavemode_nma"), ("load", "update")),
 }
-"""The modes of measurement with the commands of each; (!) all measure as the mode of the emulator does."""
+"""The modes of measurement with the commands of each; (!) every mode measures like the emulator's feedback mode."""
 
 CYCLES: Final = ("force_distance_z_z",)
 """The ids of spectroscopy cycles."""
@@ -146,7 +146,8 @@ class CurveGrid:
     """A running measurement of a grid of curves.
 
     Attributes:
-        points_m: remaining points.
+        shape: (rows, columns) of the grid.
+        points_m: remaining points, (x, y).
         curves: curves taken so far.
         at_point: True if the tip is at the next curve's point, or on its way there.
     """
@@ -227,7 +228,7 @@ class StudioProgram(MakerProgram):
         return value
 
     def put(self, path: str, value: object) -> None:
-        """Set a value of a panel. Raises InvalidValue: read-only, out of bounds, or another type."""
+        """Set a value of a panel. Raises InvalidValue: the value is read-only, out of bounds or of another type."""
         row = PANEL[path]
         if row.read_only:
             raise InvalidValue(f"{path} can't be set")
@@ -261,14 +262,21 @@ class StudioProgram(MakerProgram):
         return self.scanning or self.measuring_curve or self.engages or self.rig.busy(now_s)
 
     def start_curves(self, now_s: float) -> None:
-        """Take the curves of the grid. Raises InstrumentBusy."""
+        """Start taking the curves of the grid. Raises InstrumentBusy."""
         x, y, width, height, columns, rows, rotation_deg = (self.values[path] for path in FRAMES["grid"])
         region = Region((x, y), (max(width, 1e-12), max(height, 1e-12)), math.radians(rotation_deg))
         points = np.stack([of.ravel() for of in region.pixels_m((rows, columns))], axis=1)
         self._start_grid(CurveGrid((rows, columns), [(px, py) for px, py in points.tolist()]), now_s)
 
     def measure_at(self, kind: str, name: str, place: Sequence[Any], now_s: float) -> None:
-        """Measure a workspace item: a frame, a grid or a point. Raises InstrumentBusy, InvalidValue."""
+        """Start measuring a workspace item: a frame, a grid or a point.
+
+        Args:
+            place: centre (x, y), width, height, columns, rows and rotation, as in `FRAMES`.
+
+        Raises:
+            InstrumentBusy. InvalidValue: a value is out of bounds.
+        """
         self._item_name = name
         for path, value in zip(FRAMES.get(kind, ()), place, strict=False):
             self.put(path, value)
@@ -313,12 +321,12 @@ class StudioProgram(MakerProgram):
         self.values |= self._cantilever
 
     def load_mode(self, name: str) -> None:
-        """Load a measurement mode. Raises InstrumentBusy: a measurement is running."""
+        """Load a measurement mode. Raises InstrumentBusy."""
         self._refuse_busy()
         self.values["mode.name"] = name
 
     def select_cycle(self, cycle: str | float) -> None:
-        """Select a spectroscopy cycle by its id or number. Raises InvalidValue: unknown."""
+        """Select a spectroscopy cycle by its id or number. Raises InvalidValue: the cycle is unknown."""
         number = CYCLES.index(cycle) if cycle in CYCLES else cycle
         if not (isinstance(number, int | float) and number in range(len(CYCLES))):
             raise InvalidValue(f"there is no cycle {cycle!r}", hint=f"{', '.join(CYCLES)}, or 0 to {len(CYCLES) - 1}")
@@ -333,14 +341,17 @@ class StudioProgram(MakerProgram):
             self.rig.scan.resume(now_s)
 
     def move(self) -> None:
-        """Move the tip to the target. Raises InstrumentBusy, InvalidValue."""
+        """Start moving the tip to the target. Raises InstrumentBusy, InvalidValue."""
         self.rig.setup.move_speed_m_s = self.values["scanner.move_speed_xy_on_surface"]
         self.rig.move_probe(
             (self.values["scanner.offset_x_target"], self.values["scanner.offset_y_target"]), self.now_s
         )
 
     def lines(self, channel: int) -> tuple[str, str, list[float]]:
-        """Return name, unit and the complete lines of the running scan, flattened in scanning order."""
+        """Return name, unit and the complete lines of the last started scan, flattened in scanning order.
+
+        Empty before the first scan.
+        """
         scan = self.rig.scan
         if scan is None:
             return "", "", []

@@ -16,7 +16,7 @@ from afspm.plugins.nanosurf.emulator.workspace import MeasurementQueue, Workspac
 from afspm.simulation.emulation.scripted import ScriptFailed
 
 SESSION: Final = "91-01-000"
-"""The maker's client has this name for a simulated controller."""
+"""Name of the only session: the maker's client has this name for a simulated controller."""
 LAST_WITH_OLD_COMMANDS: Final = 18
 ALL_LEVELS: Final = 5
 _INT32: Final = 2**31 - 1
@@ -72,13 +72,21 @@ class CommandTree:
             self._roots[level] = self._prelude.environment(self._table({**shared, **self._session(workflow, level)}))
 
     def start(self, script: str, level: int | None) -> tuple[object, str | None]:
-        """Return a script ready to run, or the reply that reports why it can't run. Raises ScriptFailed."""
+        """Return (script, None), or (None, reply with the error) if the script can't be compiled.
+
+        Raises:
+            ScriptFailed: the memory is used up.
+        """
         with self._bounded():
             started = self._prelude.start(script, self._roots[level])
         return started if isinstance(started, tuple) else ((self._prelude, started), None)
 
     def step(self, script: Any) -> str | None:
-        """Continue a script; return its reply, or None while it waits for the instrument. Raises ScriptFailed."""
+        """Continue a script; return its reply, or None while the script waits for the instrument.
+
+        Raises:
+            ScriptFailed: the memory is used up.
+        """
         prelude, started = script
         if prelude is not self._prelude:
             raise ScriptFailed("another script has used up the memory, which ended all")
@@ -88,7 +96,7 @@ class CommandTree:
 
     @contextmanager
     def _bounded(self) -> Iterator[None]:
-        # Scripts of any client share the memory: one that stores too much would end the emulator.
+        # Scripts of all clients share the memory: a script that stores too much would end the emulator.
         from lupa import lua54
 
         try:
@@ -143,7 +151,7 @@ class CommandTree:
         self._level_chosen(int(level))
 
     def _session(self, workflow: Nested, level: int) -> Nested:
-        # A licence of a higher level adds commands to the application's own ones.
+        # A licence of a higher level adds commands to the application's own commands.
         imaging = workflow["imaging"]
         # The real tree has the old commands at the highest level only.
         if level == ALL_LEVELS and self._release <= LAST_WITH_OLD_COMMANDS:

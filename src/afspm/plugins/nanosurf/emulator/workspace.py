@@ -55,13 +55,17 @@ class Workspace:
         self.add("frame", _FIRST, 0.0, 0.0)
 
     def __getitem__(self, item_id: str) -> WorkspaceItem:
-        """Return an item. Raises InvalidValue: unknown."""
+        """Return an item. Raises InvalidValue: the id is unknown."""
         if item_id not in self._items:
             raise InvalidValue(f"there is no item {item_id!r} in the workspace")
         return self._items[item_id]
 
     def add(self, kind: str, name: str, x_m: float, y_m: float) -> str:
-        """Add an item, with the size of the panel's frame or grid; return its id."""
+        """Add an item, with the size of the panel's frame or grid; return the item's id.
+
+        Raises:
+            InvalidValue: the workspace has 1000 items, or the name is too long.
+        """
         if len(self._items) >= _MOST_ITEMS:
             raise InvalidValue(f"a workspace has at most {_MOST_ITEMS} items")
         sizes = [self._program.values[path] for path in FRAMES.get(kind, ())[2:]]
@@ -75,7 +79,11 @@ class Workspace:
         return next((item_id for item_id, item in self._items.items() if item.name == name), NO_ITEM)
 
     def change(self, item_id: str, **values: Any) -> None:
-        """Change an item. Raises InvalidValue: unknown, or not measurable with these values."""
+        """Change an item.
+
+        Raises:
+            InvalidValue: the id is unknown, the name is too long, or a size or number is not above 0.
+        """
         before = self[item_id]
         changed = WorkspaceItem(**{**asdict(before), **values})
         sizes = changed.width_m, changed.height_m, changed.columns, changed.rows
@@ -84,7 +92,7 @@ class Workspace:
         self._items[item_id] = changed
 
     def delete(self, item_id: str) -> None:
-        """Delete an item. Raises InvalidValue: unknown."""
+        """Delete an item. Raises InvalidValue: the id is unknown."""
         self[item_id]
         del self._items[item_id]
 
@@ -109,7 +117,7 @@ class Workspace:
         """Replace the items by the items of a saved file.
 
         Raises:
-            InvalidValue: missing or damaged.
+            InvalidValue: the file is missing or damaged, or the path is unfit.
         """
         kinds = {
             field.name: {"str": str, "int": int, "float": float}[str(field.type)] for field in fields(WorkspaceItem)
@@ -148,11 +156,11 @@ class MeasurementQueue:
 
     @property
     def running(self) -> bool:
-        """True until all items are measured."""
+        """True from `process` until all items are measured, or until `abort` or an error."""
         return self._left is not None
 
     def add(self, item_ids: list[str], repetitions: int = 1) -> None:
-        """Add items. Raises InvalidValue: unknown items, or too many."""
+        """Add items. Raises InvalidValue: unknown items, too many items or too many repetitions."""
         for item_id in item_ids:
             self._workspace[item_id]
         if not 1 <= repetitions <= _MOST_REPETITIONS or len(self.entries) + len(item_ids) > _MOST_ITEMS:
@@ -160,14 +168,18 @@ class MeasurementQueue:
         self.entries += [(item_id, int(repetitions)) for item_id in item_ids]
 
     def remove(self, item_id: str) -> None:
-        """Remove an item. Raises InvalidValue: not in the queue."""
+        """Remove an item. Raises InvalidValue: the item is not in the queue."""
         kept = [entry for entry in self.entries if entry[0] != item_id]
         if len(kept) == len(self.entries):
             raise InvalidValue(f"{item_id!r} is not in the queue")
         self.entries = kept
 
     def process(self, entries: list[tuple[str, int]]) -> None:
-        """Measure items. Raises InstrumentBusy: a measurement is running; InvalidValue: unknown item."""
+        """Start measuring items, each as often as its entry demands.
+
+        Raises:
+            InstrumentBusy: the queue or the instrument is busy. InvalidValue: an item is unknown.
+        """
         for item_id, _ in entries:
             self._workspace[item_id]
         if self.running or self._program.occupied(self._program.now_s):
@@ -181,7 +193,7 @@ class MeasurementQueue:
         self._left = None
 
     def advance(self, now_s: float) -> bool:
-        """Measure the next item if the instrument is free; return True if one was started."""
+        """Start the next item if the instrument is free; return True if a measurement was started."""
         program, begun = self._program, False
         while self._left is not None and not program.occupied(now_s):
             item_id = next(self._left, None)

@@ -32,17 +32,18 @@ LONGEST_REQUEST: Final = 1 << 20
 
 
 class ParkEmulator(ScriptedEmulator):
-    """The emulated program; unconfirmed behaviour of the real one can be chosen.
+    """The emulated program; settings choose between possible behaviours of the real program that are unconfirmed.
 
     Args:
-        errors: place of a script's error in a reply: JSON-RPC's "error", the "result", or the "value" alone ("rpc",
-            "result", "value").
+        errors: form of a script's error in a reply: "rpc" (JSON-RPC's "error"), "result" (the result "Error", with the
+            reason as value) or "value" (the usual result, with the reason as value).
         values: form of values: "text", or "native".
         replies: time of the reply to a script that waits for the instrument: "at-end", or "at-once" without a value.
         scan_words: answers of `scan_query`: scanning, idle.
         reports_gains: True if the gains of the feedback can be read, False if only set.
         start_s: duration of the ramp to the first line, in experiment time.
-        file_s: delay between the end of a measurement and the first half of its file, and between both halves.
+        file_s: delay between the end of a measurement and the first half of its file, and between both halves, in
+            experiment time.
         seed, faults, and the simulated world: settings of every emulator.
     """
 
@@ -87,7 +88,7 @@ class ParkEmulator(ScriptedEmulator):
         return _reply(request, result=self._queried(str(asked.get("method"))))
 
     def failure(self, request: bytes, reason: str) -> bytes:
-        """Return a reply with an error, in the form that `errors` chooses; JSON-RPC's own for malformed requests."""
+        """Return a reply with an error in the form of the setting `errors`; JSON-RPC's form for a malformed request."""
         if _parsed(request) is None:
             return _reply(request, error={"code": _NO_JSON, "message": reason})
         if self._errors == "rpc":
@@ -101,7 +102,7 @@ class ParkEmulator(ScriptedEmulator):
         return _reply(request, result="NaN", value="NaN")
 
     def tick(self, now_s: float) -> float | None:
-        """Advance the program and also scripts that are already answered."""
+        """Advance the program, and the scripts that run on after an early reply."""
         for script in [one for one, is_answered in self._scripts.items() if is_answered]:
             try:
                 ended = script.step() is not None
@@ -187,7 +188,7 @@ def _no_constant(name: str) -> NoReturn:
 
 
 class SmartRemoteWire:
-    """SmartRemote's socket: a ZeroMQ REP for several clients, which wait for their replies.
+    """SmartRemote's socket: like a ZeroMQ REP socket to each client, with replies pending for several clients.
 
     See `ScriptWire`.
     """

@@ -20,9 +20,11 @@ from afspm.basics.errors import AfspmError
 from afspm.simulation.emulation.scripted import ScriptFailed
 
 LONGEST_S: Final = 5.0
-"""Limit of a script's computing, in real seconds. Its thread continues: the engine can't be interrupted."""
+"""Limit of a script's computing between two requests to the instrument, in real seconds.
+
+The script's thread continues: the engine can't be interrupted."""
 _AT_ONCE_S: Final = 0.25
-"""Longest wait for a script before others are served, in real seconds; most scripts end earlier."""
+"""Longest wait for a script before other clients are served, in real seconds; most scripts end earlier."""
 _MEMORY: Final = 64 << 20
 _PRELUDE: Final = Path(__file__).with_name("prelude.js")
 _REFUSALS: Final = (AfspmError, ArithmeticError, TypeError, ValueError)
@@ -38,9 +40,9 @@ class Wait:
 
 
 Ask = Callable[[str, str, list[Any]], object]
-"""Executes a script's request: "get", "set" or "call", a path below `spm`, arguments; "now" returns ms.
+"""A function that executes a script's request: "get", "set" or "call", a path below `spm`, and the arguments.
 
-Raises AfspmError."""
+The request "now" returns the experiment time in ms. Raises AfspmError."""
 
 
 class Script:
@@ -61,7 +63,11 @@ class Script:
         Thread(target=self._work, args=(source, names), name="emulated script", daemon=True).start()
 
     def step(self) -> tuple[object, str] | None:
-        """Continue the script; return its value and text, or None while it waits or computes. Raises ScriptFailed."""
+        """Continue the script; return its value and text, or None while the script waits or computes.
+
+        Raises:
+            ScriptFailed: the script failed, or computed longer than `LONGEST_S`.
+        """
         if self._wait is not None:
             if self._wait.waiting():
                 return None
@@ -89,7 +95,7 @@ class Script:
 
     @property
     def computes_for_s(self) -> float:
-        """Return the real seconds of computing left to the script; infinite while it waits for the instrument."""
+        """The real seconds of computing left to the script; infinity while the script waits for the instrument."""
         return math.inf if self.waits else self._computes_since_s + LONGEST_S - time.monotonic()
 
     def end(self) -> None:

@@ -34,7 +34,7 @@ from afspm.simulation.fields import Array
 _VERSION = max(VERSIONS)
 _FLOATS = 2
 _GAIN = 0.5
-"""Gain of curves, other than 1 so that tests notice a reader that ignores it."""
+"""Gain of curves, other than 1 so that tests notice a reader that ignores the gain."""
 _UNITS = {"m": ("um", 1e-6), "A": ("nA", 1e-9), "N": ("nN", 1e-9)}
 """Units in files, with their SI value."""
 _BYTES, _ASCII, _LONG = 1, 2, 4
@@ -45,7 +45,7 @@ Picture = np.ndarray[tuple[int, int], np.dtype[np.uint8]]
 def images(
     scan: ScanActivity, now_s: float, mode: str, recorded: Collection[str] | None = None
 ) -> Iterator[tuple[str, bytes]]:
-    """Yield channel and direction, with the file's bytes.
+    """Yield each channel and direction, as "Height_Forward", with the bytes of its file.
 
     Args:
         recorded: the saved channels; None: all.
@@ -93,7 +93,7 @@ def _image(
 
 
 def curve(spectrum: SpectrumActivity, now_s: float, mode: str) -> bytes:
-    """Encode the file of a curve: its channels, each forward and backward."""
+    """Encode the file of a curve: its channels, each forward and then backward."""
     there, back = spectrum.both_ways()
     layout = np.zeros((), CURVES)
     columns = []
@@ -113,8 +113,8 @@ def curve(spectrum: SpectrumActivity, now_s: float, mode: str) -> bytes:
 
 
 def _tiff(header: Any, data: Mapping[int, bytes], shown: Picture, now_s: float) -> bytes:
-    # The maker's own reader (pspylib) needs a picture with a palette, in several strips: it does not parse the tags of
-    # a single strip.
+    # The maker's own reader, pspylib, needs a picture with a palette, in several strips: the tags of a single strip are
+    # not parsed.
     from PIL import Image, TiffImagePlugin
 
     tags = TiffImagePlugin.ImageFileDirectory_v2()

@@ -50,7 +50,7 @@ _TOUCHES_UM: Final = 0.02
 _SWEEP_S: Final = 3.0
 _LINE_SCAN: Final = "line scan"
 _LINE_SCAN_S: Final = 1e9
-"""A line is scanned repeatedly until stopped."""
+"""Duration of a line scan, experiment time: SmartScan repeats the line until the scan is stopped."""
 _SETPOINT, _ENABLE, _RATE, _BIAS = "zservo.setpoint.value", "zservo.enable", "scan.rate", "bias.tip"
 _GAIN: Final = "zservo.gain"
 _PROPORTIONAL, _INTEGRAL = 0.2, 3000.0
@@ -132,11 +132,11 @@ class SmartScanProgram(MakerProgram):
 
     @property
     def names(self) -> str:
-        """Return the names below `spm` as JSON."""
+        """The names below `spm` as JSON: an object with the lists "values" and "methods"."""
         return json.dumps({"values": [*self._values, *self._reported], "methods": list(self._methods)})
 
     def ask(self, kind: str, path: str, given: list[Any]) -> object:
-        """Execute a request of a script. Raises AfspmError, TypeError."""
+        """Execute a request of a script, in the form of `Ask`. Raises AfspmError; TypeError: wrong arguments."""
         if kind == "now":
             return round(self.now_s * 1e3)
         if kind == "call":
@@ -149,7 +149,7 @@ class SmartScanProgram(MakerProgram):
         return self._reported[path]() if path in self._reported else self._values[path]
 
     def next_waking_s(self, now_s: float) -> float | None:
-        """Return the time at which the next sleeping script continues."""
+        """Return the experiment time at which the next sleeping script continues; None without a sleeping script."""
         self._wakings_s = [at_s for at_s in self._wakings_s if at_s > now_s]
         return min(self._wakings_s, default=None)
 
