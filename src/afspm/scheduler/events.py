@@ -1,6 +1,6 @@
 """The inputs and effects of `SchedulerCore`.
 
-Two times come with each input: `now_s`, real and monotonic, for timeouts; `now_ns`, the experiment's, for everything
+Two times come with each input: `now_s`, real and monotonic, for timeouts; `now_ns`, experiment time, for everything
 that has a meaning in the experiment.
 """
 
@@ -46,7 +46,7 @@ class RequestIn:
 
     Attributes:
         user: the owner of the peer's key; None where connections are not authenticated.
-        heard_s: time of the first arrival, real; negative: this step.
+        heard_s: real time of the first arrival; negative: the time of the step that processes the request.
     """
 
     connection: int
@@ -74,9 +74,10 @@ class PacketIn:
 
 @dataclass(frozen=True, slots=True)
 class ReplayRequested:
-    """A subscriber's request for the cached packets under `prefixes` that are newer than `since_ns`.
+    """A subscriber's request for the cached packets that are newer than `since_ns`.
 
     Attributes:
+        prefixes: beginnings of the wanted envelopes.
         subscriber: the caller's own handle; returned in `Replay`.
     """
 
@@ -110,7 +111,7 @@ class TranslatorReply:
 
 @dataclass(frozen=True, slots=True)
 class ProblemSeen:
-    """The appearance or disappearance of a problem, found by the scheduler's own process.
+    """The appearance or disappearance of a problem, found in the scheduler's process by the coordinate frame.
 
     Attributes:
         name: the component in whose name the problem is flagged.
@@ -146,7 +147,7 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class FrameReported:
-    """A report of the coordinate frame's worker: a result, or its end; only the frame reads the content."""
+    """A report of the coordinate frame's worker, such as a result or its own end; only the frame reads `report`."""
 
     report: object
 
@@ -169,7 +170,7 @@ class FrameAnswered:
 
 @dataclass(frozen=True, slots=True)
 class ControlChanged:
-    """The event that this step changed the holder, the mode or the problems."""
+    """The event that this step replaced the state of control; the two states may be equal."""
 
     before: ArbitrationState
     after: ArbitrationState
@@ -203,7 +204,7 @@ Input = (
 
 @dataclass(slots=True)
 class Reply:
-    """The effect that answers the peer `name` over `connection`, its newest open connection.
+    """The effect that answers the peer `name` over `connection`.
 
     Attributes:
         asked: the kind of the answered request.
@@ -219,8 +220,8 @@ class Reply:
 class Forward:
     """The effect that sends a request to the translator, marked with `number`.
 
-    A client's `request.payload` is sent as it came. A request of the scheduler itself has no payload: its subject is
-    encoded.
+    A request is sent with its payload. A request without a payload, such as a request of the scheduler itself, is
+    encoded from its subject.
     """
 
     number: int
@@ -232,8 +233,8 @@ class Publish:
     """The effect that publishes a packet to the subscribers of its envelope.
 
     Attributes:
-        source_ns: the packet's time by the translator; None for a packet of the scheduler.
-        history: number of packets of this envelope kept over a restart; 0: this packet is not cached.
+        source_ns: the translator's time of the packet; None for a packet of the scheduler, or without a time.
+        history: number of packets of this envelope in the cache, also over a restart; 0: this packet is not cached.
     """
 
     packet: Packet
@@ -258,7 +259,7 @@ class SaveState:
 
 @dataclass(slots=True)
 class Log:
-    """The effect that logs a line; `level` is a name of `logging`: "INFO", "WARNING", "ERROR"."""
+    """The effect that logs a line; `level` is the name of a level of `logging`, such as "WARNING"."""
 
     level: str
     text: str
