@@ -60,7 +60,7 @@ class ControlChange(Enum):
 
 
 class Cause(Enum):
-    """The reason why control was taken from its holder."""
+    """The reason why a holder is no longer in control."""
 
     RELEASED = "released"
     PROBLEM = "problem"
@@ -123,7 +123,7 @@ class ArbitrationState:
 class RoleTable:
     """The components and people with a role. Without the key, everyone has the role.
 
-    A person who acts through a component ("dashboard:Ada") has the roles of the component and those given to that
+    A person who acts through a component ("dashboard:Ada") has the roles of the component and the roles given to that
     person there.
 
     Attributes:
@@ -438,7 +438,7 @@ def apply(row: Transition, control: ArbitrationState, ask: ControlInput) -> Arbi
 
 
 def reason(row: Transition, control: ArbitrationState, ask: ControlInput, rules: Rules) -> str:
-    """Return the text of a refusal; empty for a success."""
+    """Return the text of a refusal; empty if the row does not refuse a request."""
     if row.response in (None, ControlResponse.SUCCESS):
         return ""
     return row.why.format(

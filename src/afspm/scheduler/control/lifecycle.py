@@ -24,12 +24,13 @@ _OTHERS = ("scheduler", "translator")
 
 @dataclass(frozen=True)
 class StartupBarrier:
-    """A delay of the first control state, and of requests that may change it, until missed packets are published.
+    """A delay of the first control state until missed packets are published.
 
-    Without this delay, a repeated packet of the translator would get a time after the change, and look new.
+    After a restart, requests that may change control are delayed, too. Otherwise a repeated packet of the translator
+    would get a time after the change, and look new.
 
     Attributes:
-        patience_s: the longest wait, real.
+        patience_s: the longest wait, real, unless `put_off` extends the wait.
         until_s: the latest opening of the barrier, in real monotonic time; None: the barrier is open.
         is_restart: whether this scheduler continues a run.
         opened_s: the opening of the barrier, in real monotonic time.
@@ -46,26 +47,30 @@ class StartupBarrier:
         return replace(self, until_s=now_s + self.patience_s, is_restart=is_restart)
 
     def put_off(self, until_s: float) -> StartupBarrier:
-        """Keep the barrier closed at least until `until_s`: more packets are expected."""
+        """Extend the longest wait to `until_s`: more packets are expected."""
         return self if self.until_s is None else replace(self, until_s=max(self.until_s, until_s))
 
     def opened(self, now_s: float) -> StartupBarrier:
         return self if self.until_s is None else replace(self, until_s=None, opened_s=now_s)
 
     def keep(self, event: RequestIn) -> StartupBarrier | None:
-        """Keep a request that arrives before the barrier opens; return None if the barrier is open."""
+        """Keep a request until the barrier opens; return None if the request must be decided now.
+
+        Requests are decided at once if the barrier is open, at a first start, or with a thousand requests kept already.
+        """
+        # a first start has missed no packets, so no request needs to wait
         if self.until_s is None or not self.is_restart or len(self.kept) >= _MOST_KEPT:
             return None
         return replace(self, kept=(*self.kept, event))
 
     def let_in(self) -> tuple[StartupBarrier, RequestIn | None]:
-        """Remove and return the first kept request; None while the barrier is closed or no request is kept."""
+        """Remove and return the first kept request; None while the barrier is closed, or without kept requests."""
         if not self.kept or self.until_s is not None:
             return self, None
         return replace(self, kept=self.kept[1:]), self.kept[0]
 
     def due_s(self) -> float | None:
-        """Return when the barrier must open, or the next kept request must be decided."""
+        """Return the real time at which the barrier opens, or a kept request must be decided; None: no deadline."""
         if self.until_s is not None:
             return self.until_s
         return self.opened_s if self.kept else None
@@ -84,8 +89,8 @@ class ExperimentEnd:
     Attributes:
         by_s: the latest end of the experiment, in real monotonic time; None: no end in progress.
         kept: the delayed answers.
-        leave_at_s: the time at which the scheduler exits; inf: the experiment has not ended.
-        latest_s: the latest time at which the scheduler exits.
+        leave_at_s: the real time at which the scheduler exits; inf: the experiment has not ended.
+        latest_s: the latest real time at which the scheduler exits.
     """
 
     by_s: float | None = None
@@ -108,7 +113,7 @@ class ExperimentEnd:
         return ExperimentEnd(None, (), now_s + SHUTDOWN_GRACE_S, now_s + LONGEST_GRACE_S)
 
     def processes_reported(self, states: Iterable[ProcessState], now_s: float) -> ExperimentEnd:
-        """Stay longer while a supervisor reports that one of its processes still runs."""
+        """Extend the grace period while a supervisor reports a component that still runs, up to `latest_s`."""
         if self.leave_at_s == math.inf or not any(map(_is_at_work, states)):
             return self
         leave_at_s = max(self.leave_at_s, min(now_s + SHUTDOWN_GRACE_S, self.latest_s))

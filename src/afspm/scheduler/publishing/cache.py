@@ -24,7 +24,7 @@ _FUTURE_NS = 3600 * 10**9  # a translator's clock further ahead is wrong: its ti
 
 @dataclass(slots=True)
 class Kept:
-    """A packet in the cache, with its size in bytes."""
+    """A packet in the cache, with its size in bytes, including a fixed overhead."""
 
     logged: LoggedPacket
     size: int
@@ -39,7 +39,8 @@ class PacketCache:
 
     Args:
         envelopes: the envelope of each packet, and the number of packets kept for each envelope.
-        max_bytes: total size. Beyond it, the oldest packets are dropped whose envelope has a newer packet.
+        max_bytes: largest total size in bytes. Above this size, the oldest packet whose envelope has a newer packet is
+            dropped; if there is none, the oldest of all. A packet larger than this size is not cached.
     """
 
     def __init__(self, envelopes: Envelopes | None = None, max_bytes: int = 512 * 2**20) -> None:
@@ -61,22 +62,27 @@ class PacketCache:
 
     @property
     def newest_source_ns(self) -> int:
-        """The translator's time of its newest packet in the cache; -1 if there is none."""
+        """The translator's time of the packet that was taken or restored last; -1 if there is none."""
         return self._newest_source_ns
 
     @property
     def size(self) -> int:
-        """Size of all packets, in bytes."""
+        """Size of all packets in bytes, including a fixed overhead for each."""
         return self._bytes
 
     def take(self, packet: Packet, header: PacketHeader, now_ns: int) -> tuple[Packet, int] | None:
         """Return the packet to publish, and how many packets of its envelope are kept (0: not this packet).
 
-        The packet keeps the translator's time. It gets a later time if that would not follow the newest published
-        time: a clock was set back or is far ahead, or the peer sent no time.
+        The packet keeps the translator's time. A packet without a time, or with a time more than an hour after
+        `now_ns`, gets `now_ns` instead. If this time does not follow the newest published time, for example because a
+        clock was set back, the packet gets the next free time. A packet that was published before a restart keeps its
+        published time.
 
         Returns:
-            None if the packet is a duplicate.
+            None if the packet is a duplicate, or was passed over before a restart.
+
+        Raises:
+            ConfigError: the user's mapping gives no valid envelope.
         """
         source_ns = packet.time_ns
         if source_ns is not None:
@@ -108,7 +114,10 @@ class PacketCache:
         return is_new
 
     def recent(self) -> list[tuple[int, int]]:
-        """Return (translator's time, published time) of the last packets, for `remember` after a restart."""
+        """Return (translator's time, published time) of the last packets, for `remember` after a restart.
+
+        The published time is 0 for a packet that was passed over.
+        """
         return [*self._first_times.items(), *self._recent]
 
     def remember(self, recent: Iterable[tuple[int, int]]) -> None:
@@ -120,13 +129,17 @@ class PacketCache:
         self._first_times = {source_ns: first_ns for source_ns, first_ns in recent if source_ns not in self._sources}
 
     def stamp(self, envelope: str, payload: bytes, now_ns: int) -> tuple[Packet, int]:
-        """Stamp and cache a packet of the scheduler itself; return it with its number of kept packets."""
+        """Stamp and cache a packet of the scheduler itself.
+
+        Returns:
+            The packet, and how many packets of its envelope are kept (0: not this packet).
+        """
         out = Packet(envelope, payload, self._next_ns(now_ns))
         message = envelope.partition("_")[0]  # no message of the scheduler has an underscore in its name
         return out, self._keep(out, None, self._envelopes.history(message))
 
     def restore(self, packets: Iterable[LoggedPacket]) -> None:
-        """Restore packets published before a restart, oldest first."""
+        """Restore packets published before a restart, oldest first; skip packets out of this order."""
         newest_ns = next(reversed(self._kept), 0)
         for packet, source_ns, history in packets:
             if packet.time_ns is None or packet.time_ns <= newest_ns:
@@ -147,7 +160,11 @@ class PacketCache:
         self._last_ns = max(self._last_ns, time_ns)
 
     def replay(self, prefixes: Iterable[str], since_ns: int) -> tuple[Packet, ...]:
-        """Return the packets kept under the prefixes and newer than `since_ns`, oldest first over all envelopes."""
+        """Return the cached packets newer than `since_ns`, oldest first over all envelopes.
+
+        Args:
+            prefixes: beginnings of the wanted envelopes.
+        """
         starts = tuple(prefixes)
         return tuple(
             kept.packet

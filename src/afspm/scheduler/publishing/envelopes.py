@@ -62,7 +62,7 @@ class CacheRule:
         history: number of packets kept; without the key: the default.
 
     Raises:
-        InvalidValue: no packet could match, or no subscriber could read the envelope.
+        InvalidValue: no packet could match, nothing would be kept, or no subscriber could read the envelope.
     """
 
     message: str | None = None
@@ -151,8 +151,10 @@ class Envelopes:
 
     Args:
         rules: the rules, tried in order before the defaults.
-        mapping: a function of the user that names the envelope instead of rules and defaults.
-        history: the number of packets to keep, by message, instead of the number in the declaration.
+        mapping: a function of the user that names the envelope instead of rules and defaults; the rules still decide
+            how many packets are kept.
+        history: by message, the number of packets kept where no rule sets a number; without an entry, the number in
+            the declaration of the message.
     """
 
     def __init__(
@@ -187,7 +189,7 @@ class Envelopes:
         return (default_envelope(header) if rule is None else rule.name(header)), history
 
     def history(self, message: str) -> int:
-        """Return how many packets of a message are kept where no rule decides."""
+        """Return how many packets of a message are kept where no rule sets a number."""
         if (own := self._history.get(message)) is not None:
             return own
         try:
