@@ -1,13 +1,14 @@
 """Other instruments: their last readings, and the conditions that they set for measuring.
 
-**Theory of operation.** Each instrument is a component that reports its values about twice a second (request 102). A
-parameter "cryo.temperature" belongs to the component `cryo`: a request for it is answered from the last report, or
-waits for the next one, whose answer carries it as an order. The report after that carries the outcome.
+**Theory of operation.** Each instrument is a component that reports its values several times a second (request 102).
+A parameter "cryo.temperature" belongs to the component `cryo`. A request that reads this parameter is answered from the
+last report. A request that sets the parameter waits for the next report, and the answer to that report carries the
+request as an order. A later report carries the outcome.
 
     comes in      reports with values and outcomes; requests for parameters of instruments; time
     state         `Instruments`: the last reading of each parameter, its first unit, open orders, since when each
                   condition holds
     goes out      orders; a refusal of the actions that a condition guards; the problems to flag and to clear
-    always holds  a reading older than `OLDEST_S`, or in another unit than the first, does not count; only the
-                  scheduler's own clock determines an age
+    always holds  a reading older than `OLDEST_S`, or in another unit than the first, does not count; a report is dated
+                  by the scheduler's own clock, never by the clock of the instrument's computer
 """

@@ -1,10 +1,11 @@
 """The check of requests against the limits of an experiment.
 
-Nothing is clamped. A refusal names the parameter, the value, the limit and the place in the file where it was set.
+Nothing is clamped: a request that breaks a limit is refused. A refusal for a range, a step or a rate names the
+parameter, the value, the limit and the place in the file where the limit was set.
 
-A check is valid only at the moment when it is made: steps, rates and places are measured from the values in force. So a
-request is checked right before it is sent, after all earlier ones have settled. `depends_on` names the values to read
-from the microscope for that check.
+A check is valid only at its own moment: steps, rates and places are measured from the values in force. So a request is
+checked right before it is sent, after all earlier commands have settled. `depends_on` names the values to read from the
+microscope for that check.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ _PLACES = ((frozenset(REGION_CHANGES), frozenset({names.START_SCAN})), (frozense
 
 
 class _Breach(Exception):
-    """The error that a limit is broken. It does not leave this module."""
+    """The error that a limit is broken; raised and caught in this module alone."""
 
     def __init__(self, code: ControlResponse, reason: str) -> None:
         super().__init__(reason)

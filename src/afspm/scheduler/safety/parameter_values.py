@@ -22,7 +22,7 @@ class ParameterValue(NamedTuple):
 
 
 class ParameterValueError(Exception):
-    """An error: a value that its parameter can't have. It does not leave this package."""
+    """The error that a parameter can't have the given value; it does not leave this package."""
 
 
 def values_of(subject: object, limits: Mapping[str, Limit]) -> list[ParameterValue]:
@@ -61,7 +61,11 @@ def numbers(values: list[ParameterValue]) -> list[tuple[str, float]]:
 
 
 def number_of(parameter: Parameter) -> float | None:
-    """Return the value of a parameter in SI; None if it is no finite number or of another dimension."""
+    """Return the value of a parameter, in SI for a base parameter with an SI unit, else as given.
+
+    Returns:
+        None if the value is no finite number, or its unit is of another dimension.
+    """
     try:
         return _number(parameter, parameter.value or "", None)
     except ParameterValueError:

@@ -1,7 +1,8 @@
 """The watchdog: actions that the scheduler itself sends to the microscope when a holder loses control.
 
-It stops the running scan or spectrum. It retracts the tip if the holder lost control, rather than gave it back, and
-left the tip in a dangerous state: the holder can no longer mend that, and no other component knows of it.
+The watchdog stops the running scan or spectrum, depending on the cause. It retracts the tip if the holder lost control,
+rather than gave control back, and left the tip in a dangerous state: the holder can no longer mend that state, and no
+other component knows of it.
 """
 
 from __future__ import annotations
@@ -110,7 +111,7 @@ class RetractState:
 
     Attributes:
         calls_people: whether a person must still be called: the tip was retracted, or could not be.
-        stops: actions to send before the tip is retracted.
+        stops: the stop actions still to be sent; a retract follows them.
         for_feedback: whether the tip is in danger because the feedback is off.
         may_come: whether a retract sent before a kill of the scheduler may still be in the translator's queue; its
             answer goes to the killed process.
@@ -132,13 +133,16 @@ class Watchdog:
     `put_off`, a person or a solver of device-malfunction may. The duty towards the tip follows from a table.
 
     Attributes:
-        starting: the action that stops the measurement just started.
+        starting: the action that stops a measurement just started; None once a newer state is known.
         sent: the action that was sent and is not answered.
+        attempts: the number of failed attempts at the present action.
         can_retract: whether the microscope has the action to retract, as far as known.
         refused_at: number of states seen at the last answer NOT_FREE.
         told_to_stop: whether a stop was sent for the running measurement.
         unstoppable: whether the running measurement failed to stop.
         due_s: the real time at which `look_again` is due.
+        retries: the number of failed retracts in a row; each doubles the wait.
+        in_haste: whether the experiment ends, so that all waits are short.
     """
 
     settings: WatchdogSettings = field(default_factory=WatchdogSettings)
@@ -163,8 +167,8 @@ class Watchdog:
     def translator_answered(self) -> Watchdog:
         """Process the first answer since the restart: all requests of the killed scheduler are now done or lost.
 
-        A tip that is still owed a retract is retracted again, which does no harm. If a person has attended to it
-        meanwhile, it may have been withdrawn after that: the person is called again.
+        A tip that is still owed a retract is retracted again, which does no harm. If a person has attended to the tip
+        meanwhile, the killed scheduler's retract may have come after that: the person is called again.
         """
         if not self.tip.may_come:
             return self
@@ -172,7 +176,10 @@ class Watchdog:
         return dog if dog.owes_retract else dog._after(TipEvent.RETRACTED_LATE)
 
     def begun(self, now_s: float) -> Watchdog:
-        """Start the wait after a restart: missed packets come first, and the translator may not be connected yet."""
+        """Start the wait for an owed retract after a restart.
+
+        Missed packets come first, and the translator may not be connected yet.
+        """
         return replace(self, due_s=now_s + self.settings.again_s) if self.owes_retract else self
 
     @property
@@ -209,7 +216,10 @@ class Watchdog:
         return replace(self, tip=replace(self.tip, calls_people=False))
 
     def leave_to_people(self, microscope: MicroscopeStatus) -> Watchdog:
-        """Keep the duty towards a tip in danger when the run is stopped; the exiting translator retracts the tip."""
+        """Call a person to a tip in danger when the run is stopped, and keep the duty to retract the tip.
+
+        The exiting translator retracts the tip.
+        """
         return (
             self._after(TipEvent.LEFT) if self.settings.retract is not None and microscope.danger is not None else self
         )
@@ -245,7 +255,7 @@ class Watchdog:
         by_holder: bool = False,
         was_seen_to: bool = False,
     ) -> Watchdog:
-        """Process the loss of control for `cause` while the action `in_flight` was with the translator.
+        """Process the loss of control for `cause` while the translator executed the action `in_flight` (None: none).
 
         Args:
             had_died: whether the process that got control has died; its restarted successor gives control back.
@@ -283,7 +293,7 @@ class Watchdog:
         return self._after(TipEvent.SEEN_TO)
 
     def hurry(self, now_s: float) -> Watchdog:
-        """Shorten all waits: the experiment ends."""
+        """Shorten all waits to a second: the experiment ends."""
         due_s = None if self.due_s is None else min(self.due_s, now_s + _SOON_S)
         return replace(self, in_haste=True, due_s=due_s)
 
@@ -335,12 +345,12 @@ class Watchdog:
         return self._after(TipEvent.RETRACTED_LATE) if action == self.settings.retract else self
 
     def unsent(self, now_s: float) -> Watchdog:
-        """Undo `next_action`: the translator is not connected. The action is sent once it is."""
+        """Undo `next_action`: the translator is not connected. The action is sent after the next connection."""
         dog = replace(self, sent=None, attempts=0, refused_at=-1, told_to_stop=False)._after(TipEvent.NOT_YET)
         return replace(dog, due_s=now_s + dog._wait_s) if dog.owes_retract and dog.due_s is None else dog
 
     def translator_is_there(self, now_s: float) -> Watchdog:
-        """Schedule a retract that was put off, soon after a translator connects and sends its first packets."""
+        """Schedule a postponed retract for a second later: a new translator sends its first packets before."""
         return replace(self, due_s=now_s + _SOON_S) if self.put_off else self
 
     # --- what does not come about ---
@@ -380,6 +390,7 @@ class Watchdog:
         wait_s = min(self._wait_s * 2**self.retries, self.settings.longest_s)
         due_s = now_s + (_SOON_S if self.in_haste else wait_s)
         dog = self._after(TipEvent.FAILED)
+        # bounded, so that 2**retries stays a usable number in a long run
         return replace(dog, due_s=due_s, retries=min(self.retries + 1, 32), attempts=0)
 
     def _with_stops(self, stops: tuple[str, ...]) -> Watchdog:
