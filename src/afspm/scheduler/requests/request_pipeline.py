@@ -6,18 +6,18 @@
 | 2. authorised | at arrival, and again when it is sent | the arbitration table |
 | 3. queued | at arrival | the forwarder: one line to the translator, in order |
 | 4. within limits | when its turn comes, right before it is sent | limits, coordinate frame, the microscope itself |
-| 5. settled | at the answer, or when it is overdue | |
+| 5. settled | at the answer, or when the answer is overdue | the translator, or a timeout |
 
-No request is executed twice, and every request gets an answer.
+No request is executed twice, and every request gets an answer if its client stays connected.
 
 **Why limits are decided at the fourth stage.** Limits compare a request with values in force, and earlier requests in
-the queue change these. So a request is decided when its turn comes: no other command is on its way, all earlier ones
-have settled, and the scheduler first reads the values from the microscope. A request of unknown outcome needs no
-special case: the values that it may have changed are read before the next request that depends on them; if a value
-can't be read, that request is refused. An overdue request may still be carried out. Since the translator serves one
-request after the other, a value that it answers later is newer. A turn takes up to three steps: values are read, the
-microscope is moved to the mapped place, values are read again. Meanwhile requests that only read pass, and the
-scheduler's own (`safety_commands`) always go first.
+the queue change these. So a command is decided when its turn comes: no other command is on its way, all earlier
+commands have settled, and the scheduler first reads the values from the microscope. A command of unknown outcome needs
+no special case: the values that it may have changed are read before the next command that depends on them; if a value
+can't be read, that command is refused. An overdue command may still be carried out. Since the translator serves one
+request after the other, a value in a later answer is newer. A turn takes up to three steps: values are read, the
+microscope is moved to the mapped place, values are read again. Meanwhile read-only requests pass, and the scheduler's
+own requests (`safety_commands`) always go first.
 """
 
 from __future__ import annotations
@@ -97,7 +97,12 @@ def handle(draft: StateDraft, event: RequestIn) -> None:
 
 
 def admit(draft: StateDraft, event: RequestIn) -> bool:
-    """Return whether a request is new; a request that is not new was answered, or waits."""
+    """Return whether a request goes on to the next stage; else it was answered, or waits.
+
+    A request without the right to its name is refused, and a request over a closed connection is dropped. A repeated
+    request gets the answer to the first, unless the outcome is unknown: then it goes on if the client is in control, or
+    if it is read-only.
+    """
     if event.request.kind in _CONTROL_EVENTS and (barrier := draft.barrier.keep(event)) is not None:
         draft.barrier = barrier
         return False
@@ -165,7 +170,7 @@ def _unknown(request: Request, why: str) -> Response:
 
 
 def authorise(draft: StateDraft, event: RequestIn) -> bool:
-    """Return whether to forward a request to the translator; if not, it was answered."""
+    """Return whether to queue a request; else it was answered, or is answered at the end of the experiment."""
     kind, subject = event.request.kind, event.request.subject
     if why := draft.grants.refused_at_arrival(event.name, event.request, draft.now_ns):
         answers.answer(draft, event, ControlResponse.FAILURE, why)
@@ -219,6 +224,7 @@ def _renew_lease(draft: StateDraft, event: RequestIn) -> None:
 
 
 def _answer_clock_request(draft: StateDraft, event: RequestIn) -> None:
+    # not in the event log: supervisors and starting processes send this request all the time
     run = draft.env.settings.run
     common = {
         "run": run.name,
@@ -243,7 +249,10 @@ def _reason_to_stay(draft: StateDraft) -> str:
 
 
 def enqueue(draft: StateDraft, event: RequestIn) -> None:
-    """Queue a request, or refuse it if nothing can be sent now."""
+    """Queue a request for the translator or an instrument, or refuse a request that can't be sent now.
+
+    A read of an instrument's parameter is answered at once.
+    """
     name, request, is_command = event.name, event.request, not reads(event.request)
     if is_command and (why := _refusal_for_tip(draft)) is not None:
         answers.answer(draft, event, ControlResponse.NOT_FREE, why)
@@ -264,7 +273,7 @@ def enqueue(draft: StateDraft, event: RequestIn) -> None:
 
 
 def send_next(draft: StateDraft) -> None:
-    """Decide and send waiting requests in their order, until one is in flight."""
+    """Decide and send waiting requests in their order, until a request is in flight."""
     turn = draft.pending.turn
     if turn is not None and draft.forwarder.waiting(turn.number) is None:
         draft.pending = replace(draft.pending, turn=None)  # it was called back, or its deadline has passed
