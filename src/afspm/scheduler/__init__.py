@@ -20,7 +20,7 @@ among the effects to disk (`write_ahead`), and then carries the effects out.
     `publishing/`   envelopes, times, the cache for late joiners, the event log
     `instruments/`  readings and orders of other instruments, and conditions for measuring
 
-A coordinate frame may translate between the coordinates of components and those of the microscope
+A coordinate frame may translate between the coordinates of components and the coordinates of the microscope
 (`coordinate_frame`). Without a plug-in both are the same.
 """
 

@@ -3,7 +3,7 @@
 A coordinate frame is one more part of the scheduler's state: frozen, and replaced by its own methods. The scheduler
 knows this protocol, and no frame by name; by default it has `TipFrame`, which changes nothing.
 
-| the scheduler | asks the frame |
+| step of the scheduler | methods of the frame |
 | --- | --- |
 | takes any input | `step`: keep it, pass it on, add others, hand a job to the frame's worker |
 | sends a request | `outgoing`, and `move_before` an action |

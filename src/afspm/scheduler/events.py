@@ -142,7 +142,7 @@ class Stopped:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """The event that a deadline (`SchedulerCore.deadline_s`) has passed."""
+    """The event that a deadline (`SchedulerCore.deadline_s` or `SchedulerCore.deadline_ns`) has passed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,7 +267,7 @@ class Log:
 
 @dataclass(slots=True)
 class Kill:
-    """The effect that ends the experiment: the signal KILL is published, and the sockets are closed.
+    """The effect that ends the experiment: the signal KILL is published, and no further request is decided.
 
     Attributes:
         tip_is_safe: whether the translator may exit; if False, the translator retracts the tip when it is stopped.

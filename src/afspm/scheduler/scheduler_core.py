@@ -118,7 +118,7 @@ class SchedulerCore:
     other inputs wait.
 
     Args:
-        frame: the coordinates of components, if they differ from those of the microscope.
+        frame: the map between the coordinates of components and of the microscope; by default both are the same.
 
     Attributes:
         state: the state that decisions depend on, without the cache; replaced by every step.

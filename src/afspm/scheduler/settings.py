@@ -42,7 +42,7 @@ class ControlSettings:
         lease_s: experiment time after which an idle holder loses control.
         grace_s: real time for which a holder whose connection is gone keeps control, if it will be restarted.
         malfunction_after_s: real time for which the microscope may be lost before `device-malfunction` is flagged; the
-            flag is cleared when it is back.
+            flag is cleared when the microscope is back.
         stop_scan_on_problem: whether to stop a running scan when a flagged problem takes control from the holder.
         stop_scan_on_manual: whether to stop a running scan when the mode changes to MANUAL.
         retract: whether to retract the tip, if the microscope can, when a holder loses control in a dangerous state.

@@ -21,7 +21,7 @@ from afspm.storage.packet_log import PacketLog
 
 
 class StateFile:
-    """The file of the scheduler's state (mode, holder, problems …), saved before each publication.
+    """The file of the scheduler's state (mode, holder, problems …), saved before a change is published.
 
     Args:
         path: the path of the file; None: nothing is stored.

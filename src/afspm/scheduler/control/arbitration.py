@@ -98,7 +98,7 @@ class ArbitrationState:
     Attributes:
         solving: the flagged problem that the holder is in control for; 0 for none.
         problems: the flagged problems, each with the name of the component that flagged it.
-        ended: the experiment is over.
+        ended: whether the experiment is over.
     """
 
     mode: ControlMode = ControlMode.AUTOMATED
@@ -121,7 +121,7 @@ class ArbitrationState:
 
 @dataclass(frozen=True)
 class RoleTable:
-    """The components and people with a role. Without the key, everyone has the role.
+    """The components and people that have each role. Without the key, all have the role.
 
     A person who acts through a component ("dashboard:Ada") has the roles of the component and the roles given to that
     person there.
@@ -184,7 +184,7 @@ class Rules:
 
 @dataclass(frozen=True)
 class ControlInput:
-    """An event caused by the component `who`; `number` is its problem or mode."""
+    """An event caused by the component `who`; `number` is the problem or mode of the event, else 0."""
 
     event: ArbitrationEvent
     who: str
@@ -205,8 +205,8 @@ class Transition:
 
     Attributes:
         response: the answer to a request; None where the translator answers, or the event is not a request.
-        why: the reason of the row. With a refusal it is sent to the client, with {who}, {holder}, {number}, {problem}
-            and {problems} filled in.
+        why: the reason of the row. The reason of a refusal is sent to the client, with {who}, {holder}, {number},
+            {problem} and {problems} filled in.
         cause: the reason why the holder loses control; None if it stays in control.
     """
 
@@ -220,7 +220,7 @@ class Transition:
 def may(role: Collection[str] | None, who: str) -> bool:
     """Return whether a component, or a person who acts through a component, has a role.
 
-    A role of None belongs to everyone.
+    If `role` is None, all have the role.
     """
     return role is None or who in role or component_of(who) in role
 

@@ -12,11 +12,12 @@ from afspm.scheduler.control.supervisor_registry import OVER
 from afspm.scheduler.events import RequestIn
 
 SHUTDOWN_GRACE_S = 3.0
-"""Real time that the scheduler stays after the end, so that late components still get the last scans and the end. The
-time starts again with each report of a component that still runs.
+"""Real time that the scheduler stays after the end, so that late components get the last scans and the end.
+
+The time starts again with each report of a component that still runs, up to `LONGEST_GRACE_S`.
 """
 LONGEST_GRACE_S = 20.0
-"""Longest real time that the scheduler stays after the end: a supervisor needs it to restart a silent component."""
+"""Longest real time that the scheduler stays after the end: enough for a supervisor to restart a silent component."""
 # bounded, since requests come from peers
 _MOST_KEPT = 1000
 _OTHERS = ("scheduler", "translator")

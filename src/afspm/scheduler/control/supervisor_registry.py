@@ -26,7 +26,7 @@ from afspm.scheduler.events import Codec, RequestIn
 from afspm.scheduler.saved_state import SavedSupervisor
 
 SILENT_S = 10.0
-"""A supervisor without a report for this time, real, gets no more orders: they would be lost."""
+"""A supervisor without a report for this time, real, gets no more orders: the orders would be lost."""
 _MOST = 64  # supervisors: names come from peers, and memory must stay bounded
 OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
 """Conditions of a process that has ended for good."""
@@ -37,7 +37,7 @@ class KnownSupervisor:
     """A supervisor with its last report and its open orders.
 
     Attributes:
-        processes: the names of its processes.
+        processes: the names of the processes in its last report.
         reported_s: real time of its last report; None: no report since a restart of the scheduler.
         orders: processes that the supervisor has to restart.
         over: for each process that has ended for good, its number of starts and the real time at which its end was

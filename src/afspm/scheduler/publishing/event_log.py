@@ -39,7 +39,7 @@ LONGEST = 1000
 
 REQUEST, CONTROL, ORDER = "request", "control", "order"
 LATE = "late: the client had got no answer in time"
-"""The reason logged with an answer that came after the client had given up."""
+"""The reason logged with an answer that came after the client had got "no response"."""
 SCHEDULER = "scheduler"
 """The author of requests of the scheduler itself."""
 _UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})  # sent all the time by supervisors and starting processes

@@ -32,7 +32,8 @@ _STATE, _TRANSLATOR = wire.MessageKind.STATE, Role.TRANSLATOR
 def take_packet(draft: StateDraft, event: PacketIn) -> None:
     """Publish a packet, and update the status of the microscope from a published state.
 
-    Duplicates are dropped. A state reported during a move before an action updates the status without publication.
+    A duplicate, a `ControlState` and a packet without a valid envelope are dropped. A state hidden during a move before
+    an action updates the status without publication.
     """
     message, codec, move = event.header.message, draft.env.codec, draft.pending.move
     # only states are decoded: no decision depends on other messages, and scans are large

@@ -41,7 +41,11 @@ def publish_changes(draft: StateDraft) -> None:
 
 
 def facts(draft: StateDraft) -> dict[str, object]:
-    """Return the limits and the coordinate offset that a preflight is valid for; empty without agents."""
+    """Return the digest of the limits and the coordinate offset that a preflight is valid for.
+
+    Returns:
+        `limits`, and `offset_m` as [x, y] in m (None: no offset); empty without agents.
+    """
     if not draft.env.settings.rules.agents:
         return {}
     offset = offset_m(draft)

@@ -56,8 +56,8 @@ class ForwardedRequest(NamedTuple):
 
     Attributes:
         client: the name of the client; empty for a request of the scheduler itself.
-        command: whether the request may change the microscope, so that its client needs control; True for all requests
-            of the scheduler itself.
+        command: whether the request may change the microscope, and is authorised again before it is sent; True for all
+            requests of the scheduler itself, which need no authorisation.
         deadline_s: the deadline of the answer, real; 0: no deadline yet.
         sent_s: the real time of sending; None while the request waits.
         answered: whether the client has got "no response", since the answer was overdue.

@@ -82,7 +82,7 @@ _CONTROL_EVENTS = {
     int(ControlRequest.SET_CONTROL_MODE): ArbitrationEvent.SET_MODE,
     int(ControlRequest.END_EXPERIMENT): ArbitrationEvent.END,
 }
-"""The requests that may change control, by their numbers. All others are for the microscope."""
+"""The requests about control, problems, mode and end, by number, each with its event in the arbitration table."""
 
 
 def handle(draft: StateDraft, event: RequestIn) -> None:

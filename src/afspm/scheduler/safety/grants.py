@@ -55,7 +55,7 @@ STALE_S = 3600.0
 """Experiment time after which a preflight is too old to be approved."""
 _HOUR_NS = 3600 * 10**9
 _PROBE_M = 5e-9
-"""Side of the square, in m, within which a probe counts as where it was set: controllers round."""
+"""Side of the square, in m, within which a probe counts as at its set position: controllers round."""
 _STOPS = frozenset({names.STOP_SCAN, names.STOP_SPEC})
 """Actions that stop a measurement, and need no approval."""
 _PLACES = frozenset((*REGION_CHANGES, *SHAPE_CHANGES, *PROBE_CHANGES))

@@ -163,7 +163,7 @@ class LimitChecker:
     def sending(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> LimitChecker:
         """Count the uses of a checked request that is about to be sent.
 
-        The time of a change is unknown until the request has settled, so a limited rate is not measured from it.
+        The time of a change is unknown until the request has settled, so values with a limited rate are set aside.
         """
         usage = self.state.usage
         for name in self._counted_uses(request, used):

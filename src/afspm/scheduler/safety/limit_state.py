@@ -29,7 +29,7 @@ class KnownValue:
 
 @dataclass(frozen=True)
 class LastUse:
-    """A use of a parameter or action, with the id of the request; empty: the request had none."""
+    """A use of a parameter or action by one request; `request_id` is empty for a request without an id."""
 
     at_ns: int
     who: str

@@ -11,7 +11,7 @@ _ID = "scheduler/does-it-retract"
 
 
 def begin(draft: StateDraft) -> None:
-    """Query a new translator for the action to retract the tip, then send the due actions of the watchdog."""
+    """Check whether a new translator supports the retract, then send the due actions of the watchdog."""
     action = draft.watchdog.question
     # any answer also shows that a retract sent before a restart is done or lost (decision 0088)
     request = Request(int(ControlRequest.ACTION_SUPPORT), action, id=_ID)

@@ -27,7 +27,7 @@ class TipDuty(Enum):
     OWED = "owed"
     """A retract is due."""
     ASKED = "asked"
-    """The microscope is asked to retract the tip."""
+    """The retract was sent, and is not answered."""
     PUT_OFF = "put-off"
     """The tip was not retracted; the retract is tried again later."""
 
@@ -40,9 +40,9 @@ class TipEvent(Enum):
     SEEN_TO = "seen-to"
     """A person or a solver attends to the tip, or the tip is out of danger."""
     SENT = "sent"
-    """The microscope is asked to retract the tip."""
+    """The retract is sent to the microscope."""
     NOT_YET = "not-yet"
-    """The microscope could not be asked, was not free, or did not answer."""
+    """The retract could not be sent, or the microscope was not free or did not answer."""
     RETRACTED = "retracted"
     RETRACTED_LATE = "retracted-late"
     """The microscope has retracted the tip after the deadline."""
@@ -216,7 +216,7 @@ class Watchdog:
         return replace(self, tip=replace(self.tip, calls_people=False))
 
     def leave_to_people(self, microscope: MicroscopeStatus) -> Watchdog:
-        """Call a person to a tip in danger when the run is stopped, and keep the duty to retract the tip.
+        """Call a person to a tip in danger when the run is stopped, and keep the duty to retract.
 
         The exiting translator retracts the tip.
         """
@@ -300,7 +300,7 @@ class Watchdog:
     # --- requests to the translator ---
 
     def next_action(self, microscope: MicroscopeStatus) -> tuple[Watchdog, str | None]:
-        """Return the action to send now, or None; it counts as sent."""
+        """Return the action to send now, or None; the action counts as sent."""
         dog = self
         if dog.tip.for_feedback and microscope.risk.feedback_on is True:
             dog = dog.seen_to()
