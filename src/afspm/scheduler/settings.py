@@ -51,9 +51,9 @@ class ControlSettings:
             `feedback-off`; without the key `COARSE_MOTOR` and `feedback-off`.
         request_timeout_s: real time after which a request counts as unanswered.
         request_retries: how often an unanswered request is sent again; it is never executed twice.
-        adjustable: parameters that a person sets in AUTOMATED as well, beside the component in control: any of
-            `zctrl-setpoint`, `zctrl-pgain`, `zctrl-igain`, `tip-bias-voltage`. The translator sets them during a scan,
-            too; they hold from the next line on.
+        adjustable: parameters that a person sets in AUTOMATED as well, beside the component in control, while no
+            problem is flagged: any of `zctrl-setpoint`, `zctrl-pgain`, `zctrl-igain`, `tip-bias-voltage`. The
+            translator sets them during a scan, too; they hold from the next line on.
         idle: the end of a run in which nothing is left to run: `"end"`, or `"stay"` until a person ends it.
         solved_by_hand: problems that a person solves: a component may flag them though no component solves them.
         end_on: problems that end the experiment as soon as they are flagged, such as `["tip-shape-changed"]` where no

@@ -155,7 +155,7 @@ class Rules:
 
     Attributes:
         problems: the problems declared for this experiment.
-        adjustable: parameters that a person may set while a component is in control.
+        adjustable: parameters that a person may set while a component is in control and no problem is flagged.
         end_on: problems that end the experiment.
         agents: components whose commands need the approval of a person.
         by_hand: problems that a person solves.

@@ -1,4 +1,4 @@
-"""The answers to requests: each request gets one answer, remembered under its id and written to the event log."""
+"""The answers to requests: sent to the client, remembered under the request's id, and written to the event log."""
 
 from __future__ import annotations
 

@@ -149,7 +149,7 @@ class Forwarder:
         return replace(forwarder, up=True), settled
 
     def lost(self) -> tuple[Forwarder, Settled]:
-        """Register that the translator is disconnected; settle all requests."""
+        """Register that the translator is disconnected; settle all requests that are not answered."""
         waiting = tuple(_not_sent(job, "the translator is not connected") for job in (*self.own, *self.queue))
         if self.flight is not None and not self.flight.answered:
             why = "the connection to the translator was lost before it answered"

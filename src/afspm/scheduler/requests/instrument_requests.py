@@ -1,9 +1,9 @@
 """Requests for parameters of other instruments, their reports, and the problems of conditions.
 
-A request to set a parameter waits for the next report of its instrument, and is authorised and checked against its
-limits again when the report arrives. The answer to the report carries the request as an order. An order is repeated in
-each answer until a report contains its outcome; the instrument carries out an id once. A limited rate is not checked
-here: the order carries the rate, and the instrument keeps to this rate on its way to the target.
+A request to set a parameter waits for the next report of its instrument. When the report arrives, the request is
+authorised again, and checked against its limits. The answer to the report carries the request as an order. An order is
+repeated in each answer until a report contains its outcome; the instrument carries out an id once. A limited rate is
+not checked here: the order carries the rate, and the instrument keeps to this rate on its way to the target.
 """
 
 from __future__ import annotations

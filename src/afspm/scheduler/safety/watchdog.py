@@ -49,7 +49,7 @@ class TipEvent(Enum):
     IMPOSSIBLE = "impossible"
     """The microscope has no action to retract the tip."""
     FAILED = "failed"
-    """The microscope refuses, or does not end the retract in time."""
+    """The microscope refuses, is never free, can't be reached, or does not end the retract in time."""
     DUE = "due"
     """A postponed retract is due again."""
     LEFT = "left"
@@ -110,7 +110,8 @@ class RetractState:
     """The part of the watchdog that survives a restart.
 
     Attributes:
-        calls_people: whether a person must still be called: the tip was retracted, or could not be.
+        calls_people: whether a person must still be called: the tip was retracted, could not be retracted, or was in
+            danger when the run was stopped.
         stops: the stop actions still to be sent; a retract follows them.
         for_feedback: whether the tip is in danger because the feedback is off.
         may_come: whether a retract sent before a kill of the scheduler may still be in the translator's queue; its
