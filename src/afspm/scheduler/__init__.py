@@ -10,16 +10,18 @@ place. The shell around the function (`shell`) turns messages into events. It wr
                   frozen, replaced at every step
     goes out      one request at a time to the translator; an answer to each request; packets to all subscribers, with a
                   time and an envelope
-    always holds  at most one component is in control; every request gets one answer, and none is executed twice; the
-                  limits hold at the moment of sending; a packet is in the log before any subscriber receives it
+    always holds  at most one component is in control; every request gets one answer if its client stays connected,
+                  and none is executed twice; the limits hold at the moment of sending; while the disk works, a packet
+                  is in the log before any subscriber receives it
 
-    folder         decides
-    `control/`     control: the arbitration table, leases, problems, the start and the end of an experiment
-    `requests/`    a request from its arrival to its answer, in five stages
-    `safety/`      limits, and the scheduler's own actions for the tip when a holder dies
-    `publishing/`  envelopes, times, the cache for late joiners, the event log
+    folder          decides
+    `control/`      control: the arbitration table, leases, problems, the start and the end of an experiment
+    `requests/`     a request from its arrival to its answer, in five stages
+    `safety/`       limits, approvals of agents, and the scheduler's own actions for the tip when a holder dies
+    `publishing/`   envelopes, times, the cache for late joiners, the event log
+    `instruments/`  readings and orders of other instruments, and conditions for measuring
 
-A coordinate frame may translate between the coordinates of components and those of the microscope
+A coordinate frame may translate between the coordinates of components and the coordinates of the microscope
 (`coordinate_frame`). Without a plug-in both are the same.
 """
 

@@ -1,9 +1,9 @@
-"""The coordinates of components, where they differ from those of the microscope's tip.
+"""The map between the coordinates of components and the coordinates of the microscope's tip.
 
 A coordinate frame is one more part of the scheduler's state: frozen, and replaced by its own methods. The scheduler
 knows this protocol, and no frame by name; by default it has `TipFrame`, which changes nothing.
 
-| the scheduler | asks the frame |
+| step of the scheduler | methods of the frame |
 | --- | --- |
 | takes any input | `step`: keep it, pass it on, add others, hand a job to the frame's worker |
 | sends a request | `outgoing`, and `move_before` an action |
@@ -66,7 +66,10 @@ class SaveNow:
 
 @dataclass(frozen=True, slots=True)
 class HoldControl:
-    """The output that delays the first control state after a restart to `until_s` (real): packets are missing."""
+    """The output that extends the wait before the first control state to `until_s` (real): packets are missing.
+
+    The wait still ends at once with the input `TranslatorCaughtUp`, unless the frame keeps this input.
+    """
 
     until_s: float
 
@@ -80,7 +83,7 @@ class CoordinateFrame(Protocol):
 
     Attributes:
         is_moving: whether the microscope may have to be moved before an action. The scheduler then remembers a sent
-            action, so that it is repeated after a restart without another move.
+            action, so that the action is repeated after a restart without another move.
         reports: classes of the worker's reports: dataclasses for `model.snapshot`. `[record] requests = true` keeps
             the reports, and a replay gets them again.
     """
@@ -94,7 +97,7 @@ class CoordinateFrame(Protocol):
         """Process an input before the scheduler does.
 
         Args:
-            control: the state of control before the input.
+            control: the state of control when the frame gets the input.
 
         Returns:
             The frame after the input, and its outputs in order, including the input if it is passed on.
@@ -110,7 +113,7 @@ class CoordinateFrame(Protocol):
         ...
 
     def in_force(self, place: Region | ProbePosition, now_ns: int) -> CoordinateFrame:
-        """Store a place read from the microscope; a later change of one coordinate is applied to it."""
+        """Store a place read from the microscope; a later change of one coordinate is applied to this place."""
         ...
 
     def outgoing(

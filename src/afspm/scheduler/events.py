@@ -1,6 +1,6 @@
 """The inputs and effects of `SchedulerCore`.
 
-Two times come with each input: `now_s`, real and monotonic, for timeouts; `now_ns`, the experiment's, for everything
+Two times come with each input: `now_s`, real and monotonic, for timeouts; `now_ns`, experiment time, for everything
 that has a meaning in the experiment.
 """
 
@@ -46,7 +46,7 @@ class RequestIn:
 
     Attributes:
         user: the owner of the peer's key; None where connections are not authenticated.
-        heard_s: time of the first arrival, real; negative: this step.
+        heard_s: real time of the first arrival; negative: the time of the step that processes the request.
     """
 
     connection: int
@@ -74,9 +74,10 @@ class PacketIn:
 
 @dataclass(frozen=True, slots=True)
 class ReplayRequested:
-    """A subscriber's request for the cached packets under `prefixes` that are newer than `since_ns`.
+    """A subscriber's request for the cached packets that are newer than `since_ns`.
 
     Attributes:
+        prefixes: beginnings of the wanted envelopes.
         subscriber: the caller's own handle; returned in `Replay`.
     """
 
@@ -110,7 +111,7 @@ class TranslatorReply:
 
 @dataclass(frozen=True, slots=True)
 class ProblemSeen:
-    """The appearance or disappearance of a problem, found by the scheduler's own process.
+    """The appearance or disappearance of a problem, found in the scheduler's process by the coordinate frame.
 
     Attributes:
         name: the component in whose name the problem is flagged.
@@ -141,12 +142,12 @@ class Stopped:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """The event that a deadline (`SchedulerCore.deadline_s`) has passed."""
+    """The event that a deadline (`SchedulerCore.deadline_s` or `SchedulerCore.deadline_ns`) has passed."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameReported:
-    """A report of the coordinate frame's worker: a result, or its end; only the frame reads the content."""
+    """A report of the coordinate frame's worker, such as a result or its own end; only the frame reads `report`."""
 
     report: object
 
@@ -169,7 +170,7 @@ class FrameAnswered:
 
 @dataclass(frozen=True, slots=True)
 class ControlChanged:
-    """The event that this step changed the holder, the mode or the problems."""
+    """The event that this step replaced the state of control; the two states may be equal."""
 
     before: ArbitrationState
     after: ArbitrationState
@@ -219,8 +220,8 @@ class Reply:
 class Forward:
     """The effect that sends a request to the translator, marked with `number`.
 
-    A client's `request.payload` is sent as it came. A request of the scheduler itself has no payload: its subject is
-    encoded.
+    A request is sent with its payload. A request without a payload, such as a request of the scheduler itself, is
+    encoded from its subject.
     """
 
     number: int
@@ -232,8 +233,8 @@ class Publish:
     """The effect that publishes a packet to the subscribers of its envelope.
 
     Attributes:
-        source_ns: the packet's time by the translator; None for a packet of the scheduler.
-        history: number of packets of this envelope kept over a restart; 0: this packet is not cached.
+        source_ns: the translator's time of the packet; None for a packet of the scheduler, or without a time.
+        history: number of packets of this envelope in the cache, also over a restart; 0: this packet is not cached.
     """
 
     packet: Packet
@@ -266,7 +267,7 @@ class Log:
 
 @dataclass(slots=True)
 class Kill:
-    """The effect that ends the experiment: the signal KILL is published, and the sockets are closed.
+    """The effect that ends the experiment: the signal KILL is published, and no further request is decided.
 
     Attributes:
         tip_is_safe: whether the translator may exit; if False, the translator retracts the tip when it is stopped.

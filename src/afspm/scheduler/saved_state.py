@@ -20,7 +20,13 @@ KIND, VERSION = "scheduler", 2
 
 @dataclass(frozen=True)
 class SavedSupervisor:
-    """The part of a supervisor that survives a restart of the scheduler."""
+    """The part of a supervisor that survives a restart of the scheduler.
+
+    Attributes:
+        processes: the names of its processes.
+        orders: processes that the supervisor has to restart.
+        over: for each process that has ended for good, its number of starts.
+    """
 
     processes: tuple[str, ...]
     orders: tuple[str, ...]
@@ -32,13 +38,13 @@ class SavedState:
     """The state that survives a restart.
 
     Attributes:
-        granted_to: the token of the process that was granted control.
+        granted_to: the session token of the process that was granted control.
         lease_s: the lease that the holder requested, real.
         sessions: the token of each connected session.
         forgotten: see `idempotency_cache.Floors`.
-        last_ns: the time of the newest packet.
-        recent: (translator's time, published time) of the last packets.
-        frame: `CoordinateFrame.saved()`; read from a file, the same as plain data.
+        last_ns: the newest published time of a packet.
+        recent: (translator's time, published time) of the last packets; 0 as published time: not published.
+        frame: the result of `CoordinateFrame.saved`; as plain data if the state was read from a file.
         instrument_units: the first unit of each parameter of an instrument.
         instrument_orders: the number of the newest order or token.
     """

@@ -73,7 +73,7 @@ class Scheduler:
         self._instruments = _section(InstrumentSettings, conditions or {}, "conditions")
 
     def run_process(self, context: ProcessContext) -> int:
-        """Run until the experiment ends or the process is stopped; return an exit code.
+        """Run until the experiment ends or the process is stopped; return ENDED or ORPHAN.
 
         Raises:
             AfspmError: an address, a setting or the saved state can't be used.
@@ -113,7 +113,7 @@ class Scheduler:
         """Return the settings of the core.
 
         Raises:
-            ConfigError: a problem that ends the experiment has no number.
+            ConfigError: [control] end_on names an unknown problem, or the mapping of [cache] can't be loaded.
         """
         launch, control, cache = context.launch, self._control, self._cache
         try:

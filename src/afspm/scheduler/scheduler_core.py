@@ -118,10 +118,10 @@ class SchedulerCore:
     other inputs wait.
 
     Args:
-        frame: the coordinates of components, if they differ from those of the microscope.
+        frame: the map between the coordinates of components and of the microscope; by default both are the same.
 
     Attributes:
-        state: all that decisions depend on, except the cache; replaced by every step.
+        state: the state that decisions depend on, without the cache; replaced by every step.
     """
 
     def __init__(self, settings: SchedulerSettings, codec: Codec, frame: CoordinateFrame = TIP_FRAME) -> None:
@@ -130,7 +130,11 @@ class SchedulerCore:
         self._restored: SavedState | None = None
 
     def start(self, now_s: float, now_ns: int) -> list[Effect]:
-        """Start the scheduler; the control state is published after the translator's missed packets."""
+        """Start the scheduler, and return the effects.
+
+        The control state is published once the translator's missed packets have arrived, at the latest after
+        `Waits.catch_up_s` (a coordinate frame may extend this wait).
+        """
         draft, is_restart = StateDraft(self.state, self._env, now_s, now_ns), self._restored is not None
         draft.peers = replace(draft.peers, timeout=replace(draft.peers.timeout, started_s=now_s))
         draft.watchdog = draft.watchdog.begun(now_s)
@@ -152,7 +156,7 @@ class SchedulerCore:
         return effects
 
     def step(self, event: Input, now_s: float, now_ns: int) -> list[Effect]:
-        """Process an event; `now_s` is real and monotonic, `now_ns` the experiment's time."""
+        """Process an event, and return the effects; `now_s` is real and monotonic, `now_ns` is experiment time."""
         self.state, effects = step(self.state, event, self._env, now_s, now_ns)
         return effects
 
@@ -168,7 +172,7 @@ class SchedulerCore:
         return due_s(self.state)
 
     def deadline_ns(self) -> int | None:
-        """Return when a Tick is due at the latest, in experiment time; None: no deadline (only a lease makes one)."""
+        """Return when a Tick is due at the latest, in experiment time; None: no lease of the experiment file runs."""
         return self.state.lease.deadline_ns(is_free=self.state.microscope.is_free)
 
     def snapshot(self) -> SavedState:
@@ -198,12 +202,12 @@ class SchedulerCore:
 
     @property
     def leave_at_s(self) -> float:
-        """When the scheduler leaves after the end, in real monotonic time; inf: the experiment has not ended."""
+        """The real monotonic time at which the scheduler exits after the end; inf: the experiment has not ended."""
         return self.state.end.leave_at_s
 
     @property
     def control(self) -> ArbitrationState:
-        """The state of control: the holder, its problem, and the flagged problems with their authors."""
+        """The state of control: mode, holder, the holder's problem, and the flagged problems with their authors."""
         return self.state.control
 
     @property

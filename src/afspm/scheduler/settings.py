@@ -1,10 +1,11 @@
 """The settings of a scheduler, each described once.
 
-| described here | is |
+| class | settings |
 | --- | --- |
 | `ControlSettings`, `RoleTable` | the sections [control] and [control.roles] of the experiment file |
 | `CacheSettings`, `CacheRule` | the section [cache] |
 | `ExperimentLimits`, `Limit` | the section [limits], in the units of the microscope's parameters |
+| `InstrumentSettings` | the section [conditions], and the names of the instruments |
 | `Waits`, `RunFacts` | settings that no file holds |
 
 The experiment file is checked against these classes, the tables of the reference are made of them, and a scheduler gets
@@ -41,22 +42,24 @@ class ControlSettings:
         lease_s: experiment time after which an idle holder loses control.
         grace_s: real time for which a holder whose connection is gone keeps control, if it will be restarted.
         malfunction_after_s: real time for which the microscope may be lost before `device-malfunction` is flagged; the
-            flag is cleared when it is back.
-        stop_scan_on_problem: whether to stop a running scan when a problem is flagged.
-        stop_scan_on_manual: whether to stop it when the mode changes to MANUAL.
-        retract: whether to retract the tip when control ends in a dangerous state, if the microscope can.
-        dangerous: list of those states: `MOVING`, `SCANNING`, `COARSE_MOTOR`, `BUSY_PARAM`, `SPEC`, `feedback-off`;
-            without the key `COARSE_MOTOR` and `feedback-off`.
+            flag is cleared when the microscope is back.
+        stop_scan_on_problem: whether to stop a running scan when a flagged problem takes control from the holder.
+        stop_scan_on_manual: whether to stop a running scan when the mode changes to MANUAL.
+        retract: whether to retract the tip, if the microscope can, when a holder loses control in a dangerous state.
+            The tip is not retracted when the holder gives control back, or a person takes control.
+        dangerous: list of the dangerous states: `MOVING`, `SCANNING`, `COARSE_MOTOR`, `BUSY_PARAM`, `SPEC`,
+            `feedback-off`; without the key `COARSE_MOTOR` and `feedback-off`.
         request_timeout_s: real time after which a request counts as unanswered.
         request_retries: how often an unanswered request is sent again; it is never executed twice.
-        adjustable: parameters that a person sets in AUTOMATED as well, beside the component in control: any of
-            `zctrl-setpoint`, `zctrl-pgain`, `zctrl-igain`, `tip-bias-voltage`. The translator sets them during a scan,
-            too; they hold from the next line on.
+        adjustable: parameters that a person sets in AUTOMATED as well, beside the component in control, while no
+            problem is flagged: any of `zctrl-setpoint`, `zctrl-pgain`, `zctrl-igain`, `tip-bias-voltage`. The
+            translator sets them during a scan, too; they hold from the next line on.
         idle: the end of a run in which nothing is left to run: `"end"`, or `"stay"` until a person ends it.
         solved_by_hand: problems that a person solves: a component may flag them though no component solves them.
         end_on: problems that end the experiment as soon as they are flagged, such as `["tip-shape-changed"]` where no
             component repairs the tip.
-        agents: components whose commands need the approval of a person; without the key: those of the class `Agent`.
+        agents: components whose commands need the approval of a person; without the key: components of the class
+            `Agent`.
         roles: see below.
     """
 

@@ -110,7 +110,7 @@ class SchedulerShell:
         return self.ended and self._clock.monotonic_s() >= self._core.leave_at_s
 
     def handle(self, ready: list[Source]) -> None:
-        """Process incoming messages, then expired deadlines."""
+        """Process the worker's reports and incoming messages, then expired deadlines."""
         if self.ended:
             self._handle_after_end(ready)
             return
@@ -146,6 +146,7 @@ class SchedulerShell:
         sockets = self._sockets
         for source in ready:
             if source is sockets.publisher:
+                # a subscriber that joins now has missed the signal
                 if sockets.publisher.serve():
                     sockets.publisher.kill()
             elif source in (sockets.router, sockets.router.monitor):

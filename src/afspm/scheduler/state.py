@@ -33,6 +33,7 @@ class Peers:
     """The processes of the experiment, as far as known.
 
     Attributes:
+        sessions: the connection of each client.
         timeout: the grace period of a holder without a connection.
         supervisors: the supervisors, whose reports name the processes that have ended.
     """
@@ -49,11 +50,11 @@ class Peers:
 
 @dataclass(frozen=True)
 class SchedulerState:
-    """All that a scheduler's decisions depend on, except the packets in its cache.
+    """The state that a scheduler's decisions depend on, without the packets in its cache.
 
     Attributes:
-        logged: texts that are logged only once.
-        frame: the coordinates of components.
+        logged: texts that were logged already, and are logged only once.
+        frame: the map between the coordinates of components and of the microscope.
     """
 
     control: ArbitrationState
@@ -98,7 +99,7 @@ class SchedulerState:
         )
 
     def saved_parts(self) -> tuple[object, ...]:
-        """Return the parts whose changes are saved before they are published."""
+        """Return the parts whose change makes a step save the state before its other effects."""
         saved = self.control, self.lease.token, self.lease.asked_s, self.watchdog.tip, self.microscope.risk
         return (
             *saved,
@@ -110,7 +111,10 @@ class SchedulerState:
         )
 
     def due_s(self) -> float | None:
-        """Return the earliest deadline, in real monotonic time, of the parts that do not depend on others."""
+        """Return the earliest deadline of the parts listed here, in real monotonic time; None: no deadline.
+
+        `scheduler_core.due_s` adds the deadlines that depend on several parts.
+        """
         dues = (
             self.forwarder.deadline_s(),
             self.barrier.due_s(),
@@ -167,7 +171,7 @@ class StateDraft(StateParts):
     Attributes:
         now_s: real monotonic time, for timeouts.
         now_ns: experiment time, for everything that has a meaning in the experiment.
-        raised: inputs raised by this step; the frame processes them within it.
+        raised: inputs that this step raises for the coordinate frame, processed within the same step.
         before: the state before this step.
     """
 
@@ -194,7 +198,10 @@ class StateDraft(StateParts):
             self.forwarder = replace(self.forwarder, outbox=())
 
     def finish(self) -> tuple[SchedulerState, list[Effect]]:
-        """Return the new state and the effects: saving comes first, requests to the translator come last."""
+        """Return the new state and the effects: saving first, requests to the translator last.
+
+        At the end of the experiment, the last packets and the KILL signal follow the requests.
+        """
         self.send_forwards()
         parts = self.__dict__
         state = replace(self.before, **{name: parts[name] for name in _PARTS})
@@ -230,6 +237,8 @@ def restored_state(
     saved: SavedState, settings: SchedulerSettings, frame: CoordinateFrame = TIP_FRAME
 ) -> SchedulerState:
     """Return the state of a scheduler after a restart.
+
+    `SchedulerCore` restores the other parts of `saved`: the requested lease, the event log and the times of packets.
 
     Args:
         frame: the coordinate frame at a first start.

@@ -3,9 +3,10 @@
 The decisions are pure, so the same inputs must give the same effects: `afspm what-if` checks that. A line of the file
 is a list:
 
-- ["life", launch, saved, cached]: the scheduler starts, with the state and the packets restored from disk.
-- ["step", event, now_s, now_ns, effects, state]: an input, or null for the start itself; `state` has a checksum of each
-  part of the state that the step has changed.
+- ["life", launch, saved, cached]: the scheduler starts, with the state and the packets restored from disk; `launch` is
+  kept without its keys.
+- ["step", event, now_s, now_ns, effects, state]: an input, or null for the start itself; `effects` are the results of
+  `facts_of`; `state` has a checksum of each part of the state that the step has changed.
 
 Measured values decide nothing, so large scans, lines and spectra are kept compressed, with zeros in place of values. Of
 other large packets only the length is kept. The results of a coordinate frame's worker are inputs, too: a replay gets
@@ -88,7 +89,7 @@ class StateSums:
         self._sums: dict[str, int] = {}
 
     def changed(self, state: SchedulerState) -> dict[str, int]:
-        """Return the checksum of each part that differs from the last call."""
+        """Return the checksum of each part that has changed since the last call."""
         before = dict(self._sums)
         for name, part in vars(state).items():
             if part is not self._parts.get(name, self):  # most steps leave most parts as they are
@@ -156,24 +157,25 @@ class StepLog:
 
 
 def log_path(run_dir: Path, name: str) -> Path:
-    """Return the file of a scheduler's step log."""
+    """Return the path of a scheduler's step log."""
     return run_dir / REQUESTS_FOLDER / f"{name}{SUFFIX}"
 
 
 def read_cached(plain: Sequence[Any]) -> tuple[LoggedPacket, ...]:
-    """Return the packets in a line "life"."""
+    """Return the packets from the field `cached` of a line "life"."""
     return tuple(LoggedPacket(_packet(packet), source_ns, history) for packet, source_ns, history in plain)
 
 
 def read_event(plain: Sequence[Any] | None, reports: Iterable[type] = ()) -> events.Input | None:
-    """Return the input in a line "step".
+    """Return the input from the field `event` of a line "step"; None for the start.
 
     Args:
         reports: the classes that the scheduler's coordinate frame declares.
 
     Raises:
         KeyError: the input is unknown, or a report of another coordinate frame.
-        WireError: its bytes are damaged.
+        WireError: the bytes of a message are damaged.
+        TypeError, ValueError, AttributeError: the line is damaged.
     """
     if plain is None:
         return None

@@ -21,7 +21,7 @@ from afspm.storage.packet_log import PacketLog
 
 
 class StateFile:
-    """The file of the scheduler's state (mode, holder, problems …), saved before each publication.
+    """The file of the scheduler's state (mode, holder, problems …), saved before a change is published.
 
     Args:
         path: the path of the file; None: nothing is stored.
@@ -34,13 +34,14 @@ class StateFile:
         self._outage = OutageLog("a restart would not know the present state", log)
 
     def load(self) -> SavedState | None:
-        """Return the state saved last; None if none was.
+        """Return the state saved last; None if there is no file.
 
-        If a power cut has damaged it, the generation before is used, with its mode and problems, but without a holder:
-        the holder may have changed since, and requests control again.
+        If a power cut has damaged the last state, the last readable state before is used, with its mode and problems,
+        but without a holder: the holder may have changed since, and requests control again.
 
         Raises:
-            FileError: neither can be read. Starting without a flagged problem could cost a tip.
+            FileError: no saved state can be read, or the folder is missing. Starting without a flagged problem could
+                cost a tip.
         """
         if self.path is None:
             return None
@@ -106,7 +107,7 @@ class WriteAhead:
         self._problems: frozenset[int] = frozenset()
 
     def write(self, state: SavedState | None, entries: Sequence[LoggedPacket]) -> None:
-        """Save the state and append the packets; new problems are flushed to the disk."""
+        """Save the state and append the packets; a newly flagged problem is also synced to the disk."""
         if state is None and not entries:
             return
         entries = [*self._missed(entries), *entries]

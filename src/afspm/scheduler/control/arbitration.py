@@ -60,7 +60,7 @@ class ControlChange(Enum):
 
 
 class Cause(Enum):
-    """The reason why control was taken from its holder."""
+    """The reason why a holder is no longer in control."""
 
     RELEASED = "released"
     PROBLEM = "problem"
@@ -98,7 +98,7 @@ class ArbitrationState:
     Attributes:
         solving: the flagged problem that the holder is in control for; 0 for none.
         problems: the flagged problems, each with the name of the component that flagged it.
-        ended: the experiment is over.
+        ended: whether the experiment is over.
     """
 
     mode: ControlMode = ControlMode.AUTOMATED
@@ -123,7 +123,7 @@ class ArbitrationState:
 class RoleTable:
     """The components and people with a role. Without the key, everyone has the role, except `operate` and `approve`.
 
-    A person who acts through a component ("dashboard:Ada") has the roles of the component and those given to that
+    A person who acts through a component ("dashboard:Ada") has the roles of the component and the roles given to that
     person there.
 
     Attributes:
@@ -155,7 +155,7 @@ class Rules:
 
     Attributes:
         problems: the problems declared for this experiment.
-        adjustable: parameters that a person may set while a component is in control.
+        adjustable: parameters that a person may set while a component is in control and no problem is flagged.
         end_on: problems that end the experiment.
         agents: components whose commands need the approval of a person.
         by_hand: problems that a person solves.
@@ -184,7 +184,7 @@ class Rules:
 
 @dataclass(frozen=True)
 class ControlInput:
-    """An event caused by the component `who`; `number` is its problem or mode."""
+    """An event caused by the component `who`; `number` is the problem or mode of the event, else 0."""
 
     event: ArbitrationEvent
     who: str
@@ -220,7 +220,7 @@ class Transition:
 def may(role: Collection[str] | None, who: str) -> bool:
     """Return whether a component, or a person who acts through a component, has a role.
 
-    A role of None belongs to everyone.
+    If `role` is None, all have the role.
     """
     return role is None or who in role or component_of(who) in role
 
@@ -438,7 +438,7 @@ def apply(row: Transition, control: ArbitrationState, ask: ControlInput) -> Arbi
 
 
 def reason(row: Transition, control: ArbitrationState, ask: ControlInput, rules: Rules) -> str:
-    """Return the text of a refusal; empty for a success."""
+    """Return the text of a refusal; empty if the row does not refuse a request."""
     if row.response in (None, ControlResponse.SUCCESS):
         return ""
     return row.why.format(

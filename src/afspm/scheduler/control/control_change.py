@@ -48,7 +48,7 @@ class _Change:
 
     @property
     def cause(self) -> Cause | None:
-        """Why the microscope may be unattended: the holder's loss of control, or the end of the experiment."""
+        """The reason why the microscope may be unattended: the cause in the row, or the end; None: no reason."""
         # a person at the microscope attends to the tip, also at the end of the experiment
         if self.after.ended and self.before.mode is not ControlMode.MANUAL:
             return Cause.ENDED
@@ -59,7 +59,7 @@ def decide(draft: StateDraft, ask: ControlInput, event: RequestIn | None = None)
     """Apply the arbitration table; return whether the translator must answer the request.
 
     Args:
-        event: the request; None: the event is not a request.
+        event: the request; None: the input is not a request.
     """
     before, rules = draft.control, draft.env.settings.rules
     row = row_for(before, ask, rules)
@@ -81,7 +81,7 @@ def decide(draft: StateDraft, ask: ControlInput, event: RequestIn | None = None)
 
 
 def begin_end(draft: StateDraft) -> None:
-    """Begin the end of the experiment, which waits until the tip is out of danger."""
+    """Begin the end of the experiment, which waits, for a limited time, until the tip is out of danger."""
     draft.watchdog = draft.watchdog.hurry(draft.now_s)
     settings = draft.env.settings
     draft.end = draft.end.begin(draft.now_s + settings.control.request_timeout_s + settings.waits.answer_s)

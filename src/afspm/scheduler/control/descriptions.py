@@ -49,7 +49,10 @@ _FEEDBACK_WORDS = {"on": "feedback", "proportional_gain": "P gain", "integral_ga
 
 
 def is_routine(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, holder_logged: str | None) -> bool:
-    """Return whether a change is routine: a release of control, or its return to the holder logged last."""
+    """Return whether a change is routine: control is released, or returns to the holder logged last.
+
+    A change is never routine while a problem is flagged, or if the mode or the end changes.
+    """
     if (after.problems, after.mode, after.ended) != (before.problems, before.mode, before.ended) or after.problems:
         return False
     return ask.event is ArbitrationEvent.RELEASE_CONTROL if after.holder is None else after.holder == holder_logged

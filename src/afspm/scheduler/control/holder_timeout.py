@@ -18,8 +18,8 @@ class Lease:
     such a holder acts for a client that may vanish without losing a connection.
 
     Attributes:
-        lease_ns: longest idle time by the experiment file; None: no limit.
-        asked_s: longest idle time that the holder requested; None: no such request.
+        lease_ns: longest idle time by the experiment file, in experiment time; None: no limit.
+        asked_s: longest idle time that the holder requested, real; None: no such request.
         token: the session token of the process that was granted control.
         announced: the holder named last in the log.
     """
@@ -33,23 +33,27 @@ class Lease:
     idle_since_s: float = 0.0
 
     def held_by(self, holder: str | None, now_ns: int) -> Lease:
-        """Restart the idle time if the holder changed; None: no component is in control."""
+        """Register the holder; a new holder starts without idle time and without a requested lease.
+
+        Args:
+            holder: the component in control; None: no component.
+        """
         return self if holder == self.holder else replace(self, holder=holder, idle_since_ns=now_ns, asked_s=None)
 
     def used(self, now_ns: int) -> Lease:
-        """Restart the idle time: the microscope began or ended an activity."""
+        """Restart the idle time in experiment time: the microscope began or ended an activity."""
         return replace(self, idle_since_ns=now_ns)
 
     def commanded(self, now_ns: int, now_s: float) -> Lease:
-        """Restart the idle time: a request of the holder was accepted."""
+        """Restart both idle times: a command of the holder was sent, or has succeeded."""
         return replace(self, idle_since_ns=now_ns, idle_since_s=now_s)
 
     def asked(self, lease_s: float | None, now_s: float) -> Lease:
-        """Begin or renew the lease that the holder requests."""
+        """Begin or renew the lease that the holder requests; None: end it."""
         return replace(self, asked_s=lease_s, idle_since_s=now_s)
 
     def asked_until_s(self) -> float | None:
-        """Return the real time at which the lease requested by the holder expires; None: no such lease."""
+        """Return the real time at which the lease requested by the holder expires; None without such a lease."""
         return None if self.asked_s is None or self.holder is None else self.idle_since_s + self.asked_s
 
     def deadline_ns(self, *, is_free: bool) -> int | None:
@@ -66,6 +70,7 @@ class HolderTimeout:
     Attributes:
         grace_s: real time before control is revoked.
         restart_grace_s: the same for a holder without a connection since the scheduler itself was restarted.
+        started_s: real time of the scheduler's start.
         next_loss_log_s: no further loss is logged before this time, real.
     """
 

@@ -12,11 +12,12 @@ from afspm.scheduler.control.supervisor_registry import OVER
 from afspm.scheduler.events import RequestIn
 
 SHUTDOWN_GRACE_S = 3.0
-"""Real time that the scheduler stays after the end, so that late components still get the last scans and the end. The
-time starts again with each report of a component that still runs.
+"""Real time that the scheduler stays after the end, so that late components get the last scans and the end.
+
+The time starts again with each report of a component that still runs, up to `LONGEST_GRACE_S`.
 """
 LONGEST_GRACE_S = 20.0
-"""Longest real time that the scheduler stays after the end: a supervisor needs it to restart a silent component."""
+"""Longest real time that the scheduler stays after the end: enough for a supervisor to restart a silent component."""
 # bounded, since requests come from peers
 _MOST_KEPT = 1000
 _OTHERS = ("scheduler", "translator")
@@ -26,10 +27,11 @@ _OTHERS = ("scheduler", "translator")
 class StartupBarrier:
     """A delay of the first control state until missed packets are published; after a restart, also of control requests.
 
-    Without this delay, a repeated packet of the translator would get a time after the change, and look new.
+    After a restart, requests that may change control are delayed, too. Otherwise a repeated packet of the translator
+    would get a time after the change, and look new.
 
     Attributes:
-        patience_s: the longest wait, real.
+        patience_s: the longest wait, real, unless `put_off` extends the wait.
         until_s: the latest opening of the barrier, in real monotonic time; None: the barrier is open.
         is_restart: whether this scheduler continues a run.
         opened_s: the opening of the barrier, in real monotonic time.
@@ -46,7 +48,7 @@ class StartupBarrier:
         return replace(self, until_s=now_s + self.patience_s, is_restart=is_restart)
 
     def put_off(self, until_s: float) -> StartupBarrier:
-        """Keep the barrier closed at least until `until_s`: more packets are expected."""
+        """Extend the longest wait to `until_s`: more packets are expected."""
         return self if self.until_s is None else replace(self, until_s=max(self.until_s, until_s))
 
     def opened(self, now_s: float) -> StartupBarrier:
@@ -63,13 +65,13 @@ class StartupBarrier:
         return replace(self, kept=(*self.kept, event))
 
     def let_in(self) -> tuple[StartupBarrier, RequestIn | None]:
-        """Remove and return the first kept request; None while the barrier is closed or no request is kept."""
+        """Remove and return the first kept request; None while the barrier is closed, or without kept requests."""
         if not self.kept or self.until_s is not None:
             return self, None
         return replace(self, kept=self.kept[1:]), self.kept[0]
 
     def due_s(self) -> float | None:
-        """Return when the barrier must open, or the next kept request must be decided."""
+        """Return the real time at which the barrier opens, or a kept request must be decided; None: no deadline."""
         if self.until_s is not None:
             return self.until_s
         return self.opened_s if self.kept else None
@@ -88,8 +90,8 @@ class ExperimentEnd:
     Attributes:
         by_s: the latest end of the experiment, in real monotonic time; None: no end in progress.
         kept: the delayed answers.
-        leave_at_s: the time at which the scheduler exits; inf: the experiment has not ended.
-        latest_s: the latest time at which the scheduler exits.
+        leave_at_s: the real time at which the scheduler exits; inf: the experiment has not ended.
+        latest_s: the latest real time at which the scheduler exits.
     """
 
     by_s: float | None = None

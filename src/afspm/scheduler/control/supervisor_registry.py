@@ -26,7 +26,7 @@ from afspm.scheduler.events import Codec, RequestIn
 from afspm.scheduler.saved_state import SavedSupervisor
 
 SILENT_S = 10.0
-"""A supervisor without a report for this time, real, gets no more orders: they would be lost."""
+"""A supervisor without a report for this time, real, gets no more orders: the orders would be lost."""
 _MOST = 64  # supervisors: names come from peers, and memory must stay bounded
 OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
 """Conditions of a process that has ended for good."""
@@ -37,8 +37,9 @@ class KnownSupervisor:
     """A supervisor with its last report and its open orders.
 
     Attributes:
-        reported_s: time of its last report, real; None: known from before a restart of the scheduler.
-        orders: processes that it has to restart.
+        processes: the names of the processes in its last report.
+        reported_s: real time of its last report; None: no report since a restart of the scheduler.
+        orders: processes that the supervisor has to restart.
         over: for each process that has ended for good, its number of starts and the real time at which its end was
             first reported.
         states: the states of its processes in its last report.
@@ -53,7 +54,7 @@ class KnownSupervisor:
 
 @dataclass(frozen=True)
 class SupervisorRegistry:
-    """The supervisors by name, in the order of their last reports."""
+    """The supervisors by name, in the order of their last reports; the newest is last."""
 
     supervisors: Mapping[str, KnownSupervisor] = field(default_factory=dict)
 
@@ -101,18 +102,22 @@ class SupervisorRegistry:
         return None if goes_on else since_s
 
     def orders_for(self, supervisor: str) -> tuple[SupervisorRegistry, tuple[str, ...]]:
-        """Remove and return a supervisor's open orders: the processes that it has to restart."""
+        """Remove and return a supervisor's open orders: the processes that the supervisor has to restart."""
         known = self.supervisors.get(supervisor)
         if known is None or not known.orders:
             return self, ()
         return replace(self, supervisors={**self.supervisors, supervisor: replace(known, orders=())}), known.orders
 
     def order(self, process: str, now_s: float) -> tuple[SupervisorRegistry, str]:
-        """Order the restart of a process. Also return the reason if that is impossible, else ""."""
+        """Order the restart of a process; also return the reason if the order is impossible, else "".
+
+        The order goes to the supervisor that reported the process last.
+        """
         having = {name: one for name, one in self.supervisors.items() if process in one.processes}
         if not having:
             known = sorted({process for one in self.supervisors.values() for process in one.processes})
             return self, f"there is no process {process!r}; known: {', '.join(known) or 'none'}"
+        # after a restart of the scheduler the next report is still to come: the supervisor counts as alive
         name, newest = max(having.items(), key=lambda item: now_s if item[1].reported_s is None else item[1].reported_s)
         if newest.reported_s is not None and now_s - newest.reported_s > SILENT_S:
             return (
@@ -140,10 +145,10 @@ class SupervisorRegistry:
 
 @dataclass(frozen=True)
 class Announcement:
-    """A message that a process asks the scheduler to publish.
+    """A message for publication in the name of a process.
 
     Attributes:
-        envelope: empty: the message is refused.
+        envelope: the envelope of the packet; empty if the message is refused.
         why: the reason of the refusal.
         states: the states of a supervisor's processes, if the message reports them.
     """

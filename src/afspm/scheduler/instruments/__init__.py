@@ -8,6 +8,6 @@ request to set it waits for the next report, whose answer carries it as an order
     state         `Instruments`: the last reading of each parameter, its first unit, open orders, since when each
                   condition holds
     goes out      orders; a refusal of the actions that a condition guards; the problems to flag and to clear
-    always holds  a reading older than `OLDEST_S`, or in another unit than the first, does not count; only the
-                  scheduler's own clock determines an age
+    always holds  a reading older than `OLDEST_S`, or in another unit than the first, does not count; a report is dated
+                  by the scheduler's own clock, never by the clock of the instrument's computer
 """

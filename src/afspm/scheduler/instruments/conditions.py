@@ -82,7 +82,7 @@ class InstrumentSettings:
     Attributes:
         instruments: the components that report values.
         conditions: the conditions by name.
-        problems: the number of each problem that a condition flags.
+        problems: by name, the number of each problem that a condition flags.
     """
 
     instruments: tuple[str, ...] = ()

@@ -32,7 +32,8 @@ class OpenOrder:
     """A set request for an instrument.
 
     Attributes:
-        order: the order given to the instrument; None: the request still waits.
+        job: the request of the client.
+        order: the order given to the instrument; None: the request still waits for a report.
     """
 
     job: ForwardedRequest
@@ -155,7 +156,7 @@ class Instruments:
     # --- orders ---
 
     def asked(self, job: ForwardedRequest) -> Instruments:
-        """Queue a set request."""
+        """Queue a set request under a new number."""
         owner = instrument_of(job.request.subject.name)
         number = self.number + 1
         known = self._of(owner)
@@ -172,7 +173,7 @@ class Instruments:
         return self._with(instrument, replace(known, open=(order, *known.open[1:])))
 
     def settled(self, instrument: str, number: int) -> Instruments:
-        """Remove an order."""
+        """Remove the order with this number."""
         known = self._of(instrument)
         rest = tuple(one for one in known.open if one.job.number != number)
         return self._with(instrument, replace(known, open=rest))
@@ -185,7 +186,7 @@ class Instruments:
         return None
 
     def overdue(self, now_s: float) -> list[tuple[str, OpenOrder]]:
-        """Return the orders whose clients have waited too long, each with its instrument."""
+        """Return the orders whose deadline has passed, each with its instrument."""
         return [(name, one) for name, known in self.known.items() for one in known.open if now_s >= one.job.deadline_s]
 
     def answered(self, instrument: str, now_s: float) -> Instruments:

@@ -24,7 +24,7 @@ _FUTURE_NS = 3600 * 10**9  # a translator's clock further ahead is wrong: its ti
 
 @dataclass(slots=True)
 class Kept:
-    """A packet in the cache, with its size in bytes."""
+    """A packet in the cache, with its size in bytes, including a fixed overhead."""
 
     logged: LoggedPacket
     size: int
@@ -67,7 +67,7 @@ class PacketCache:
 
     @property
     def size(self) -> int:
-        """Size of all packets, in bytes."""
+        """Size of all packets in bytes, including a fixed overhead for each."""
         return self._bytes
 
     def take(self, packet: Packet, header: PacketHeader, now_ns: int) -> tuple[Packet, int] | None:
@@ -110,7 +110,10 @@ class PacketCache:
         return is_new
 
     def recent(self) -> list[tuple[int, int]]:
-        """Return (translator's time, published time) of the last packets, for `remember` after a restart."""
+        """Return (translator's time, published time) of the last packets, for `remember` after a restart.
+
+        The published time is 0 for a packet that was passed over.
+        """
         return [*self._first_times.items(), *self._recent]
 
     def remember(self, recent: Iterable[tuple[int, int]]) -> None:
@@ -122,13 +125,17 @@ class PacketCache:
         self._first_times = {source_ns: first_ns for source_ns, first_ns in recent if source_ns not in self._sources}
 
     def stamp(self, envelope: str, payload: bytes, now_ns: int) -> tuple[Packet, int]:
-        """Stamp and cache a packet of the scheduler itself; return it with its number of kept packets."""
+        """Stamp and cache a packet of the scheduler itself.
+
+        Returns:
+            The packet, and how many packets of its envelope are kept (0: not this packet).
+        """
         out = Packet(envelope, payload, self._next_ns(now_ns))
         message = envelope.partition("_")[0]  # no message of the scheduler has an underscore in its name
         return out, self._keep(out, None, self._envelopes.history(message))
 
     def restore(self, packets: Iterable[LoggedPacket]) -> None:
-        """Restore packets published before a restart, oldest first."""
+        """Restore packets published before a restart, oldest first; skip packets out of this order."""
         newest_ns = next(reversed(self._kept), 0)
         for packet, source_ns, history in packets:
             if packet.time_ns is None or packet.time_ns <= newest_ns:
@@ -149,7 +156,11 @@ class PacketCache:
         self._last_ns = max(self._last_ns, time_ns)
 
     def replay(self, prefixes: Iterable[str], since_ns: int) -> tuple[Packet, ...]:
-        """Return the packets kept under the prefixes and newer than `since_ns`, oldest first over all envelopes."""
+        """Return the cached packets newer than `since_ns`, oldest first over all envelopes.
+
+        Args:
+            prefixes: beginnings of the wanted envelopes.
+        """
         starts = tuple(prefixes)
         return tuple(
             kept.packet

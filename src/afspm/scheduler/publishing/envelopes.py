@@ -188,7 +188,7 @@ class Envelopes:
         return (default_envelope(header) if rule is None else rule.name(header)), history
 
     def history(self, message: str) -> int:
-        """Return how many packets of a message are kept where no rule decides."""
+        """Return how many packets of a message are kept where no rule sets a number."""
         if (own := self._history.get(message)) is not None:
             return own
         try:

@@ -31,7 +31,7 @@ from afspm.scheduler.control.arbitration import ArbitrationState, ControlInput, 
 from afspm.scheduler.control.descriptions import request_text
 
 PERIOD_S = 0.1
-"""Least real time between two publications."""
+"""Real time from the first entry of a batch to its publication."""
 MOST = 1000
 """The largest number of entries gathered within `PERIOD_S`; further requests are only counted."""
 LONGEST = 1000
@@ -39,7 +39,7 @@ LONGEST = 1000
 
 REQUEST, CONTROL, ORDER = "request", "control", "order"
 LATE = "late: the client had got no answer in time"
-"""The reason logged with an answer that came after the client had given up."""
+"""The reason logged with an answer that came after the client had got "no response"."""
 SCHEDULER = "scheduler"
 """The author of requests of the scheduler itself."""
 _UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})  # sent all the time by supervisors and starting processes
@@ -53,9 +53,10 @@ class AnsweredRequest(NamedTuple):
     """A request with its answer, before the log entry is put into words.
 
     Attributes:
+        time_ns: the experiment time of the answer.
         took_s: real time from the request to its answer.
-        late: the answer came after the client had got "no response".
-        sent_ns: the time of forwarding to the translator; None if not forwarded.
+        late: whether the answer came after the client had got "no response".
+        sent_ns: the experiment time of forwarding to the translator; None if not forwarded.
     """
 
     time_ns: int
@@ -106,7 +107,7 @@ class SentStart:
     """The request that starts a measurement, saved before forwarding; its log entry holds the measurement's key.
 
     Attributes:
-        sent_ns: time of its first forwarding.
+        sent_ns: experiment time of its first forwarding.
     """
 
     who: str
@@ -135,7 +136,7 @@ class EventLog:
 
     Attributes:
         due_s: the due time of their publication, in real monotonic time; None without entries.
-        left_out: the number of requests beyond `most`.
+        left_out: the number of requests that were only counted, with `most` entries gathered.
         starts: the last starts of measurements, each saved before forwarding, since a kill loses the gathered entries.
     """
 
@@ -152,7 +153,10 @@ class EventLog:
         return replace(self, due_s=due_s, gathered=(*self.gathered, *entries))
 
     def add_request(self, now_s: float, entry: AnsweredRequest | JournalEntry) -> EventLog:
-        """Add the entry of a request; beyond `most` entries the request is only counted."""
+        """Add the entry of a request; with `most` entries gathered, the request is only counted.
+
+        Clock requests and messages for publication are not logged.
+        """
         if isinstance(entry, AnsweredRequest) and entry.request.kind in _UNWRITTEN:
             return self
         if len(self.gathered) >= self.most:
@@ -160,7 +164,7 @@ class EventLog:
         return self.add(now_s, entry)
 
     def sent_ns(self, who: str, request: Request, now_ns: int) -> int:
-        """Return when a request was first forwarded: now, unless it repeats a start."""
+        """Return the experiment time of a request's first forwarding: now, unless the request repeats a start."""
         known = (one.sent_ns for one in self.starts if (one.who, one.request_id) == (who, request.id) and request.id)
         return next(known, now_ns)
 
@@ -174,7 +178,7 @@ class EventLog:
     def restored(
         self, starts: Sequence[SentStart], published: Iterable[JournalEntry], now_s: float, now_ns: int
     ) -> EventLog:
-        """Restore the starts saved before a restart; add an entry for each start without a published one.
+        """Restore the starts saved before a restart; add an entry for each start without a published entry.
 
         Args:
             published: the entries in the restored cache.

@@ -14,7 +14,13 @@ from afspm.wire.messages import CONTROL_STATE, JOURNAL, NOTE
 
 
 def publish(draft: StateDraft, envelope: str, payload: bytes, time_ns: int | None = None) -> None:
-    """Publish a packet of the scheduler itself. Its time is saved first, so that no later packet gets the same time."""
+    """Publish a packet of the scheduler itself.
+
+    The time of the packet is saved first, so that no later packet gets the same time.
+
+    Args:
+        time_ns: the earliest time of the packet; None: the time of the step.
+    """
     packet, history = draft.env.cache.stamp(envelope, payload, draft.now_ns if time_ns is None else time_ns)
     draft.effects.append(Publish(packet, None, history))
     draft.save()
@@ -33,7 +39,7 @@ def publish_entries(draft: StateDraft) -> None:
 
 
 def publish_for_process(draft: StateDraft, event: RequestIn) -> None:
-    """Publish a message for a process. The answer to a supervisor carries its orders."""
+    """Publish a message for a process, or refuse the message; the answer to a supervisor carries its orders."""
     announced = announcement(event, draft.env.codec)
     if not announced.envelope:
         answers.answer(draft, event, ControlResponse.FAILURE, announced.why)

@@ -1,4 +1,4 @@
-"""Packets of the translator: each gets an envelope, a time and its coordinates, and updates the microscope's state."""
+"""Packets of the translator: each gets an envelope, a time and coordinates; a state updates the microscope's status."""
 
 from __future__ import annotations
 
@@ -30,7 +30,11 @@ _STATE, _TRANSLATOR = wire.MessageKind.STATE, Role.TRANSLATOR
 
 
 def take_packet(draft: StateDraft, event: PacketIn) -> None:
-    """Publish a packet, and update the state of the microscope from it."""
+    """Publish a packet, and update the status of the microscope from a published state.
+
+    A duplicate, a `ControlState` and a packet without a valid envelope are dropped. A state hidden during a move before
+    an action updates the status without publication.
+    """
     message, codec, move = event.header.message, draft.env.codec, draft.pending.move
     # only states are decoded: no decision depends on other messages, and scans are large
     reported = codec.decode_packet(message, event.packet.payload) if _is_state(message) else None

@@ -1,4 +1,4 @@
-"""The answers to requests: each request gets one answer, remembered under its id and written to the event log."""
+"""The answers to requests: sent to the client, remembered under the request's id, and written to the event log."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def reply(draft: StateDraft, event: RequestIn, response: Response) -> None:
 
 
 def refuse_peer(draft: StateDraft, event: RequestIn, why: str, code: int = ControlResponse.FAILURE) -> None:
-    """Refuse a peer that may not use its name; log the refusal once for each connection."""
+    """Refuse a request of a peer that may not use its name; log the refusal once for each connection."""
     draft.pending, was_refused = refused_again(draft.pending, event.connection)
     if not was_refused:
         draft.log("WARNING", f"refused a request of {event.name or 'a nameless peer'}: {why}")
@@ -44,7 +44,8 @@ def refuse_peer(draft: StateDraft, event: RequestIn, why: str, code: int = Contr
 def answer_unsent(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
     """Answer a request that is not sent.
 
-    The outcome of a repeated request stays unknown: it may have been carried out before.
+    The outcome of a repeated request stays unknown: it may have been carried out before. An answer NO_RESPONSE is not
+    remembered, so that the client may repeat the request.
     """
     unknown = ResponseDetail.OUTCOME_UNKNOWN
     if job.is_repeated:
@@ -83,7 +84,12 @@ def answer_job(draft: StateDraft, job: ForwardedRequest, response: Response) -> 
 
 
 def call_back(draft: StateDraft, former: str | None, cause: Cause | None) -> None:
-    """Remove unsent commands of a former holder from the queue (None: of all clients), and answer them."""
+    """Remove unsent commands from the queue, and refuse them with NOT_IN_CONTROL.
+
+    Args:
+        former: the former holder, whose commands are removed; None: the commands of all clients.
+        cause: the reason in the answer; None: the mode was changed.
+    """
     reason = f"control was taken before this was sent: {cause.text if cause else 'the mode was changed'}"
     draft.forwarder, jobs = draft.forwarder.called_back(lambda job: job.command and former in (None, job.client))
     for job in jobs:

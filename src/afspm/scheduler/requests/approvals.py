@@ -41,7 +41,11 @@ def publish_changes(draft: StateDraft) -> None:
 
 
 def facts(draft: StateDraft) -> dict[str, object]:
-    """Return the limits and the coordinate offset that a preflight is valid for; empty without agents."""
+    """Return the digest of the limits and the coordinate offset that a preflight is valid for.
+
+    Returns:
+        `limits`, and `offset_m` as [x, y] in m (None: no offset); empty without agents.
+    """
     if not draft.env.settings.rules.agents:
         return {}
     offset = offset_m(draft)
@@ -49,7 +53,11 @@ def facts(draft: StateDraft) -> dict[str, object]:
 
 
 def offset_m(draft: StateDraft) -> XY | None:
-    """Return the origin of component coordinates in microscope coordinates, in m; None if both are the same."""
+    """Return the origin of component coordinates in microscope coordinates, in m.
+
+    Returns:
+        None if both are the same; NaN while the frame can't map.
+    """
     if not draft.frame.maps(draft.now_ns):
         return None
     _, mapped = draft.frame.outgoing("", _ORIGIN, draft.now_ns)
@@ -69,10 +77,10 @@ def refused(draft: StateDraft, job: ForwardedRequest) -> str:
 
 
 def sending(draft: StateDraft, job: ForwardedRequest) -> None:
-    """Count a command that is about to be sent against its approval."""
+    """Count a command, about to be sent, against its approval."""
     draft.grants = draft.grants.sending(job.client, job.request, draft.now_ns, offset_m(draft))
 
 
 def done(draft: StateDraft, job: ForwardedRequest) -> None:
-    """Store the success of a command."""
+    """Store the place that a successful command has set, and remove a completed plan."""
     draft.grants = draft.grants.done(job.client, job.request)

@@ -56,17 +56,18 @@ class ForwardedRequest(NamedTuple):
 
     Attributes:
         client: the name of the client; empty for a request of the scheduler itself.
-        command: whether only the holder of control may send the request.
+        command: whether the request may change the microscope, and is authorised again before it is sent; True for all
+            requests of the scheduler itself, which need no authorisation.
         deadline_s: the deadline of the answer, real; 0: no deadline yet.
         sent_s: the real time of sending; None while the request waits.
-        answered: whether the client has got "no response in time".
+        answered: whether the client has got "no response", since the answer was overdue.
         connection: the connection over which the request arrived.
         states_seen: the number of states that the microscope had reported at sending.
         mapped: the request in the coordinates of the microscope, if they differ.
         heard_s: the real time of arrival.
-        sent_ns: the experiment time of sending; None if not sent.
+        sent_ns: the experiment time of the first sending; None if not sent.
         is_repeated: whether the request was sent before under its id, with an unknown outcome.
-        purpose: the purpose of a request of the scheduler itself; None: the tip's safety.
+        purpose: the purpose of a request of the scheduler itself; None: the tip's safety, or a client's request.
     """
 
     client: str
@@ -123,6 +124,7 @@ class Forwarder:
         patience_s: the further time to wait for an overdue answer before the next request is sent.
         longest_queue: the largest number of waiting requests.
         up: whether the translator is connected.
+        number: the number of the newest request.
         flight: the request that the translator is serving.
         own: waiting requests of the scheduler itself, in order; they go first.
         queue: waiting requests of clients, in order.
@@ -147,7 +149,7 @@ class Forwarder:
         return replace(forwarder, up=True), settled
 
     def lost(self) -> tuple[Forwarder, Settled]:
-        """Register that the translator is disconnected; settle all requests."""
+        """Register that the translator is disconnected; settle all requests that are not answered."""
         waiting = tuple(_not_sent(job, "the translator is not connected") for job in (*self.own, *self.queue))
         if self.flight is not None and not self.flight.answered:
             why = "the connection to the translator was lost before it answered"
@@ -171,7 +173,11 @@ class Forwarder:
     def ask_own(
         self, request: Request, now_s: float, purpose: OwnPurpose | None = None, mapped: MappedRequest | None = None
     ) -> tuple[Forwarder, ForwardedRequest | None]:
-        """Queue a request of the scheduler before clients' requests; return None if no translator is connected."""
+        """Queue a request of the scheduler before clients' requests, and return the queued request.
+
+        Returns:
+            None in its place if no translator is connected.
+        """
         if not self.up:
             return self, None
         number, deadline_s = self.number + 1, now_s + self.timeout_s
@@ -211,7 +217,7 @@ class Forwarder:
         return replace(self, overdue=rest), SettledRequest(late, ForwardOutcome.LATE, response)
 
     def expired(self, now_s: float) -> tuple[Forwarder, Settled]:
-        """Settle the requests whose deadline has passed."""
+        """Settle the requests whose deadline has passed; free the line after the wait for an overdue answer."""
         settled, flight = list[SettledRequest](), self.flight
         if flight is not None and not flight.answered and now_s >= flight.deadline_s:
             flight = flight._replace(answered=True)
@@ -239,7 +245,7 @@ class Forwarder:
         return replace(self, queue=tuple(job for job in self.queue if job not in called)), called
 
     def deadline_s(self) -> float | None:
-        """Return when `expired` is due, real; None: no request is open."""
+        """Return the real time at which `expired` is due; None: no request waits or is in flight."""
         times = [jobs[0].deadline_s for jobs in (self.own, self.queue) if jobs]
         if self.flight is not None:
             times.append(self._patience_ends_s(self.flight) if self.flight.answered else self.flight.deadline_s)

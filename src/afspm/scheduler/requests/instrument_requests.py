@@ -87,7 +87,7 @@ def _part(reading: InstrumentReading, part: str) -> str | None:
 
 
 def report_in(draft: StateDraft, event: RequestIn) -> InstrumentReadings | None:
-    """Return the instrument report in a request; None without a report about the sender."""
+    """Return the instrument report in a request; None unless the report is about the sender's own parameters."""
     subject = event.request.subject
     if event.request.kind != RELAY_REQUEST or not isinstance(subject, RelayedMessage):
         return None
@@ -102,7 +102,7 @@ def report_in(draft: StateDraft, event: RequestIn) -> InstrumentReadings | None:
 
 
 def take_report(draft: StateDraft, event: RequestIn, report: InstrumentReadings, may_send: MaySend) -> None:
-    """Store a report, settle its orders, and answer with the next order."""
+    """Store a report, settle the orders with an outcome in it, and answer with the next order."""
     name = report.instrument
     draft.instruments = draft.instruments.reported(report, draft.now_s, draft.now_ns)
     for outcome in report.outcomes:
@@ -211,12 +211,12 @@ def expire(draft: StateDraft) -> None:
 
 
 def flag_is_due(state: SchedulerState | StateDraft) -> bool:
-    """Return whether a condition changed so that its problem must be flagged or cleared."""
+    """Return whether the problem of a condition must be flagged or cleared."""
     return _next_flag(state) is not None
 
 
 def flag(draft: StateDraft) -> bool:
-    """Flag or clear the problem of one condition; return whether there was one."""
+    """Flag or clear the problem of one condition; return False if no problem has to change."""
     if (found := _next_flag(draft)) is None:
         return False
     event, problem, why = found

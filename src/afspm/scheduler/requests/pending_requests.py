@@ -23,7 +23,7 @@ class PrePositioner:
     Attributes:
         move: the request that moves the microscope.
         states_seen: number of states reported before the move.
-        settled_at_s: until when (real) to wait for the microscope after the move; None: it has not moved yet.
+        settled_at_s: the real time at which the wait after the move ends; None: the move is not answered yet.
     """
 
     move: ForwardedRequest
@@ -42,7 +42,7 @@ class PrePositioner:
         return replace(self, settled_at_s=min(now_s + SETTLED_WITHIN_S, self.move.deadline_s))
 
     def is_ready(self, microscope: MicroscopeStatus, now_s: float) -> bool:
-        """Return whether the action may be sent: a moving microscope would refuse it."""
+        """Return whether the action may be sent: a moving microscope would refuse the action."""
         if self.settled_at_s is None:
             return False
         is_free = microscope.state is ScopeState.FREE and microscope.states_seen > self.states_seen
@@ -57,7 +57,7 @@ class Turn:
         number: the number of the request in the forwarder's queue.
         awaited: parameters being read; None: reading has not begun.
         values: the read values, by parameter; None where the microscope answered without a value.
-        move: the move before an action; None: there was none.
+        move: the move before an action; None: no move so far.
     """
 
     number: int
@@ -118,9 +118,9 @@ class PendingRequests:
         return [name for name, (_, until_s) in self.unclear.items() if now_s >= until_s]
 
     def due_s(self, *, line_is_free: bool) -> float | None:
-        """Return the real time at which the next wait ends.
+        """Return the real time at which the next wait ends; None: no wait.
 
-        The forwarder has the deadline of a move in flight.
+        `Forwarder.deadline_s` has the deadline of a move in flight.
         """
         dues = [until_s for _, until_s in self.unclear.values()]
         if line_is_free and self.move is not None and self.move.settled_at_s is not None:

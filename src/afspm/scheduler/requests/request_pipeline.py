@@ -6,18 +6,18 @@
 | 2. authorised | at arrival, and again when it is sent | the arbitration table |
 | 3. queued | at arrival | the forwarder: one line to the translator, in order |
 | 4. within limits | when its turn comes, right before it is sent | limits, coordinate frame, the microscope itself |
-| 5. settled | at the answer, or when it is overdue | |
+| 5. settled | at the answer, or when the answer is overdue | the translator, or a timeout |
 
-No request is executed twice, and every request gets an answer.
+No request is executed twice, and every request gets an answer if its client stays connected.
 
 **Why limits are decided at the fourth stage.** Limits compare a request with values in force, and earlier requests in
-the queue change these. So a request is decided when its turn comes: no other command is on its way, all earlier ones
-have settled, and the scheduler first reads the values from the microscope. A request of unknown outcome needs no
-special case: the values that it may have changed are read before the next request that depends on them; if a value
-can't be read, that request is refused. An overdue request may still be carried out. Since the translator serves one
-request after the other, a value that it answers later is newer. A turn takes up to three steps: values are read, the
-microscope is moved to the mapped place, values are read again. Meanwhile requests that only read pass, and the
-scheduler's own (`safety_commands`) always go first.
+the queue change these. So a command is decided when its turn comes: no other command is on its way, all earlier
+commands have settled, and the scheduler first reads the values from the microscope. A command of unknown outcome needs
+no special case: the values that it may have changed are read before the next command that depends on them; if a value
+can't be read, that command is refused. An overdue command may still be carried out. Since the translator serves one
+request after the other, a value in a later answer is newer. A turn takes up to three steps: values are read, the
+microscope is moved to the mapped place, values are read again. Meanwhile read-only requests pass, and the scheduler's
+own requests (`safety_commands`) always go first.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ _CONTROL_EVENTS = {
     int(ControlRequest.SET_CONTROL_MODE): ArbitrationEvent.SET_MODE,
     int(ControlRequest.END_EXPERIMENT): ArbitrationEvent.END,
 }
-"""The requests that may change control, by their numbers. All others are for the microscope."""
+"""The requests about control, problems, mode and end, by number, each with its event in the arbitration table."""
 
 
 def handle(draft: StateDraft, event: RequestIn) -> None:
@@ -219,6 +219,7 @@ def _renew_lease(draft: StateDraft, event: RequestIn) -> None:
 
 
 def _answer_clock_request(draft: StateDraft, event: RequestIn) -> None:
+    # not in the event log: supervisors and starting processes send this request all the time
     run = draft.env.settings.run
     common = {
         "run": run.name,
@@ -243,7 +244,10 @@ def _reason_to_stay(draft: StateDraft) -> str:
 
 
 def enqueue(draft: StateDraft, event: RequestIn) -> None:
-    """Queue a request, or refuse it if nothing can be sent now."""
+    """Queue a request for the translator or an instrument, or refuse a request that can't be sent now.
+
+    A read of an instrument's parameter is answered at once.
+    """
     name, request, is_command = event.name, event.request, not reads(event.request)
     if is_command and (why := _refusal_for_tip(draft)) is not None:
         answers.answer(draft, event, ControlResponse.NOT_FREE, why)
@@ -264,7 +268,7 @@ def enqueue(draft: StateDraft, event: RequestIn) -> None:
 
 
 def send_next(draft: StateDraft) -> None:
-    """Decide and send waiting requests in their order, until one is in flight."""
+    """Decide and send waiting requests in their order, until a request is in flight."""
     turn = draft.pending.turn
     if turn is not None and draft.forwarder.waiting(turn.number) is None:
         draft.pending = replace(draft.pending, turn=None)  # it was called back, or its deadline has passed

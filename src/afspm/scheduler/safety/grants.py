@@ -2,7 +2,7 @@
 
 An agent is a component whose commands need the approval of a person (`Rules.agents`). An approval is either of one
 plan, whose requests the agent sends in order and exactly as approved, or a grant: a region, ranges and counts within
-which the agent measures by itself. Both are one more set of limits for that name, beside [limits] and [limits.roles].
+which the agent measures by itself. Both are one more set of limits for the agent, beside [limits] and [limits.roles].
 
     comes in      approvals, and ends of approvals; requests of agents, at arrival and right before they are sent
     state         `GrantBook`: approvals in force, and the uses of the last hour; saved before a request is sent
@@ -55,7 +55,7 @@ STALE_S = 3600.0
 """Experiment time after which a preflight is too old to be approved."""
 _HOUR_NS = 3600 * 10**9
 _PROBE_M = 5e-9
-"""Side of the square, in m, within which a probe counts as where it was set: controllers round."""
+"""Side of the square, in m, within which a probe counts as at its set position: controllers round."""
 _STOPS = frozenset({names.STOP_SCAN, names.STOP_SPEC})
 """Actions that stop a measurement, and need no approval."""
 _PLACES = frozenset((*REGION_CHANGES, *SHAPE_CHANGES, *PROBE_CHANGES))
@@ -78,11 +78,13 @@ _ALWAYS = frozenset({int(ControlRequest.ACTION_SUPPORT), int(ControlRequest.RELE
 
 @dataclass(frozen=True)
 class SpentRequest:
-    """A request that was sent under an approval.
+    """A request that was sent under an approval or under the limits of a role.
 
     Attributes:
-        plan: the approved plan; empty: a grant, or none was needed.
-        action: the action that it counts as; empty: none.
+        request: the kind of the request.
+        at_ns: the experiment time of sending.
+        plan: the approved plan that the request is part of; empty: no plan.
+        action: the action that the request starts; empty: the request is no action.
     """
 
     request_id: str
@@ -95,10 +97,11 @@ class SpentRequest:
 
 @dataclass(frozen=True)
 class HeldGrant:
-    """An approval in force.
+    """An approval that a person has given, with its uses so far.
 
     Attributes:
         by: the person who approved.
+        given_ns: the experiment time of the approval.
         step: the number of requests of a plan that were sent.
         used: the uses of a grant, by action.
     """
@@ -180,7 +183,7 @@ class GrantBook:
 
 
 def limits_digest(limits: ExperimentLimits) -> str:
-    """Return a short hash of all limits."""
+    """Return a hash of all limits, as 16 hexadecimal digits."""
     plain = json.dumps(to_plain(limits, lists=True), sort_keys=True)
     return hashlib.sha256(plain.encode()).hexdigest()[:16]
 
@@ -224,6 +227,9 @@ class GrantChecker:
         self, before: ArbitrationState, after: ArbitrationState, by_hand: frozenset[int], now_ns: int
     ) -> GrantChecker:
         """End the approvals that a change of control makes stale.
+
+        A flagged problem or a changed mode ends all plans. A changed mode, `stopped-by-agent` or a problem in `by_hand`
+        also ends all grants. A begun plan ends when its agent loses control.
 
         Args:
             by_hand: the problems that a person solves.
@@ -303,6 +309,7 @@ class GrantChecker:
         """Return the reason why a command may not be sent now; empty if it may.
 
         Args:
+            offset_m: the origin of component coordinates in microscope coordinates; None: both are the same.
             position: the position of the tip, in the microscope's coordinates.
         """
         if why := self._refused_by_role(who, request, now_ns, offset_m, position):
@@ -327,7 +334,7 @@ class GrantChecker:
         return f"{refused}; {why_not}" if refused and plan is not None else refused
 
     def sending(self, who: str, request: Request, now_ns: int, offset_m: XY | None) -> GrantChecker:
-        """Count a checked request, about to be sent, against its approval."""
+        """Count a checked request, about to be sent, against its approval or the limits of its role."""
         is_agent = self.rules.is_agent(who)
         if not is_agent and self._role(who) is None:
             return self
@@ -362,7 +369,7 @@ class GrantChecker:
         return replace(self, book=replace(book, spent={**book.spent, who: rest}))
 
     def done(self, who: str, request: Request) -> GrantChecker:
-        """Update the book after a success: the place that the agent has set, and a completed plan."""
+        """Store the place that an agent has set, and remove a completed plan, after a success."""
         book = self.book
         if request.kind in (_SET_REGION, _SET_PROBE) and self.rules.is_agent(who):
             book = replace(book, placed=book.placed.after(who, request))

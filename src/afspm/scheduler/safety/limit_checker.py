@@ -3,9 +3,9 @@
 Nothing is clamped. A refusal by a range, a step or a rate names the parameter, the value, the limit and its place in
 the experiment file.
 
-A check is valid only at the moment when it is made: steps, rates and places are measured from the values in force. So a
-request is checked right before it is sent, after all earlier ones have settled. `depends_on` names the values to read
-from the microscope for that check.
+A check is valid only at its own moment: steps, rates and places are measured from the values in force. So a request is
+checked right before it is sent, after all earlier commands have settled. `depends_on` names the values to read from the
+microscope for that check.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _PLACES = ((frozenset(REGION_CHANGES), frozenset({names.START_SCAN})), (frozense
 
 
 class _Breach(Exception):
-    """The error that a limit is broken. It does not leave this module."""
+    """The error that a limit is broken; raised and caught in this module alone."""
 
     def __init__(self, code: ControlResponse, reason: str) -> None:
         super().__init__(reason)
@@ -163,7 +163,7 @@ class LimitChecker:
     def sending(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> LimitChecker:
         """Count the uses of a checked request that is about to be sent.
 
-        The time of a change is unknown until the request has settled, so a limited rate is not measured from it.
+        The time of a change is unknown until the request has settled, so values with a limited rate are set aside.
         """
         usage = self.state.usage
         for name in self._counted_uses(request, used):

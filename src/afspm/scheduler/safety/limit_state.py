@@ -29,7 +29,7 @@ class KnownValue:
 
 @dataclass(frozen=True)
 class LastUse:
-    """A use of a parameter or action, with the id of the request; empty: the request had none."""
+    """A use of a parameter or action by one request; `request_id` is empty for a request without an id."""
 
     at_ns: int
     who: str
@@ -45,7 +45,8 @@ class Usage:
     """Values and latest uses of parameters and actions, by name. Kept over a restart, so that no interval is shortened.
 
     Attributes:
-        sent: uses of unknown outcome, which count.
+        done: the last successful uses.
+        sent: uses in progress or of unknown outcome, which count, too.
         before: the values that a rate is measured from, set aside during a request that has not settled.
     """
 
@@ -55,10 +56,11 @@ class Usage:
     sent: Mapping[str, LastUse] = field(default_factory=dict)
 
     def learn(self, name: str, value: float, now_ns: int, *, was_read: bool = False) -> Usage:
-        """Store a value in force.
+        """Store a value in force; an equal value keeps its earlier time.
 
         Args:
-            was_read: whether the value was read, and may have been in force for long.
+            was_read: whether the value was read, and may have been in force for long. Then the time and the origin of
+                a known value are kept.
         """
         known = self.known.get(name)
         if known is not None and known.value == value:
@@ -85,7 +87,7 @@ class Usage:
         return replace(self, known={**self.known, name: self.before[name]}, before=_without(self.before, name))
 
     def last_ns(self, name: str, repeated: tuple[str, str] | None = None) -> int | None:
-        """Return the time of the last use.
+        """Return the experiment time of the last use; None without a use.
 
         Args:
             repeated: client and id of a repeated request, whose own use does not count.

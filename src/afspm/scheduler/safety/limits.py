@@ -28,9 +28,9 @@ class Limit:
         step: the largest change in one request.
         rate_per_s: the largest change per experiment time since the parameter last changed, such as `"1 V/s"`.
         interval_s: the least experiment time between two requests.
-        only: the components that may set it.
-        unit: of the values above (the rate: per second); SI for the base parameters.
-        source: where it was set, e.g. "experiment.toml:42".
+        only: the components that may set the parameter or start the action.
+        unit: of the values above (the rate: per second); None: SI for the base parameters.
+        source: the place in the experiment file, e.g. "experiment.toml:42".
     """
 
     low: float | None = None

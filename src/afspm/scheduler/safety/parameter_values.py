@@ -15,14 +15,17 @@ from afspm.scheduler.safety.limits import Limit
 
 
 class ParameterValue(NamedTuple):
-    """A parameter with its number, in SI units or in the unit of its limit; None for a text or a switch."""
+    """A parameter with its number; None for a text or a switch.
+
+    The number is in the unit of the parameter's limit; without such a unit in SI for a base parameter, else as given.
+    """
 
     name: str
     number: float | None
 
 
 class ParameterValueError(Exception):
-    """An error: a value that its parameter can't have. It does not leave this package."""
+    """The error that a parameter can't have the given value; it does not leave this package."""
 
 
 def values_of(subject: object, limits: Mapping[str, Limit]) -> list[ParameterValue]:

@@ -11,7 +11,7 @@ _ID = "scheduler/does-it-retract"
 
 
 def begin(draft: StateDraft) -> None:
-    """Ask a new translator whether it can retract the tip."""
+    """Check whether a new translator supports the retract, then send the due actions of the watchdog."""
     action = draft.watchdog.question
     # any answer also shows that a retract sent before a restart is done or lost (decision 0088)
     request = Request(int(ControlRequest.ACTION_SUPPORT), action, id=_ID)
@@ -34,7 +34,7 @@ def send(draft: StateDraft) -> None:
 
 
 def settle(draft: StateDraft, job: ForwardedRequest, end: ForwardOutcome, response: Response) -> None:
-    """Process the end of a safety command."""
+    """Process the answer to a safety command, or its failure."""
     subject, now_s = str(job.request.subject), draft.now_s
     if end is ForwardOutcome.LATE:
         if response.ok and job.request.kind == ControlRequest.ACTION:

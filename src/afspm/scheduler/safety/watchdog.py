@@ -26,7 +26,7 @@ class TipDuty(Enum):
     OWED = "owed"
     """A retract is due."""
     ASKED = "asked"
-    """The microscope is asked to retract the tip."""
+    """The retract was sent, and is not answered."""
     PUT_OFF = "put-off"
     """The tip was not retracted; the retract is tried again later."""
 
@@ -39,16 +39,16 @@ class TipEvent(Enum):
     SEEN_TO = "seen-to"
     """A person or a solver attends to the tip, or the tip is out of danger."""
     SENT = "sent"
-    """The microscope is asked to retract the tip."""
+    """The retract is sent to the microscope."""
     NOT_YET = "not-yet"
-    """The microscope could not be asked, was not free, or did not answer."""
+    """The retract could not be sent, or the microscope was not free or did not answer."""
     RETRACTED = "retracted"
     RETRACTED_LATE = "retracted-late"
     """The microscope has retracted the tip after the deadline."""
     IMPOSSIBLE = "impossible"
     """The microscope has no action to retract the tip."""
     FAILED = "failed"
-    """The microscope refuses, or does not end the retract in time."""
+    """The microscope refuses, is never free, can't be reached, or does not end the retract in time."""
     DUE = "due"
     """A postponed retract is due again."""
     LEFT = "left"
@@ -109,8 +109,9 @@ class RetractState:
     """The part of the watchdog that survives a restart.
 
     Attributes:
-        calls_people: whether a person must still be called: the tip was retracted, or could not be.
-        stops: actions to send before the tip is retracted.
+        calls_people: whether a person must still be called: the tip was retracted, could not be retracted, or was in
+            danger when the run was stopped.
+        stops: the stop actions still to be sent; a retract follows them.
         for_feedback: whether the tip is in danger because the feedback is off.
         may_come: whether a retract sent before a kill of the scheduler may still be in the translator's queue; its
             answer goes to the killed process.
@@ -132,13 +133,16 @@ class Watchdog:
     `put_off`, a person or a solver of device-malfunction may. The duty towards the tip follows from a table.
 
     Attributes:
-        starting: the action that stops the measurement just started.
+        starting: the action that stops a measurement just started; None once a newer state is known.
         sent: the action that was sent and is not answered.
+        attempts: the number of failed attempts at the present action.
         can_retract: whether the microscope has the action to retract, as far as known.
         refused_at: number of states seen at the last answer NOT_FREE.
         told_to_stop: whether a stop was sent for the running measurement.
         unstoppable: whether the running measurement failed to stop.
         due_s: the real time at which `look_again` is due.
+        retries: the number of failed retracts in a row; each doubles the wait.
+        in_haste: whether the experiment ends, so that all waits are short.
     """
 
     settings: WatchdogSettings = field(default_factory=WatchdogSettings)
@@ -172,7 +176,10 @@ class Watchdog:
         return dog if dog.owes_retract else dog._after(TipEvent.RETRACTED_LATE)
 
     def begun(self, now_s: float) -> Watchdog:
-        """Start the wait after a restart: missed packets come first, and the translator may not be connected yet."""
+        """Start the wait for an owed retract after a restart.
+
+        Missed packets come first, and the translator may not be connected yet.
+        """
         return replace(self, due_s=now_s + self.settings.again_s) if self.owes_retract else self
 
     @property
@@ -248,7 +255,7 @@ class Watchdog:
         by_holder: bool = False,
         was_seen_to: bool = False,
     ) -> Watchdog:
-        """Process the loss of control for `cause` while the action `in_flight` was with the translator.
+        """Process the loss of control for `cause` while the translator executed the action `in_flight` (None: none).
 
         Args:
             had_died: whether the process that got control has died; its restarted successor gives control back.
@@ -286,7 +293,7 @@ class Watchdog:
         return self._after(TipEvent.SEEN_TO)
 
     def hurry(self, now_s: float) -> Watchdog:
-        """Shorten all waits: the experiment ends."""
+        """Shorten all waits to a second: the experiment ends."""
         due_s = None if self.due_s is None else min(self.due_s, now_s + _SOON_S)
         return replace(self, in_haste=True, due_s=due_s)
 
@@ -338,12 +345,12 @@ class Watchdog:
         return self._after(TipEvent.RETRACTED_LATE) if action == self.settings.retract else self
 
     def unsent(self, now_s: float) -> Watchdog:
-        """Undo `next_action`: the translator is not connected. The action is sent once it is."""
+        """Undo `next_action`: the translator is not connected. The action is sent after the next connection."""
         dog = replace(self, sent=None, attempts=0, refused_at=-1, told_to_stop=False)._after(TipEvent.NOT_YET)
         return replace(dog, due_s=now_s + dog._wait_s) if dog.owes_retract and dog.due_s is None else dog
 
     def translator_is_there(self, now_s: float) -> Watchdog:
-        """Schedule a retract that was put off, soon after a translator connects and sends its first packets."""
+        """Schedule a postponed retract for a second later: a new translator sends its first packets before."""
         return replace(self, due_s=now_s + _SOON_S) if self.put_off else self
 
     # --- expired waits ---
@@ -383,6 +390,7 @@ class Watchdog:
         wait_s = min(self._wait_s * 2**self.retries, self.settings.longest_s)
         due_s = now_s + (_SOON_S if self.in_haste else wait_s)
         dog = self._after(TipEvent.FAILED)
+        # bounded, so that 2**retries stays a usable number in a long run
         return replace(dog, due_s=due_s, retries=min(self.retries + 1, 32), attempts=0)
 
     def _with_stops(self, stops: tuple[str, ...]) -> Watchdog:
