@@ -32,12 +32,13 @@ def bad_scans(
     """Return the times of the bad scans.
 
     A scan is bad if it was interrupted, or if the last verdict on it is bad. In a run without verdicts, the newest scan
-    is bad when a problem is flagged.
+    before the flag of a problem is bad; thermal-drift and device-malfunction do not count.
 
     Args:
         times_ns: ends of scans, or their interruptions.
         verdicts: time of the scan and score, in the order of arrival.
         flagged_ns: the times at which each problem was flagged, by its number.
+        interrupted_ns: the times of the interruptions.
     """
     judged: dict[int, float] = {}
     for of_ns, score in verdicts:

@@ -44,13 +44,14 @@ class RunSummary:
     """The summary of one run.
 
     Attributes:
-        folder: relative to the folder of all runs, with "/".
+        folder: path of the run, relative to the folder of all runs, with "/".
         name: the name of the experiment.
-        began_ns, ended_ns: start and end (or last publication) in experiment time; None if nothing was published.
+        began_ns: the first time that a component was in control, in experiment time; None if there was none.
+        ended_ns: the end, or else the last publication, in experiment time; None if nothing was published.
         state: running, ended or cut off, in words.
         metadata: sample, person, project, technique … where known.
-        scans: the number of complete scans; spectra: their number.
-        problems: the names of all flagged problems.
+        scans, spectra: the numbers of complete scans, and of spectra.
+        problems: the names of all flagged problems, except routine flags.
         notes: the texts of all notes.
         scanned_m: the path of the probe in scans, trace and retrace, in metres.
         treatments: the number of executions of each action that is not a measurement, by name.
@@ -101,9 +102,9 @@ def find_runs(
     """Return the runs under a folder whose texts contain all words, the newest first.
 
     Args:
-        root: the folder to search with all its subfolders; it gets the index `runs.sqlite` if it is writable.
-        words: each in any field, or as "sample:gold" in that field; case is ignored.
-        since, until: the first and last day (UTC) with publications.
+        root: the folder to search with all its subfolders; the index `runs.sqlite` is written there if possible.
+        words: each is searched in all fields, or as "sample:gold" in one field; case is ignored.
+        since, until: first and last day (UTC); only runs that overlap these days are returned. None: no bound.
 
     Raises:
         FileError: there is no such folder.
@@ -133,7 +134,7 @@ def _has(texts: Mapping[str, str], words: Sequence[tuple[str, str]]) -> bool:
 
 
 def _was_within(run: RunSummary, since: date | None, until: date | None) -> bool:
-    # a run without publications has no days
+    # a run without known start or end overlaps no days
     if run.began_ns is None or run.ended_ns is None:
         return since is None and until is None
     starts_ns = None if since is None else _midnight_ns(since)
@@ -282,13 +283,13 @@ class ProbeHistory:
 
     Attributes:
         name: the name in [metadata] `probe`; `UNNAMED` for all runs without a name, perhaps several probes.
-        runs: their folders, oldest first.
-        first_ns, last_ns: begin of the first and end of the last run, in experiment time; None: not known.
-        scans, spectra: numbers of complete scans and spectra.
+        runs: the folders of the runs, oldest first.
+        first_ns, last_ns: start of the first and end of the last run, in experiment time; None: not known.
+        scans, spectra: numbers of complete scans and of spectra.
         scanned_m: the path along scan lines, trace and retrace, in metres.
         treatments: the number of executions of each treatment, by the name of its action.
         flagged: the number of runs in which a problem was flagged.
-        judged, good: the number of scans with a verdict on the tip, and of scans with a good verdict.
+        judged, good: the number of scans with a verdict on the tip, and of scans with a good last verdict.
         simulated: whether all runs were simulated.
     """
 

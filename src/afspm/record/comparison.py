@@ -29,7 +29,7 @@ Aligner = Callable[[Array, Region, Array, Region], tuple[Array, str]]
 """A function that moves the levelled values of a second scan onto the first, and describes the alignment."""
 
 _ALIKE = 0.01  # of a size; regions that differ less are the same
-_CENTRES = 0.05  # of the width: drift between two nights moves no region out of the scanner's frame of reference
+_CENTRES = 0.05  # of the longer side: drift between two nights moves no region out of the scanner's frame of reference
 _ANGLE_RAD = 0.01
 ABSENT: Final = "–"
 
@@ -62,8 +62,8 @@ class ScanDifference:
     """A later scan minus the first of the same region.
 
     Attributes:
-        aligned, values: [y, x] the later scan moved onto the first, and the difference; None if they can't be
-            subtracted.
+        aligned: the later scan moved onto the first, [y, x]; None if there is no difference.
+        values: the difference minus its median, [y, x]; None if the scans can't be subtracted.
         words: the alignment, or the reason why there is no difference.
     """
 
@@ -92,10 +92,11 @@ class RunComparison:
 
     Attributes:
         names: the names of the runs' folders.
+        simulated: whether the microscope of each run was simulated.
         facts: a text for each run, by heading.
         settings: keys of the experiment file whose values differ, with a text for each run.
         unread: reasons why settings or scans are missing.
-        left_out: the number of common regions that are not shown.
+        left_out: the number of common regions beyond the limit of `compare`.
     """
 
     names: Sequence[str]
@@ -108,7 +109,9 @@ class RunComparison:
 
 
 def compare(runs: Sequence[Run], align: Aligner, most_regions: int = 24) -> RunComparison:
-    """Compare runs; each scan is compared with the first run's scan of the same region.
+    """Compare runs and their last complete scans of the same regions.
+
+    The reference of a region is the scan in the first run with a readable scan there.
 
     Raises:
         InvalidValue: fewer than two runs, or one run given twice.

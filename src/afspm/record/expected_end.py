@@ -14,7 +14,7 @@ Plans = Mapping[str, PlannedWork | None]
 
 
 def plans_of(facts: PlainMapping) -> dict[str, PlannedWork | None]:
-    """Return the plans that run.json keeps, by component; None: no estimate."""
+    """Return the plans in run.json, by component; None: a plan without estimate."""
     return {name: data and PlannedWork.from_dict(data) for name, data in (facts.get(PLANNED) or {}).items()}
 
 

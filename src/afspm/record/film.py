@@ -1,9 +1,10 @@
 """Scans of one place as a film aligned on the sample: `run.film()`, and `afspm export --to gif` or `mp4`.
 
-Theory of operation. Scans with one channel in common whose regions overlap by half or more, after the recorded drift is
-subtracted, are scans of one place. The first of them is the window of the film. Each scan is levelled as small pictures
-are, and sampled at the window's pixels in sample coordinates; pixels outside a scan stay NaN. All frames have one
-contrast, the widest robust range of any.
+Theory of operation. Scans of one place have the same size (within 5 %) and angle (within 1°). After subtraction of the
+recorded drift, their centres differ along each axis by at most half the size. `places` groups only scans with equal
+channels. The region of the first scan is the window of the film. Each scan is levelled as thumbnails are, and sampled
+at the window's pixels in sample coordinates; pixels outside a scan are NaN. All frames share one range of values, which
+contains the robust range of each frame.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ FORMATS: Final = (".gif", ".mp4")
 WIDTH_PX: Final = 480
 FRAMES_PER_S: Final = 8.0
 _MOST_OFFSET: Final = 0.5
-"""Largest offset of scans of one place, as a share of their width."""
+"""Largest offset of scans of one place, along each axis, as a share of the scan's size along that axis."""
 _SIZE_TOLERANCE: Final = 0.05
 _TURN_TOLERANCE_RAD: Final = math.radians(1.0)
 _FONT_PX: Final = 15
@@ -69,9 +70,9 @@ class Film:
         frames: levelled values, shape (scans, rows, columns), [y, x] ascending; NaN where a scan does not reach.
         channel, unit: channel and unit of the values.
         numbers, times_ns: number and end of each scan.
-        window: the region of each frame, which is the region of the first scan.
-        drift_m: displacement of the sample since the first scan that was subtracted, shape (scans, 2), in m; zeros
-            where none was recorded.
+        window: the region of each frame: the region of the first scan, after subtraction of its recorded drift.
+        drift_m: the subtracted displacement of the sample since the first scan, (x, y) in m, shape (scans, 2);
+            zeros without recorded drift.
         aligned_by: "sample coordinates", "recorded drift", or "" if the scans are as they were measured.
         name: the name of the experiment; simulated: whether the microscope was simulated.
     """
@@ -112,7 +113,7 @@ class Film:
         """Write a film as .gif, or as .mp4 (needs the extra `film`).
 
         Raises:
-            InvalidValue: another ending, or no rate of frames.
+            InvalidValue: another ending, or `frames_per_s` not above 0 and at most 60.
             FileError: the film can't be written, or the extra is missing.
         """
         path = Path(path)
@@ -157,7 +158,7 @@ def film_of(
     """Return the film of scans of one place.
 
     Args:
-        rows: the scans, in the order of the film; interrupted scans show the lines taken.
+        rows: the scans, in the order of the film; of interrupted scans, the measured lines are shown.
         channel: the shown channel; None: the first channel of the first scan.
         drift: the result of `recorded_drift`; None: read from the run.
 
@@ -211,8 +212,9 @@ def places(rows: Sequence[ScanRow], drift: Mapping[int, XY]) -> list[list[ScanRo
 
 
 def recorded_drift(run: RecordedScans) -> Mapping[int, XY]:
-    """Return the displacement of the sample at each registered or predicted scan, by its time, in tip coordinates.
+    """Return the displacement of the sample (x, y) in m, in tip coordinates, by the time of the scan.
 
+    Scans at which the position of the sample was lost are left out.
     Empty if the regions are in sample coordinates, or if no drift was recorded.
     """
     if run.frame is Frame.SAMPLE:

@@ -1,4 +1,4 @@
-"""journal.sqlite: its tables, and functions that open it. One process writes; any number read at the same time."""
+"""journal.sqlite: its tables, and functions that open it. One process writes; any number of processes read."""
 
 from __future__ import annotations
 
@@ -153,7 +153,10 @@ def check_format(connection: sqlite3.Connection, path: Path) -> None:
 
 
 class _OfCopy(sqlite3.Connection):
-    """A connection to a copy, which is removed when it is closed, collected, or (except on Windows) at exit."""
+    """A connection to a copy of the journal.
+
+    The copy is removed when the connection is closed or collected, or at exit (except on Windows).
+    """
 
     remove: Callable[[], object] = staticmethod(lambda: None)
 

@@ -43,7 +43,7 @@ _HAS_STARTS = "SELECT 1 FROM sqlite_master WHERE name = 'starts'"
 
 
 class KeyedTable(Table[R]):
-    """Rows of measurements; `table["tile-1"]` is the row of that key."""
+    """Rows of measurements; `table["tile-1"]` is the last row with that key, or raises NoSuchItem."""
 
     @overload
     def __getitem__(self, index: int | str) -> R: ...
@@ -112,12 +112,13 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
             quantity: the name of a variable, read at one value of the sweep; or a function of one spectrum that
                 returns a number.
             at: the value of the sweep, in its unit.
-            unit: of the function's result.
+            unit: the unit of the function's result.
             direction: "forward" or "backward" along the sweep.
-            name: of the channel; by default the variable's or function's.
+            name: the channel of the map; by default derived from the variable or the function.
 
         Raises:
-            InvalidValue: these spectra do not form a grid of at least two by two, or there is no such quantity.
+            InvalidValue: these spectra do not form a grid of at least two by two, the quantity was not measured, or
+                `at` is missing or outside the sweep.
             FileError: a file is missing or damaged.
         """
         from afspm.record.spectrum_stack import map_of

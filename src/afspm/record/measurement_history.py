@@ -155,7 +155,7 @@ class MeasurementHistory:
         return self.running.progress(now_ns, round(median(took_ns)) if took_ns else None)
 
     def end_scan(self, time_ns: int, *, interrupted: bool) -> None:
-        """End the running scan. The lines received of an interrupted scan become its summaries."""
+        """End the running scan. If it was interrupted, add a summary for each channel with received lines."""
         running = self.running
         if running is None:
             return

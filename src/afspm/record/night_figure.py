@@ -54,11 +54,11 @@ def prepare() -> None:
 def draw(
     record: NightRecord, path: Path, problems: Mapping[int, str], *, title: str = "", simulated: bool = False
 ) -> None:
-    """Write the picture.
+    """Write the figure as an image file.
 
     Args:
-        problems: number -> name.
-        simulated: printed on the picture, so that it can't pass as a measurement.
+        problems: the names of problems, by number.
+        simulated: mark the figure as SIMULATED, so that it can't pass as a measurement.
     """
     shots = _chosen(record)
     repairs = _episodes(record)[:MOST_LOOKS]
@@ -232,7 +232,7 @@ def _lane(ax: Axes, lane: int, spans: Sequence[Span], limits: tuple[int, int], *
 
 
 def flagged_by(record: NightRecord, span: Span) -> str:
-    """Return the component whose verdict on a scan caused a flag; empty if there is none."""
+    """Return the component with the bad verdict nearest to the start of a flag, within 2 min; empty without one."""
     near = [m for m in record.marks if m.score == BAD and abs(m.time_ns - span.start_ns) < AROUND_NS / 4]
     return min(near, key=lambda m: abs(m.time_ns - span.start_ns)).by if near else ""
 

@@ -61,7 +61,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class NightMark:
-    """An action of a component, or its verdict on the scan of `of_ns`."""
+    """An action of a component, or its verdict on the scan that ended at `of_ns`."""
 
     time_ns: int
     by: str
@@ -101,7 +101,11 @@ class NightRecord:
         return record
 
     def add(self, entry: Plain) -> bool:
-        """Add an entry; return False for a known entry (packets are replayed after a restart)."""
+        """Add an entry; return False for a known entry (packets are replayed after a restart).
+
+        Raises:
+            ValueError, KeyError, TypeError: the entry is malformed or of an unknown kind.
+        """
         kind, time_ns = entry["kind"], int(entry["time_ns"])
         identity = f"{kind} {time_ns} {entry.get('by', '')}"
         if identity in self._known:
@@ -128,7 +132,7 @@ class NightRecord:
 
     @property
     def start_ns(self) -> int:
-        """The time of the first scan or the first control state."""
+        """The start of the first scan or of the first control by a component; `end_ns` without both."""
         times = [shot.start_ns or shot.time_ns for shot in self.shots] + [t for t, s in self.control if s.holder]
         return min(times, default=self.end_ns)
 

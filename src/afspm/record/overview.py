@@ -62,7 +62,8 @@ class ReadingCurve:
     """Values over time; NaN where the value was unknown.
 
     Attributes:
-        step_ns: the least time between two points; a nearer point replaces the last. It grows with the run.
+        step_ns: the least time between points; a nearer point replaces the last, unless a gap begins or ends. The
+            step grows with the length of the curve.
     """
 
     unit: str = ""
@@ -158,15 +159,17 @@ class ProcessHistory:
 class Overview:
     """The present state and the history of an experiment, reduced from packets. Pure: no clock, socket or file.
 
-    A packet older than the newest of its envelope is ignored, so replayed packets may be given as they arrive.
+    A packet not newer than the newest packet of its envelope is ignored, so replayed packets do no harm.
 
     Args:
-        problems: the names of problems, for the search in the journal for the component that flagged one.
+        problems: the names of problems, for the labels of their spans.
+        most_entries: the bound of notes, journal entries, refusals and restarts.
 
     Attributes:
         newest_ns: the time of the newest packet; 0 before the first.
         status, control: the newest state of the microscope and of control; None before the first.
-        processes, progress_reports: the newest of each, by name.
+        processes, progress_reports: the newest state and progress of each process, by name.
+        instruments: the curve of each instrument parameter, by its name.
         proposals: the proposals of agents by id, newest last, bounded.
         approvals: the approvals in force.
         log, notes, entries, refusals: newest last, bounded.
@@ -221,7 +224,8 @@ class Overview:
     def is_routine(self, span: Span | None) -> bool:
         """Return whether a problem is flagged in the normal course of a run.
 
-        That is thermal-drift until the first scan of a run with drift correction was taken in both directions.
+        Routine is a thermal-drift flag within a second of the request for a scan in the opposite direction: with drift
+        correction, the first scan is taken in both directions.
         """
         if span is None or span.label != self.problems.name(Problem.THERMAL_DRIFT):
             return False
@@ -252,7 +256,7 @@ class Overview:
 
     @property
     def ended_ns(self) -> int | None:
-        """The end of the experiment; None if it continues, was stopped, or was cut off."""
+        """The end of the experiment; None if the experiment continues, was stopped, or was cut off."""
         entries = reversed(self.entries)
         return next((one.time_ns for one in entries if one.event is ControlEvent.EXPERIMENT_ENDED), None)
 
@@ -264,7 +268,7 @@ class Overview:
 
     @property
     def control_since_ns(self) -> int | None:
-        """The time of the last change of control; in MANUAL, of the mode. None if it is unknown."""
+        """The time of the last change of the holder, in MANUAL of the mode; None if unknown."""
         is_manual = self.control is not None and self.control.mode is ControlMode.MANUAL
         return self.timelines.mode.changed_ns if is_manual else self.timelines.control.changed_ns
 
@@ -273,9 +277,10 @@ class Overview:
         return self._measured.scan_progress(now_ns)
 
     def silent_ns(self, name: str, speed: float) -> int | None:
-        """Return the time since the last report on a process; None while reports arrive.
+        """Return the experiment time in ns since the last report on a process; None while reports arrive.
 
-        If other packets arrive meanwhile, the computer of the process is unreachable.
+        Reports are missing after 6 s of real time. The time ends at the newest packet, so a silent process is on an
+        unreachable computer: other packets have arrived since.
 
         Args:
             speed: experiment seconds in a real second.
@@ -287,7 +292,7 @@ class Overview:
         """Process a published packet. Unknown messages are ignored.
 
         Args:
-            message: its name, e.g. "Scan2d".
+            message: the name of the message, e.g. "Scan2d".
             thing: the decoded message from `wire.decode`.
             time_ns: the time of the packet.
             envelope: the envelope of the packet; by default the name of the message.

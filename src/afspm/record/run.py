@@ -75,8 +75,10 @@ def open_run(path: str | Path = "runs") -> Run:
 class Run:
     """The record of a run. Every access reads the files again, so a running experiment shows its newest data.
 
+    Only `experiment` is read once, since the experiment file of a run does not change.
+
     Attributes:
-        folder: of the run.
+        folder: the folder of the run.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -165,7 +167,7 @@ class Run:
         return Table(map(self._note_row, self._notes()), NoteRow)
 
     def notes_on(self, row: ScanRow | SpectrumRow) -> Table[NoteRow]:
-        """Return the notes on a scan."""
+        """Return the notes on a scan; empty for a spectrum, since notes refer to scans."""
         near = (one for one in self._notes() if one.scan_ns and abs(one.scan_ns - row.time_ns) <= _SAME_SCAN_NS)
         return Table(map(self._note_row, near), NoteRow).where(
             lambda note: isinstance(row, ScanRow) and note.scan == row.number
@@ -182,7 +184,7 @@ class Run:
 
     @property
     def journal(self) -> Table[JournalEntry]:
-        """Requests with their answers, changes of control and orders; oldest first."""
+        """Requests with their answers, changes of control, orders and notes; oldest first."""
         rows = self._query("SELECT payload FROM packets WHERE message = 'JournalEntries' ORDER BY time_ns, rowid")
         published = (self._decoded("JournalEntries", payload) for (payload,) in rows)
         entries = [entry for one in published if isinstance(one, JournalEntries) for entry in one.entries]
@@ -277,7 +279,10 @@ class Run:
         return [verdict for verdict in verdicts if verdict is not None]
 
     def changed_rows(self) -> dict[int, int]:
-        """Return the first row with a changed tip, found while the scan ran, by the time of the scan."""
+        """Return the index of the first row after a tip change, by the end of the scan in ns.
+
+        Only changes are included that were found while the scan ran; the last verdict on a scan counts.
+        """
         sql = "SELECT payload FROM packets WHERE message = ? ORDER BY time_ns, rowid"
         found: dict[int, int] = {}
         for (payload,) in self._query(sql, (LINE_VERDICT_MESSAGE,)):
@@ -303,26 +308,26 @@ class Run:
 
         Args:
             messages: names of the wanted messages, e.g. "ControlState"; None: all.
-            tell: called with a message for each packet without a readable file; None: that is an error.
+            tell: called with a message for each packet without a readable file, which is left out; None: raise.
 
         Raises:
-            FileError: a file is missing or damaged.
+            FileError: without `tell`: a file is missing or damaged.
         """
         yield from packets(self._query, self.folder, since_ns, messages, tell)
 
     def messages(self, messages: Sequence[str] | None = None) -> Iterator[tuple[Packet, str, Any]]:
         """Yield packet, name of its message and decoded content, without reading files.
 
-        Scans and spectra have NaN for values; lines of running scans are left out.
+        Scans and spectra have NaN for values; lines of running scans and unreadable packets are left out.
         """
         yield from without_reading_files(self._query, self.frame, messages)
 
     def overview(self, messages: Sequence[str] | None = None, problems: ProblemNames | None = None) -> Overview:
-        """Return the overview that the dashboard shows. Files of scans are not read for it.
+        """Return the overview that the dashboard shows, without reading the files of scans.
 
         Args:
             messages: names of the messages to reduce; None: all.
-            problems: names that replace the recorded ones.
+            problems: names of problems that replace the recorded names.
         """
         from afspm.record.overview import Overview
 
@@ -335,7 +340,7 @@ class Run:
 
     @cached_property
     def experiment(self) -> dict[str, Any]:
-        """The expanded experiment file."""
+        """The content of the expanded experiment file. Raises FileError if the file can't be read."""
         try:
             return tomllib.loads((self.folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
@@ -358,7 +363,7 @@ class Run:
 
     @property
     def newest_ns(self) -> int:
-        """The time of the last packet."""
+        """The time of the scheduler's last packet; 0 if there is none."""
         return int(self._query("SELECT coalesce(max(time_ns), 0) FROM packets WHERE source = ?", (SCHEDULER,))[0][0])
 
     @property
@@ -373,7 +378,7 @@ class Run:
 
     @property
     def frame(self) -> Frame:
-        """The frame of all positions: of the sample where drift was compensated."""
+        """The frame of all positions: the sample frame if drift was compensated, else the tip frame."""
         return Frame(self._note("frame") or Frame.TIP.value)
 
     def numbered(self, number: int) -> ScanRow:

@@ -17,7 +17,7 @@ ENDED: Final = "ended"
 REAL_S: Final = "real_s"
 """Key in run.json, after the end of a run: its real duration, summed over its parts."""
 UNFINISHED: Final = "unfinished"
-"""Key in run.json, after the end of a run: the stop of each unfinished component as text, by name."""
+"""Key in run.json, after the end of a run: how each unfinished component was stopped, as text by name."""
 REPLAY_OF: Final = "replay_of"
 """Key in run.json of a replay: the folder of the replayed run."""
 EXPERIMENT_FILE: Final = "experiment.toml"
@@ -38,7 +38,7 @@ def read_run_json(folder: Path) -> Plain:
     """Return the content of run.json in the folder of a run.
 
     Raises:
-        FileError: the file is missing, unreadable, or of another kind.
+        FileError: the file is missing, unreadable, or not a JSON object.
     """
     file = folder / RUN_FILE
     try:
@@ -59,7 +59,7 @@ def run_json_or_empty(folder: Path) -> Plain:
 
 
 def latest_run(runs: Path) -> Path | None:
-    """Return the newest run in the folder of all runs; None if there is none."""
+    """Return the folder of the newest run in the folder of all runs; None if there is none."""
     link, file = runs / LATEST_LINK, runs / LATEST_FILE
     if link.is_dir():
         return runs / link.resolve().name

@@ -25,7 +25,7 @@ class DoneScan:
     took_ns: int
 
     def resembles(self, other: RunningScan) -> bool:
-        """Return whether both have the same size and pixels; unknown parameters count as equal."""
+        """Return whether both scans have the same size and pixels; unknown parameters count as equal."""
         ours, theirs = _extent(self.parameters), _extent(other.parameters)
         return ours is None or theirs is None or ours == theirs
 
@@ -58,7 +58,7 @@ class RunningScan:
 
     @property
     def rows(self) -> tuple[int, int] | None:
-        """(received, total) rows; None where no lines are delivered."""
+        """(received, total) rows of the most complete channel; None before the first lines."""
         if not self.channels:
             return None
         lines = max(self.channels.values(), key=lambda one: len(one.rows))

@@ -56,6 +56,7 @@ class RecordSettings:
 
     Attributes:
         facts: written into every file: the name of the experiment, seeds …
+        problems: the names of the experiment's problems.
         frame: the coordinate frame of published positions.
         measured: write scans and spectra; otherwise only the journal.
     """
@@ -112,14 +113,14 @@ class RecordStore:
                 self._take(packet, source)
 
     def flush(self) -> None:
-        """End the last scan. Raises as `take`."""
+        """End the open scan if one of its channels has arrived. Raises as `take`."""
         if not self.waiting():
             return
         with self._all_or_nothing():
             self._write(self._gathering.flush())
 
     def finish(self) -> None:
-        """End every scan, also a scan with lines only. Raises as `take`."""
+        """End the open scan; with lines only, it is recorded as interrupted. Raises as `take`."""
         with self._all_or_nothing():
             self._write(self._gathering.finish(self._newest_ns))
 
@@ -144,7 +145,7 @@ class RecordStore:
         sync_folder(self._folder)
 
     def settle(self) -> None:
-        """Make the journal a single file, readable without its write-ahead log."""
+        """Merge the write-ahead log into the journal file, unless a reader has the journal open."""
         self._journal.execute("PRAGMA busy_timeout = 1000")
         with suppress(sqlite3.OperationalError):  # a reader is open: the write-ahead log stays, which is as safe
             self._journal.execute("PRAGMA journal_mode = DELETE")

@@ -14,8 +14,8 @@ class Span:
 
     Attributes:
         label: the state during the span.
-        start_ns, end_ns: experiment time; an end of None: it continues.
-        by: the component or person that caused it; empty if unknown.
+        start_ns, end_ns: experiment time; an end of None: the span continues.
+        by: the component or person that caused the span; empty if unknown.
     """
 
     label: str
@@ -42,7 +42,10 @@ class Timeline:
         return self.spans[-1] if self.spans and self.spans[-1].end_ns is None else None
 
     def change(self, label: str | None, time_ns: int, by: str = "") -> None:
-        """Start a span of this label at `time_ns`; None: a gap. Changes older than the last are ignored."""
+        """Start a span of this label at `time_ns`; None: a gap.
+
+        A change to the current label, or older than the last change, is ignored.
+        """
         if self.changed_ns is not None and time_ns < self.changed_ns:
             return
         now = self.now
@@ -55,12 +58,12 @@ class Timeline:
             self.spans.append(Span(label, time_ns, by=by))
 
     def name_last(self, by: str) -> None:
-        """Set the cause of the last span unless it is known."""
+        """Set the author of the last span, unless the author is known."""
         if self.spans and not self.spans[-1].by:
             self.spans[-1] = replace(self.spans[-1], by=by)
 
     def at(self, time_ns: int) -> Span | None:
-        """Return the span that contains a time."""
+        """Return the span that contains a time; None in a gap."""
         for span in reversed(self.spans):
             if span.start_ns <= time_ns:
                 return span if span.end_ns is None or time_ns < span.end_ns else None
