@@ -277,10 +277,10 @@ class Overview:
         return self._measured.scan_progress(now_ns)
 
     def silent_ns(self, name: str, speed: float) -> int | None:
-        """Return the experiment time in ns since the last report on a process; None while reports arrive.
+        """Return the experiment time in ns from the last report on a process to the newest packet.
 
-        Reports are missing after 6 s of real time. The time ends at the newest packet, so a silent process is on an
-        unreachable computer: other packets have arrived since.
+        None up to 6 s of real time. Since other packets arrive meanwhile, a longer silence means that the computer of
+        the process is unreachable.
 
         Args:
             speed: experiment seconds in a real second.

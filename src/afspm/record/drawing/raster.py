@@ -40,7 +40,7 @@ class ValueRange:
 
 
 def value_range(values: Array, contrast: Contrast = Contrast.ROBUST) -> ValueRange:
-    """Return the range of the finite values; 0 to 1 if there are none, a range around a single value."""
+    """Return the robust or full range of the finite values; 0 to 1 without any, a range around a single value."""
     stride = max(1, values.size // _SAMPLED)
     # the stride shares no divisor with the width; otherwise it would sample a few columns only
     while stride > 1 and np.gcd(stride, max(values.shape[-1], 1)) != 1:
@@ -62,7 +62,7 @@ def value_range(values: Array, contrast: Contrast = Contrast.ROBUST) -> ValueRan
 
 
 def shared_range(pictures: Iterable[Array], contrast: Contrast = Contrast.ROBUST) -> ValueRange:
-    """Return one range for compared images: it contains the range of each."""
+    """Return one range for compared images, which contains the range of each image."""
     spans = [value_range(values, contrast) for values in pictures]
     return ValueRange(min(span.low for span in spans), max(span.high for span in spans))
 
@@ -73,7 +73,7 @@ def pooled_range(pictures: Iterable[Array]) -> ValueRange:
 
 
 def indices(values: Array, span: ValueRange) -> NDArray[np.uint8]:
-    """Return the index of each value in the colour map; UNMEASURED where it is not finite."""
+    """Return the index of each value in the colour map; UNMEASURED for values that are not finite."""
     with np.errstate(invalid="ignore", over="ignore"):
         scaled = (values - span.low) * ((LEVELS - 1) / (span.high - span.low))
         np.clip(scaled, 0.0, LEVELS - 1, out=scaled)
@@ -103,6 +103,8 @@ def webp(levels: NDArray[np.uint8], palette: str = PALETTES[0]) -> bytes:
 
 def reduced(values: Array, largest_px: int, *, each_side: bool = False) -> Array:
     """Return an image reduced to at most `largest_px` a side, by means over blocks of pixels; NaN is ignored.
+
+    Incomplete blocks at the end of a side are dropped.
 
     Args:
         each_side: reduce each side separately, for images drawn in the proportions of their region; otherwise blocks

@@ -50,7 +50,7 @@ CSS = """
 
 
 class Interval(Protocol):
-    """An interval of time; an end of None means it continues."""
+    """An interval of time; an end of None means that the interval continues."""
 
     @property
     def label(self) -> str: ...
@@ -82,7 +82,7 @@ class DrawnBand:
 
 @dataclass(frozen=True)
 class TimelineCurve:
-    """A value over time under the rows; NaN where it is unknown."""
+    """A value over time, drawn below the rows; NaN where the value is unknown."""
 
     name: str
     unit: str
@@ -111,7 +111,7 @@ class TimelineCurve:
 
 @dataclass
 class Stretch:
-    """Intervals that share columns of the image: the longest, and their number."""
+    """A drawn interval, or several that share columns: the label and duration of the longest, and their number."""
 
     begin: int
     end: int

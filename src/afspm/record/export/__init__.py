@@ -1,10 +1,10 @@
 """A recorded run in other file formats: `afspm export`.
 
-An exporter is a module that a package declares by its format. `write(run, row)` yields (suffix, content) of each file
-of a scan or spectrum. Two functions are optional: `tables(run, scans, spectra)` yields (name, content) of files about
-the whole run, and `grid_file(stack, metadata)` returns the spectra of a grid as one file.
-A format that keeps everything in one file has `archive(run, scans, spectra, folder)` instead of `write`: it writes that
-file, which may be larger than memory, and yields its path.
+An exporter is a module or an object that a package declares by its format. `write(run, row)` yields (suffix, content)
+of each file of a scan or spectrum. Two functions are optional: `tables(run, scans, spectra)` yields (name, content) of
+files about the whole run, and `grid_file(stack, metadata)` returns the spectra of a grid as one file.
+A format with one file for many measurements (an archive, a film) has `archive(run, scans, spectra, folder)` instead of
+`write`: `archive` writes the files itself, since they may be larger than memory, and yields their paths.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def export(
         to: a format that a package declares an exporter for.
         folder: created if it is missing.
         scans: numbers of scans, as for `chosen`; None: all scans and spectra.
-        tell: called with a message for each omitted measurement; None: a damaged file of the record is an error.
+        tell: called with a message for each omitted measurement; None: raise FileError for a damaged file.
 
     Raises:
         InvalidValue: there is no such format, or no such scan.
@@ -121,9 +121,9 @@ def chosen(rows: list[ScanRow], numbers: str) -> list[ScanRow]:
 
 
 def grids(run: Run, rows: Sequence[SpectrumRow]) -> Iterator[tuple[str, SpectrumStack]]:
-    """Yield each grid of at least two by two equally measured spectra, with the name of its file.
+    """Yield each grid of at least two by two spectra of one kind, with the name of its file.
 
-    A spectrum with a damaged file is left out, like an unmeasured one.
+    Different sweeps are interpolated to common values. A spectrum with a damaged file counts as unmeasured.
     """
     spectra: dict[tuple[str, tuple[str, ...]], list[Spectrum]] = {}
     for row in rows:

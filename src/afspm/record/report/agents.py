@@ -57,7 +57,7 @@ class AgentWork:
 
 
 def read(run: Run) -> list[AgentWork]:
-    """Return the work of each agent that proposed a plan, had an approval, or stopped the run."""
+    """Return the work of each agent that proposed a plan, had an approval or a refusal, or stopped the run."""
     proposals: dict[str, set[str]] = {}
     plans: dict[str, set[tuple[str, int]]] = {}
     grants: dict[tuple[str, str, int], RecordedGrant] = {}
@@ -72,7 +72,7 @@ def read(run: Run) -> list[AgentWork]:
     stop = run.problem_names.get(STOPPED_BY_AGENT)
     stops = [entry for entry in run.journal if _stops(entry, stop)] if stop is not None else []
     stopped = {_agent(entry.who) for entry in stops if entry.who.endswith(STOPPER)}
-    # an agent without any proposal or approval is known by the component that others act through
+    # a refused agent without any proposal or approval is found by the component that it shares with other agents
     components = {component_of(name) for name in (*proposals, *plans, *(agent for agent, *_ in grants), *stopped)}
     refusals = [entry for entry in run.refusals if component_of(entry.who) in components]
     names = {*proposals, *plans, *(agent for agent, *_ in grants), *stopped, *(_agent(one.who) for one in refusals)}

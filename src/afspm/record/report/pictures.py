@@ -35,11 +35,11 @@ _log = logging.getLogger("afspm.report")
 
 @dataclass(frozen=True)
 class TopographyPicture:
-    """A scan with images of its topography; None if its values can't be read.
+    """A scan with images of its topography.
 
     Attributes:
-        image: the levelled image in colour.
-        thumbnail: the image for the figure of the night.
+        image: the levelled image in colour; None if the scan has no readable values.
+        thumbnail: the image for the figure of the night; None if the scan has no readable values.
         is_bad: whether the image is drawn with a frame.
         changed_row: the first row with a changed tip, found in the lines of the running scan; None: no change found.
     """
@@ -55,7 +55,7 @@ class TopographyPicture:
 
 @dataclass(frozen=True)
 class FigurePicture:
-    """A figure drawn by a component, as embedded in the page; `ratio`: width by height."""
+    """A figure drawn by a component, as embedded in the page; `ratio` is its width divided by its height."""
 
     name: str
     image: bytes
@@ -90,7 +90,11 @@ def bad_ns(run: Run, story: RunStory) -> frozenset[int]:
 
 
 def chosen(rows: Sequence[ScanRow], most: int = MOST, kept_ns: Collection[int] = ()) -> list[ScanRow]:
-    """Return at most `most` rows in order: the scans at the times `kept_ns`, and an even selection of the rest."""
+    """Return at most `most` rows in order, selected evenly if there are more.
+
+    Args:
+        kept_ns: times of scans that are always selected, up to half of `most`.
+    """
     if len(rows) <= most:
         return list(rows)
     odd = [k for k, row in enumerate(rows) if row.time_ns in kept_ns][: most // 2]
@@ -114,7 +118,7 @@ def _read(run: Run, row: ScanRow) -> tuple[TopographyPicture, Array | None]:
 
 
 def is_topography(channel: str) -> bool:
-    """Return whether the name of a channel is one of heights."""
+    """Return whether a channel contains heights, by its name."""
     return channel.lower().startswith(_TOPOGRAPHY)
 
 

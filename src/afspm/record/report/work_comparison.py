@@ -12,7 +12,10 @@ from afspm.record.tables import ScanRow, SpectrumRow
 
 @dataclass(frozen=True)
 class WorkComparison:
-    """The planned and the measured work of a component; the measured duration includes interruptions."""
+    """The planned and the measured work of a component.
+
+    The measured duration extends from the first start to the last end, so pauses are included.
+    """
 
     name: str
     planned: PlannedWork
@@ -27,6 +30,7 @@ def compare(
     Args:
         planned: the planned work by component; None: no estimate.
         scans, spectra: all scans and spectra of the run; each counts for the component in control at its start.
+            Interrupted scans do not count.
     """
     all_scans, all_spectra = list(scans), list(spectra)
     return [
