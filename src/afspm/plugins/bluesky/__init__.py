@@ -226,7 +226,7 @@ class Microscope(StandardReadable):
         where: the folder of the run, of all runs, or the experiment file, as for `afspm.connect`.
         parameters: generic names of the parameters that become signals: "tip-bias-voltage" becomes `tip_bias_voltage`.
             All are in SI units.
-        client: the name of the holder of control, as the experiment shows it.
+        client: the name under which the plan holds control.
 
     Attributes:
         scan: a `ScanDevice`; spectrum: a `SpectrumDevice`.

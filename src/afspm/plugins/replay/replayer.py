@@ -64,7 +64,7 @@ class Replayer:
         """The number of packets published."""
 
     def run(self, *, stay: bool = False) -> None:
-        """Publish packets until the last one or `stop`, then publish the end of the experiment.
+        """Publish packets until the last packet or `stop`, then publish the end of the experiment.
 
         Args:
             stay: after the last packet, wait for `stop`.

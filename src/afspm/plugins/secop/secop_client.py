@@ -18,13 +18,13 @@ from afspm.plugins.secop import lines
 from afspm.plugins.secop.lines import SecopLine
 
 POLL_S = 0.75
-"""Interval at which each value is asked for."""
+"""The least time between two requests for a value."""
 SILENT_S = 3.0
-"""A server that answers nothing for this time is disconnected, and connected again."""
+"""A server that sends nothing for this time is disconnected, and connected again."""
 BUSY_S = 3.0
 """A new target counts as on its way for at least this time: some servers report "idle" until their next cycle."""
 STEP_S = 1.0
-"""Interval of the steps of a target whose rate the server does not keep itself."""
+"""The least time between two steps of a target, where the server has no ramp of its own."""
 _IDLE, _BUSY, _ERROR = 100, 300, 400
 _NUMBERS = ("double", "int")
 _ROUNDED = 1e-6  # relative: a server may keep a value in single precision
@@ -89,7 +89,7 @@ class RampInSteps:
         ideal: the last step before the server rounded it.
         sent_s: time of the last step.
         in_flight: whether the last step is still unconfirmed.
-        target_s: time when the target was read, to check that it still equals the last step.
+        target_s: time of the request for the target, which must still equal the last step.
         is_interrupted: whether the connection was lost: the target read afterwards decides how to continue.
     """
 

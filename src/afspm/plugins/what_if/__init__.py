@@ -11,5 +11,5 @@ Everything after the first difference that reaches the microscope is therefore c
 simulated night again instead, and compares the outcomes.
 
 A replay may differ without any change, if the component depends on more than its inputs: `hazards` watches for that.
-Nothing outside a temporary folder is written, no program started and no connection made.
+A replayed component can't write outside a temporary folder, start a program or make a connection.
 """

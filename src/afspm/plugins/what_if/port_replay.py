@@ -28,7 +28,7 @@ from afspm.transport.port import (
 )
 
 PacketOf = Callable[[int, str], Packet]
-"""Returns the recorded packet of a time and an envelope."""
+"""A function that returns the recorded packet of a time and an envelope."""
 
 _SIGNALS = {one.__name__: one for one in (Killed, ParentGone, ControlConnected, ControlDisconnected)}
 _ANSWERABLE = {
@@ -176,8 +176,9 @@ class ReplayPort:
     """Port that offers a recorded life to a component. See `afspm.transport.port.Port`.
 
     While the component sends the recorded outputs, every event comes as recorded. After the first difference, a request
-    is answered at once: as the n-th recorded request of the same content, or with a success if the record has none. A
-    command to the microscope without a recorded answer ends the replay.
+    is answered at once, as the n-th recorded request of the same content. Without a recorded answer, a parameter is
+    read as its last recorded value (or the read fails), other harmless requests succeed, and a command to the
+    microscope ends the replay.
 
     Attributes:
         outputs: all outputs of the component so far.
@@ -212,7 +213,7 @@ class ReplayPort:
 
     @property
     def is_over(self) -> bool:
-        """True once all recorded events are delivered and all recorded outputs are passed."""
+        """Whether all recorded events are delivered and all recorded outputs are passed."""
         return self._at >= len(self._life.lines) and not self._pending
 
     def wake_up(self, incoming: Incoming | None = None) -> None:
@@ -286,7 +287,7 @@ class ReplayPort:
         return Response(int(ControlResponse.FAILURE), b"", reason, request_id)
 
     def place(self) -> PacketName | None:
-        """Return the packet that the component is handling, or the newest one."""
+        """Return the packet that the component is handling, or else the newest received packet; None before any."""
         packet = self.handled()
         return self._newest if packet is None else PacketName(packet.time_ns or 0, packet.envelope)
 
@@ -366,7 +367,7 @@ class ReplayPort:
 
 
 def recorded_outputs(life: Life, outputs: OutputReader) -> Iterator[Output]:
-    """Yield all outputs of a recorded life; repetitions of a request are left out."""
+    """Yield all outputs of a recorded life, and its end if recorded; repetitions of a request are left out."""
     sent: set[str] = set()
     newest: PacketName | None = None
     now_ns = life.facts["now_ns"]

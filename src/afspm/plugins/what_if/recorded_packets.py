@@ -8,7 +8,7 @@ from afspm.plugins.what_if.port_replay import PacketOf
 from afspm.record.run import Run
 
 _KEPT = 64
-"""Packets kept in memory: all components get a scan at about one time."""
+"""The number of packets kept in memory."""
 
 
 def recorded_packets(record: Run) -> PacketOf:
