@@ -230,6 +230,7 @@ def _summary(folder: Path) -> RunSummary:
 
 
 def _read(run: Run) -> RunSummary:
+    # rescans are needed to recognise routine flags of thermal-drift
     overview = run.overview((CONTROL_STATE.name, JOURNAL.name, DRIFT_RESCAN.name))
     began = next(iter(overview.timelines.control.spans), None)
     scans = run.scans

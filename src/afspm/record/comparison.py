@@ -77,7 +77,7 @@ class ComparedRegion:
     """A region that was scanned in at least two runs.
 
     Attributes:
-        scans: one for each run, in the order of runs; None in a run without a readable scan of the region.
+        scans: a scan for each run, in the order of runs; None for a run without a readable scan of the region.
         differences: the differences from the first run with a scan, by the index of the run.
     """
 

@@ -21,7 +21,7 @@ def plans_of(facts: PlainMapping) -> dict[str, PlannedWork | None]:
 def expected_end_ns(plans: Plans, reports: Mapping[str, Progress], began_ns: int | None, now_ns: int) -> int | None:
     """Return the experiment time of the end, never before `now_ns`; None if unknown.
 
-    The reported pace counts. Before the first report of a component its plan counts.
+    The end follows from the reported progress of each component; before its first report, from its plan.
 
     Args:
         reports: newest progress of each component.

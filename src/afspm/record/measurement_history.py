@@ -95,7 +95,7 @@ class DriftPoint:
         reason: the reason why the scan was not registered, or only coarsely.
         outcome: how the position of the scan is known.
         sd_m: standard deviation of the position along its most uncertain axis; None if unknown.
-        failures: the number of errors of the estimator over the scan.
+        failures: the number of pairs of scans over which the estimator failed with an error of its own.
         filename: the file of the scan.
     """
 

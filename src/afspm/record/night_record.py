@@ -132,7 +132,7 @@ class NightRecord:
 
     @property
     def start_ns(self) -> int:
-        """The start of the first scan or of the first control by a component; `end_ns` without both."""
+        """The earlier of the first scan's start and the first control by a component; `end_ns` without either."""
         times = [shot.start_ns or shot.time_ns for shot in self.shots] + [t for t, s in self.control if s.holder]
         return min(times, default=self.end_ns)
 

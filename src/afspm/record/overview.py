@@ -318,6 +318,7 @@ class Overview:
             if before is None or before.state is not ScopeState.SCANNING or self.running is None:
                 readings = self.readings
                 setpoint = readings.feedback.setpoint if readings.feedback else None
+                # a late joiner has not observed the start of a scan that was running already
                 self._measured.running = RunningScan(
                     time_ns if before else None, self._holder, readings.scan_parameters, setpoint
                 )

@@ -210,10 +210,7 @@ class Run:
 
     @property
     def problems(self) -> Table[ProblemRow]:
-        """Each flag of a non-routine problem.
-
-        Routine is thermal-drift while the first scan of a run with drift correction is taken in both directions.
-        """
+        """A row for each flag of a problem, without routine flags; see `Overview.is_routine`."""
         overview = self.overview()
         numbers = overview.problems
         rows = [
@@ -353,7 +350,10 @@ class Run:
 
     @property
     def metadata(self) -> dict[str, str]:
-        """Sample, person, project, technique … where known: [metadata] of the experiment file."""
+        """Sample, person, technique … where known.
+
+        From [metadata] of the experiment file, the microscope's class, and entries made at the start of the run.
+        """
         return dict(self.facts.get(METADATA) or {})
 
     @property
@@ -450,6 +450,6 @@ class Run:
 def _folder(path: Path) -> Path:
     if not (path / journal.JOURNAL_FILE).is_file():
         path = latest_run(path) or path
-    path = path.resolve() if path.is_symlink() else path
+    path = path.resolve() if path.is_symlink() else path  # the link `latest` moves to the next run
     replayed = None if (path / journal.JOURNAL_FILE).is_file() else run_json_or_empty(path).get(REPLAY_OF)
     return Path(replayed) if isinstance(replayed, str) else path

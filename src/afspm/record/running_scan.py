@@ -19,7 +19,7 @@ class ChannelLines:
 
 @dataclass(frozen=True, slots=True)
 class DoneScan:
-    """The duration of a scan, with its parameters; None if they were unknown."""
+    """The duration of a completed scan; `parameters` is None if the scan parameters were unknown."""
 
     parameters: ScanParameters | None
     took_ns: int

@@ -1,7 +1,7 @@
 """`RecordStore`: the writer of a run's record: the journal, and a file for each scan and spectrum.
 
-Each call is recorded completely or not at all, and a repeated packet is recorded once: files are written under
-temporary names and renamed before the journal names them, in one transaction.
+The packets of a call are recorded completely or not at all, and a repeated packet is recorded once. For this, files are
+written under temporary names, and renamed before the journal's transaction with their names is committed.
 """
 
 from __future__ import annotations
@@ -146,6 +146,7 @@ class RecordStore:
 
     def settle(self) -> None:
         """Merge the write-ahead log into the journal file, unless a reader has the journal open."""
+        # shorter than the 30 s of other calls: an open reader may stay for hours
         self._journal.execute("PRAGMA busy_timeout = 1000")
         with suppress(sqlite3.OperationalError):  # a reader is open: the write-ahead log stays, which is as safe
             self._journal.execute("PRAGMA journal_mode = DELETE")

@@ -52,10 +52,10 @@ class ScanRow:
     Attributes:
         number: the number of the scan, from 1, in the order of recording.
         time_ns: the end of the scan, or its interruption; began_ns: None if the start was not observed.
-        channels: (name, unit) of each.
+        channels: (name, unit) of each channel.
         region, shape: None if the scan was interrupted before its first line; shape is (rows, columns).
         interrupted: the scan is incomplete.
-        holder, mode, problems: the state of control at the start; None if unknown.
+        holder, mode, problems: the state of control at the start; None or () if unknown.
         filename: the controller's file; file: the record's file, relative to the run folder, empty if there is none.
         key: the key of the request, `scope.scan(…, key="tile-1")`; empty without a key.
         registration: how the position of the scan on the sample is known; None without drift correction.

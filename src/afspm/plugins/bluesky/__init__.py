@@ -225,7 +225,7 @@ class Microscope(StandardReadable):
     Args:
         where: the folder of the run, of all runs, or the experiment file, as for `afspm.connect`.
         parameters: generic names of the parameters that become signals: "tip-bias-voltage" becomes `tip_bias_voltage`.
-            All are in SI units.
+            All signals are in SI units.
         client: the name under which the plan holds control.
 
     Attributes:

@@ -29,7 +29,7 @@ from afspm.transport.process import signals
 from afspm.transport.rate_limited_log import RateLimitedLog
 
 BEFORE_S = 1.0
-"""Real time before the first packet, so that programs that join at once miss none."""
+"""Real time before the first packet, so that programs that join at once miss no packet."""
 
 
 @dataclass(frozen=True)

@@ -193,6 +193,7 @@ class SecopClient:
             ServerUnfit: the server is no SECoP server, or lacks something that the experiment file demands.
         """
         self.heard_s = now_s
+        # the answer to *IDN? names the protocol, and has neither action nor data
         if not self.is_described and "SECoP" in text and not text.startswith("describing"):
             return []
         line = lines.parse(text)

@@ -30,7 +30,7 @@ _DAMAGE = ("pulse", "crash")
 
 @dataclass(frozen=True)
 class Outcomes:
-    """Outcomes of a recorded and a new run.
+    """Outcomes of a recorded run and its rerun.
 
     Attributes:
         folder: folder of the new run.

@@ -45,7 +45,11 @@ class LifeOver(BaseException):
 
 @dataclass(slots=True)
 class Poll:
-    """A recorded return of `poll`, with its events as in the log."""
+    """A recorded return of `poll`, with its events as in the log.
+
+    Attributes:
+        readings: the clock readings before the return, as kind and value in turn.
+    """
 
     timeout_s: float | None
     monotonic_s: float
@@ -60,6 +64,8 @@ class Sent:
 
     Attributes:
         frames: frames of the request; for a message (envelope, payload).
+        handled: the packet that the component was handling; None if unknown.
+        readings: the clock readings before the sending, as kind and value in turn.
     """
 
     frames: tuple[bytes, ...]
@@ -183,7 +189,7 @@ class ReplayPort:
     Attributes:
         outputs: all outputs of the component so far.
         differs: whether an output differs from the recorded life.
-        unanswered: the command that ended the replay; empty if none.
+        unanswered: the command, or the endless polling, that ended the replay early; empty otherwise.
         handled: returns the packet that the component is handling.
     """
 

@@ -182,7 +182,7 @@ def time_ticks(begin_s: float, end_s: float, about: int = 7) -> list[float]:
 
 
 def stretches(spans: Sequence[Interval], begin_ns: int, end_ns: int) -> list[Stretch]:
-    """Return intervals as columns of the image; intervals in one column become the longest, with their number."""
+    """Return the drawn stretch of each interval; short intervals in one column are merged and counted."""
     width_ns = (end_ns - begin_ns) / COLUMNS
     found: list[Stretch] = []
     for span in spans:

@@ -34,8 +34,8 @@ def export(
     """Write a run in another format, and yield the path of each written file.
 
     Args:
-        to: a format that a package declares an exporter for.
-        folder: created if it is missing.
+        to: the name of a format that a package exports.
+        folder: the folder for the files; created if it is missing.
         scans: numbers of scans, as for `chosen`; None: all scans and spectra.
         tell: called with a message for each omitted measurement; None: raise FileError for a damaged file.
 

@@ -17,8 +17,6 @@ REPORT_FILE = "report.html"
 def write(folder: str | Path) -> Path:
     """Write `report.html`, and figures that no component has drawn; return the path of the report.
 
-    Needs the extra `record`; the figures need `plot`.
-
     Args:
         folder: the folder of a run, which may still go on; or the folder of all runs, for the newest run.
 

@@ -44,7 +44,7 @@ class SpectrumCurves:
 
     @property
     def back(self) -> dict[str, Array]:
-        """The variables measured on the backward sweep too."""
+        """The variables of the backward sweep, by name; empty without a backward sweep."""
         directions = ways(self.spectrum)[1]
         return directions[1] if len(directions) > 1 else {}
 

@@ -174,6 +174,7 @@ def read(run: Run) -> RunStory:
         overview=overview,
         scans=[_without_routine(scan, overview) for scan in scans],
         spectra=len(run.spectra),
+        # late flags are listed with the problems instead
         refusals=gathered([entry for entry in run.refusals if entry not in late]),
         ledger=run.ledger(),
         actions=[entry for entry in run.journal if entry.what in names.EXTENSION_ACTIONS and entry.response == 0],
@@ -253,9 +254,9 @@ def colours(story: RunStory) -> dict[str, str]:
 
 
 def timeline_rows(story: RunStory) -> Iterator[TimelineRow]:
-    """Yield a row for each holder, MANUAL, each problem, each state except free, each troubled process, and events.
+    """Yield the rows: holders, MANUAL, problems, states of the microscope, processes in trouble, restarts, notes.
 
-    Events are restarts and notes. Rows without spans are left out.
+    Rows without spans, and the states free and undefined, are left out.
     """
     seen = story.overview
     for holder, style in colours(story).items():
