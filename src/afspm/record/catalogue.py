@@ -146,7 +146,7 @@ def _midnight_ns(day: date) -> int:
     return int(datetime(day.year, day.month, day.day, tzinfo=UTC).timestamp()) * NS_PER_S
 
 
-# --- the index: what was read of each run, until it changes ---------------------------------------------------------
+# --- the index: the summary of each run, until the run changes ------------------------------------------------------
 
 
 def _up_to_date(root: Path) -> list[RunSummary]:
@@ -258,7 +258,7 @@ def _scanned_m(run: Run, scan: ScanRow) -> float:
         return 0.0
     rows = scan.shape[0]
     if scan.interrupted:
-        with suppress(FileError):  # damaged: counted as whole, the most that it can be
+        with suppress(FileError):  # a damaged scan counts as complete, which is the upper bound
             first = next(iter(run.scan(scan).values()))
             rows = int(np.isfinite(first.values).any(axis=1).sum())
     return path_length_m(scan.region, rows)

@@ -113,6 +113,9 @@ def compare(runs: Sequence[Run], align: Aligner, most_regions: int = 24) -> RunC
 
     The reference of a region is the scan in the first run with a readable scan there.
 
+    Args:
+        most_regions: the largest number of compared regions; other common regions are counted in `left_out`.
+
     Raises:
         InvalidValue: fewer than two runs, or one run given twice.
     """

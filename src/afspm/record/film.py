@@ -147,7 +147,7 @@ class Film:
         low = height - _MARGIN_PX
         draw.rectangle((_MARGIN_PX, low - 5, _MARGIN_PX + bar_px, low), fill="white", outline="black")
         _write(draw, (_MARGIN_PX, low - 9), typeset_length(bar_m), "ld")
-        # heights after levelling have no zero: their span says all
+        # heights after levelling have no zero: only their span has a meaning
         shown = f"{self.channel}, {quantity(span.high - span.low, self.unit, 3)} dark to bright"
         _write(draw, (width - _MARGIN_PX, low), f"SIMULATED, {shown}" if self.simulated else shown, "rd")
 

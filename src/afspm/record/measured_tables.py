@@ -43,7 +43,7 @@ _HAS_STARTS = "SELECT 1 FROM sqlite_master WHERE name = 'starts'"
 
 
 class KeyedTable(Table[R]):
-    """Rows of measurements; `table["tile-1"]` is the last row with that key, or raises NoSuchItem."""
+    """Rows of measurements; `table["tile-1"]` is the last row with that key. Raises NoSuchItem for an unknown key."""
 
     @overload
     def __getitem__(self, index: int | str) -> R: ...
@@ -170,7 +170,7 @@ def _keys(query: Query, table: str, action: str, rows: Sequence[Row]) -> dict[in
     waiting = sorted(starts, key=itemgetter(0), reverse=True)
     for end_ns, number in ends:
         while waiting and waiting[-1][0] <= end_ns:
-            keys[number] = waiting.pop()[1]  # the last start counts: earlier ones were without result
+            keys[number] = waiting.pop()[1]  # the last start counts: earlier starts had no result
     return keys
 
 
@@ -189,7 +189,7 @@ def _positions(query: Query) -> dict[int, tuple[RegistrationOutcome, float | Non
             payload = newest if time_ns > after_ns else payload
         after_ns = published_ns
         if number is not None and payload is not None:
-            with suppress(WireError):  # another implementation may encode it differently
+            with suppress(WireError):  # another implementation may encode the mapping differently
                 found[number] = drift_knowledge(wire.decode("DriftMapping", payload))
     return found
 

@@ -85,7 +85,7 @@ class Run:
         self.folder = folder
         self._journal = journal.open_to_read(folder)
 
-    # --- what was measured ---
+    # --- measurements ---
 
     @property
     def scans(self) -> KeyedTable[ScanRow]:
@@ -159,7 +159,7 @@ class Run:
         rows = map(scan_row, self._query(near, (time_ns, _SAME_SCAN_NS, time_ns)))
         return next((row for row in rows if not channel or channel in dict(row.channels)), None)
 
-    # --- what happened ---
+    # --- events ---
 
     @property
     def notes(self) -> Table[NoteRow]:

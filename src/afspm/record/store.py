@@ -168,7 +168,7 @@ class RecordStore:
         except BaseException:  # only to roll back: every error is raised again, also KeyboardInterrupt
             self._files.discard()
             self._gathering, self._newest_ns = gathering, newest_ns
-            with suppress(sqlite3.Error):  # a full disk may have rolled it back already
+            with suppress(sqlite3.Error):  # after an error of a full disk, SQLite may have rolled back already
                 self._journal.execute("ROLLBACK")
             raise
 

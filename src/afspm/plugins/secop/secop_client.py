@@ -329,7 +329,7 @@ class SecopClient:
             self._finish(order, ControlResponse.PARAM_NOT_SUPPORTED, f"there is no parameter {order.parameter.name!r}")
             return []
         if not self.is_described:
-            return []  # it comes again until it has an outcome, or its client gives up
+            return []  # the order comes again until it has an outcome, or its client gives up
         try:
             number, rate_per_s = _in_unit(order, channel)
         except UnitError as error:
@@ -458,7 +458,7 @@ class SecopClient:
                 del self._ramps[name]
 
     def _leave(self, channel: Channel, ramp: RampInSteps) -> None:
-        # a person at the instrument, or another client, has set a target: this one must not undo it
+        # a person at the instrument, or another client, has set a target, which afspm must not undo
         del self._ramps[channel.name]
         self.log.append(
             f"{channel.name}: another client set the target {channel.newest_target}; the steps to {ramp.final:.6g} end"

@@ -232,7 +232,7 @@ class ReplayPort:
     def close(self) -> None:
         """Do nothing: there is nothing to close."""
 
-    # --- what the component sends ---
+    # --- outputs of the component ---
 
     def send(self, frames: Sequence[bytes]) -> None:
         self._end_if_killed()
@@ -297,7 +297,7 @@ class ReplayPort:
         packet = self.handled()
         return self._newest if packet is None else PacketName(packet.time_ns or 0, packet.envelope)
 
-    # --- what the component gets ---
+    # --- inputs of the component ---
 
     def poll(self, timeout_s: float | None) -> list[Incoming]:
         if self._pending:
@@ -367,7 +367,7 @@ class ReplayPort:
             raise LifeOver
 
     def _end_if_killed(self) -> None:
-        # what a killed process would have sent next is not known; one that ended by itself sent nothing more
+        # the next output of a killed process is unknown; a process that ended by itself had no further output
         if self._life.end is None:
             self._end_if_over()
 

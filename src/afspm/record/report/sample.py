@@ -27,7 +27,7 @@ _LEGEND = (
     "one height, without its plane; scans of one size share one range of heights."
 )
 _MARGIN = 0.04
-_HIDDEN_BEHIND = 40  # most pictures on the map: older ones disappear beneath newer ones
+_HIDDEN_BEHIND = 40  # most pictures on the map: older pictures disappear beneath newer pictures
 
 
 def sheet(story: RunStory, shown: Sequence[TopographyPicture], clock: PageTimes) -> str:
