@@ -36,7 +36,12 @@ ABSENT: Final = "–"
 
 @dataclass(frozen=True)
 class Roughness:
-    """Roughness of a levelled scan, in the unit of its values: root mean square and mean deviation (ISO 25178)."""
+    """Roughness of a levelled scan, in the unit of its values (ISO 25178).
+
+    Attributes:
+        sq: root mean square deviation from the mean.
+        sa: mean absolute deviation from the mean.
+    """
 
     sq: float
     sa: float

@@ -1,4 +1,4 @@
-"""A `NightRecord` as a figure: contact sheet, bands over the night, and a close-up of each repair."""
+"""A `NightRecord` as a figure: contact sheet, bands over the night, and close-ups of the first three repairs."""
 
 from __future__ import annotations
 

@@ -129,7 +129,10 @@ def _placed(thing: object, frame: Frame) -> object:
 
 
 class _Values:
-    """The values of packets, read from files; a few files stay open, since channels of a scan come together."""
+    """The values of packets, read from files.
+
+    The contents of the newest files are kept in memory, since channels of a scan come together.
+    """
 
     def __init__(self, query: Query, folder: Path) -> None:
         self._query = query

@@ -1,4 +1,4 @@
-"""The lock held by the supervisor of a run: it shows whether the run continues, has ended, or was cut off."""
+"""The lock held by the supervisor of a run, which shows whether the run continues or was cut off."""
 
 from __future__ import annotations
 

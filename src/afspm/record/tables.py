@@ -26,7 +26,12 @@ T = TypeVar("T")
 
 
 class SweptSetting(NamedTuple):
-    """A parameter that a sweep had set: a number in SI or in the microscope's own unit, a switch, or text."""
+    """A parameter that a sweep had set.
+
+    Attributes:
+        value: a number, a switch, or text.
+        unit: an SI unit, or the microscope's own unit; empty without a unit.
+    """
 
     name: str
     value: float | str | bool

@@ -40,7 +40,10 @@ class ValueRange:
 
 
 def value_range(values: Array, contrast: Contrast = Contrast.ROBUST) -> ValueRange:
-    """Return the robust or full range of the finite values; 0 to 1 without any, a range around a single value."""
+    """Return the robust or full range of the finite values; 0 to 1 without values.
+
+    If all values are equal, the range extends a little around the value.
+    """
     stride = max(1, values.size // _SAMPLED)
     # the stride shares no divisor with the width; otherwise it would sample a few columns only
     while stride > 1 and np.gcd(stride, max(values.shape[-1], 1)) != 1:

@@ -1,4 +1,4 @@
-"""Gwyddion's own files (.gwy): all channels of a scan, the curves of a spectrum, or a grid of spectra in one file.
+"""Gwyddion's own files (.gwy): the channels of a scan, the curves of a spectrum, or a grid of spectra.
 
 The format: Gwyddion user guide, "Format of Gwyddion files". A file is "GWYP" and an object; an object is its name, the
 size of its components, and the components: name, type, value. Numbers are little-endian, texts end with a zero byte.

@@ -1,4 +1,4 @@
-"""Images (.png): an image of each channel of a scan, with scale bar and colour bar, and an image of each spectrum."""
+"""Images (.png) of each channel of a scan, with scale bar and colour bar, and of each spectrum."""
 
 from __future__ import annotations
 

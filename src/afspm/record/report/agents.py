@@ -29,7 +29,8 @@ class RecordedGrant:
     """A grant in its last published form.
 
     Attributes:
-        gone_ns: the time from which it was no longer published; None: in force until it expired or the record ended.
+        gone_ns: the time from which the grant was no longer published; None: in force until its expiry or the end of
+            the record.
     """
 
     approval: Approval

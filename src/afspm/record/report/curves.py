@@ -1,4 +1,4 @@
-"""The spectra of a report: for each kind all curves with mean and spread, and small charts that enlarge."""
+"""The spectra of a report: for each kind the curves with mean and spread, and small charts that enlarge."""
 
 from __future__ import annotations
 

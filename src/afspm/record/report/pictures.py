@@ -174,7 +174,10 @@ def night_of(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -
 
 
 def of_figures(folder: Path) -> list[FigurePicture]:
-    """Return the figures for the page: the night first, then drift, then all others in the run folder."""
+    """Return the figures for the page: the night first, then drift, then all others in the run folder.
+
+    The report's own picture of the night and unreadable files are left out.
+    """
     found = [path for path in folder.glob("*.png") if path.name != OWN_NIGHT]  # the page itself shows the same
     first = (NIGHT, OFFSET, OWN_OFFSET)
     found.sort(key=lambda path: (first.index(path.name) if path.name in first else len(first), path.name))
