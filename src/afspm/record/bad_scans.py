@@ -17,7 +17,7 @@ _NOT_OF_A_SCAN = frozenset({int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFU
 
 
 def read_verdict(message: Any) -> tuple[int, float] | None:
-    """Return (time of the scan in ns, score) of a verdict message; None if it is not about a scan."""
+    """Return (time of the scan in ns, score) of a verdict message; None if the message is not about a scan."""
     if not message.spatials or not message.HasField("timestamp"):
         return None
     return message.timestamp.ToNanoseconds(), float(message.spatials[0].score)

@@ -56,7 +56,7 @@ class RunSummary:
         scanned_m: the path of the probe in scans, trace and retrace, in metres.
         treatments: the number of executions of each action that is not a measurement, by name.
         judged: the number of scans with a verdict on the tip, and of scans with a good last verdict.
-        damage: the reason why the record can't be read; empty if it can.
+        damage: the reason why the record can't be read; empty if readable.
     """
 
     folder: str

@@ -59,7 +59,7 @@ _DAMAGE = (sqlite3.DatabaseError, UnicodeDecodeError)  # SQLite's messages quote
 
 
 def open_to_write(folder: Path) -> sqlite3.Connection:
-    """Open the journal in a run folder; create it if it is missing.
+    """Open the journal in a run folder; create a missing journal.
 
     Raises:
         FileError: the file is damaged, or of another kind.
@@ -84,7 +84,7 @@ def open_to_write(folder: Path) -> sqlite3.Connection:
 
 
 def open_to_read(folder: Path) -> sqlite3.Connection:
-    """Open the journal in a run folder for reading; another process may write it, and the disk may be read-only.
+    """Open the journal in a run folder for reading, also during writes by another process or on a read-only disk.
 
     Raises:
         FileError: the file is missing, damaged, or of another kind.

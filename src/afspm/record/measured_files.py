@@ -236,7 +236,7 @@ def insert_packet(
 
 
 def header_of(filename: str, folder: Path) -> Mapping[str, object]:
-    """Return the header of the controller's own file; empty if it is on another computer, or can't be read."""
+    """Return the header of the controller's own file; empty if the file is on another computer, or unreadable."""
     from afspm.storage.formats import read
 
     path = folder / filename if filename else folder

@@ -273,7 +273,7 @@ class Overview:
         return self.timelines.mode.changed_ns if is_manual else self.timelines.control.changed_ns
 
     def scan_progress(self, now_ns: int) -> tuple[float, int] | None:
-        """Return (fraction done, ns remaining) of the running scan; None if it can't be estimated."""
+        """Return (fraction done, ns remaining) of the running scan; None without an estimate."""
         return self._measured.scan_progress(now_ns)
 
     def silent_ns(self, name: str, speed: float) -> int | None:

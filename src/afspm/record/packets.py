@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from afspm.storage.formats.content import FileContent
 
 Query = Callable[[str, Sequence[object]], list[Row]]
-"""A function that runs a query on the journal; it raises FileError if the journal is damaged."""
+"""A function that runs a query on the journal, and raises FileError if the journal is damaged."""
 
 _AT_ONCE = 500
 _FILES_KEPT = 4
@@ -142,7 +142,11 @@ class _Values:
     def of(
         self, scan: int | None, spectrum: int | None, channel: str | None, first_row: int | None, rows: int | None
     ) -> NDArray[np.float64] | None:
-        """Return the values of a packet, or None if it contains its values. Raises FileError: missing or damaged."""
+        """Return the values of a packet from its file; None if the packet contains its values.
+
+        Raises:
+            FileError: the file is missing or damaged.
+        """
         if spectrum is not None:
             return self._content("spectra", spectrum).spectra[0].values
         if scan is None:

@@ -345,7 +345,7 @@ class Run:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """The content of run.json: clock, addresses, the end. Empty if it can't be read."""
+        """The content of run.json: clock, addresses, the end. Empty if the file can't be read."""
         return run_json_or_empty(self.folder)
 
     @property

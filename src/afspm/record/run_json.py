@@ -1,4 +1,4 @@
-"""run.json: the facts about a run for processes that join it, resume it or read it afterwards."""
+"""run.json: the facts about a run, for processes that join, resume or read the run."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def read_run_json(folder: Path) -> Plain:
 
 
 def run_json_or_empty(folder: Path) -> Plain:
-    """Return the content of run.json; empty if it can't be read."""
+    """Return the content of run.json; empty if the file can't be read."""
     try:
         return read_run_json(folder)
     except FileError:
@@ -67,5 +67,5 @@ def latest_run(runs: Path) -> Path | None:
 
 
 def experiment_name(folder: Path, otherwise: str = "") -> str:
-    """Return the name of the experiment of a run folder; `otherwise` if it is unknown."""
+    """Return the name of the experiment of a run folder; `otherwise` if unknown."""
     return str(run_json_or_empty(folder).get("name") or otherwise)

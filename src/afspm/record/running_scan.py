@@ -38,7 +38,7 @@ class RunningScan:
         began_ns: None if the start was not observed.
         holder: the component in control at the start.
         parameters: the scan parameters in force at the start; None if unknown.
-        setpoint: the feedback setpoint at the start; None if it was not published.
+        setpoint: the feedback setpoint at the start; None if not published.
         channels: received lines of each channel, where the microscope delivers lines.
     """
 
@@ -65,7 +65,7 @@ class RunningScan:
         return len(lines.rows), lines.shape[0]
 
     def progress(self, now_ns: int, expected_ns: int | None = None) -> tuple[float, int] | None:
-        """Return (fraction done, ns remaining); None if it can't be estimated.
+        """Return (fraction done, ns remaining); None without an estimate.
 
         Args:
             expected_ns: the expected duration of the whole scan; None: extrapolate from the received lines.

@@ -119,14 +119,14 @@ class ScanAssembler:
         return self.flush() if status.state is ScopeState.FREE else []
 
     def flush(self) -> list[Assembled]:
-        """End the open scan if a channel of it has arrived."""
+        """End the open scan if one of its channels has arrived."""
         if not self._open.channels:
             return []
         taken, self._open = self._open, AssembledScan()
         return [taken]
 
     def finish(self, time_ns: int) -> list[Assembled]:
-        """End the open scan; without channels it counts as interrupted."""
+        """End the open scan; a scan without channels counts as interrupted."""
         if not self._open.channels and not self._open.lines:
             return []
         taken, self._open = self._open, AssembledScan()

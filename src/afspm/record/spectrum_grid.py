@@ -27,7 +27,7 @@ _LEAST_FILLED: Final = 0.5
 
 @dataclass(frozen=True)
 class PointGrid:
-    """A rectangular grid, and the cell of each position in it.
+    """A rectangular grid, and the grid cell of each position.
 
     Attributes:
         x_m, y_m: coordinates of columns and rows, before the rotation about `center_m`.
@@ -160,7 +160,7 @@ def ways(spectrum: Spectrum) -> tuple[Floats, list[dict[str, Floats]]]:
 
 
 def columns_of(spectrum: Spectrum) -> list[dict[str, str]]:
-    """Return the column of each variable: a mapping for forward, then for backward if it has own columns.
+    """Return the column of each variable: a mapping for forward, then for backward if measured in own columns.
 
     A single sweep that goes forth and back has one mapping, since its columns contain both directions.
     """

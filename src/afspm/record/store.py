@@ -120,7 +120,7 @@ class RecordStore:
             self._write(self._gathering.flush())
 
     def finish(self) -> None:
-        """End the open scan; with lines only, it is recorded as interrupted. Raises as `take`."""
+        """End the open scan; a scan with lines only is recorded as interrupted. Raises as `take`."""
         with self._all_or_nothing():
             self._write(self._gathering.finish(self._newest_ns))
 
@@ -138,7 +138,7 @@ class RecordStore:
         self._journal.execute("INSERT OR REPLACE INTO about VALUES (?, ?)", (name, text))
 
     def sync(self) -> None:
-        """Sync the record to the disk, so that it survives a power cut. Raises OSError."""
+        """Sync the record to the disk, for the case of a power cut. Raises OSError."""
         with suppress(FileNotFoundError), (self._folder / f"{journal.JOURNAL_FILE}-wal").open("rb+") as file:
             sync_file(file.fileno())
         # a new file survives a power cut only if its folder is synced, too

@@ -118,7 +118,7 @@ class ControlRow:
 
 @dataclass(frozen=True, slots=True)
 class ProblemRow:
-    """One flag of a problem; `cleared_ns` is None while it is flagged. `by`: "" if unknown."""
+    """A flag of a problem; `cleared_ns` is None while the problem is flagged. `by`: "" if unknown."""
 
     name: str
     number: int

@@ -59,7 +59,7 @@ def treatment_ledger(
         journal: the journal entries in the order of time.
         positions: times and positions of the probe.
         scanned: starts and regions of scans.
-        feedback: times at which the feedback's state was published, and whether it was on.
+        feedback: times at which the feedback's state was published, with True for on.
         end_ns: the end of the run.
         keep_away_m: distance from scanned regions within which a treatment counts as near.
     """

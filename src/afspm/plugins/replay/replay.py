@@ -1,4 +1,4 @@
-"""Replay of a recorded run, with a run folder through which programs find it like a running experiment."""
+"""Replay of a recorded run, with a run folder in which programs find the addresses of the replay."""
 
 from __future__ import annotations
 

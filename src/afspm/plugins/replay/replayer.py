@@ -1,4 +1,4 @@
-"""`Replayer`: publishes recorded packets in place of a scheduler, and refuses every command."""
+"""`Replayer`: the publisher of recorded packets in place of a scheduler; every command is refused."""
 
 from __future__ import annotations
 

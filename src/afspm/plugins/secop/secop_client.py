@@ -86,7 +86,7 @@ class RampInSteps:
 
     Attributes:
         sent: the last step, as confirmed by the server; before: the previous step.
-        ideal: the last step before the server rounded it.
+        ideal: the last step before its rounding by the server.
         sent_s: time of the last step.
         in_flight: whether the last step is still unconfirmed.
         target_s: time of the request for the target, which must still equal the last step.
@@ -318,7 +318,7 @@ class SecopClient:
     # --- orders ---
 
     def order(self, order: InstrumentOrder, now_s: float) -> list[str]:
-        """Begin an order unless it is already known; return the lines to send."""
+        """Begin an order unless already known; return the lines to send."""
         if self._progress is not None and self._progress.order.id == order.id:
             return []
         if (known := self._done.get(order.id)) is not None:

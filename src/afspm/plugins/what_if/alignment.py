@@ -31,7 +31,7 @@ class Output:
         packet: the packet being handled, or else the newest packet; None if no packet has arrived.
         time_ns: experiment time.
         life: number of the process's life (from a start to its end), from 1.
-        reaches: whether the output changes the microscope, or the control of it.
+        reaches: whether the output changes the microscope, or its control.
     """
 
     message: str
@@ -59,7 +59,7 @@ class Difference:
 
     Attributes:
         component: name of the sender.
-        recorded, now: the output on each side; None if it is missing there.
+        recorded, now: the output on each side; None if missing.
         counterfactual: whether an earlier difference reaches the microscope.
     """
 

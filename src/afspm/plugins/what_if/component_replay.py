@@ -42,7 +42,7 @@ class ComponentReplay:
         first: the first difference; None if all outputs are equal.
         acts: whether the component commands the microscope, or requests control.
         hazards: dependencies beyond the recorded inputs, as text.
-        stopped: reason why the replay ended before the record; empty if it did not.
+        stopped: reason why the replay ended before the record; empty for a complete replay.
         real_s: real time of the replay.
         recorded_s: experiment time that the record covers.
     """

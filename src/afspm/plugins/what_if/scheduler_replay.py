@@ -42,7 +42,7 @@ class SchedulerReplay:
         differences: all differences, in order of the steps.
         first: the first difference; None if all effects are equal.
         first_step: the first step, counted from 1, with a different state or effect; None if all effects are equal.
-        stopped: reason why the replay ended before the record; empty if it did not.
+        stopped: reason why the replay ended before the record; empty for a complete replay.
         note: limitation of the result, as text.
     """
 

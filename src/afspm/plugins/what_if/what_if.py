@@ -58,7 +58,7 @@ class WhatIf:
     Attributes:
         run: folder of the recorded run.
         components: replays of components, by name.
-        scheduler: replay of the scheduler; None if it was not replayed.
+        scheduler: replay of the scheduler; None if not replayed.
         controls: replays without the change, for each changed component that differs.
         unread: reasons why processes were not replayed, by name.
         left_out: reasons why processes were left out, by name.

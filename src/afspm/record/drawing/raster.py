@@ -71,7 +71,7 @@ def shared_range(pictures: Iterable[Array], contrast: Contrast = Contrast.ROBUST
 
 
 def pooled_range(pictures: Iterable[Array]) -> ValueRange:
-    """Return the range of all values of a series of images, so that a few odd images don't widen it."""
+    """Return the range of all values of a series of images, which a few odd images do not widen."""
     return value_range(np.concatenate([values.ravel() for values in pictures])[None, :])
 
 

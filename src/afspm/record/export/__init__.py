@@ -35,7 +35,7 @@ def export(
 
     Args:
         to: the name of a format that a package exports.
-        folder: the folder for the files; created if it is missing.
+        folder: the folder for the files; created if missing.
         scans: numbers of scans, as for `chosen`; None: all scans and spectra.
         tell: called with a message for each omitted measurement; None: raise FileError for a damaged file.
 

@@ -88,7 +88,7 @@ def figure(
 
     Args:
         name: the anchor of the figure on the page.
-        shown, caption: HTML of the picture, and of the line below it.
+        shown, caption: HTML of the picture, and of its caption.
         facts: shown beside the enlarged picture: names, and HTML.
         beside: names of the previous and next figure; empty if there is none.
         style: CSS classes.

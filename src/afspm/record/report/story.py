@@ -54,7 +54,7 @@ class RunStory:
 
     Attributes:
         start_ns: the first known time of the run.
-        real_s: the duration in real time; None if it is unknown, or the clock ran at real speed.
+        real_s: the duration in real time; None if unknown, or if the clock ran at real speed.
         ended: the state of the run as text: its end, running, or cut off.
         frame: the coordinate frame of all positions.
         problems: spans of all non-routine problems, in the order of time.
