@@ -103,7 +103,7 @@ def find_runs(
 
     Args:
         root: the folder to search with all its subfolders; the index `runs.sqlite` is written there if possible.
-        words: each is searched in all fields, or as "sample:gold" in one field; case is ignored.
+        words: each word is searched in all fields, or as "sample:gold" in one field; case is ignored.
         since, until: first and last day (UTC); only runs that overlap these days are returned. None: no bound.
 
     Raises:

@@ -305,7 +305,8 @@ class Run:
 
         Args:
             messages: names of the wanted messages, e.g. "ControlState"; None: all.
-            tell: called with a message for each packet without a readable file, which is left out; None: raise.
+            tell: called with a message for each packet without a readable file, which is left out. None: raise
+                FileError.
 
         Raises:
             FileError: without `tell`: a file is missing or damaged.

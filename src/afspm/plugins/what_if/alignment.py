@@ -70,7 +70,7 @@ class Difference:
 
     @property
     def at_ns(self) -> int:
-        """The earlier time of the two outputs: of their packet, or without a packet their own."""
+        """The earlier time of the two sides: the time of the packet, or of an output without a packet."""
         return min(one.packet.time_ns if one.packet else one.time_ns for one in self._sides)
 
     @property
