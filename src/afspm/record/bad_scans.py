@@ -38,6 +38,7 @@ def bad_scans(
         times_ns: ends of scans, or their interruptions.
         verdicts: time of the scan and score, in the order of arrival.
         flagged_ns: the times at which each problem was flagged, by its number.
+        interrupted_ns: the times of the interruptions.
     """
     judged: dict[int, float] = {}
     for of_ns, score in verdicts:

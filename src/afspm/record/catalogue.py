@@ -44,13 +44,13 @@ class RunSummary:
     """The summary of one run.
 
     Attributes:
-        folder: relative to the folder of all runs, with "/".
+        folder: path of the run, relative to the folder of all runs, with "/".
         name: the name of the experiment.
         began_ns, ended_ns: first control state, and end or last publication, in experiment time; None if there is none.
         state: running, ended or cut off, in words.
         metadata: sample, person, project, technique … where known.
-        scans: the number of complete scans; spectra: their number.
-        problems: the names of all flagged problems.
+        scans, spectra: the numbers of complete scans, and of spectra.
+        problems: the names of all flagged problems, except routine flags.
         notes: the texts of all notes.
         scanned_m: the path of the probe in scans, trace and retrace, in metres.
         treatments: the number of successful executions of each action beside the base actions, by name.
@@ -133,7 +133,7 @@ def _has(texts: Mapping[str, str], words: Sequence[tuple[str, str]]) -> bool:
 
 
 def _was_within(run: RunSummary, since: date | None, until: date | None) -> bool:
-    # a run without publications has no days
+    # a run without known start or end overlaps no days
     if run.began_ns is None or run.ended_ns is None:
         return since is None and until is None
     starts_ns = None if since is None else _midnight_ns(since)
@@ -229,6 +229,7 @@ def _summary(folder: Path) -> RunSummary:
 
 
 def _read(run: Run) -> RunSummary:
+    # rescans are needed to recognise routine flags of thermal-drift
     overview = run.overview((CONTROL_STATE.name, JOURNAL.name, DRIFT_RESCAN.name))
     began = next(iter(overview.timelines.control.spans), None)
     scans = run.scans
@@ -256,7 +257,7 @@ def _scanned_m(run: Run, scan: ScanRow) -> float:
         return 0.0
     rows = scan.shape[0]
     if scan.interrupted:
-        with suppress(FileError):  # damaged: counted as whole, the most that it can be
+        with suppress(FileError):  # a damaged scan counts as complete, which is the upper bound
             first = next(iter(run.scan(scan).values()))
             rows = int(np.isfinite(first.values).any(axis=1).sum())
     return path_length_m(scan.region, rows)
@@ -282,13 +283,13 @@ class ProbeHistory:
 
     Attributes:
         name: the name in [metadata] `probe`; `UNNAMED` for all runs without a name, perhaps several probes.
-        runs: their folders, oldest first.
-        first_ns, last_ns: begin of the first and end of the last run, in experiment time; None: not known.
-        scans, spectra: numbers of complete scans and spectra.
+        runs: the folders of the runs, oldest first.
+        first_ns, last_ns: start of the first and end of the last run, in experiment time; None: not known.
+        scans, spectra: numbers of complete scans and of spectra.
         scanned_m: the path along scan lines, trace and retrace, in metres.
         treatments: the number of executions of each treatment, by the name of its action.
         flagged: the number of runs in which a problem was flagged.
-        judged, good: the number of scans with a verdict on the tip, and of scans with a good verdict.
+        judged, good: the number of scans with a verdict on the tip, and of scans with a good last verdict.
         simulated: whether all runs were simulated.
     """
 

@@ -1,4 +1,4 @@
-"""The catalogue of runs as one HTML page: a card for each run, with pictures and a link to its report."""
+"""The catalogue of runs as one HTML page: a card for each run, with pictures and a link to the report."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from afspm.storage.atomic import replace_file
 
 PAGE_FILE: Final = "index.html"
 _PICTURES: Final = 4
-"""The number of shown scans of a run, evenly selected."""
+"""The largest number of shown scans of a run, evenly selected."""
 _ABOUT: Final = ("sample", "person", "project")
 _REPORT: Final = "report.html"
 _CSS: Final = """

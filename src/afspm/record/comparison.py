@@ -29,14 +29,19 @@ Aligner = Callable[[Array, Region, Array, Region], tuple[Array, str]]
 """A function that moves the levelled values of a second scan onto the first, and describes the alignment."""
 
 _ALIKE = 0.01  # of a size; regions that differ less are the same
-_CENTRES = 0.05  # of the width: drift between two nights moves no region out of the scanner's frame of reference
+_CENTRES = 0.05  # of the longer side: drift between two nights moves no region out of the scanner's frame of reference
 _ANGLE_RAD = 0.01
 ABSENT: Final = "–"
 
 
 @dataclass(frozen=True)
 class Roughness:
-    """Roughness of a levelled scan, in the unit of its values: root mean square and mean deviation (ISO 25178)."""
+    """Roughness of a levelled scan, in the unit of its values (ISO 25178).
+
+    Attributes:
+        sq: root mean square deviation from the mean.
+        sa: mean absolute deviation from the mean.
+    """
 
     sq: float
     sa: float
@@ -62,8 +67,8 @@ class ScanDifference:
     """A later scan minus the first of the same region.
 
     Attributes:
-        aligned, values: [y, x] the later scan moved onto the first, and the difference; None if they can't be
-            subtracted.
+        aligned: the later scan moved onto the first, [y, x]; None if there is no difference.
+        values: the difference minus its median, [y, x]; None if the scans can't be subtracted.
         words: the alignment, or the reason why there is no difference.
     """
 
@@ -77,7 +82,7 @@ class ComparedRegion:
     """A region that was scanned in at least two runs.
 
     Attributes:
-        scans: one for each run, in the order of runs; None in a run without a readable scan of the region.
+        scans: a scan for each run, in the order of runs; None for a run without a readable scan of the region.
         differences: the differences from the first run with a scan, by the index of the run.
     """
 
@@ -92,10 +97,11 @@ class RunComparison:
 
     Attributes:
         names: the names of the runs' folders.
+        simulated: whether the microscope of each run was simulated.
         facts: a text for each run, by heading.
         settings: keys of the experiment file whose values differ, with a text for each run.
         unread: reasons why settings or scans are missing.
-        left_out: the number of common regions that are not shown.
+        left_out: the number of common regions beyond the limit of `compare`.
     """
 
     names: Sequence[str]
@@ -108,7 +114,12 @@ class RunComparison:
 
 
 def compare(runs: Sequence[Run], align: Aligner, most_regions: int = 24) -> RunComparison:
-    """Compare runs; each scan is compared with the first run's scan of the same region.
+    """Compare runs and their last complete scans of the same regions.
+
+    The reference of a region is the scan in the first run with a readable scan there.
+
+    Args:
+        most_regions: the largest number of compared regions; other common regions are counted in `left_out`.
 
     Raises:
         InvalidValue: fewer than two runs, or one run given twice.

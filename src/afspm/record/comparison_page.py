@@ -33,7 +33,7 @@ figure:has(:checked) .over{animation:flicker 1.4s steps(1) infinite}
 
 
 def write(comparison: RunComparison, target: Path) -> None:
-    """Write the page.
+    """Write a comparison as an HTML page.
 
     Raises:
         FileError: the page can't be written.

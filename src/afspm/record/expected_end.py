@@ -14,14 +14,14 @@ Plans = Mapping[str, PlannedWork | None]
 
 
 def plans_of(facts: PlainMapping) -> dict[str, PlannedWork | None]:
-    """Return the plans that run.json keeps, by component; None: no estimate."""
+    """Return the plans in run.json, by component; None: a plan without estimate."""
     return {name: data and PlannedWork.from_dict(data) for name, data in (facts.get(PLANNED) or {}).items()}
 
 
 def expected_end_ns(plans: Plans, reports: Mapping[str, Progress], began_ns: int | None, now_ns: int) -> int | None:
     """Return the experiment time of the end, never before `now_ns`; None if unknown.
 
-    The reported pace counts. Before the first report of a component its plan counts.
+    The end follows from the reported progress of each component; before its first report, from its plan.
 
     Args:
         reports: newest progress of each component.

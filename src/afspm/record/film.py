@@ -69,9 +69,9 @@ class Film:
         frames: levelled values, shape (scans, rows, columns), [y, x] ascending; NaN where a scan does not reach.
         channel, unit: channel and unit of the values.
         numbers, times_ns: number and end of each scan.
-        window: the region of each frame, which is the region of the first scan.
-        drift_m: displacement of the sample since the first scan that was subtracted, shape (scans, 2), in m; zeros
-            where none was recorded.
+        window: the region of each frame: the region of the first scan, after subtraction of its recorded drift.
+        drift_m: the subtracted displacement of the sample since the first scan, (x, y) in m, shape (scans, 2);
+            zeros without recorded drift.
         aligned_by: "sample coordinates", "recorded drift", or "" if the scans are as they were measured.
         name: the name of the experiment; simulated: whether the microscope was simulated.
     """
@@ -112,7 +112,7 @@ class Film:
         """Write a film as .gif, or as .mp4 (needs the extra `film`).
 
         Raises:
-            InvalidValue: another ending, or no rate of frames.
+            InvalidValue: another ending, or `frames_per_s` not above 0 and at most 60.
             FileError: the film can't be written, or the extra is missing.
         """
         path = Path(path)
@@ -146,7 +146,7 @@ class Film:
         low = height - _MARGIN_PX
         draw.rectangle((_MARGIN_PX, low - 5, _MARGIN_PX + bar_px, low), fill="white", outline="black")
         _write(draw, (_MARGIN_PX, low - 9), typeset_length(bar_m), "ld")
-        # heights after levelling have no zero: their span says all
+        # heights after levelling have no zero: only their span has a meaning
         shown = f"{self.channel}, {quantity(span.high - span.low, self.unit, 3)} dark to bright"
         _write(draw, (width - _MARGIN_PX, low), f"SIMULATED, {shown}" if self.simulated else shown, "rd")
 
@@ -157,7 +157,7 @@ def film_of(
     """Return the film of scans of one place.
 
     Args:
-        rows: the scans, in the order of the film; interrupted scans show the lines taken.
+        rows: the scans, in the order of the film; of interrupted scans, the measured lines are shown.
         channel: the shown channel; None: the first channel of the first scan.
         drift: the result of `recorded_drift`; None: read from the run.
 
@@ -211,8 +211,9 @@ def places(rows: Sequence[ScanRow], drift: Mapping[int, XY]) -> list[list[ScanRo
 
 
 def recorded_drift(run: RecordedScans) -> Mapping[int, XY]:
-    """Return the displacement of the sample at each registered or predicted scan, by its time, in tip coordinates.
+    """Return the displacement of the sample (x, y) in m, in tip coordinates, by the time of the scan.
 
+    Scans at which the position of the sample was lost are left out.
     Empty if the regions are in sample coordinates, or if no drift was recorded.
     """
     if run.frame is Frame.SAMPLE:

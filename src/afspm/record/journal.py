@@ -1,4 +1,4 @@
-"""journal.sqlite: its tables, and functions that open it. One process writes; any number read at the same time."""
+"""journal.sqlite: its tables, and functions that open it. One process writes; any number of processes read."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ CREATE TABLE IF NOT EXISTS log (
 CREATE INDEX IF NOT EXISTS log_by_time ON log (time_ns);
 """
 _VIRTUAL = re.compile(r"\s*CREATE\s+VIRTUAL\b", re.IGNORECASE)
-_DAMAGE = (sqlite3.DatabaseError, UnicodeDecodeError)  # SQLite quotes what it can't make sense of
+_DAMAGE = (sqlite3.DatabaseError, UnicodeDecodeError)  # SQLite's messages quote damaged text, which may be no UTF-8
 
 
 def open_to_write(folder: Path) -> sqlite3.Connection:

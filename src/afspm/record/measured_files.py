@@ -60,7 +60,7 @@ class MeasuredFiles:
         self._batch.finish()
 
     def discard(self) -> None:
-        """Remove the files written since the last `finish`."""
+        """Remove all files that do not have their final names yet."""
         self._batch.discard()
 
     def close(self) -> None:

@@ -112,12 +112,13 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
             quantity: the name of a variable, read at one value of the sweep; or a function of one spectrum that
                 returns a number.
             at: the value of the sweep, in its unit.
-            unit: of the function's result.
+            unit: the unit of the function's result.
             direction: "forward" or "backward" along the sweep.
-            name: of the channel; by default the variable's or function's.
+            name: the channel of the map; by default derived from the variable or the function.
 
         Raises:
-            InvalidValue: these spectra do not form a grid of at least two by two, or there is no such quantity.
+            InvalidValue: these spectra do not form a grid of at least two by two, the quantity was not measured, or
+                `at` is missing or outside the sweep.
             FileError: a file is missing or damaged.
         """
         from afspm.record.spectrum_stack import map_of
@@ -169,7 +170,7 @@ def _keys(query: Query, table: str, action: str, rows: Sequence[Row]) -> dict[in
     waiting = sorted(starts, key=itemgetter(0), reverse=True)
     for end_ns, number in ends:
         while waiting and waiting[-1][0] <= end_ns:
-            keys[number] = waiting.pop()[1]  # the last start counts: earlier ones were without result
+            keys[number] = waiting.pop()[1]  # the last start counts: earlier starts had no result
     return keys
 
 
@@ -188,7 +189,7 @@ def _positions(query: Query) -> dict[int, tuple[RegistrationOutcome, float | Non
             payload = newest if time_ns > after_ns else payload
         after_ns = published_ns
         if number is not None and payload is not None:
-            with suppress(WireError):  # another implementation may encode it differently
+            with suppress(WireError):  # another implementation may encode the mapping differently
                 found[number] = drift_knowledge(wire.decode("DriftMapping", payload))
     return found
 

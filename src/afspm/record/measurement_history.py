@@ -35,7 +35,7 @@ class ScanSummary:
         shape: (rows, columns).
         holder: the component in control; None if the microscope was free, or the holder is unknown.
         interrupted: the scan is incomplete.
-        setpoint: the feedback setpoint at the start, in the unit of the operating mode; None if it was not published.
+        setpoint: the feedback setpoint at the start, in the unit of the operating mode; None if not published.
         number: the number of the scan in the run, from 1, the same for all its channels.
     """
 
@@ -62,7 +62,7 @@ class ScanSummary:
 
 @dataclass(frozen=True, slots=True)
 class SpectrumSummary:
-    """A spectrum, without its values. `position_m` is (x, y) in `frame`; None if it is unknown."""
+    """A spectrum, without its values. `position_m` is (x, y) in `frame`; None if unknown."""
 
     time_ns: int
     kind: str
@@ -95,7 +95,7 @@ class DriftPoint:
         reason: the reason why the scan was not registered, or only coarsely.
         outcome: how the position of the scan is known.
         sd_m: standard deviation of the position along its most uncertain axis; None if unknown.
-        failures: the number of errors of the estimator over the scan.
+        failures: the number of pairs of scans over which the estimator failed with an error of its own.
         filename: the file of the scan.
     """
 
@@ -148,14 +148,14 @@ class MeasurementHistory:
         return tuple(place for found in self._places.values() for place in found)
 
     def scan_progress(self, now_ns: int) -> tuple[float, int] | None:
-        """Return (fraction done, ns remaining) of the running scan; None if it can't be estimated."""
+        """Return (fraction done, ns remaining) of the running scan; None without an estimate."""
         if self.running is None:
             return None
         took_ns = [scan.took_ns for scan in reversed(self._done) if scan.resembles(self.running)][:COMPARED]
         return self.running.progress(now_ns, round(median(took_ns)) if took_ns else None)
 
     def end_scan(self, time_ns: int, *, interrupted: bool) -> None:
-        """End the running scan. The lines received of an interrupted scan become its summaries."""
+        """End the running scan. After an interruption, add a summary for each channel with received lines."""
         running = self.running
         if running is None:
             return

@@ -1,6 +1,6 @@
 """Reader of the record's HDF5 files, which follow NeXus' NXspm (`record.nexus_writer`), without loss.
 
-It also reads a grid of spectra in one file (`record.export.nexus`), which holds the mean of several spectra at a point.
+It also reads a grid of spectra in one file (`record.export.nexus`), with the mean of repeated spectra at a point.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ class FileProvenance:
 
 
 def encode_scan(scans: Sequence[Scan], circumstances: FileProvenance) -> bytes:
-    """Return the file of one scan; all channels have one region and shape."""
+    """Return the bytes of an HDF5 file with all channels of one scan, which share one region and shape."""
     first, fields = scans[0], field_names((scan.channel for scan in scans), ("x", "y"))
     region = first.region
     about = _about("scan", first.filename, circumstances) | {
@@ -166,7 +166,11 @@ def _about(content: str, filename: str, circumstances: FileProvenance) -> dict[s
 
 
 def field_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
-    """Return unique names that NeXus allows; the original names are stored as `long_name`."""
+    """Return a unique name that NeXus allows for each channel or variable, in lower case.
+
+    Args:
+        taken: names that are already used in the group.
+    """
     found, used = [], set(taken)
     for name in names:
         plain = re.sub(r"[^a-z0-9_]+", "_", name.lower()).strip("_") or "value"

@@ -54,11 +54,11 @@ def prepare() -> None:
 def draw(
     record: NightRecord, path: Path, problems: Mapping[int, str], *, title: str = "", simulated: bool = False
 ) -> None:
-    """Write the picture.
+    """Write the figure as an image file.
 
     Args:
-        problems: number -> name.
-        simulated: printed on the picture, so that it can't pass as a measurement.
+        problems: the names of problems, by number.
+        simulated: mark the figure as SIMULATED, so that it can't pass as a measurement.
     """
     shots = _chosen(record)
     repairs = _episodes(record)[:MOST_LOOKS]

@@ -61,7 +61,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class NightMark:
-    """An action of a component, or its verdict on the scan of `of_ns`."""
+    """An action of a component, or its verdict on the scan that ended at `of_ns`."""
 
     time_ns: int
     by: str
@@ -101,7 +101,11 @@ class NightRecord:
         return record
 
     def add(self, entry: Plain) -> bool:
-        """Add an entry; return False for a known entry (packets are replayed after a restart)."""
+        """Add an entry; return False for a known entry (packets are replayed after a restart).
+
+        Raises:
+            ValueError, KeyError, TypeError: the entry is malformed or of an unknown kind.
+        """
         kind, time_ns = entry["kind"], int(entry["time_ns"])
         identity = f"{kind} {time_ns} {entry.get('by', '')}"
         if identity in self._known:

@@ -27,9 +27,9 @@ def append_note(
     Args:
         folder: the folder of the run.
         who: the author.
-        written_ns: real time.
+        written_ns: real time of writing, in ns since the epoch.
         scan_ns: time of the scan that the note is about.
-        time_ns: the moment that the note is about; None: the end of the scan, or of the run.
+        time_ns: the moment that the note is about; None: the end of the scan, or else the last packet of the run.
 
     Raises:
         InvalidValue: the text is empty or too long.

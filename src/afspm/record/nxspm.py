@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _VERSION: Final = "v2024.02"
 """The version of the NeXus definitions."""
 _OF_SAMPLE: Final = {"temperature": "temperature", "field": "magnetic_field", "pressure": "pressure"}
-"""Fields of NXsample, by the last word of a parameter of an instrument."""
+"""Fields of NXsample, by the last word in the name of an instrument parameter."""
 _TECHNIQUE, _BIAS_TECHNIQUE = "STM", "STS"
 
 
@@ -69,7 +69,7 @@ def write_frame(instrument: h5py.Group, scan: Scan) -> None:
 
 
 def write_point(instrument: h5py.Group, spectrum: Spectrum) -> None:
-    """Write the position of the probe, as a scan of one point."""
+    """Write the position of the probe, if known, as a scan of one point."""
     if spectrum.position_m is not None:
         _write_pattern(instrument, spectrum.position_m, None, (1, 1))
 

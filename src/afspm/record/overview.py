@@ -166,7 +166,8 @@ class Overview:
     Attributes:
         newest_ns: the time of the newest packet; 0 before the first.
         status, control: the newest state of the microscope and of control; None before the first.
-        processes, progress_reports: the newest of each, by name.
+        processes, progress_reports: the newest state and progress of each process, by name.
+        instruments: the curve of each instrument parameter, by its name.
         proposals: the proposals of agents by id, newest last, bounded.
         approvals: the approvals in force.
         log, notes, entries, refusals: newest last, bounded.
@@ -270,13 +271,14 @@ class Overview:
         return self.timelines.mode.changed_ns if is_manual else self.timelines.control.changed_ns
 
     def scan_progress(self, now_ns: int) -> tuple[float, int] | None:
-        """Return (fraction done, ns remaining) of the running scan; None if it can't be estimated."""
+        """Return (fraction done, ns remaining) of the running scan; None without an estimate."""
         return self._measured.scan_progress(now_ns)
 
     def silent_ns(self, name: str, speed: float) -> int | None:
-        """Return the time since the last report on a process; None while reports arrive.
+        """Return the experiment time in ns from the last report on a process to the newest packet.
 
-        If other packets arrive meanwhile, the computer of the process is unreachable.
+        None up to 6 s of real time. Since other packets arrive meanwhile, a longer silence means that the computer of
+        the process is unreachable.
 
         Args:
             speed: experiment seconds in a real second.
@@ -314,6 +316,7 @@ class Overview:
             if before is None or before.state is not ScopeState.SCANNING or self.running is None:
                 readings = self.readings
                 setpoint = readings.feedback.setpoint if readings.feedback else None
+                # a late joiner has not observed the start of a scan that was running already
                 self._measured.running = RunningScan(
                     time_ns if before else None, self._holder, readings.scan_parameters, setpoint
                 )

@@ -69,7 +69,7 @@ def packets(
     messages: Sequence[str] | None,
     tell: Callable[[str], None] | None,
 ) -> Iterator[Packet]:
-    """Yield packets of the scheduler as they were published, oldest first."""
+    """Yield packets of the scheduler as they were published, oldest first; arguments as of `Run.packets`."""
     values = _Values(query, folder)
     for time_ns, envelope, message, payload, *place in _rows(query, since_ns, messages):
         try:

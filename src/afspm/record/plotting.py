@@ -67,7 +67,7 @@ def _fill(scan: Scan, kind: str, axes: Any, factor: float, ends: tuple[float, fl
 
 
 def _explain(scan: Scan, drawn: object, axes: Any, label: str, *, colorbar: bool) -> None:
-    # only for the first scan in these axes: later ones lie over it in the same units and frame
+    # only for the first scan in these axes: later scans are drawn over it in the same units and frame
     factor, length_unit = scale(max(scan.region.size_m), "m")
     for axis, name in ((axes.xaxis, "x"), (axes.yaxis, "y")):
         axis.set_major_formatter(lambda place_m, _: f"{place_m * factor:.6g}".replace("-", "−"))

@@ -57,7 +57,13 @@ class ControlAtStart:
 def control_at_start(
     journal: sqlite3.Connection, time_ns: int, doing: ScopeState, measured_ns: int | None = None
 ) -> ControlAtStart:
-    """Return control and feedback at the start of a measurement published at `time_ns`."""
+    """Return control and feedback at the start of a measurement, or at its publication if the start is unknown.
+
+    Args:
+        time_ns: the time of publication.
+        doing: the state of the microscope during the measurement.
+        measured_ns: the end of the measurement; a later start counts as unknown.
+    """
     began_ns = _began(journal, time_ns, doing)
     if began_ns is not None and measured_ns is not None and began_ns > measured_ns:
         began_ns = None  # the start was not observed: a restarted translator published the state later
@@ -74,7 +80,9 @@ def drift(journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filen
     """Return the drift mapping published just before a scan; None if there was none, or it is about another file.
 
     Args:
-        filenames: the controller's files of the scan's channels.
+        time_ns: the time of the scan's publication.
+        since_ns: the start of the scan; earlier mappings belong to other scans. None: unknown.
+        filenames: the controller's files of the scan's channels; a mapping for another file does not count.
     """
     row = journal.execute(
         "SELECT payload FROM packets WHERE message = 'DriftMapping' AND time_ns <= ? AND time_ns > ?"

@@ -77,8 +77,10 @@ class Run:
 
     Every access except `experiment` reads the files again, so a running experiment shows its newest data.
 
+    Only `experiment` is read once, since the experiment file of a run does not change.
+
     Attributes:
-        folder: of the run.
+        folder: the folder of the run.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -210,10 +212,7 @@ class Run:
 
     @property
     def problems(self) -> Table[ProblemRow]:
-        """Each flag of a non-routine problem.
-
-        Routine is thermal-drift while the first scan of a run with drift correction is taken in both directions.
-        """
+        """A row for each flag of a problem, without routine flags; see `Overview.is_routine`."""
         overview = self.overview()
         numbers = overview.problems
         rows = [
@@ -279,7 +278,10 @@ class Run:
         return [verdict for verdict in verdicts if verdict is not None]
 
     def changed_rows(self) -> dict[int, int]:
-        """Return the first row with a changed tip, found while the scan ran, by the time of the scan."""
+        """Return the index of the first row after a tip change, by the end of the scan in ns.
+
+        Only changes are included that were found while the scan ran; the last verdict on a scan counts.
+        """
         sql = "SELECT payload FROM packets WHERE message = ? ORDER BY time_ns, rowid"
         found: dict[int, int] = {}
         for (payload,) in self._query(sql, (LINE_VERDICT_MESSAGE,)):
@@ -305,26 +307,27 @@ class Run:
 
         Args:
             messages: names of the wanted messages, e.g. "ControlState"; None: all.
-            tell: called with a message for each packet without a readable file; None: that is an error.
+            tell: called with a message for each packet without a readable file, which is left out. None: raise
+                FileError.
 
         Raises:
-            FileError: a file is missing or damaged.
+            FileError: without `tell`: a file is missing or damaged.
         """
         yield from packets(self._query, self.folder, since_ns, messages, tell)
 
     def messages(self, messages: Sequence[str] | None = None) -> Iterator[tuple[Packet, str, Any]]:
         """Yield packet, name of its message and decoded content, without reading files.
 
-        Scans and spectra have NaN for values; lines of running scans are left out.
+        Scans and spectra have NaN for values; lines of running scans and unreadable packets are left out.
         """
         yield from without_reading_files(self._query, self.frame, messages)
 
     def overview(self, messages: Sequence[str] | None = None, problems: ProblemNames | None = None) -> Overview:
-        """Return the overview that the dashboard shows. Files of scans are not read for it.
+        """Return the overview that the dashboard shows, without reading the files of scans.
 
         Args:
             messages: names of the messages to reduce; None: all.
-            problems: names that replace the recorded ones.
+            problems: names of problems that replace the recorded names.
         """
         from afspm.record.overview import Overview
 
@@ -337,7 +340,7 @@ class Run:
 
     @cached_property
     def experiment(self) -> dict[str, Any]:
-        """The expanded experiment file."""
+        """The content of the expanded experiment file. Raises FileError if the file can't be read."""
         try:
             return tomllib.loads((self.folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
@@ -345,12 +348,15 @@ class Run:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """The content of run.json: clock, addresses, the end. Empty if it can't be read."""
+        """The content of run.json: clock, addresses, the end. Empty if the file can't be read."""
         return run_json_or_empty(self.folder)
 
     @property
     def metadata(self) -> dict[str, str]:
-        """Sample, person, project, technique … where known: [metadata] of the experiment file."""
+        """Sample, person, technique … where known.
+
+        From [metadata] of the experiment file, the microscope's class, and entries made at the start of the run.
+        """
         return dict(self.facts.get(METADATA) or {})
 
     @property
@@ -375,7 +381,7 @@ class Run:
 
     @property
     def frame(self) -> Frame:
-        """The frame of all positions: of the sample where drift was compensated."""
+        """The frame of all positions: the sample frame if drift was compensated, else the tip frame."""
         return Frame(self._note("frame") or Frame.TIP.value)
 
     def numbered(self, number: int) -> ScanRow:
@@ -447,6 +453,6 @@ class Run:
 def _folder(path: Path) -> Path:
     if not (path / journal.JOURNAL_FILE).is_file():
         path = latest_run(path) or path
-    path = path.resolve() if path.is_symlink() else path
+    path = path.resolve() if path.is_symlink() else path  # the link `latest` moves to the next run
     replayed = None if (path / journal.JOURNAL_FILE).is_file() else run_json_or_empty(path).get(REPLAY_OF)
     return Path(replayed) if isinstance(replayed, str) else path

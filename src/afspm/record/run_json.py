@@ -1,4 +1,4 @@
-"""run.json: the facts about a run for processes that join it, resume it or read it afterwards."""
+"""run.json: the facts about a run, for processes that join, resume or read the run."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ ENDED: Final = "ended"
 REAL_S: Final = "real_s"
 """Key in run.json, after the end of a run: its real duration, summed over its parts."""
 UNFINISHED: Final = "unfinished"
-"""Key in run.json, after the end of a run: the stop of each unfinished component as text, by name."""
+"""Key in run.json, after the end of a run: how each unfinished component was stopped, as text by name."""
 REPLAY_OF: Final = "replay_of"
 """Key in run.json of a replay: the folder of the replayed run."""
 EXPERIMENT_FILE: Final = "experiment.toml"
 """File beside run.json: the expanded experiment."""
 COMPUTER: Final = "computer"
-"""Key in run.json: the name of the computer that started the run."""
+"""Key in run.json: the name of the computer on which the run was started or last resumed."""
 PLANNED: Final = "planned"
 """Key in run.json: the planned work of each component at the first start, as `PlannedWork.as_dict`."""
 METADATA: Final = "metadata"
@@ -38,7 +38,7 @@ def read_run_json(folder: Path) -> Plain:
     """Return the content of run.json in the folder of a run.
 
     Raises:
-        FileError: the file is missing, unreadable, or of another kind.
+        FileError: the file is missing, unreadable, or not a JSON object.
     """
     file = folder / RUN_FILE
     try:
@@ -51,7 +51,7 @@ def read_run_json(folder: Path) -> Plain:
 
 
 def run_json_or_empty(folder: Path) -> Plain:
-    """Return the content of run.json; empty if it can't be read."""
+    """Return the content of run.json; empty if the file can't be read."""
     try:
         return read_run_json(folder)
     except FileError:
@@ -59,7 +59,7 @@ def run_json_or_empty(folder: Path) -> Plain:
 
 
 def latest_run(runs: Path) -> Path | None:
-    """Return the newest run in the folder of all runs; None if there is none."""
+    """Return the folder of the newest run in the folder of all runs; None if there is none."""
     link, file = runs / LATEST_LINK, runs / LATEST_FILE
     if link.is_dir():
         return runs / link.resolve().name
@@ -67,5 +67,5 @@ def latest_run(runs: Path) -> Path | None:
 
 
 def experiment_name(folder: Path, otherwise: str = "") -> str:
-    """Return the name of the experiment of a run folder; `otherwise` if it is unknown."""
+    """Return the name of the experiment of a run folder; `otherwise` if unknown."""
     return str(run_json_or_empty(folder).get("name") or otherwise)

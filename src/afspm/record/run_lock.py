@@ -1,4 +1,4 @@
-"""The lock held by the supervisor of a run: it shows whether the run continues, has ended, or was cut off."""
+"""The lock held by the supervisor of a run, which shows whether the run continues or was cut off."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def lock_run(folder: Path) -> Iterator[None]:
 def cut_off_message(folder: Path) -> str:
     """Return a message about a run that was cut off; empty if the run goes on, or has ended.
 
-    Only the computer that ran the run can know.
+    Also empty on another computer, where the lock of the run can't be checked.
     """
     facts = run_json_or_empty(folder)
     if not facts or facts.get(ENDED) or other_computer(folder) or not _is_left(folder):
@@ -45,7 +45,7 @@ def cut_off_message(folder: Path) -> str:
 
 
 def other_computer(folder: Path) -> str:
-    """Return the name of the computer that started a run; empty for this computer, or if unknown."""
+    """Return the name of the computer on which a run was last started; empty for this computer, or if unknown."""
     name = str(run_json_or_empty(folder).get(COMPUTER) or "")
     return "" if name == platform.node() else name
 

@@ -19,13 +19,13 @@ class ChannelLines:
 
 @dataclass(frozen=True, slots=True)
 class DoneScan:
-    """The duration of a scan, with its parameters; None if they were unknown."""
+    """The duration of a completed scan; `parameters` is None if the scan parameters were unknown."""
 
     parameters: ScanParameters | None
     took_ns: int
 
     def resembles(self, other: RunningScan) -> bool:
-        """Return whether both have the same size and pixels; unknown parameters count as equal."""
+        """Return whether both scans have the same size and pixels; unknown parameters count as equal."""
         ours, theirs = _extent(self.parameters), _extent(other.parameters)
         return ours is None or theirs is None or ours == theirs
 
@@ -38,7 +38,7 @@ class RunningScan:
         began_ns: None if the start was not observed.
         holder: the component in control at the start.
         parameters: the scan parameters in force at the start; None if unknown.
-        setpoint: the feedback setpoint at the start; None if it was not published.
+        setpoint: the feedback setpoint at the start; None if not published.
         channels: received lines of each channel, where the microscope delivers lines.
     """
 
@@ -58,14 +58,14 @@ class RunningScan:
 
     @property
     def rows(self) -> tuple[int, int] | None:
-        """(received, total) rows; None where no lines are delivered."""
+        """(received, total) rows of the most complete channel; None before the first lines."""
         if not self.channels:
             return None
         lines = max(self.channels.values(), key=lambda one: len(one.rows))
         return len(lines.rows), lines.shape[0]
 
     def progress(self, now_ns: int, expected_ns: int | None = None) -> tuple[float, int] | None:
-        """Return (fraction done, ns remaining); None if it can't be estimated.
+        """Return (fraction done, ns remaining); None without an estimate.
 
         Args:
             expected_ns: the expected duration of the whole scan; None: extrapolate from the received lines.

@@ -13,11 +13,11 @@ from afspm.model import Packet, Scan, ScanLines, ScopeState, ScopeStatus, Spectr
 
 @dataclass
 class AssembledScan:
-    """An ended scan.
+    """The packets of one scan, open or ended.
 
     Attributes:
         channels: the packets of the channels with their content; empty if the scan was interrupted.
-        lines: the earlier packets with the scan's lines.
+        lines: the packets with the scan's lines and their content, published while the scan ran.
         interrupted_ns: the time of the interruption; None if the scan is complete.
     """
 
@@ -72,7 +72,7 @@ class ScanAssembler:
         self._open = AssembledScan()
 
     def copy(self) -> ScanAssembler:
-        """Return a copy, to roll back to."""
+        """Return a copy of the state, for a rollback."""
         other = ScanAssembler(self._state)
         other._open = AssembledScan(list(self._open.channels), list(self._open.lines), self._open.interrupted_ns)
         return other
@@ -82,7 +82,7 @@ class ScanAssembler:
         return self._open.packets()
 
     def scan(self, packet: Packet, scan: Scan) -> list[Assembled]:
-        """Add a channel of a scan; return the measurements that it ends."""
+        """Add a channel; return the previous scan if the channel belongs to another scan."""
         over: list[Assembled] = []
         if self._open.channels and not _same(self._open, scan):
             over = self.flush()
@@ -90,7 +90,10 @@ class ScanAssembler:
         return over
 
     def lines(self, packet: Packet, lines: ScanLines) -> list[Assembled]:
-        """Add lines of a running scan; a restarted translator publishes them from the first row again."""
+        """Add lines of a running scan; return the previous scan if these lines belong to another scan.
+
+        Repeated lines are accepted, since a restarted translator publishes a scan from its first row again.
+        """
         before = self._open.lines[-1][1] if self._open.lines else None
         over: list[Assembled] = []
         if self._open.channels or (before is not None and (before.region, before.shape) != (lines.region, lines.shape)):
@@ -99,11 +102,11 @@ class ScanAssembler:
         return over
 
     def spectrum(self, packet: Packet, spectrum: Spectrum) -> list[Assembled]:
-        """Add a spectrum, which is complete at once."""
+        """Return a spectrum, which is complete at once, after the open scan if that has channels."""
         return [*self.flush(), AssembledSpectrum(packet, spectrum)]
 
     def status(self, status: ScopeStatus, time_ns: int) -> list[Assembled]:
-        """Process a new state of the microscope."""
+        """Process a new state of the microscope; return the scan that ends with this state."""
         before, self._state = self._state, status.state
         # a scan with channels is complete: translators publish none of an interrupted scan
         if status.state is ScopeState.INTERRUPTED and before is ScopeState.SCANNING and not self._open.channels:
@@ -116,14 +119,14 @@ class ScanAssembler:
         return self.flush() if status.state is ScopeState.FREE else []
 
     def flush(self) -> list[Assembled]:
-        """End the open scan if a channel of it has arrived."""
+        """End the open scan if one of its channels has arrived."""
         if not self._open.channels:
             return []
         taken, self._open = self._open, AssembledScan()
         return [taken]
 
     def finish(self, time_ns: int) -> list[Assembled]:
-        """End the open scan; without channels it counts as interrupted."""
+        """End the open scan; a scan without channels counts as interrupted."""
         if not self._open.channels and not self._open.lines:
             return []
         taken, self._open = self._open, AssembledScan()

@@ -1,6 +1,6 @@
 """Scans to and from sidpy's Datasets, the format of the pycroscopy ecosystem.
 
-sidpy's images are [x, y], afspm's are [y, x]. Install sidpy yourself: with its dependencies it takes a gigabyte.
+sidpy's images are [x, y], afspm's are [y, x]. Install sidpy yourself; with its dependencies, sidpy takes a gigabyte.
 """
 
 from __future__ import annotations

@@ -20,14 +20,14 @@ DIRECTIONS: Final = ("forward", "backward")
 _BACKWARD = re.compile(r"\s*(?:\[bwd\]|\bretrace\b|\bbackward\b|\bbwd\b)", re.IGNORECASE)
 _FORWARD = re.compile(r"\s*(?:\[fwd\]|\btrace\b|\bforward\b|\bfwd\b)", re.IGNORECASE)
 _TOLERANCE: Final = 0.1
-"""Largest distance of a position from its grid point, as a part of the spacing."""
+"""Largest distance of a position from its grid point, as a fraction of the spacing."""
 _LEAST_FILLED: Final = 0.5
-"""Least share of measured grid points: below it the positions are a list of places, not a grid."""
+"""Largest share of measured grid points at which positions still count as a list of places, not as a grid."""
 
 
 @dataclass(frozen=True)
 class PointGrid:
-    """A rectangular grid, and the cell of each position in it.
+    """A rectangular grid, and the grid cell of each position.
 
     Attributes:
         x_m, y_m: coordinates of columns and rows, before the rotation about `center_m`.
@@ -52,7 +52,7 @@ def grid(positions_m: Sequence[XY]) -> PointGrid:
     """Return the rectangular grid of some positions; the grid may be rotated, and points may be missing.
 
     Raises:
-        InvalidValue: the positions do not lie on a grid.
+        InvalidValue: the positions do not lie on a grid, or on too few points of a grid.
     """
     given = np.array(positions_m, dtype=np.float64).reshape(-1, 2)
     center = (given.min(axis=0) + given.max(axis=0)) / 2.0
@@ -147,7 +147,10 @@ def alike(spectra: Sequence[Spectrum], *, swept_alike: bool) -> Spectrum:
 
 
 def ways(spectrum: Spectrum) -> tuple[Floats, list[dict[str, Floats]]]:
-    """Return the swept values, and the curves of each variable by direction: forward, and backward if there is one."""
+    """Return the swept values, and the curves by variable: a mapping for forward, then for backward if measured.
+
+    Backward curves are in the order of the returned swept values.
+    """
     swept, columns = spectrum.values[:, 0], columns_of(spectrum)
     curves = [{name: spectrum[column] for name, column in one.items()} for one in columns]
     if (half := _turning_point(swept)) is None:
@@ -157,7 +160,10 @@ def ways(spectrum: Spectrum) -> tuple[Floats, list[dict[str, Floats]]]:
 
 
 def columns_of(spectrum: Spectrum) -> list[dict[str, str]]:
-    """Return the column of each variable by direction; one direction if a single sweep goes forth and back."""
+    """Return the column of each variable: a mapping for forward, then for backward if measured in own columns.
+
+    A single sweep that goes forth and back has one mapping, since its columns contain both directions.
+    """
     names = spectrum.names[1:]
     plain = {_FORWARD.sub("", name) or name: name for name in names if not _BACKWARD.search(name)}
     back = {_BACKWARD.sub("", name): name for name in names if _BACKWARD.search(name)}

@@ -46,7 +46,7 @@ class SpectrumStack:
         curves: the curves by variable, shape (y, x, repeat, direction, z); NaN where nothing was measured.
         units: the units by variable.
         names: the measured columns of each spectrum, without the swept column.
-        columns: columns of each variable by direction; one direction if a single sweep goes forth and back.
+        columns: columns of each variable, as from `columns_of`.
         times: times of measurement, shape (y, x, repeat); NaT if unknown.
     """
 

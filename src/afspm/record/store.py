@@ -1,7 +1,7 @@
 """`RecordStore`: the writer of a run's record: the journal, and a file for each scan and spectrum.
 
-Each call is recorded completely or not at all, and a repeated packet is recorded once: files are written under
-temporary names and renamed before the journal names them, in one transaction.
+The packets of a call are recorded completely or not at all, and a repeated packet is recorded once. For this, files are
+written under temporary names, and renamed before the journal's transaction with their names is committed.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ class RecordSettings:
 
     Attributes:
         facts: written into every file: the name of the experiment, seeds …
+        problems: the names of the experiment's problems.
         frame: the coordinate frame of published positions.
         measured: write scans and spectra; otherwise only the journal.
     """
@@ -119,7 +120,7 @@ class RecordStore:
             self._write(self._gathering.flush())
 
     def finish(self) -> None:
-        """End every scan, also a scan with lines only. Raises as `take`."""
+        """End the open scan; a scan with lines only is recorded as interrupted. Raises as `take`."""
         with self._all_or_nothing():
             self._write(self._gathering.finish(self._newest_ns))
 
@@ -137,14 +138,15 @@ class RecordStore:
         self._journal.execute("INSERT OR REPLACE INTO about VALUES (?, ?)", (name, text))
 
     def sync(self) -> None:
-        """Sync the record to the disk, so that it survives a power cut. Raises OSError."""
+        """Sync the record to the disk, for the case of a power cut. Raises OSError."""
         with suppress(FileNotFoundError), (self._folder / f"{journal.JOURNAL_FILE}-wal").open("rb+") as file:
             sync_file(file.fileno())
         # a new file survives a power cut only if its folder is synced, too
         sync_folder(self._folder)
 
     def settle(self) -> None:
-        """Make the journal a single file, readable without its write-ahead log."""
+        """Merge the write-ahead log into the journal file, unless a reader has the journal open."""
+        # shorter than the 30 s of other calls: an open reader may stay for hours
         self._journal.execute("PRAGMA busy_timeout = 1000")
         with suppress(sqlite3.OperationalError):  # a reader is open: the write-ahead log stays, which is as safe
             self._journal.execute("PRAGMA journal_mode = DELETE")
@@ -166,7 +168,7 @@ class RecordStore:
         except BaseException:  # only to roll back: every error is raised again, also KeyboardInterrupt
             self._files.discard()
             self._gathering, self._newest_ns = gathering, newest_ns
-            with suppress(sqlite3.Error):  # a full disk may have rolled it back already
+            with suppress(sqlite3.Error):  # after an error of a full disk, SQLite may have rolled back already
                 self._journal.execute("ROLLBACK")
             raise
 

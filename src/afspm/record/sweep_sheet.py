@@ -28,7 +28,10 @@ Values = tuple[object, ...]
 
 
 def draw(run: Run, title: str) -> None:
-    """Draw `sweep.png` into the folder of a run with sweep scans; further sweeps have a number in the file name."""
+    """Draw `sweep.png` into the folder of a run with sweep scans; further sweeps have a number in the file name.
+
+    Interrupted scans, and sweeps of more than `MOST` scans, are left out.
+    """
     swept: dict[tuple[str, ...], list[ScanRow]] = {}
     for row in run.scans:
         if row.settings and row.file and not row.interrupted:

@@ -26,7 +26,12 @@ T = TypeVar("T")
 
 
 class SweptSetting(NamedTuple):
-    """A parameter that a sweep had set: a number in SI or in the microscope's own unit, a switch, or text."""
+    """A parameter that a sweep had set.
+
+    Attributes:
+        value: a number, a switch, or text.
+        unit: an SI unit, or the microscope's own unit; empty without a unit.
+    """
 
     name: str
     value: float | str | bool
@@ -52,14 +57,14 @@ class ScanRow:
     Attributes:
         number: the number of the scan, from 1, in the order of recording.
         time_ns: the end of the scan, or its interruption; began_ns: None if the start was not observed.
-        channels: (name, unit) of each.
-        region, shape: None of a scan interrupted before its first line; shape is (rows, columns).
+        channels: (name, unit) of each channel.
+        region, shape: None if the scan was interrupted before its first line; shape is (rows, columns).
         interrupted: the scan is incomplete.
-        holder, mode, problems: the state of control at the start; None if unknown.
+        holder, mode, problems: the state of control at the start; None or () if unknown.
         filename: the controller's file; file: the record's file, relative to the run folder, empty if there is none.
         key: the key of the request, `scope.scan(…, key="tile-1")`; empty without a key.
-        registration: how its position on the sample is known; None without drift correction.
-        position_sd_m: standard deviation of that position along its most uncertain axis; None if unknown.
+        registration: how the position of the scan on the sample is known; None without drift correction.
+        position_sd_m: standard deviation of the position along its most uncertain axis; None if unknown.
         settings: parameters that a sweep had set for the scan, as the microscope reported them; a column for each.
     """
 

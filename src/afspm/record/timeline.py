@@ -55,12 +55,12 @@ class Timeline:
             self.spans.append(Span(label, time_ns, by=by))
 
     def name_last(self, by: str) -> None:
-        """Set the cause of the last span unless it is known."""
+        """Set the author of the last span, unless the author is known."""
         if self.spans and not self.spans[-1].by:
             self.spans[-1] = replace(self.spans[-1], by=by)
 
     def at(self, time_ns: int) -> Span | None:
-        """Return the span that contains a time."""
+        """Return the span that contains a time; None in a gap."""
         for span in reversed(self.spans):
             if span.start_ns <= time_ns:
                 return span if span.end_ns is None or time_ns < span.end_ns else None

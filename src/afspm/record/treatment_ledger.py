@@ -27,7 +27,7 @@ class TreatmentLedger:
         crashes, crash_depth_m: number of controlled crashes, and the sum of their depths.
         unknown: treatments whose voltage, duration or depth the record does not show; the sums lack them.
         in_keep_away: treatments nearer than the given distance to a region scanned before.
-        feedback_off_s: time with the feedback off, as published, except while the tip was retracted by a request.
+        feedback_off_s: time in which the published feedback was off, without the time after requested retractions.
         by: number of treatments of each author.
     """
 
@@ -58,8 +58,8 @@ def treatment_ledger(
     Args:
         journal: the journal entries in the order of time.
         positions: times and positions of the probe.
-        scanned: beginnings and regions of scans.
-        feedback: times at which the feedback's state was published, and whether it was on.
+        scanned: starts and regions of scans.
+        feedback: times at which the feedback's state was published, with True for on.
         end_ns: the end of the run.
         keep_away_m: distance from scanned regions within which a treatment counts as near.
     """

@@ -6,7 +6,7 @@
     RE(bp.scan([scope.scan], scope.scan.center_x, -1e-6, 1e-6, 5))
 
 The scheduler treats a plan like a notebook: the plan waits for control, limits hold, tip repairs come first. A
-plan keeps control while it has staged the microscope. An aborted plan stops its measurement.
+plan keeps control while the microscope is staged. An aborted plan stops its measurement.
 """
 
 from __future__ import annotations
@@ -225,8 +225,8 @@ class Microscope(StandardReadable):
     Args:
         where: the folder of the run, of all runs, or the experiment file, as for `afspm.connect`.
         parameters: generic names of the parameters that become signals: "tip-bias-voltage" becomes `tip_bias_voltage`.
-            All are in SI units.
-        client: the name of the holder of control, as the experiment shows it.
+            All signals are in SI units.
+        client: the name under which the plan holds control.
 
     Attributes:
         scan: a `ScanDevice`; spectrum: a `SpectrumDevice`.
@@ -246,7 +246,7 @@ class Microscope(StandardReadable):
 
     @AsyncStatus.wrap
     async def stage(self) -> None:
-        """Wait for control, and keep it until `unstage`."""
+        """Wait for control, which is then kept until `unstage`."""
         await self._session.call(lambda scope: self._held.enter_context(scope.control()))
 
     @AsyncStatus.wrap

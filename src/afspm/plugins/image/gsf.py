@@ -24,7 +24,7 @@ def read_field(path: Path, zone: tzinfo | None) -> FileContent:
     The format's y points down, so its YOffset is the negative upper edge of the region.
 
     Raises:
-        FileError, ValueError: the file is broken.
+        FileError, KeyError, ValueError: the file is broken.
     """
     data = path.read_bytes()
     end = data.find(b"\0")

@@ -1,1 +1,1 @@
-"""`afspm replay`: publishes a recorded run again, so that programs can join it like a running experiment."""
+"""`afspm replay`: publication of a recorded run, which programs can join like a running experiment."""

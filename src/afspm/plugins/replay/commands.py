@@ -33,8 +33,8 @@ def replay(
 ) -> None:
     """Publish a recorded run again, with its timing at any speed, as its scheduler did.
 
-    It can be joined like a running experiment: afspm.connect, afspm dashboard, afspm run FILE --only COMPONENT. Late
-    joiners get the cached packets. Requests are refused, since nothing is measured.
+    The replay can be joined like a running experiment: afspm.connect, afspm dashboard, afspm run FILE --only COMPONENT.
+    Late joiners get the cached packets. Requests are refused, since nothing is measured.
     """
     from afspm.plugins.replay import replay as replaying
 

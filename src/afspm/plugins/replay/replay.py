@@ -1,4 +1,4 @@
-"""Replay of a recorded run, with a run folder through which programs find it like a running experiment."""
+"""Replay of a recorded run, with a run folder in which programs find the addresses of the replay."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from afspm.transport.process import signals
 from afspm.transport.rate_limited_log import RateLimitedLog
 
 BEFORE_S = 1.0
-"""Real time before the first packet, so that programs that join at once miss none."""
+"""Real time before the first packet, so that programs that join at once miss no packet."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""`Replayer`: publishes recorded packets in place of a scheduler, and refuses every command."""
+"""`Replayer`: the publisher of recorded packets in place of a scheduler; every command is refused."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Replayer:
         """The number of packets published."""
 
     def run(self, *, stay: bool = False) -> None:
-        """Publish packets until the last one or `stop`, then publish the end of the experiment.
+        """Publish packets until the last packet or `stop`, then publish the end of the experiment.
 
         Args:
             stay: after the last packet, wait for `stop`.

@@ -22,10 +22,10 @@ CONNECT_S = 1.0
 class Instrument(Component):
     """Another instrument of the experiment: a cryostat, a magnet, a lock-in amplifier … at a SECoP server.
 
-    Its parameters are set and read as those of the microscope, and [limits] and [conditions] apply to them.
+    Its parameters are set and read like parameters of the microscope, and [limits] and [conditions] apply to them.
 
     Args:
-        address: of the server: "secop://cryo-pc:10767".
+        address: the address of the server: "secop://cryo-pc:10767".
         parameters: the parameters of the experiment, each with its module: `"cryo.temperature" = "tt"`, or with one
             accessible of a module, `"lockin.sensitivity" = "sr830:sensitivity"`. A name begins with the name of this
             component and a dot.
@@ -108,7 +108,7 @@ class LineSocket:
     """TCP connection that exchanges lines and blocks only while connecting.
 
     Raises:
-        OSError: there is no connection; every method raises it, too.
+        OSError: there is no connection; also raised by `receive` and `send`.
     """
 
     def __init__(self, host: str, port: int) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 IDENTIFY, DESCRIBE, ACTIVATE = "*IDN?", "describe", "activate"
 LONGEST = 1 << 20
-"""Characters of a line; a longer one is no SECoP."""
+"""The greatest length of a line in bytes; a longer line is not SECoP."""
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,13 @@ from afspm.plugins.secop import lines
 from afspm.plugins.secop.lines import SecopLine
 
 POLL_S = 0.75
-"""Interval at which each value is asked for."""
+"""The least time between two requests for a value."""
 SILENT_S = 3.0
-"""A server that answers nothing for this time is disconnected, and connected again."""
+"""A server that sends nothing for this time is disconnected, and connected again."""
 BUSY_S = 3.0
 """A new target counts as on its way for at least this time: some servers report "idle" until their next cycle."""
 STEP_S = 1.0
-"""Interval of the steps of a target whose rate the server does not keep itself."""
+"""The least time between two steps of a target, where the server has no ramp of its own."""
 _IDLE, _BUSY, _ERROR = 100, 300, 400
 _NUMBERS = ("double", "int")
 _ROUNDED = 1e-6  # relative: a server may keep a value in single precision
@@ -86,10 +86,10 @@ class RampInSteps:
 
     Attributes:
         sent: the last step, as confirmed by the server; before: the previous step.
-        ideal: the last step before the server rounded it.
+        ideal: the last step before its rounding by the server.
         sent_s: time of the last step.
         in_flight: whether the last step is still unconfirmed.
-        target_s: time when the target was read, to check that it still equals the last step.
+        target_s: time of the request for the target, which must still equal the last step.
         is_interrupted: whether the connection was lost: the target read afterwards decides how to continue.
     """
 
@@ -193,6 +193,7 @@ class SecopClient:
             ServerUnfit: the server is no SECoP server, or lacks something that the experiment file demands.
         """
         self.heard_s = now_s
+        # the answer to *IDN? names the protocol, and has neither action nor data
         if not self.is_described and "SECoP" in text and not text.startswith("describing"):
             return []
         line = lines.parse(text)
@@ -317,7 +318,7 @@ class SecopClient:
     # --- orders ---
 
     def order(self, order: InstrumentOrder, now_s: float) -> list[str]:
-        """Begin an order unless it is already known; return the lines to send."""
+        """Begin an order unless already known; return the lines to send."""
         if self._progress is not None and self._progress.order.id == order.id:
             return []
         if (known := self._done.get(order.id)) is not None:
@@ -328,7 +329,7 @@ class SecopClient:
             self._finish(order, ControlResponse.PARAM_NOT_SUPPORTED, f"there is no parameter {order.parameter.name!r}")
             return []
         if not self.is_described:
-            return []  # it comes again until it has an outcome, or its client gives up
+            return []  # the order comes again until it has an outcome, or its client gives up
         try:
             number, rate_per_s = _in_unit(order, channel)
         except UnitError as error:
@@ -457,7 +458,7 @@ class SecopClient:
                 del self._ramps[name]
 
     def _leave(self, channel: Channel, ramp: RampInSteps) -> None:
-        # a person at the instrument, or another client, has set a target: this one must not undo it
+        # a person at the instrument, or another client, has set a target, which afspm must not undo
         del self._ramps[channel.name]
         self.log.append(
             f"{channel.name}: another client set the target {channel.newest_target}; the steps to {ramp.final:.6g} end"

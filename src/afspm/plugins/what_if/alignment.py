@@ -1,7 +1,7 @@
 """Comparison of recorded and replayed outputs. Pure.
 
-Outputs are aligned by message, key and the packet that they answer, the n-th with the n-th; the remaining ones by
-message and key. An output that is added or missing therefore shifts no later one.
+Outputs are aligned by message, key, life and the packet that they answer, the n-th with the n-th; the remaining outputs
+by message and key only. An added or missing output therefore shifts no later output.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ class Output:
         key: subject of the message, such as a parameter, an action or a problem.
         value: content, which is compared.
         text: description, for people.
-        packet: the packet being handled, or the newest one; None if no packet has arrived.
+        packet: the packet being handled, or else the newest packet; None if no packet has arrived.
         time_ns: experiment time.
         life: number of the process's life (from a start to its end), from 1.
-        reaches: whether the output changes the microscope, or the control of it.
+        reaches: whether the output changes the microscope, or its control.
     """
 
     message: str
@@ -59,7 +59,7 @@ class Difference:
 
     Attributes:
         component: name of the sender.
-        recorded, now: the output on each side; None if it is missing there.
+        recorded, now: the output on each side; None if missing.
         counterfactual: whether an earlier difference reaches the microscope.
     """
 
@@ -70,7 +70,7 @@ class Difference:
 
     @property
     def at_ns(self) -> int:
-        """The time of the packet at which the two sides diverge."""
+        """The earlier time of the two sides: the time of the packet, or of an output without a packet."""
         return min(one.packet.time_ns if one.packet else one.time_ns for one in self._sides)
 
     @property

@@ -30,7 +30,7 @@ _DAMAGE = ("pulse", "crash")
 
 @dataclass(frozen=True)
 class Outcomes:
-    """Outcomes of a recorded and a new run.
+    """Outcomes of a recorded run and its rerun.
 
     Attributes:
         folder: folder of the new run.
@@ -121,7 +121,7 @@ def _truth(folder: Path) -> list[dict[str, Any]]:
 
 
 def _usable(_: RunStory, run: Run, truth: list[dict[str, Any]]) -> str:
-    # by the truth, not by the verdicts of the night: those may be what was changed
+    # by the truth, not by the verdicts of the night: the change may concern the verdicts
     scans = [line.get("scan", {}).get("tips") for line in truth if line.get("event") == "scan"]
     known = [tips for tips in scans if tips]
     return f"{sum(not any(tip['flaws'] for tip in tips) for tips in known)} of {len(known)}" if known else "unknown"

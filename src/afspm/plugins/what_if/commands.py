@@ -56,7 +56,7 @@ def what_if(
 ) -> None:
     """Replay recorded nights with a change, and show the differences.
 
-    Each component gets its recorded packets and answers again, and its outputs are compared with the recorded ones.
+    Each component gets its recorded packets and answers again, and its outputs are compared with the recorded outputs.
     Needs runs with `requests = true` in [record]. Exit code 3: a night differs.
     """
     folders, changes = _given(paths, change or [])

@@ -27,7 +27,7 @@ from afspm.transport.process.loading import load
 from afspm.wire.message_types import register_all
 
 Make = Callable[[Launch], ExperimentProcess]
-"""Makes the component of a launch line."""
+"""A function that creates the component of a launch line."""
 
 
 @dataclass
@@ -35,14 +35,14 @@ class ComponentReplay:
     """The result of a replay of one component.
 
     Attributes:
-        name: of the component.
+        name: name of the component.
         recorded, now: recorded and replayed outputs.
         same: number of equal outputs.
         differences: all differences, in order of time.
-        first: the first difference.
+        first: the first difference; None if all outputs are equal.
         acts: whether the component commands the microscope, or requests control.
         hazards: dependencies beyond the recorded inputs, as text.
-        stopped: reason why the replay ended before the record; empty if it did not.
+        stopped: reason why the replay ended before the record; empty for a complete replay.
         real_s: real time of the replay.
         recorded_s: experiment time that the record covers.
     """
@@ -80,13 +80,13 @@ def replay(
     settings: Mapping[str, Any] | None = None,
     watch: bool = False,
 ) -> ComponentReplay:
-    """Replay all lives of a component, and compare the outputs with the recorded ones.
+    """Replay all lives of a component, and compare the outputs with the recorded outputs.
 
     Args:
         packet_of: returns a recorded packet with its values.
         run_dir: folder of the run.
         make: creates the component; by default from the class in the launch line.
-        settings: settings that replace the ones in the launch line.
+        settings: settings that replace all settings of the launch line; None: the recorded settings.
         watch: also detect uses of clocks and random numbers, at half the speed.
 
     Raises:
@@ -144,7 +144,7 @@ def _replay(
 
 
 def _parted(recorded: Sequence[Output], now: Sequence[Output]) -> bool:
-    # of the lives so far; the recorded outputs of the next one are among the first, but not among the second
+    # `recorded` already contains the outputs of the next life: only as many outputs as in `now` are compared
     return first_difference("", recorded[: len(now)], now) is not None
 
 
@@ -204,7 +204,7 @@ class _Home:
                 shutil.copy(run_dir / file, self.folder)
 
     def begin(self, life: Life, *, is_own: bool) -> None:
-        """Restore the files saved at the start of a life, unless the replay continues with its own (`is_own`)."""
+        """Restore the files saved at the start of a life, unless the replay continues with its own files (`is_own`)."""
         if is_own:
             return
         for kept, file in (("memory", f"{self._name}.json"), ("measurements", f"{self._name}.scope.json")):

@@ -21,7 +21,10 @@ _log = logging.getLogger("afspm.what_if")
 
 
 def hazards(run: Path, name: str) -> list[str]:
-    """Return a text about the hazard if the outputs of an unchanged component depend on the hash seed."""
+    """Return a description if the outputs of an unchanged component depend on the hash seed.
+
+    Empty if they do not, or if a replay fails.
+    """
     command = [sys.executable, "-c", f"from {__name__} import main; main()", str(run), name]
     path = os.pathsep.join([os.getcwd(), *filter(None, sys.path)])  # noqa: PTH109 - "" in sys.path means this folder
     lines = []

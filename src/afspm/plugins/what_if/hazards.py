@@ -1,7 +1,8 @@
 """Detection of a component's dependencies beyond its inputs, and a guard against side effects of a replay.
 
 The guard uses Python's audit events, which precede the opening of a file or the start of a program. The watch uses
-Python's profiler: it sees every call of a clock or an unseeded random function.
+Python's profiler, which sees every call of a clock or of an unseeded random function of Python. The functions of numpy
+are invisible to the profiler, so the state of numpy's global generator is compared before and after.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ class ReplayForbids(PermissionError):
 
 
 class HazardGuard:
-    """Guard that confines one replayed process to its folder.
+    """Guard that confines one replayed process to its folder; threads that the component starts are not guarded.
 
     Args:
         folder: folder of the replay, in which the component may do everything.
-        known: folders of the record, which may be read.
+        known: folders of the record; other files of the user can be read, but count as a hazard.
 
     Attributes:
         seen: descriptions of the hazards, in order of occurrence.
@@ -72,7 +73,7 @@ class HazardGuard:
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Record every call to a clock or an unseeded random function within the block, at half the speed."""
+        """Record uses of clocks and unseeded random functions within the block, at half the speed."""
         before = _numpy_state()
         sys.setprofile(self._profile)
         try:
@@ -169,7 +170,7 @@ def _path_of(path: object) -> str | None:
 
 
 def _hook() -> None:
-    # an audit hook can't be removed: one for all replays
+    # an audit hook can't be removed, so all replays share one hook
     global _is_hooked
     if not _is_hooked:
         _is_hooked = True

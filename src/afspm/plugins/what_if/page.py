@@ -17,7 +17,7 @@ from afspm.record.report.markup import document, section, table
 from afspm.storage.atomic import replace_file
 
 MOST_SHOWN = 100
-"""Differences of a night on the page."""
+"""The largest number of differences of a night on the page."""
 _CSS = """
 article{margin-top:3rem}article>h2{font-size:1.4rem}article:only-of-type>h2{display:none}
 .differs{color:var(--problem)}td pre{margin:0;font:inherit;white-space:pre-wrap;overflow-wrap:anywhere;min-width:9rem}

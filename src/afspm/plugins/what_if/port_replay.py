@@ -28,7 +28,7 @@ from afspm.transport.port import (
 )
 
 PacketOf = Callable[[int, str], Packet]
-"""Returns the recorded packet of a time and an envelope."""
+"""A function that returns the recorded packet of a time and an envelope."""
 
 _SIGNALS = {one.__name__: one for one in (Killed, ParentGone, ControlConnected, ControlDisconnected)}
 _ANSWERABLE = {
@@ -45,7 +45,11 @@ class LifeOver(BaseException):
 
 @dataclass(slots=True)
 class Poll:
-    """A recorded return of `poll`, with its events as in the log."""
+    """A recorded return of `poll`, with its events as in the log.
+
+    Attributes:
+        readings: the clock readings before the return, as kind and value in turn.
+    """
 
     timeout_s: float | None
     monotonic_s: float
@@ -60,6 +64,8 @@ class Sent:
 
     Attributes:
         frames: frames of the request; for a message (envelope, payload).
+        handled: the packet that the component was handling; None if unknown.
+        readings: the clock readings before the sending, as kind and value in turn.
     """
 
     frames: tuple[bytes, ...]
@@ -176,13 +182,14 @@ class ReplayPort:
     """Port that offers a recorded life to a component. See `afspm.transport.port.Port`.
 
     While the component sends the recorded outputs, every event comes as recorded. After the first difference, a request
-    is answered at once: as the n-th recorded request of the same content, or with a success if the record has none. A
-    command to the microscope without a recorded answer ends the replay.
+    is answered at once, as the n-th recorded request of the same content. Without a recorded answer, a parameter is
+    read as its last recorded value (or the read fails), other harmless requests succeed, and a command to the
+    microscope ends the replay.
 
     Attributes:
         outputs: all outputs of the component so far.
         differs: whether an output differs from the recorded life.
-        unanswered: the command that ended the replay; empty if none.
+        unanswered: the command, or the endless polling, that ended the replay early; empty otherwise.
         handled: returns the packet that the component is handling.
     """
 
@@ -212,7 +219,7 @@ class ReplayPort:
 
     @property
     def is_over(self) -> bool:
-        """True once all recorded events are delivered and all recorded outputs are passed."""
+        """Whether all recorded events are delivered and all recorded outputs are passed."""
         return self._at >= len(self._life.lines) and not self._pending
 
     def wake_up(self, incoming: Incoming | None = None) -> None:
@@ -225,7 +232,7 @@ class ReplayPort:
     def close(self) -> None:
         """Do nothing: there is nothing to close."""
 
-    # --- what the component sends ---
+    # --- outputs of the component ---
 
     def send(self, frames: Sequence[bytes]) -> None:
         self._end_if_killed()
@@ -286,11 +293,11 @@ class ReplayPort:
         return Response(int(ControlResponse.FAILURE), b"", reason, request_id)
 
     def place(self) -> PacketName | None:
-        """Return the packet that the component is handling, or the newest one."""
+        """Return the packet that the component is handling, or else the newest received packet; None before any."""
         packet = self.handled()
         return self._newest if packet is None else PacketName(packet.time_ns or 0, packet.envelope)
 
-    # --- what the component gets ---
+    # --- inputs of the component ---
 
     def poll(self, timeout_s: float | None) -> list[Incoming]:
         if self._pending:
@@ -360,13 +367,13 @@ class ReplayPort:
             raise LifeOver
 
     def _end_if_killed(self) -> None:
-        # what a killed process would have sent next is not known; one that ended by itself sent nothing more
+        # the next output of a killed process is unknown; a process that ended by itself had no further output
         if self._life.end is None:
             self._end_if_over()
 
 
 def recorded_outputs(life: Life, outputs: OutputReader) -> Iterator[Output]:
-    """Yield all outputs of a recorded life; repetitions of a request are left out."""
+    """Yield all outputs of a recorded life, and its end if recorded; repetitions of a request are left out."""
     sent: set[str] = set()
     newest: PacketName | None = None
     now_ns = life.facts["now_ns"]

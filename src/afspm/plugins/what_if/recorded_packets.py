@@ -8,7 +8,7 @@ from afspm.plugins.what_if.port_replay import PacketOf
 from afspm.record.run import Run
 
 _KEPT = 64
-"""Packets kept in memory: all components get a scan at about one time."""
+"""The number of packets kept in memory."""
 
 
 def recorded_packets(record: Run) -> PacketOf:
@@ -18,7 +18,7 @@ def recorded_packets(record: Run) -> PacketOf:
     def packet_of(time_ns: int, envelope: str) -> Packet:
         if (found := kept.get((time_ns, envelope))) is not None:
             return found
-        for packet in record.packets(since_ns=time_ns - 1):
+        for packet in record.packets(since_ns=time_ns - 1):  # `since_ns` itself is excluded
             if packet.time_ns != time_ns:
                 break
             if packet.envelope == envelope:

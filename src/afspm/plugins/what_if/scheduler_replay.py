@@ -40,9 +40,9 @@ class SchedulerReplay:
         steps: number of steps compared.
         same: number of equal effects.
         differences: all differences, in order of the steps.
-        first: the first difference.
-        first_step: the first step, counted from 1, with a different state or effect.
-        stopped: reason why the replay ended before the record; empty if it did not.
+        first: the first difference; None if all effects are equal.
+        first_step: the first step, counted from 1, with a different state or effect; None if all effects are equal.
+        stopped: reason why the replay ended before the record; empty for a complete replay.
         note: limitation of the result, as text.
     """
 
@@ -83,7 +83,7 @@ def replay_file(path: Path, settings: Mapping[str, Any] | None = None) -> Schedu
     """Replay the scheduler of a run.
 
     Args:
-        settings: settings that replace the ones in the launch line.
+        settings: settings that replace all settings of the launch line; None: the recorded settings.
 
     Raises:
         FileError: the file can't be read, or is not a step log.

@@ -29,7 +29,7 @@ class ChangedField(NamedTuple):
 
 
 def sides(one: Difference) -> tuple[str, str]:
-    """Return the texts of recorded and replayed output; of long ones the part that differs."""
+    """Return the texts of recorded and replayed output; of two long texts, the part that differs."""
     if one.recorded is None or one.now is None:
         return _side(one.recorded), _side(one.now)
     before, after = one.recorded, one.now
@@ -56,7 +56,7 @@ def changed_fields(one: Difference) -> list[ChangedField]:
 
 
 def message_name(one: Difference) -> str:
-    """Return the envelope of a published message."""
+    """Return the envelope of the published message in a difference."""
     output = one.recorded or one.now
     return (output.key or output.message) if output else ""
 

@@ -38,7 +38,7 @@ class Row:
 
     Attributes:
         same, added, removed, changed: numbers of outputs.
-        counterfactual: number of differences after the first one that reaches the microscope.
+        counterfactual: number of differences after the first difference that reaches the microscope.
         note: limitation of the result, as text.
     """
 
@@ -58,7 +58,7 @@ class WhatIf:
     Attributes:
         run: folder of the recorded run.
         components: replays of components, by name.
-        scheduler: replay of the scheduler; None if it was not replayed.
+        scheduler: replay of the scheduler; None if not replayed.
         controls: replays without the change, for each changed component that differs.
         unread: reasons why processes were not replayed, by name.
         left_out: reasons why processes were left out, by name.
@@ -86,7 +86,7 @@ class WhatIf:
 
     @property
     def differences(self) -> list[Difference]:
-        """All differences in order of time; all after the first one that reaches the microscope are marked."""
+        """All differences in order of time, marked as counterfactual after `counterfactual_from_ns`."""
         since_ns = self.counterfactual_from_ns
         marked = (
             replace(one, counterfactual=since_ns is not None and one.at_ns > since_ns)
@@ -107,7 +107,7 @@ class WhatIf:
     def table(self) -> list[Row]:
         """Return a row for each process, with counts of equal and different outputs.
 
-        For a component that acts, differences after the first one that reaches the microscope are not counted: its
+        For a component that acts, differences after `counterfactual_from_ns` count as counterfactual only, since its
         recorded inputs no longer match its decisions.
         """
         acting = {name for name, one in self.components.items() if one.acts}
@@ -160,13 +160,14 @@ class WhatIf:
 
 
 def what_if(run: str | Path, changes: Changes = None, *, only: Collection[str] = ()) -> WhatIf:
-    """Replay a recorded run with changed components, and compare their outputs with the recorded ones.
+    """Replay a recorded run with changed components, and compare their outputs with the recorded outputs.
 
         r = afspm.what_if("runs/night-12", {"classifier": {"sigmas": 4.0}})
         r.first     # the first difference: its time, its packet, recorded and now
         r.table()   # for each component: same, added, removed, changed
 
-    The run must have been recorded with `[record] requests = true`. Nothing outside a temporary folder is written.
+    The run must have been recorded with `[record] requests = true`. Nothing outside a temporary folder is written. A
+    process that can't be replayed is listed in `unread`, unless it was changed or chosen by `only`.
 
     Args:
         run: folder of the run.
@@ -175,8 +176,10 @@ def what_if(run: str | Path, changes: Changes = None, *, only: Collection[str] =
         only: names of processes to replay; empty: all.
 
     Raises:
-        FileError: the run has no recorded requests, or they can't be read.
-        ConfigError: a changed component can't be created, or a name is unknown.
+        FileError: the run has no recorded requests, those of a changed or chosen process can't be read, or the
+            experiment file of `changes` is missing.
+        ConfigError: a changed or chosen component can't be created, or a name is unknown.
+        InvalidValue: a change is neither settings nor a class.
     """
     with open_run(run) as record:
         logs = _logs(record.folder)
@@ -225,7 +228,7 @@ def _replay(
     result.components[name] = made
     if made.first is None:
         return
-    # is it the change? the unchanged component must repeat its record; if not, the watch says what it depends on
+    # is it the change? the unchanged component must repeat its record; if not, the watch finds its hidden dependencies
     control = component_replay.replay(lives, packet_of, result.run, watch=True)
     if changed is not None:
         result.controls[name] = control

@@ -15,7 +15,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 8.0, 8.0, 34.0
 _MOST_POINTS = 200
 Size = tuple[int, int]
 FORWARD, BACKWARD = "#c2571a", "#3f7fc4"
-"""Colours that are distinct on white and on black."""
+"""Colours of forward and backward curves, distinct on white and on black."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Axis:
 
 @dataclass(frozen=True)
 class Curve:
-    """A curve; an `opacity` below 1 draws it thin, and an empty colour uses the text colour."""
+    """A curve. An `opacity` below 1 makes the line thin; an empty colour means the text colour."""
 
     x: Array
     y: Array

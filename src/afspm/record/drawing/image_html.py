@@ -1,4 +1,4 @@
-"""An image of values as HTML, with a scale bar inside and a colour bar beside it."""
+"""An image of values as HTML, with a scale bar and a colour bar."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def pooled_range(pictures: Iterable[Array]) -> ValueRange:
 
 
 def indices(values: Array, span: ValueRange) -> NDArray[np.uint8]:
-    """Return the index of each value in the colour map; UNMEASURED where it is not finite."""
+    """Return the index of each value in the colour map; UNMEASURED for values that are not finite."""
     with np.errstate(invalid="ignore", over="ignore"):
         scaled = (values - span.low) * ((LEVELS - 1) / (span.high - span.low))
         np.clip(scaled, 0.0, LEVELS - 1, out=scaled)
@@ -103,6 +103,8 @@ def webp(levels: NDArray[np.uint8], palette: str = PALETTES[0]) -> bytes:
 
 def reduced(values: Array, largest_px: int, *, each_side: bool = False) -> Array:
     """Return an image reduced to at most `largest_px` a side, by means over blocks of pixels; NaN is ignored.
+
+    Incomplete blocks at the end of a side are dropped.
 
     Args:
         each_side: reduce each side separately, for images drawn in the proportions of their region; otherwise blocks

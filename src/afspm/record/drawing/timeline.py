@@ -82,7 +82,7 @@ class DrawnBand:
 
 @dataclass(frozen=True)
 class TimelineCurve:
-    """A value over time under the rows; NaN where it is unknown."""
+    """A value over time, drawn below the rows; NaN where the value is unknown."""
 
     name: str
     unit: str
@@ -111,7 +111,7 @@ class TimelineCurve:
 
 @dataclass
 class Stretch:
-    """Intervals that share columns of the image: the longest, and their number."""
+    """A drawn interval, or several that share columns: the label and duration of the longest, and their number."""
 
     begin: int
     end: int
@@ -182,7 +182,7 @@ def time_ticks(begin_s: float, end_s: float, about: int = 7) -> list[float]:
 
 
 def stretches(spans: Sequence[Interval], begin_ns: int, end_ns: int) -> list[Stretch]:
-    """Return intervals as columns of the image; intervals in one column become the longest, with their number."""
+    """Return the drawn stretch of each interval; short intervals in one column are merged and counted."""
     width_ns = (end_ns - begin_ns) / COLUMNS
     found: list[Stretch] = []
     for span in spans:

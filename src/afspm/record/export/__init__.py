@@ -121,9 +121,9 @@ def chosen(rows: list[ScanRow], numbers: str) -> list[ScanRow]:
 
 
 def grids(run: Run, rows: Sequence[SpectrumRow]) -> Iterator[tuple[str, SpectrumStack]]:
-    """Yield each grid of at least two by two equally measured spectra, with the name of its file.
+    """Yield each grid of at least two by two spectra of one kind, with the name of its file.
 
-    A spectrum with a damaged file is left out, like an unmeasured one.
+    Different sweeps are interpolated to common values. A spectrum with a damaged file counts as unmeasured.
     """
     spectra: dict[tuple[str, tuple[str, ...]], list[Spectrum]] = {}
     for row in rows:

@@ -1,4 +1,4 @@
-"""Images (.png): an image of each channel of a scan, with scale bar and colour bar, and an image of each spectrum."""
+"""Images (.png) of each channel of a scan, with scale bar and colour bar, and of each spectrum."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _DPI = 150
 
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
-    """Yield (suffix, content) of an image for each channel of a scan, or of a spectrum. Needs matplotlib."""
+    """Yield (suffix, content) of an image for each channel of a scan, or of a spectrum."""
     time = f"{iso_utc(row.time_ns)[:19].replace('T', ' ')} UTC"
     if isinstance(row, ScanRow):
         for channel, scan in run.scan(row).items():

@@ -15,12 +15,10 @@ REPORT_FILE = "report.html"
 
 
 def write(folder: str | Path) -> Path:
-    """Write `report.html` and missing figures; return the path of the report.
-
-    Needs the extra `record`; the figures need `plot`.
+    """Write `report.html`, and figures that no component has drawn; return the path of the report.
 
     Args:
-        folder: of a run, which may still go on; or of all runs: then the newest run.
+        folder: the folder of a run, which may still go on; or the folder of all runs, for the newest run.
 
     Raises:
         FileError: there is no record, or the report can't be written.

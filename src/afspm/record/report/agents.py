@@ -29,7 +29,8 @@ class RecordedGrant:
     """A grant in its last published form.
 
     Attributes:
-        gone_ns: the time from which it was no longer published; None: in force until it expired or the record ended.
+        gone_ns: the time from which the grant was no longer published; None: in force until its expiry or the end of
+            the record.
     """
 
     approval: Approval
@@ -72,7 +73,7 @@ def read(run: Run) -> list[AgentWork]:
     stop = run.problem_names.get(STOPPED_BY_AGENT)
     stops = [entry for entry in run.journal if _stops(entry, stop)] if stop is not None else []
     stopped = {_agent(entry.who) for entry in stops if entry.who.endswith(STOPPER)}
-    # an agent without any proposal or approval is known by the component that others act through
+    # a refused agent without any proposal or approval is found by the component that it shares with other agents
     components = {component_of(name) for name in (*proposals, *plans, *(agent for agent, *_ in grants), *stopped)}
     refusals = [entry for entry in run.refusals if component_of(entry.who) in components]
     names = {*proposals, *plans, *(agent for agent, *_ in grants), *stopped, *(_agent(one.who) for one in refusals)}

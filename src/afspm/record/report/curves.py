@@ -1,4 +1,4 @@
-"""The spectra of a report: for each kind all curves with mean and spread, and small charts that enlarge."""
+"""The spectra of a report: for each kind the curves with mean and spread, and small charts that enlarge."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class SpectrumCurves:
 
     @property
     def back(self) -> dict[str, Array]:
-        """The variables measured on the backward sweep too."""
+        """The variables of the backward sweep, by name; empty without a backward sweep."""
         directions = ways(self.spectrum)[1]
         return directions[1] if len(directions) > 1 else {}
 

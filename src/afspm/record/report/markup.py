@@ -88,10 +88,12 @@ def figure(
 
     Args:
         name: the anchor of the figure on the page.
-        shown, caption: HTML of the picture, and of the line below it.
+        shown, caption: HTML of the picture, and of its caption.
         facts: shown beside the enlarged picture: names, and HTML.
         beside: names of the previous and next figure; empty if there is none.
-        style: CSS classes; ratio: width by height; place: in a grid, as CSS.
+        style: CSS classes.
+        ratio: width divided by height.
+        place: place in a grid, as CSS.
     """
     entries = "".join(f"<dt>{escape(head)}</dt><dd>{text}</dd>" for head, text in facts.items() if text)
     steps = "".join(

@@ -38,8 +38,8 @@ class TopographyPicture:
     """A scan with images of its topography, which are None if no values can be read.
 
     Attributes:
-        image: the levelled image in colour.
-        thumbnail: the image for the figure of the night.
+        image: the levelled image in colour; None if the scan has no readable values.
+        thumbnail: the image for the figure of the night; None if the scan has no readable values.
         is_bad: whether the image is drawn with a frame.
         changed_row: the first row with a changed tip, found in the lines of the running scan; None: no change found.
     """
@@ -55,7 +55,7 @@ class TopographyPicture:
 
 @dataclass(frozen=True)
 class FigurePicture:
-    """A figure drawn by a component, as embedded in the page; `ratio`: width by height."""
+    """A figure drawn by a component, as embedded in the page; `ratio` is its width divided by its height."""
 
     name: str
     image: bytes

@@ -27,11 +27,11 @@ _LEGEND = (
     "one height, without its plane; scans of one size share one range of heights."
 )
 _MARGIN = 0.04
-_HIDDEN_BEHIND = 40  # most pictures on the map: older ones disappear beneath newer ones
+_HIDDEN_BEHIND = 40  # most pictures on the map: older pictures disappear beneath newer pictures
 
 
 def sheet(story: RunStory, shown: Sequence[TopographyPicture], clock: PageTimes) -> str:
-    """Return the pictures of scans in the order of time."""
+    """Return the contact sheet of scans as HTML; empty if the run has spectra only."""
     if not shown:
         return "" if story.spectra else "<p>None.</p>"
     styles = colours(story)
@@ -43,7 +43,7 @@ def sheet(story: RunStory, shown: Sequence[TopographyPicture], clock: PageTimes)
 
 
 def sample_map(shown: Sequence[TopographyPicture], spectra_m: Sequence[XY], frame: Frame) -> str:
-    """Return a map of pictures and spectra on the sample, the newest on top; empty if no position is known."""
+    """Return an HTML map of the newest scans, with the newest on top, and of all spectra; empty without positions."""
     pictures = _topmost(shown)
     corners = [one.row.region.corners_m() for one in pictures if one.row.region is not None]
     corners += [np.array([position]) for position in spectra_m]

@@ -54,7 +54,7 @@ class RunStory:
 
     Attributes:
         start_ns: the first known time of the run.
-        real_s: the duration in real time; None if it is unknown, or the clock ran at real speed.
+        real_s: the duration in real time; None if unknown, or if the clock ran at real speed.
         ended: the state of the run as text: its end, running, or cut off.
         frame: the coordinate frame of all positions.
         problems: spans of all non-routine problems, in the order of time.
@@ -64,7 +64,7 @@ class RunStory:
         comparisons: planned and measured work of each component with a plan.
         agents: the work of each agent.
         bands: the values of other instruments that the conditions allowed.
-        unfinished: the stop of each unfinished component as text, by name.
+        unfinished: how each unfinished component was stopped, as text by name.
     """
 
     name: str
@@ -130,7 +130,7 @@ class RunStory:
         return [scan for scan in self.scans if scan.registration not in well]
 
     def why_unregistered(self, scan: ScanRow) -> str:
-        """Return the reason why the position of a scan is uncertain."""
+        """Return the reason why the position of a scan is uncertain; empty if unknown."""
         began_ns = scan.time_ns if scan.began_ns is None else scan.began_ns
         points = (point for point in self.overview.drift if began_ns <= point.time_ns <= scan.time_ns)
         return next((point.reason for point in points), "")
@@ -140,7 +140,7 @@ class RunStory:
         return sorted(lane.lasted_ns(self.end_ns).items(), key=lambda share: -share[1])
 
     def done_meanwhile(self, problem: Span) -> list[str]:
-        """Return the treatments of the tip while a problem was flagged: "4 × pulse", "1 × crash"."""
+        """Return the actions while a problem was flagged, with their numbers: "4 × pulse", "1 × retract"."""
         end_ns = self.end_ns if problem.end_ns is None else problem.end_ns
         done = [entry.what for entry in self.actions if problem.start_ns <= entry.time_ns <= end_ns]
         return [f"{count} × {what.removeprefix('x-')}" for what, count in Counter(done).items()]
@@ -174,6 +174,7 @@ def read(run: Run) -> RunStory:
         overview=overview,
         scans=[_without_routine(scan, overview) for scan in scans],
         spectra=len(run.spectra),
+        # late flags are listed with the problems instead
         refusals=gathered([entry for entry in run.refusals if entry not in late]),
         ledger=run.ledger(),
         actions=[entry for entry in run.journal if entry.what in names.EXTENSION_ACTIONS and entry.response == 0],
@@ -253,7 +254,10 @@ def colours(story: RunStory) -> dict[str, str]:
 
 
 def timeline_rows(story: RunStory) -> Iterator[TimelineRow]:
-    """Yield a row for each holder, mode, problem, state, and process in trouble."""
+    """Yield the rows: holders, MANUAL, problems, states of the microscope, processes in trouble, restarts, notes.
+
+    Rows without spans, and the states free and undefined, are left out.
+    """
     seen = story.overview
     for holder, style in colours(story).items():
         yield _row(holder, style, (span for span in seen.timelines.control.spans if span.label == holder))

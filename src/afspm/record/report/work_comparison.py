@@ -12,7 +12,10 @@ from afspm.record.tables import ScanRow, SpectrumRow
 
 @dataclass(frozen=True)
 class WorkComparison:
-    """The planned and the measured work of a component; the measured duration includes interruptions."""
+    """The planned and the measured work of a component.
+
+    The measured duration extends from the first start to the last end, with spectra and pauses.
+    """
 
     name: str
     planned: PlannedWork
