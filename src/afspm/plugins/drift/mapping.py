@@ -115,7 +115,7 @@ class Mapping:
 
 
 def unlike_drift(linear: Array) -> str:
-    """Return the reason why drift can't cause a given 2 x 2 part between two scans; empty if it can."""
+    """Return the reason why drift can't cause a given 2 x 2 part between two scans; empty for a plausible part."""
     if np.linalg.det(linear) <= 0.0:
         return f"mirrored or flat: {linear.tolist()}"
     stretches = np.linalg.svd(linear, compute_uv=False)

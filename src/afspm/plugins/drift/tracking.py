@@ -84,7 +84,7 @@ class Update:
 
     @property
     def outcome(self) -> RegistrationOutcome:
-        """Kind of determination of the scan's position."""
+        """Outcome for the position of the scan, judged by all its registrations."""
         found = self.registrations.values()
         if self.matched:
             accepted = [one for one in found if one.accepted]
@@ -97,7 +97,7 @@ class Update:
 
 
 def require_newer(scan: DriftScan, newest_s: float | None) -> None:
-    """Raise InvalidValue for a scan older than the newest one."""
+    """Raise InvalidValue for a scan with its middle before `newest_s`, the middle of the newest scan; None: no scan."""
     if newest_s is not None and scan.mid_s < newest_s:
         late = f"the middle of scan {scan.key!r} is at {scan.mid_s:g} s, and {newest_s:g} s was reached already"
         raise InvalidValue(late, hint="give a tracker its scans in the order of time")
