@@ -22,7 +22,7 @@ from afspm.plugins.drift.registration import DriftScan, Estimator, Prior, Regist
 
 Array = NDArray[np.float64]
 
-_SAFETY = 2.0  # on the standard deviation of the shear, which is only derived from that of the displacement
+_SAFETY = 2.0  # on the standard deviation of the shear, which is only derived from the displacement
 _CONTRADICTION = 16.0  # chi2 of the difference between both routes
 
 

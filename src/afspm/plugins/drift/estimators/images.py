@@ -19,7 +19,7 @@ MOST_SATURATED = 0.6  # of the pixels at exactly the lowest or the highest value
 
 
 class Unusable(Exception):
-    """Error: a scan can't be registered with any other scan, for the reason in its text."""
+    """Error: a scan, or the overlap of two scans, can't be registered, for the reason in its text."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +27,9 @@ class Image:
     """An image prepared for registration.
 
     Attributes:
-        values: [y, x], finite everywhere: unmeasured pixels are filled from the nearest row.
-        known: [y, x], true for measured pixels, and for a single missing row between measured ones.
+        values: [y, x], finite everywhere: unmeasured pixels are filled from the nearest measured pixel.
+        known: [y, x], true for measured pixels of rows that are mostly measured, and for a single missing row between
+            measured rows.
         made_up: [y, x], true for values interpolated from neighbouring rows, which carry no information about a
             displacement; None: nowhere.
     """
@@ -42,8 +43,8 @@ def prepare(values: Array) -> Image:
     """Return an image with flattened rows, clipped outliers, mended scars, and a standard deviation of 1.
 
     Raises:
-        Unusable: fewer than half of the rows are measured, or the values are constant, saturated or without topography
-            (a crashed tip).
+        Unusable: fewer than half of the rows are measured, or the values are constant, saturated, only an offset and a
+            tilt in each row, or without topography (a crashed tip).
     """
     known = np.isfinite(values)
     known &= ~_unfinished(np.where(known, values, 0.0))[:, None]

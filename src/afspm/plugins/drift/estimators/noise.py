@@ -101,7 +101,7 @@ class CrossingLines:
     """The lines of a scan that is rotated against the grid; each line has its own unknown parabola.
 
     Attributes:
-        number: [y, x], number of the line nearest to each pixel of the grid, from 0.
+        number: [y, x], number of the line nearest to each pixel of the grid, in half lines from 0.
         along: [y, x], position of the pixel along its line, about -1 to 1.
     """
 
@@ -118,10 +118,9 @@ class CrossingLines:
         return cls(half - half.min(), 2.0 * (x - x.min()) / max(float(np.ptp(x)), 1.0) - 1.0)
 
     def seen(self, columns: NDArray[Real], weight: Array) -> NDArray[Real]:
-        """Return the result of the function `seen` for white noise, with the parabolas of the crossing lines removed,
-        too.
+        """Return the result of the function `seen` for white noise, also without the parabolas of the crossing lines.
 
-        Both sets are projected away in turn (von Neumann, Functional Operators II, 1950).
+        Both sets of parabolas are projected away in turn (von Neumann, Functional Operators II, 1950).
         """
         root = np.sqrt(weight)
         left = (columns * root[:, None, :]).astype(columns.dtype)
@@ -235,9 +234,10 @@ def products(one: NDArray[Real], two: NDArray[Real]) -> Array:
 
 
 def noise_metric(residual: Array, known: NDArray[np.bool_], seen_through: FineFilter) -> Array | None:
-    """Return the metric Q of white and 1/f noise; None if the noise is nearly white (b W <= 0.3 a).
+    """Return the metric Q of white and 1/f noise; None if the noise is nearly white (b W <= 0.3 a, with W the width).
 
-    N(f) = a + b / f is fitted to the median row spectrum of a residual, corrected for the filter.
+    The result is also None for small images and for a residual without noise. N(f) = a + b / f is fitted to the median
+    row spectrum of a residual, corrected for the filter.
     """
     from scipy.linalg import inv, toeplitz
     from scipy.optimize import nnls

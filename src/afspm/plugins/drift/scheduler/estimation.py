@@ -82,7 +82,7 @@ class Estimation:
         """Take into account that the controller moves the tip with this velocity from `time_s` on.
 
         Raises:
-            ConfigError: the tracker can't take this into account.
+            ConfigError: the tracker can't take this into account. InvalidValue: as `BankTracker.compensated`.
         """
         compensated = getattr(self._tracker, "compensated", None)
         if compensated is None:

@@ -34,7 +34,10 @@ class PlaceCodec(Codec, Protocol):
         """Return a ScanParameters or ProbePosition as a message."""
 
     def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
-        """Return a message with the place of the message `told`, a ScanParameters2d or a ProbePosition."""
+        """Return a message with its place replaced by the place in another message.
+
+        The other message is a ScanParameters2d or a ProbePosition.
+        """
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ class ScanStartTracker:
         return self.begun if self.begun is not None and self.begun.time_s < end_s else None
 
     def middle_s(self, end_s: float, expected_s: float) -> float:
-        """Return the middle of the scan that ended at `end_s`, from its start; for an unknown start, from `expected_s`."""
+        """Return the middle of the scan that ended at `end_s`, from its start or, if unknown, `expected_s`."""
         begun = self.of_scan(end_s)
         return end_s - expected_s / 2 if begun is None else (begun.time_s + end_s) / 2
 

@@ -36,14 +36,14 @@ class Models:
     def wandered_m2(self, duration_s: float) -> Array:
         """Return the variance (n,) of the mean position over the rows of a scan minus the position in its middle.
 
-        It is caused by a random walk of the position and a random acceleration.
+        The cause is a random walk of the position and a random acceleration.
         """
         return np.asarray(self.walk_m2_s * duration_s / 12 + self.density_m2_s3 * duration_s**3 / 320)
 
     def over(self, step_s: float) -> tuple[Array, Array]:
         """Return transition matrix and added covariance, (n, 4, 4) each, of a state (x, y, v_x, v_y) over a time step.
 
-        A negative step goes back in a straight line, and adds the same covariance.
+        A negative step goes back in a straight line, and adds the same variances.
         """
         a, q, t = self.fading_per_s, self.density_m2_s3, abs(step_s)
         reach_s = np.full_like(a, step_s)  # distance per initial velocity
@@ -184,7 +184,7 @@ class Filters:
     def updated(self, rows: Array, measured: Array, noise: Array, *, forget: float, rarest: float) -> Filters:
         """Update with the measurement `measured` (m,) = `rows` (m, s) @ state + noise.
 
-        `noise` is a covariance (m, m), or one for each filter (n, m, m).
+        `noise` is a covariance (m, m), or a covariance for each filter (n, m, m).
 
         Args:
             forget: share of the logarithm of the old weights that is kept.
