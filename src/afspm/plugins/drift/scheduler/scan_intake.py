@@ -77,7 +77,7 @@ _MOST_ENDS = 4
 
 
 def take_packet(draft: DriftDraft, event: PacketIn) -> None:
-    """Pass a packet on, or hold the packet with the scan of which it is a part or after which it arrived.
+    """Pass a packet on, or hold the packet until the current scan is released.
 
     A late or repeated channel of a settled scan passes with the mapping of that scan.
     """
