@@ -36,7 +36,8 @@ class Adaptive(Component):
     everywhere, the complete lattices are measured, row by row; where it is rough in a few places, mostly these places.
     No spectrum is taken twice, even if processes are killed.
 
-    The table `map.csv` and the picture `map.png` are written into the run folder at the end.
+    The table `map.csv` and the picture `map.png` are written into the run folder at the end, from at least
+    three spectra.
 
     Args:
         size: (width, height) of the region.

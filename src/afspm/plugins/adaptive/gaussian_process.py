@@ -4,8 +4,8 @@ The mean is constant, the covariance Matérn 5/2 with one length. The position o
 `velocity * (time - first time)`, so all times give one map of the sample as it lay at the first measurement. Length,
 noise and velocity are those of the highest marginal likelihood; mean and amplitude follow in closed form.
 
-A map may be even in most places and rough in a few. The amplitude is therefore scaled locally by how well each
-measurement is predicted from the others (leave one out).
+A map may be even in most places and rough in a few. The amplitude is therefore scaled locally by the errors with
+which measurements are predicted from the others (leave one out).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 Floats = NDArray[np.float64]
 
 _MOST_FITTED: Final = 240  # measurements for the likelihood, whose time grows with the cube
-_LEAST_NOISE: Final = 1e-4  # variance, as a part of the amplitude: below it the matrix is not solved stably
+_LEAST_NOISE: Final = 1e-4  # variance relative to the squared amplitude; with less the matrix is not solved stably
 _NEAREST: Final = 8  # measurements that give the local scale
 _LEAST_SCALE: Final = 0.04  # of the local variance: a feature may hide between measurements
 _DRIFT_GAIN: Final = 4.0  # in log likelihood: with less, the drift is taken for zero
@@ -35,8 +35,8 @@ class Parameters:
     """Parameters of the process.
 
     Attributes:
-        length_m: distance over which values are related.
-        noise: variance of a measurement, as a part of the amplitude.
+        length_m: length of the Matérn correlation, over which values are related.
+        noise: variance of a measurement, relative to the squared amplitude of the map.
         velocity_m_s: velocity (x, y) of the sample under the tip.
     """
 

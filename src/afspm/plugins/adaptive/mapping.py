@@ -218,7 +218,7 @@ def optimizer_of(name: str, region: Region, quantity: str, **settings: Any) -> O
     """Return the optimiser "adaptive" or "nested", or the result of a function "module.name" of region and quantity.
 
     Args:
-        settings: settings of afspm's optimisers.
+        settings: settings for "adaptive" and "nested", see `LatticeMap`.
 
     Raises:
         ConfigError: there is no such optimiser or function, or its result has no `suggest` and `ingest`.

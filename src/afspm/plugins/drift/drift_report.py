@@ -30,6 +30,7 @@ def drift_of(run: Run) -> DriftRecord:
     published = [message for message in published if len(message.matrix) == 6 and len(message.center) == 2]
 
     def square(values: Any) -> NDArray[np.float64]:
+        # before the first registration the scheduler publishes no covariance
         return np.array(values if len(values) == 4 else [np.nan] * 4, dtype=np.float64).reshape(2, 2)
 
     return DriftRecord(

@@ -45,7 +45,7 @@ class Analysis:
 
     Attributes:
         record: drift record of the tracker.
-        pairs: registrations of the first scan with each later one.
+        pairs: registrations of the first scan with each later scan.
         estimates: drift record of the pairs.
     """
 
@@ -58,7 +58,8 @@ def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Pa
     """Analyse files, print the table, and write the results.
 
     Raises:
-        InvalidValue: no file can be analysed. ConfigError: the estimator or tracker is unknown.
+        InvalidValue: no file can be analysed. ConfigError: the estimator or tracker is unknown. FileError: as
+            `written`.
     """
     console, aside = Console(file=sys.stdout, highlight=False), Console(stderr=True, highlight=False)
     contents, unreadable = read_all(paths)

@@ -95,7 +95,8 @@ class Mapping:
     def to_sample(self, region: Region) -> Region:
         """Map a region from tip to sample coordinates.
 
-        The result is again a rectangle: its centre is mapped, and it is rotated and scaled by the nearest similarity.
+        The result is again a rectangle: the centre is mapped, and the sides are rotated and scaled by the nearest
+            similarity.
         Shear is left out, because a microscope scans rectangles.
         """
         return self._mapped(region, Frame.SAMPLE)

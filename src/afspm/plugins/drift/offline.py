@@ -34,7 +34,7 @@ def against_first(record: DriftRecord, scans: Sequence[DriftScan], pairs: Sequen
 
     Args:
         record: drift record of the tracker.
-        pairs: registrations of the first scan with each later one.
+        pairs: registrations of the first scan with each later scan.
     """
     drift, covariance = [np.zeros(2)], [np.zeros((2, 2))]
     rate_m_s = record.rate_then_m_s
@@ -136,6 +136,7 @@ def corrected(scans: Sequence[DriftScan], drift_m: Array, rate_m_s: Array | None
     values = np.empty((len(scans), *shape))
     for k, scan in enumerate(scans):
         rows, columns = _pixels_at(scan, x_m + drift_m[k, 0], y_m + drift_m[k, 1], rates[k])
+        # NaN would spread through the whole spline: holes are filled here, and marked again in the result
         measured = np.isfinite(scan.values)
         filled = np.where(measured, scan.values, np.median(scan.values[measured]) if measured.any() else 0.0)
         values[k] = map_coordinates(filled, [rows, columns], order=3, mode="nearest")

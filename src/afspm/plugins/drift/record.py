@@ -35,9 +35,9 @@ class DriftRecord:
         drift_m: (n, 2) displacement of the sample under the tip since the start, as estimated after each scan.
         covariance_m2: (n, 2, 2) covariance of the drift.
         rate_m_s: (n, 2) velocity of the sample after each scan; zero after the first scan (unknown then).
-        matched: (n,) whether each scan was registered; otherwise its drift is a prediction.
+        matched: (n,) whether each scan was registered; the drift of other scans is a prediction.
         reasons: reason why each scan was not registered, for people; empty for registered scans.
-        outcomes: how the position of each scan was determined.
+        outcomes: outcome of the registration of each scan.
         failures: number of estimator errors with each scan.
     """
 

@@ -49,7 +49,7 @@ class Forecast(Protocol):
     """A tracker's predictions for any time: small, immutable and convertible to JSON, without the scans."""
 
     def at(self, time_s: float) -> Prediction:
-        """Return the prediction for any time; before the newest scan, its estimate is extrapolated backwards."""
+        """Return the prediction for any time; times before the newest scan are extrapolated backwards."""
         ...
 
     def to_dict(self) -> Plain:
@@ -65,7 +65,8 @@ class Update:
         key: key of the scan.
         before: prediction for the middle of the scan, without the scan.
         after: estimate for the same time, with the scan.
-        matched: whether the scan could be registered with any reference (the very first scan counts as matched).
+        matched: whether a registration determines the position of the scan; true for the very first scan. A
+            registration that the tracker does not use, such as a doubtful result, does not count.
         reason: reason why the scan did not match, or only coarsely, for people.
         lost: whether the position of the sample is unknown.
         registrations: registrations by key of the reference.

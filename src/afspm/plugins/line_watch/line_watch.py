@@ -60,7 +60,7 @@ class _Finished:
 
 
 class LineWatch(Component):
-    """A watch on running scans: publishes the row from which their lines show that the tip has changed.
+    """A watch on running scans, which publishes the row at which their lines show that the tip has changed.
 
     With `action = "stop"` an alarm of the higher level also flags `tip-shape-changed`: the scheduler stops the scan, so
     its remaining time is saved. Each line is compared with an earlier scan of the place at the predicted drift; without

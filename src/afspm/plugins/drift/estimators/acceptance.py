@@ -57,7 +57,7 @@ class MatchEvidence:
     searched: float
 
     def features(self) -> dict[str, float]:
-        """Return the figures of merit on additive scales, limited to the range of real matches."""
+        """Return the figures of merit on the scales of the regression, limited to the range of real matches."""
         return {
             "overlap": math.log(max(self.overlap, 0.05)),
             "sd_px": math.log(min(max(self.sd_px, 1e-3), 10.0)),

@@ -33,9 +33,9 @@ ROUNDS = 4
 SETTLED_PX = 1e-3
 DIGITS = 1e-6  # of products of columns of 32 bits
 LEAST_CURVATURE = 0.4
-"""The least curvature H'QJ, as a share of H'QH, in any direction. On the worst pairs (one bar in view) it is a fifth to
-two fifths: most of H'QH is noise there, and a fit that took it for the surface was up to five times too certain of
-stretch. With 0.2 hard pairs get worse, since the share itself is then hardly known."""
+"""The least curvature H'QJ, as a share of H'QH, in any direction. On the worst pairs (one bar in view) the share is a
+fifth to two fifths: most of H'QH is noise there, and a fit that took this noise for the surface was up to five times
+too certain of stretch. With 0.2 hard pairs get worse, since the share itself is then hardly known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,8 +210,8 @@ class Doubt:
             and contrast act on the shift as well.
         sd_px: largest standard deviation by the model: the weaker the features, the more disturbances count.
         leverage: largest share, in any direction, of the information about the shift in one block of rows (MacKinnon,
-            Nielsen and Webb, J. Econometrics 235, 2001, 2023). A disturbance of these rows neither averages out nor
-            shows.
+            Nielsen and Webb, J. Econometrics 235, 2001, 2023). A disturbance of these rows does not average out, and
+            remains unnoticed.
     """
 
     varied: float

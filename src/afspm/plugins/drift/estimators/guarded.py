@@ -1,7 +1,7 @@
 """Guard around any estimator: distinguishes errors from refusals, reports errors, and replaces failed results.
 
-A refusal means that two scans can't be registered. An error of the estimator says nothing about the scans: it is
-reported with the pair. A plain correlation then replaces the result, if there is a prior and the peak is clear.
+A refusal means that two scans can't be registered. An error of the estimator says nothing about the scans, and
+is reported with the pair. A plain correlation then replaces the result, if there is a prior and the peak is clear.
 """
 
 from __future__ import annotations

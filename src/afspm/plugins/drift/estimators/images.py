@@ -101,7 +101,7 @@ def without_scars(values: Array) -> Array:
     """Replace scars by interpolation between the rows above and below.
 
     A scar is up to `SCAR_ROWS` rows thick. In each of its rows, most of `SCAR_PX` pixels are above both neighbouring
-    rows, or below both. No feature of a surface is as thin and much longer.
+    rows, or below both. No feature of a surface is as thin and as long.
     """
     level = levelled(values)
     scar = np.zeros(values.shape, dtype=bool)
@@ -223,8 +223,8 @@ class CommonGrid:
     Pixel coordinates (x, y) start at the centre of each scan and follow the axes of the reference.
 
     Attributes:
-        to_m: (2, 2) from pixels to metres in tip coordinates.
-        to_own: (2, 2) from pixels of the grid to pixels of the scan, along the scan's own axes.
+        to_m: (2, 2) matrix from pixels to metres in tip coordinates.
+        to_own: (2, 2) matrix from pixels of the grid to pixels of the scan, along the scan's own axes.
         reference_m, scan_m: (2,) the centres in tip coordinates.
     """
 

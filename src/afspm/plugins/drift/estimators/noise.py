@@ -29,12 +29,13 @@ class FineFilter:
     """Radial filter H = sqrt(2 S / (2 S + N)) exp(-2 pi² f² 0.45²), applied to both images in the fine alignment.
 
     Applied to two noisy images, H² weighs each frequency as the maximum-likelihood processor does (Hannan and Thomson,
-    Biometrika 58, 77, 1971; Knapp and Carter, IEEE Trans. ASSP 24, 320, 1976). S and N come from the radial mean of
-    both spectra. N is its floor in the top octave. S is the rest, taken flat below its peak: a filter that whitens low
-    frequencies would have a long impulse response, and the borders would leak across the image.
+    Biometrika 58, 77, 1971; Knapp and Carter, IEEE Trans. ASSP 24, 320, 1976). S comes from the radial
+    mean of both spectra, N from the median power in the top octave. S is the mean minus N, taken flat below its peak:
+    a filter that whitens low frequencies would have a long impulse response, and the borders would leak across the
+    image.
 
     Attributes:
-        frequency: in cycles per pixel, ascending.
+        frequency: frequencies in cycles per pixel, ascending.
         gain: sqrt(2 S / (2 S + N)) at each frequency.
     """
 
@@ -158,9 +159,9 @@ def seen(
 
     Generalised least squares row by row: each row has its own parabola, and correlated noise. A row takes seconds, and
     the next row has new offsets (feedback, flattening by up to the second order, drift of the z piezo). So nothing is
-    assumed about its parabola, and the noise within a row is white plus 1/f, with covariance C and Q = C^-1. The rest
-    of a row f after a fit of the nuisance B = [1, x, x²] in this metric, f - B (B'QB)^-1 B'Q f, carries all information
-    of the row (Frisch and Waugh, Econometrica 1, 387, 1933; Aitken, Proc. R. Soc. Edinb. 55, 42, 1936).
+    assumed about the parabola of a row, and the noise within a row is white plus 1/f, with covariance C and Q = C^-1.
+    The rest of a row f after a fit of the nuisance B = [1, x, x²] in this metric, f - B (B'QB)^-1 B'Q f, carries all
+    information of the row (Frisch and Waugh, Econometrica 1, 387, 1933; Aitken, Proc. R. Soc. Edinb. 55, 42, 1936).
 
     Args:
         columns: [y, column, x].

@@ -85,7 +85,8 @@ class Form:
 
     Attributes:
         pairs: number of pairs needed to determine a transform.
-        linear: returns the least-squares 2 x 2 part, from points relative to their means; None if undetermined.
+        linear: function that returns the least-squares 2 x 2 part, from points relative to their means; None if
+            undetermined.
     """
 
     pairs: int
@@ -142,7 +143,7 @@ class Search:
             radius: largest distance of an agreeing pair from the transform.
 
         Returns:
-            None if no transform was found.
+            The best consensus; None if no transform was found.
         """
         best: Consensus | None = None
         best_error = math.inf

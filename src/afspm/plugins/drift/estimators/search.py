@@ -215,7 +215,7 @@ class Scorer:
             return None
         theta = np.concatenate([shift, np.zeros(COUNT - 2)])
         theta = least_squares(WarpedPair(*self._scene.smooth_splines, box), theta, NOTHING_BELIEVED, SHIFT, steps=2)
-        if np.hypot(*(theta[:2] - shift)) > 4.0:
+        if np.hypot(*(theta[:2] - shift)) > 4.0:  # the steps have left the peak of this candidate
             theta[:2] = shift
         likelihood = 0.0 if self._expected is None else -0.5 * float(self._expected.chi2(theta[:2]))
         for splines, density in self._channels:

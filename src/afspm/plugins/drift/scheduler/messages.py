@@ -26,7 +26,7 @@ class Registered:
         covariance_m2, rate_m_s, rate_covariance: see `drift.tracking.Prediction`; empty if unknown.
         outcome, lost, reason: see `drift.tracking.Update`.
         residual_m: (x, y) measured minus predicted position of the sample in tip coordinates; empty if unknown.
-        references: names of the scans with which this scan was registered.
+        references: names of the scans with which this scan was registered successfully.
         rescan: reason for a rescan; empty if the scan need not be repeated.
         forecast: the new forecast, for `forecast_from_dict`; None: unchanged.
         failures: errors of the estimator with this scan, each with its pair of scans.
@@ -84,7 +84,7 @@ class NotRegistered:
 
 @dataclass(frozen=True)
 class WorkerGone:
-    """Report that the worker has ended."""
+    """Report that the worker has ended, or could not be started."""
 
     reason: str
 

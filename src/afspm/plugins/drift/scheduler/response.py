@@ -176,7 +176,7 @@ def hand_over(draft: DriftDraft) -> None:
 
 
 def rate_answered(draft: DriftDraft, given: RateGiven, response: Response) -> None:
-    """Process the controller's answer for one axis; it may accept one axis and refuse the other."""
+    """Process the controller's answer for one axis; the controller may accept one axis and refuse the other."""
     if not response.ok:
         # NOT_FREE: a scan has already begun; the rate is handed over after the next one
         if response.code != ControlResponse.NOT_FREE:

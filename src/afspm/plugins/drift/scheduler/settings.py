@@ -55,7 +55,7 @@ class DriftCompensationSettings:
     Attributes:
         estimator, tracker: a name, or a table with the name as its `class` and with its settings.
         channel: channel of the scans that are compared; None: the first published channel in a unit of length.
-        correct: whether components are given sample coordinates; else drift is only followed and published.
+        correct: whether components use sample coordinates; otherwise drift is only tracked and published.
         correct_after: time since the start of the experiment, s, before which `correct` has no effect.
         rescan: rule for requesting rescans.
         most_unregistered: largest share of unregistered scans among the last ten; above it thermal-drift is

@@ -67,15 +67,15 @@ class BankTracker:
     holds for the middle of a scan; where the overlap lies elsewhere, the time of its rows counts.
 
     A result far from every prediction is used only if the next scan confirms it. A scan that matches no other is
-    adrift: it is stored at its predicted place, and neither it nor scans that match only scans adrift are evidence.
-    Their places relative to each other are still tracked. After several such scans in a row the tracker is lost. A
-    single such scan is enough if the standard deviation of its position exceeds half of the misplacement at which scans
-    can still be compared. A lost tracker searches everywhere, until a scan has a measured place again; this scan also
-    corrects the scans adrift.
+    adrift: it is stored at its predicted place, and neither this scan nor scans that match only scans adrift are
+    evidence. Their places relative to each other are still tracked. After several such scans in a row the tracker is
+    lost. A single such scan is enough if the standard deviation of its position exceeds half of the misplacement at
+    which scans can still be compared. A lost tracker searches everywhere, until a scan has a measured place again; this
+    scan also corrects the scans adrift.
 
     A scan that can't be compared with any other, such as a zoom too fine for the overview, starts a new series. A zoom
-    is searched in an overview only at its expected place, and the tracker is not lost if it is not recognised there,
-    since one particle looks like the next.
+    is searched in an overview only at its expected place, and the tracker is not lost if the zoom is not recognised
+    there, since one particle looks like the next.
 
     With the transform "similarity", rotation and scale are first removed from scans: see `Similarity`.
 
@@ -348,7 +348,7 @@ class BankTracker:
         return snapshot(self._state, "bank", VERSION)
 
     def restore(self, state: PlainMapping) -> None:
-        """Restore the result of `state`. Raises InvalidValue if it belongs to another tracker, or to other settings."""
+        """Restore the result of `state`. Raises InvalidValue for the state of another tracker or of other settings."""
         found = restored(BankState, state, "bank", VERSION)
         if (filters := found.filters) is not None:
             if (self._settings.transform == "similarity") != (found.similarity is not None):

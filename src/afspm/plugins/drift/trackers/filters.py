@@ -137,7 +137,10 @@ class Filters:
         return replace(self, time_s=time_s, mean=mean, covariance=covariance)
 
     def widened(self, position_sd_m: float, velocity_sd_m_s: float, scans: Sequence[int] = ()) -> Filters:
-        """Return the filters with a less certain present; the given scans move by the same unknown distance."""
+        """Return the filters with less certain present position and velocity.
+
+        The positions of the given scans become uncertain by the same unknown distance.
+        """
         covariance = self.covariance.copy()
         for axis in range(2):
             together = [axis, *(4 + 4 * number + axis for number in scans)]
@@ -178,6 +181,7 @@ class Filters:
 
     def with_velocity(self, time_s: float, velocity_m_s: Array, covariance: Array, *, rarest: float) -> Filters:
         """Update with a velocity of the sample, measured at about the time of the filters."""
+        # between both times the velocity may have changed
         elsewhen = self.models.over(abs(self.time_s - time_s))[1][:, 2:, 2:]
         return self.updated(self.velocity_rows(), velocity_m_s, covariance + elsewhen, forget=1.0, rarest=rarest)
 
