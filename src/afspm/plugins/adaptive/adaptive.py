@@ -1,4 +1,4 @@
-"""`Adaptive`: maps a quantity of spectra over a region, and measures where the map is still uncertain."""
+"""`Adaptive`: the component that maps a quantity of spectra over a region, mostly where the map is uncertain."""
 
 from __future__ import annotations
 
@@ -26,34 +26,36 @@ from afspm.plugins.adaptive.quantities import evaluation
 from afspm.storage.atomic import OutageLog, write_atomic
 
 MOST_LINES: Final = 20
-"""Limit on log lines about the progress of a map."""
+"""Approximate largest number of log lines about the progress of a map."""
 
 
 class Adaptive(Component):
-    """Maps a quantity over a region: spectra on nested lattices, refined where the map is still uncertain.
+    """A component that maps a quantity over a region: spectra on nested lattices, refined where the map is uncertain.
 
     A Gaussian process gives the map and its expected error, and follows drift from the values. Where the map is rough
-    everywhere, the complete lattices are measured, row by row; where it is rough in a few places, mostly these. No
-    spectrum is taken twice, even if processes are killed.
+    everywhere, the complete lattices are measured, row by row; where it is rough in a few places, mostly these places.
+    No spectrum is taken twice, even if processes are killed.
 
-    The table `map.csv` and the picture `map.png` are in the run folder.
+    The table `map.csv` and the picture `map.png` are written into the run folder at the end, from at least
+    three spectra.
 
     Args:
         size: (width, height) of the region.
         quantity: "gap" (I(V) curves, in eV), "adhesion" (force curves, in N), or a function of a spectrum as
             "module.name".
-        until: the end of the map, at the first that holds: `error`, the expected rms error in the unit of the quantity;
-            `spectra`, their number; `time`, experiment time.
-        center: (x, y) of the middle of the region.
-        angle: of the region, counter-clockwise.
-        unit: of a function of your own.
-        kind: of the spectra; by default the kind of the quantity, or the present one.
+        until: limits of the map, at least one; the first that is reached ends the map: `error`, the expected rms error
+            in the unit of the quantity; `spectra`, the number of spectra; `time`, experiment time since the first
+            spectrum.
+        center: (x, y), middle of the region.
+        angle: angle of the region, counter-clockwise.
+        unit: unit of the result of your own function.
+        kind: kind of the spectra; by default the kind of the quantity, or the kind set at the microscope.
         optimizer: "adaptive", "nested" (complete lattices), or a function of region and quantity as "module.name" that
             returns an optimiser with `suggest` and `ingest` of bluesky-adaptive, with the parameters `x` and `y`.
-        coarsest: positions along the longer side of the first lattice.
-        levels: number of refinements, each twice as fine.
+        coarsest: number of positions along the longer side of the first lattice, 3 to 9.
+        levels: number of refinements, 1 to 9, each twice as fine as the last.
         end_when_done: whether to end the whole experiment after the last spectrum.
-        file: name of table and picture.
+        file: name of table and picture, without suffix.
     """
 
     needs_actions = (names.START_SPEC,)

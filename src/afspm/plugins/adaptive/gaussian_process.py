@@ -4,8 +4,8 @@ The mean is constant, the covariance Matérn 5/2 with one length. The position o
 `velocity * (time - first time)`, so all times give one map of the sample as it lay at the first measurement. Length,
 noise and velocity are those of the highest marginal likelihood; mean and amplitude follow in closed form.
 
-A map may be even in most places and rough in a few. The amplitude is therefore scaled locally by how well each
-measurement is predicted from the others (leave one out).
+A map may be even in most places and rough in a few. The amplitude is therefore scaled locally by the errors with
+which measurements are predicted from the others (leave one out).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 Floats = NDArray[np.float64]
 
 _MOST_FITTED: Final = 240  # measurements for the likelihood, whose time grows with the cube
-_LEAST_NOISE: Final = 1e-4  # variance, as a part of the amplitude: below it the matrix is not solved stably
+_LEAST_NOISE: Final = 1e-4  # variance relative to the squared amplitude; with less the matrix is not solved stably
 _NEAREST: Final = 8  # measurements that give the local scale
 _LEAST_SCALE: Final = 0.04  # of the local variance: a feature may hide between measurements
 _DRIFT_GAIN: Final = 4.0  # in log likelihood: with less, the drift is taken for zero
@@ -35,9 +35,9 @@ class Parameters:
     """Parameters of the process.
 
     Attributes:
-        length_m: distance over which values are related.
-        noise: variance of a measurement, as a part of the amplitude.
-        velocity_m_s: (x, y) of the sample.
+        length_m: length of the Matérn correlation, over which values are related.
+        noise: variance of a measurement, relative to the squared amplitude of the map.
+        velocity_m_s: velocity (x, y) of the sample under the tip.
     """
 
     length_m: float
@@ -49,10 +49,10 @@ class GaussianProcess:
     """The process after some measurements.
 
     Args:
-        xy_m: (n, 2), as measured.
-        values: (n,).
-        times_s: (n,).
-        parameters: of the process.
+        xy_m: (n, 2) measured positions in tip coordinates.
+        values: (n,) measured values.
+        times_s: (n,) times of the measurements; the first is the time of the map.
+        parameters: parameters of the process.
     """
 
     def __init__(self, xy_m: Floats, values: Floats, times_s: Floats, parameters: Parameters) -> None:
@@ -66,14 +66,14 @@ class GaussianProcess:
         self.amplitude = math.sqrt(max(square, 1e-300))
 
     def predict(self, xy_m: Floats) -> Floats:
-        """Return the expected values at positions (m, 2) of the sample at the first time."""
+        """Return the expected values (m,) at positions (m, 2) on the sample as it lay at the first time."""
         return np.asarray(self.mean + self._related(xy_m) @ self._weights)
 
     def variance(self, xy_m: Floats, also_m: Floats | None = None) -> Floats:
-        """Return the expected square error at positions (m, 2), scaled by the local roughness.
+        """Return the expected square error (m,) at positions (m, 2), scaled by the local roughness.
 
         Args:
-            also_m: positions that will be measured before.
+            also_m: (k, 2) positions that will also have been measured by then.
         """
         at_m = self._at_m if also_m is None else np.vstack([self._at_m, also_m])
         inverse = self._inverse if also_m is None else np.linalg.inv(_covariance(at_m, self.parameters))
@@ -111,12 +111,13 @@ class GaussianProcess:
 def fitted(
     xy_m: Floats, values: Floats, times_s: Floats, start: Parameters, shortest_m: float, *, drifts: bool, seed: int = 0
 ) -> Parameters:
-    """Return the parameters of the highest likelihood, searched from `start`.
+    """Return the parameters of the highest marginal likelihood, searched from `start`.
 
     Args:
-        shortest_m: lower bound of the length; the upper one is a hundred times that.
-        drifts: whether to search for a velocity, too; otherwise `start` has the known one.
-        seed: of the choice of measurements where there are many.
+        shortest_m: lower bound of the length; the upper bound is a hundred times as large.
+        drifts: whether to search for a velocity, too; otherwise the velocity of `start` is known. The velocity found is
+            zero if drift hardly improves the likelihood.
+        seed: seed for the choice of 240 measurements, if there are more.
     """
     if len(values) > _MOST_FITTED:
         chosen = np.random.default_rng(seed).choice(len(values), _MOST_FITTED, replace=False)
@@ -154,7 +155,7 @@ def matern(distance_m: Floats, length_m: float) -> Floats:
 
 
 def distances(a_m: Floats, b_m: Floats) -> Floats:
-    """Return the distances between two sets of points, shape (len(a), len(b))."""
+    """Return the distances between two sets of points, shape (len(a_m), len(b_m))."""
     return np.hypot(a_m[:, None, 0] - b_m[None, :, 0], a_m[:, None, 1] - b_m[None, :, 1])
 
 

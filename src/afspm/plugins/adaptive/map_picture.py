@@ -23,11 +23,11 @@ _WIDTH_IN, _TEXT = 9.6, 9.0
 
 
 def draw_map(found: MapProgress, region: Region, path: Path, *, title: str = "", simulated: bool = False) -> None:
-    """Draw the map of some measurements and its expected error.
+    """Draw a map and its expected error, with the measured positions.
 
     Args:
-        region: that was mapped.
-        path: of the picture; its suffix gives the format.
+        region: region that was mapped.
+        path: file of the picture; its suffix determines the format.
         simulated: whether to mark the picture, so that it is not taken for a measurement.
     """
     values, errors = _pictures(found, region)

@@ -1,4 +1,4 @@
-"""Measuring a map: suggestions of an optimiser become spectra, and their values go back to it."""
+"""Measurement of a map: an optimiser suggests positions, and gets the values of the spectra taken there."""
 
 from __future__ import annotations
 
@@ -20,15 +20,16 @@ from afspm.plugins.adaptive.refinement import ID, AdaptiveMap, LatticeMap, Neste
 from afspm.transport.process.loading import find_object
 
 MOST_SPECTRA: Final = 1500
-"""The Gaussian process takes about a second for as many, and the time grows with the cube."""
+"""Largest number of spectra in a map. For this number the Gaussian process takes about a second; the time grows with
+the cube of the number."""
 MOST_FAILURES: Final = 10  # in a row, before a person has to look
-_LOOKS: Final = 1.08  # the expected error is computed again with that many times more spectra
+_LOOKS: Final = 1.08  # factor on the number of spectra after which the expected error is computed again
 _log = logging.getLogger("afspm.adaptive")
 
 
 @dataclass(frozen=True)
 class Until:
-    """When a map is complete: at the first of these that holds.
+    """Limits of a map, which is complete when the first limit is reached.
 
     Attributes:
         error: expected rms error of the map, in the unit of the quantity.
@@ -45,7 +46,7 @@ class Until:
         """Return the limits of a table {error = "20 meV", spectra = 400, time = "2 h"}.
 
         Raises:
-            ConfigError: no limit, an unknown one, or an impossible value.
+            ConfigError: the table has no limit, an unknown limit, or an impossible value.
         """
         if unknown := sorted(given.keys() - {"error", "spectra", "time"}):
             raise ConfigError(f"no limit named {unknown[0]!r}", where="until", hint="error, spectra or time")
@@ -65,7 +66,13 @@ class Until:
 
 @dataclass(frozen=True)
 class MeasuredPoint:
-    """One measurement of a map: `name` of the optimiser's suggestion, position, value, end and duration."""
+    """One measurement of a map.
+
+    Attributes:
+        name: `_id` of the optimiser's suggestion.
+        time_s: end of the spectrum, experiment time.
+        seconds: time since the end of the spectrum before; 0 for the first spectrum.
+    """
 
     name: Any
     x_m: float
@@ -76,20 +83,20 @@ class MeasuredPoint:
 
 
 class MapProgress:
-    """A map in progress: one spectrum a step.
+    """A map in progress, which grows by one spectrum a step.
 
     Args:
-        optimizer: of afspm, or any with `suggest` and `ingest` of bluesky-adaptive.
-        region: to map.
-        evaluation: from spectrum to value.
-        until: its end.
-        planning: entered while positions are computed, which may take a second.
+        optimizer: an optimiser of afspm, or any other with `suggest` and `ingest` of bluesky-adaptive.
+        region: region of the map.
+        evaluation: quantity of the map.
+        until: limits of the map.
+        planning: context entered while positions are computed, which may take a second.
 
     Attributes:
-        map: the map that follows from the measurements so far.
-        measured: the measurements so far.
-        failures: positions that could not be measured or evaluated.
-        error: the expected rms error, as computed last; None: too few measurements.
+        map: map from the measurements so far.
+        measured: measurements so far.
+        failures: number of positions that could not be measured or evaluated, since the start of the process.
+        error: latest expected rms error; None with fewer measurements than the second lattice has positions.
     """
 
     def __init__(
@@ -101,7 +108,7 @@ class MapProgress:
         planning: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
         self.optimizer, self.evaluation, self.until = optimizer, evaluation, until
-        # the optimiser of another package has no map: the values are mapped as ours are
+        # the optimiser of another package has no map, so its values are mapped by a lattice map
         self.map = optimizer if isinstance(optimizer, LatticeMap) else NestedGrid(region, evaluation.name)
         self.measured: list[MeasuredPoint] = []
         self.failures = 0
@@ -111,7 +118,7 @@ class MapProgress:
         self._looked = 0
 
     def restore(self, measured: list[MeasuredPoint], failures: list[Any]) -> None:
-        """Take the measurements of an earlier life of the component, and the names of failed suggestions."""
+        """Restore the measurements before a restart of the component, and the names of failed suggestions."""
         with self._planning():
             for one in measured:
                 self._take(one, is_suggested=isinstance(self.optimizer, LatticeMap))
@@ -119,7 +126,7 @@ class MapProgress:
         self._look()
 
     def finished(self) -> str:
-        """Return why the map is complete, or an empty text."""
+        """Return the reason why the map is complete, for people; empty if it is not complete."""
         until, count = self.until, len(self.measured)
         if until.spectra is not None and count >= until.spectra:
             return f"{count} spectra are measured"
@@ -136,7 +143,11 @@ class MapProgress:
         return ""
 
     def suggestion(self) -> Plain | None:
-        """Return the next position, with `_id`, `x` and `y`; None: there is none left."""
+        """Return the next position, with `_id`, `x` and `y` (m); None if no position is left.
+
+        Raises:
+            InvalidValue: the optimiser suggests a position without `x` or `y`.
+        """
         # a position of a round that is planned already takes no time
         quick = isinstance(self.optimizer, LatticeMap) and self.optimizer.has_planned
         with nullcontext() if quick else self._planning():
@@ -149,10 +160,10 @@ class MapProgress:
         return {ID: point.get(ID), "x": float(point["x"]), "y": float(point["y"])}
 
     def measure(self, scope: Scope, point: Plain, key: str | None = None) -> MeasuredPoint | None:
-        """Take a spectrum at a suggested position; None if it could not be measured or evaluated: that is logged.
+        """Take a spectrum at a suggested position; log a failure to measure or evaluate it, and return None.
 
         Raises:
-            MeasurementFailed: many failures in a row.
+            MeasurementFailed: the tenth failure in a row. InvalidValue: the spectrum has no time.
         """
         at_m = (point["x"], point["y"])
         try:
@@ -206,8 +217,11 @@ class MapProgress:
 def optimizer_of(name: str, region: Region, quantity: str, **settings: Any) -> Optimizer:
     """Return the optimiser "adaptive" or "nested", or the result of a function "module.name" of region and quantity.
 
+    Args:
+        settings: settings for "adaptive" and "nested", see `LatticeMap`.
+
     Raises:
-        ConfigError: there is no such function, or its result has no `suggest` and `ingest`.
+        ConfigError: there is no such optimiser or function, or its result has no `suggest` and `ingest`.
     """
     if name in ("adaptive", "nested"):
         return {"adaptive": AdaptiveMap, "nested": NestedGrid}[name](region, quantity, **settings)
@@ -238,10 +252,13 @@ def measure_map(
 
     Args:
         quantity: "gap", "adhesion", a function of a spectrum, or its name "module.name".
-        until: {"error": …, "spectra": …, "time": …}: the first that holds ends the map.
-        unit: of a function of your own.
-        kind: of the spectra.
-        optimizer: instead of afspm's own.
+        until: {"error": …, "spectra": …, "time": …}: the first limit that is reached ends the map.
+        unit: unit of the result of your own function.
+        kind: kind of the spectra; None: the kind of the quantity, or the present kind.
+        optimizer: optimiser; None: `AdaptiveMap`.
+
+    Raises:
+        ConfigError: a limit or the quantity is invalid. MeasurementFailed, InvalidValue: as `MapProgress.measure`.
     """
     if callable(quantity):
         evaluated = Evaluation(getattr(quantity, "__name__", "quantity"), unit, kind, quantity)
@@ -255,5 +272,5 @@ def measure_map(
 
 
 def rows(measured: list[MeasuredPoint]) -> list[Plain]:
-    """Return measurements in JSON's types."""
+    """Return measurements as plain dictionaries, to save as JSON."""
     return [asdict(one) for one in measured]

@@ -1,4 +1,4 @@
-"""From a curve to the number that is mapped."""
+"""Evaluation of a spectrum: the number that a map shows."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from afspm.transport.process.loading import find_object
 
 Floats = NDArray[np.float64]
 _EDGE: Final = (0.2, 0.65)
-"""Part of the largest conductance of a side, between which it rises as the square root of the energy above its band."""
+"""Limits of the fit to a band edge, as shares of the largest conductance on its side. Between them the conductance
+rises as the square root of the energy beyond the edge."""
 _LEAST_POINTS: Final = 4
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A quantity: its name, its unit, the kind of spectrum that shows it, and the function of a spectrum."""
+    """A quantity: its name and unit, the kind of spectrum that shows it (None: any), and the function of a spectrum."""
 
     name: str
     unit: str
@@ -30,10 +31,10 @@ class Evaluation:
     function: Callable[[Spectrum], float]
 
     def of(self, spectrum: Spectrum) -> float:
-        """Return the value.
+        """Return the value of the quantity in a spectrum.
 
         Raises:
-            InvalidValue: the curve does not show the quantity.
+            InvalidValue: the curve does not show the quantity, or the function raises or returns no finite number.
         """
         try:
             value = float(self.function(spectrum))
@@ -49,8 +50,11 @@ class Evaluation:
 def gap_ev(spectrum: Spectrum) -> float:
     """Return the band gap in eV: the distance of the band edges in dI/dV.
 
-    At an edge the squared conductance rises linearly, so a line through it meets zero at the edge, also where
+    At an edge the squared conductance rises linearly, so a line through the squares meets zero at the edge, also where
     temperature rounds the edge itself.
+
+    Raises:
+        InvalidValue: the spectrum has neither dI/dV nor Current, or shows no band edges.
     """
     bias = spectrum.values[:, 0]
     order = np.argsort(bias)
@@ -70,7 +74,10 @@ def gap_ev(spectrum: Spectrum) -> float:
 
 
 def adhesion_n(spectrum: Spectrum) -> float:
-    """Return the pull-off force in N: the lowest force while the tip withdraws, with its sign turned."""
+    """Return the pull-off force in N: the negative of the lowest force while the tip withdraws.
+
+    Without the channel "Force Retrace", the channel "Force" is used.
+    """
     name = "Force Retrace" if "Force Retrace" in spectrum.names else "Force"
     return -float(spectrum[name].min())
 
@@ -82,10 +89,10 @@ QUANTITIES: Final = {
 
 
 def evaluation(quantity: str, unit: str = "", kind: str | None = None) -> Evaluation:
-    """Return the evaluation of a name, or of a function "module.name" with its unit.
+    """Return the evaluation of a named quantity, or of a function "module.name" with its unit.
 
     Raises:
-        ConfigError: there is no such function, or a unit is given for a quantity with its own.
+        ConfigError: there is no such quantity or function, or a unit is given for a named quantity.
     """
     if quantity in QUANTITIES:
         known = QUANTITIES[quantity]

@@ -3,7 +3,7 @@
 **Theory of operation.** The region carries nested lattices, each twice as fine as the one before. A round of
 `AdaptiveMap` takes positions of the next finer lattice, but only beside positions that are measured already, and only
 where the Gaussian process expects an error worth the seconds. On a map that is rough everywhere the whole lattice
-is taken, exactly as by a nested grid; on a map that is rough in a few places, these places.
+is taken, exactly as by a nested grid; on a map that is rough in a few places, mostly these places.
 
     comes in      measured values with their times and the seconds that they took
     state         the measurements, the rest of the round, the parameters of the process
@@ -32,26 +32,26 @@ ID: Final = "_id"
 COARSEST: Final = 5  # positions along the longer side of the first lattice
 LEVELS: Final = 6  # of refinement
 _MORE: Final = 1.2  # times as many measurements as at the last fit
-_PART: Final = 0.5  # of the good positions that make a round where ways cost little: the next one knows more
+_PART: Final = 0.5  # share of the good positions in a round where ways cost little: the next round knows more
 _EVEN: Final = 0.6  # part of good positions above which a map is rough everywhere
-_WORTH: Final = 0.2  # least gain of a position, as a part of the gain of the good ones
+_WORTH: Final = 0.2  # least gain of a good position, as a part of the gain of a typical good position
 
 
 @runtime_checkable
 class Optimizer(Protocol):
-    """The part of bluesky-adaptive's protocol that measuring needs."""
+    """The part of bluesky-adaptive's protocol that the measurement of a map needs."""
 
     def suggest(self, num_points: int | None = None) -> Sequence[Point]:
         """Return positions to measure next, each with `_id`, `x` and `y` (m)."""
         ...
 
     def ingest(self, points: Sequence[Point]) -> None:
-        """Take measured values: `x`, `y` and the quantity by its name; with `_id` if it was suggested."""
+        """Take measured values: `x`, `y` (m) and the quantity by its name; with `_id` if the position was suggested."""
         ...
 
 
 class NestedLattices:
-    """Nested lattices over a region. Cells are (column, row) of the finest one."""
+    """Nested lattices over a region. Cells are (column, row) of the finest lattice."""
 
     def __init__(self, region: Region, coarsest: int = COARSEST, levels: int = LEVELS) -> None:
         self.region, self.levels = region, levels
@@ -61,11 +61,11 @@ class NestedLattices:
         self.finest_m: float = max(size / (count - 1) for size, count in zip(region.size_m, self.counts, strict=True))
 
     def stride(self, level: int) -> int:
-        """Return the distance of the positions of a level, in cells."""
+        """Return the distance between neighbouring positions of a level, in cells."""
         return 1 << (self.levels - level)
 
     def spacing_m(self, level: int) -> float:
-        """Return the distance of the positions of a level."""
+        """Return the distance between neighbouring positions of a level in m, the larger of both axes."""
         return float(self.finest_m * self.stride(level))
 
     def cells(self, level: int) -> list[Cell]:
@@ -90,7 +90,7 @@ class NestedLattices:
         return [(i, j) for i in columns for j in rows]
 
     def xy_m(self, cells: Iterable[Cell]) -> Floats:
-        """Return the positions of cells, shape (n, 2)."""
+        """Return the positions of cells, shape (n, 2), in m."""
         at = np.array(list(cells), dtype=np.float64).reshape(-1, 2)
         last = np.array(self.counts, dtype=np.float64) - 1.0
         along = (at / last - 0.5) * np.asarray(self.region.size_m)
@@ -102,16 +102,16 @@ class LatticeMap:
     """Measurements on nested lattices, and the map that follows from them.
 
     Args:
-        region: to map.
+        region: region of the map.
         quantity: name of the measured value.
-        velocity_m_s: (x, y) of the sample, if it is known; None: follow from the values.
-        coarsest: positions along the longer side of the first lattice.
-        levels: of refinement, each twice as fine.
+        velocity_m_s: known velocity (x, y) of the sample; None: estimated from the values.
+        coarsest: number of positions along the longer side of the first lattice.
+        levels: number of refinements, each twice as fine as the last.
 
     Attributes:
         lattice: nested lattices over the region.
-        parameters: of the Gaussian process, as fitted last.
-        cost: of a measurement in seconds, learnt from the run.
+        parameters: parameters of the Gaussian process from the last fit.
+        cost: cost of a measurement in seconds, learnt from the run.
     """
 
     def __init__(
@@ -140,7 +140,11 @@ class LatticeMap:
     # -- the protocol
 
     def suggest(self, num_points: int | None = None) -> Sequence[Point]:
-        """Return positions to measure next: fewer than `num_points`, or none, if the finest lattice is measured."""
+        """Return positions to measure next, by default one position.
+
+        Fewer than `num_points`, or none, at the end of a round whose measurements are incomplete, and after the finest
+        lattice.
+        """
         count = 1 if num_points is None else num_points
         found: list[Point] = []
         while len(found) < count:
@@ -161,7 +165,7 @@ class LatticeMap:
         """Take measured values; optional keys are `time_s` and `seconds`, the duration with the way to the position.
 
         Raises:
-            InvalidValue: a value is missing or not finite; nothing is taken.
+            InvalidValue: a value is missing or not finite, and no point is taken; or an `_id` is not of this map.
         """
         rows = [self._row(point) for point in points]
         for point, row in zip(points, rows, strict=True):
@@ -176,13 +180,13 @@ class LatticeMap:
         self.cost = learnt_cost(self._ways_m, self._seconds)
 
     def register_failures(self, suggestions: Sequence[Point]) -> None:
-        """Leave suggested positions out: they can't be measured."""
+        """Leave out suggested positions that can't be measured."""
         for point in suggestions:
             self._done.add(self._cell(point[ID]))
             self._asked.pop(str(point[ID]), None)
 
     def get_best_points(self) -> Sequence[tuple[Any, Point, Point]]:
-        """Return the highest measured value: (its number, position, value)."""
+        """Return a list with the highest measured value as (number, position, value); empty without measurements."""
         if not self._rows:
             return []
         number, (x, y, value, _) = max(enumerate(self._rows), key=lambda one: one[1][2])
@@ -197,7 +201,7 @@ class LatticeMap:
 
     @property
     def measurements(self) -> Floats:
-        """The measurements, (n, 4): x, y, value, time."""
+        """The measurements, (n, 4): x and y in m, value, time in s."""
         return np.array(self._rows, dtype=np.float64).reshape(-1, 4)
 
     @property
@@ -209,7 +213,7 @@ class LatticeMap:
         return self._model
 
     def fit(self) -> None:
-        """Fit the parameters of the process to all measurements, if there are clearly more than at the last fit."""
+        """Fit the process to all measurements, if their number has grown by a fifth since the last fit."""
         if len(self._rows) < _MORE * self._fitted:
             return
         self._fitted = len(self._rows)
@@ -222,7 +226,7 @@ class LatticeMap:
         self._model = None
 
     def map(self, xy_m: Floats) -> Floats:
-        """Return the expected values at positions of the sample as it lay at the first measurement."""
+        """Return the expected values at positions (m, 2) of the sample as it lay at the first measurement."""
         return self.model.predict(xy_m)
 
     def expected_error(self) -> float:

@@ -1,4 +1,4 @@
-"""Order of positions: short ways from one to the next, and the seconds that a way takes."""
+"""Order of positions along a short way, and the cost of a measurement in seconds."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from afspm.plugins.adaptive.gaussian_process import distances
 Floats = NDArray[np.float64]
 Cell = tuple[int, int]
 _PASSES: Final = 6  # of improvement of a tour
-_REMEMBERED: Final = 60  # measurements that the costs are learnt from
+_REMEMBERED: Final = 60  # latest measurements, from which the costs are learnt
 
 
 @dataclass(frozen=True)
 class MeasurementCost:
-    """The seconds of a measurement: a fixed part (settling, curve, requests), and one for the distance moved."""
+    """Cost of a measurement in seconds: a fixed part (settling, curve, requests), and a part per distance moved."""
 
     fixed_s: float = 1.0
     per_m_s: float = 0.0
@@ -29,7 +29,10 @@ class MeasurementCost:
 
 
 def learnt_cost(distances_m: Sequence[float], seconds: Sequence[float]) -> MeasurementCost:
-    """Return the cost that fits the latest measurements best; neither part is negative."""
+    """Return the cost that fits the latest measurements best; neither part is negative.
+
+    Measurements that took more than five times the median are left out.
+    """
     way_m, took_s = np.asarray(distances_m[-_REMEMBERED:]), np.asarray(seconds[-_REMEMBERED:])
     if len(took_s) == 0:
         return MeasurementCost()
@@ -70,7 +73,7 @@ def short_tour(xy_m: Floats, start_m: Floats) -> list[int]:
 
 
 def way_m(xy_m: Floats, start_m: Floats) -> float:
-    """Return the length of the way through positions in their order."""
+    """Return the length in m of the way from `start_m` through positions in their order."""
     return float(np.hypot(*np.diff(np.vstack([start_m, xy_m]), axis=0).T).sum())
 
 

@@ -38,11 +38,12 @@ class DriftTable(Component):
     """The writer of `drift_correction.csv`: for each scan the offset of tip and sample coordinates, and its rate.
 
     The offset is x_sample - x_tip. The columns from `scan` to `failures` are those of `drift.record`, which reads the
-    table. `outcome` is how the position of a scan was determined: registered, coarse, or by dead reckoning (refused,
-    failed, new); the variances belong to it. After a kill and restart, header and rows are still written only once.
+    table. `outcome` is the way in which the position of a scan was determined: registered, coarse, or by dead reckoning
+    (refused, failed, new); the variances belong to this position. After a kill and restart, header and rows are still
+    written only once.
 
     Args:
-        file: its name in the run folder.
+        file: name of the table in the run folder.
     """
 
     listens: ClassVar = ("DriftMapping",)
@@ -98,7 +99,8 @@ class TabledScan:
 def parts(tabled: Sequence[TabledScan]) -> list[tuple[str, int, int]]:
     """Return name, start and stop index of each part of the night, without and with correction.
 
-    The first scan with correction is in neither part: it may have been requested before correction was switched on.
+    Empty parts are left out. The first scan with correction is in neither part, because it may have been requested
+    before correction was switched on. Only a night corrected from its first scan on includes this scan.
     """
     first_on = next((k for k, one in enumerate(tabled) if one.correcting), len(tabled))
     found = [("off", 0, first_on), ("on", first_on + 1 if first_on else 0, len(tabled))]
@@ -134,12 +136,12 @@ class DriftPictures(DriftTable):
     are drawn, too. Scans are read from the files that the microscope saves.
 
     Args:
-        channel: of the compared scans.
-        estimator: for the comparison.
+        channel: channel of the compared scans.
+        estimator: name of the estimator for the comparison.
         features: an estimator that matches features, for the figure of matches; by default "brief" where
             `afspm[features]` is installed.
-        title: above the figure of the offset.
-        file: the table's name in the run folder.
+        title: title above the figure of the offset.
+        file: name of the table in the run folder, as for `DriftTable`.
     """
 
     longest_step_s: ClassVar[float] = 60.0

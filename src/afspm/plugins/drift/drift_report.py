@@ -15,7 +15,7 @@ from afspm.record.run import Run
 
 
 def draw(run: Run, title: str) -> None:
-    """Draw the drift into the run folder, if at least two scans have sample coordinates."""
+    """Draw the drift into the run folder if no component has drawn it and at least two scans have a mapping."""
     if not is_ours(run.folder, OWN_OFFSET, OFFSET) or len(record := drift_of(run)) < 2:
         return
     from afspm.plugins.drift.figures import style
@@ -25,11 +25,12 @@ def draw(run: Run, title: str) -> None:
 
 
 def drift_of(run: Run) -> DriftRecord:
-    """Return the drift that the scheduler published during a run."""
+    """Return the drift that the scheduler published during a run; messages without a mapping are left out."""
     published = [wire.decode("DriftMapping", packet.payload) for packet in run.packets(messages=("DriftMapping",))]
     published = [message for message in published if len(message.matrix) == 6 and len(message.center) == 2]
 
     def square(values: Any) -> NDArray[np.float64]:
+        # before the first registration the scheduler publishes no covariance
         return np.array(values if len(values) == 4 else [np.nan] * 4, dtype=np.float64).reshape(2, 2)
 
     return DriftRecord(

@@ -45,7 +45,7 @@ class Analysis:
 
     Attributes:
         record: drift record of the tracker.
-        pairs: registrations of the first scan with each later one.
+        pairs: registrations of the first scan with each later scan.
         estimates: drift record of the pairs.
     """
 
@@ -58,7 +58,8 @@ def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Pa
     """Analyse files, print the table, and write the results.
 
     Raises:
-        InvalidValue: no file can be analysed. ConfigError: the estimator or tracker is unknown.
+        InvalidValue: no file can be analysed. ConfigError: the estimator or tracker is unknown. FileError: as
+            `written`.
     """
     console, aside = Console(file=sys.stdout, highlight=False), Console(stderr=True, highlight=False)
     contents, unreadable = read_all(paths)
@@ -104,12 +105,15 @@ def _files(paths: Sequence[Path]) -> Iterator[Path]:
 
 
 def register_pair(by: str, reference: DriftScan, scan: DriftScan) -> Registration:
-    """Register a pair of scans in a worker process."""
+    """Register two scans with the named estimator; a module-level function, so that worker processes can import it."""
     return estimator(by).register(reference, scan)
 
 
 def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int | None, console: Console) -> Analysis:
-    """Track drift through the scans in this process, while other processes register each scan with the first."""
+    """Track drift through the scans, and register each later scan with the first in parallel.
+
+    The tracker runs in this process. Registrations run in other processes, or with a single job in a thread.
+    """
     tracking = tracker(following, estimator(by))
     wanted = processes(jobs, sum(scan.values.size for scan in scans))
     others = 1 if wanted == 1 else max(wanted - 1, 2)  # processes that compare; 1 is this one
@@ -137,7 +141,7 @@ def _pairs(scans: Sequence[DriftScan], by: str, jobs: int, done: Callable[[], No
 
 
 def as_table(record: DriftRecord) -> Table:
-    """Return the record as a table: hours since the first scan, positions in nm, rates in nm/min."""
+    """Return the record as a table: hours since the first scan, drift and its uncertainty in nm, rates in nm/min."""
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("scan", no_wrap=True, max_width=24)
     for name in ("h", "x / nm", "y / nm", "± sd", "nm/min x", "y"):

@@ -95,7 +95,8 @@ class Mapping:
     def to_sample(self, region: Region) -> Region:
         """Map a region from tip to sample coordinates.
 
-        The result is again a rectangle: its centre is mapped, and it is rotated and scaled by the nearest similarity.
+        The result is again a rectangle: the centre is mapped, and the sides are rotated and scaled by the nearest
+            similarity.
         Shear is left out, because a microscope scans rectangles.
         """
         return self._mapped(region, Frame.SAMPLE)
@@ -115,7 +116,7 @@ class Mapping:
 
 
 def unlike_drift(linear: Array) -> str:
-    """Return the reason why drift can't cause a given 2 x 2 part between two scans; empty if it can."""
+    """Return the reason why drift can't cause a given 2 x 2 part between two scans; empty for a plausible part."""
     if np.linalg.det(linear) <= 0.0:
         return f"mirrored or flat: {linear.tolist()}"
     stretches = np.linalg.svd(linear, compute_uv=False)

@@ -18,9 +18,9 @@ def named(what: str, spec: str | PlainMapping, default: str, *arguments: object)
 
     Args:
         what: "estimator" or "tracker".
-        spec: a name declared by a package, or "module.Name"; or a table with such a name as its `class`, and the
+        spec: a name declared by a package, or "module.Name"; or a table with such a name as its `class` and with the
             settings.
-        default: name if the table has no class.
+        default: name if the table has no `class`.
         arguments: positional arguments of the constructor, before the settings.
 
     Raises:

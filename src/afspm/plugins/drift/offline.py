@@ -27,14 +27,14 @@ def followed(scans: Sequence[DriftScan], tracker: Tracker) -> Iterator[Update]:
 
 
 def against_first(record: DriftRecord, scans: Sequence[DriftScan], pairs: Sequence[Registration]) -> DriftRecord:
-    """Return a record of the displacement from the first scan to each later one, by registration of the pair alone.
+    """Return a record of the displacement from the first scan to each later scan, by registration of the pair alone.
 
-    A registration holds at the centre of the overlap, which was not scanned in the middle of either scan. The drift in
-    between is subtracted, with the tracker's rates.
+    A registration holds for the times at which both scans passed the centre of the overlap. The drift between these
+    times and the middles of the scans is subtracted, with the tracker's rates.
 
     Args:
         record: drift record of the tracker.
-        pairs: registrations of the first scan with each later one.
+        pairs: registrations of the first scan with each later scan.
     """
     drift, covariance = [np.zeros(2)], [np.zeros((2, 2))]
     rate_m_s = record.rate_then_m_s
@@ -55,7 +55,11 @@ def against_first(record: DriftRecord, scans: Sequence[DriftScan], pairs: Sequen
 
 
 def spread_pairs(record: DriftRecord, apart_s: float, count: int) -> list[tuple[int, int]]:
-    """Return index pairs of matched scans about `apart_s` apart, spread over the run; in a shorter run, its ends."""
+    """Return at most `count` index pairs of matched scans about `apart_s` apart, with starts spread over the run.
+
+    In a run shorter than `apart_s`, the pairs join scans from its beginning and its end. Empty with fewer than two
+    matched scans.
+    """
     good = np.flatnonzero(record.matched)
     if len(good) < 2:
         return []
@@ -114,8 +118,8 @@ class Stack:
 def corrected(scans: Sequence[DriftScan], drift_m: Array, rate_m_s: Array | None = None) -> Stack:
     """Return the stack of drift-corrected scans, with the pixel size and angle of the first scan.
 
-    The sample moves during a scan, so the place of a row on the sample depends on its time. The rate corrects this in
-    scans with a known row direction.
+    The sample moves during a scan, so the place of a row on the sample depends on the time of the row. The rate
+    corrects this shear in scans with a known slow-scan direction.
 
     Args:
         drift_m: (n, 2) displacement of the sample at the middle of each scan.
@@ -132,6 +136,7 @@ def corrected(scans: Sequence[DriftScan], drift_m: Array, rate_m_s: Array | None
     values = np.empty((len(scans), *shape))
     for k, scan in enumerate(scans):
         rows, columns = _pixels_at(scan, x_m + drift_m[k, 0], y_m + drift_m[k, 1], rates[k])
+        # NaN would spread through the whole spline: holes are filled here, and marked again in the result
         measured = np.isfinite(scan.values)
         filled = np.where(measured, scan.values, np.median(scan.values[measured]) if measured.any() else 0.0)
         values[k] = map_coordinates(filled, [rows, columns], order=3, mode="nearest")

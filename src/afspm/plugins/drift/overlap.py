@@ -151,8 +151,8 @@ def too_little_shared(asked: Region, scanned: Region, f_rescan: float = F_RESCAN
 def too_far_off(asked: Region, scanned: Region, sd_m: float, tolerance_m: float) -> str:
     """Return the reason for a rescan if a corner may be off by more than the tolerance; else "".
 
-    The paper's rule tolerates an offset of an eighth of the scan's size. Here the user sets the tolerance, and the
-    uncertainty counts: |residual| + 2 sd > tolerance.
+    The paper's rule tolerates an offset of a quarter of the side along one axis (f_rescan = 0.75). Here the user sets
+    the tolerance, and the uncertainty counts: |residual| + 2 sd > tolerance.
 
     Args:
         sd_m: standard deviation of the estimated position, `update.after.sd_m`.

@@ -34,10 +34,10 @@ class DriftRecord:
         center_m: (n, 2) centre of each scan's region.
         drift_m: (n, 2) displacement of the sample under the tip since the start, as estimated after each scan.
         covariance_m2: (n, 2, 2) covariance of the drift.
-        rate_m_s: (n, 2) velocity of the sample after each scan; zero after the first one, when it is unknown.
-        matched: (n,) whether each scan was registered; otherwise its drift is a prediction.
-        reasons: reason why each scan was not registered, for people; empty if it was.
-        outcomes: how the position of each scan was determined.
+        rate_m_s: (n, 2) velocity of the sample after each scan; zero after the first scan (unknown then).
+        matched: (n,) whether each scan was registered; the drift of other scans is a prediction.
+        reasons: reason why each scan was not registered, for people; empty for registered scans.
+        outcomes: outcome of the registration of each scan.
         failures: number of estimator errors with each scan.
     """
 
@@ -59,7 +59,7 @@ class DriftRecord:
         return self.chosen(range(len(self.keys))[part])
 
     def chosen(self, which: Sequence[int]) -> DriftRecord:
-        """Return the record of the scans with given indices."""
+        """Return the record of the scans with the given indices, in the given order."""
         at = list(which)
         return DriftRecord(
             tuple(self.keys[k] for k in at), self.time_s[at], self.center_m[at], self.drift_m[at],

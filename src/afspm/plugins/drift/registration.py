@@ -93,7 +93,7 @@ class Matches:
 
 @dataclass(frozen=True, eq=False)
 class LinearSeen:
-    """Linear part estimated without a prior; `Registration.linear` may be biased towards its prior.
+    """Linear part estimated without a prior, whereas a prior may bias `Registration.linear`.
 
     Attributes:
         linear: (2, 2) linear part.
@@ -112,7 +112,7 @@ class Registration:
     tip coordinates.
 
     Attributes:
-        accepted: whether the result may be used; if not, the numbers are the best guess, or NaN without one.
+        accepted: whether the result may be used; if not, displacement and covariance are the best guess, or NaN.
         reason: reason for a refusal, for people; empty if accepted.
         displacement_m: (2,) displacement at `center_m`.
         covariance_m2: (2, 2) covariance of the displacement.
@@ -121,9 +121,8 @@ class Registration:
         quality: figures of merit by name (overlap, correlation, …), for people and for studies.
         matches: matched features, if the estimator uses features.
         linear_seen: linear part with its uncertainty, if the estimator provides it.
-        failure: error of the estimator, if it raised or returned no usable result; empty without an error. An error
-            says nothing about the scans. The result is still accepted if a coarse estimate replaces it; the linear part
-            is then unknown.
+        failure: error of an estimator that raised or returned no usable result; empty without an error. A coarse
+            estimate that replaces the failed result may be accepted; its linear part is unknown.
     """
 
     accepted: bool

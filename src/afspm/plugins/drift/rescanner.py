@@ -27,15 +27,15 @@ _IN_WORDS = {
 class Rescanner(Component):
     """A component that scans a region again on a `DriftRescan`: unchanged, in the other direction, or wider.
 
-    Meanwhile thermal-drift is flagged, so that no other component scans. After some attempts without success it logs an
-    error and the experiment goes on. If the sample is not found again, it flags device-malfunction and a person is
-    needed.
+    During a rescan thermal-drift is flagged, so that no other component scans. If no attempt succeeds, the component
+    logs the failure and the experiment goes on. If a search does not find the sample, the component flags
+    device-malfunction, which a person must clear.
 
     Args:
-        attempts: scans for one request; in the other direction there is one.
-        widen: factor from each search region to the next.
-        most_pixels: largest side of a search in pixels; up to this bound the pixel size stays.
-        problem: the problem that it solves.
+        attempts: largest number of scans for one request; a request for the other direction allows one scan.
+        widen: factor from the requested region to the first search region, and from each search region to the next.
+        most_pixels: largest side of a search region in pixels; up to this bound the pixel size stays.
+        problem: problem that the component flags and solves.
     """
 
     solves: ClassVar = ("thermal-drift",)

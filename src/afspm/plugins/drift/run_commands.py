@@ -1,6 +1,6 @@
 """`afspm compare`: compare runs side by side. `afspm find`: find a remounted sample.
 
-Both register scans of different nights, so they are in the package with the estimators.
+Both commands register scans of different runs, so this module is in the package of the estimators.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Shear of an image by drift during the scan, and the drift velocity from an up frame and a down frame.
 
 Rows are scanned one after the other, so a feature at `p` in the middle of the scan is found at
-x = p + v a e.(x - c), with c the centre, e the direction of the slow axis and a the time per length along it, negative
-when scanning down. Two scans with a_1 and a_2 are then related by 1 + A = (1 - a_2 v e')^-1 (1 - a_1 v e'), that is
-A e = v (a_2 - a_1) / (1 - a_2 v.e): an up frame and a down frame differ by a shear and a stretch of 2 v times duration
-over height, regardless of the drift in between. The velocity from the shear is free of a lattice's ambiguity; the
-velocity from the displacement between their middles is more precise.
+x = p + v a e.(x - c), with c the centre, e the direction of the slow axis and a the time per length along this axis,
+negative when scanning down. Two scans with a_1 and a_2 are then related by 1 + A = (1 - a_2 v e')^-1 (1 - a_1 v e'),
+that is A e = v (a_2 - a_1) / (1 - a_2 v.e): an up frame and a down frame differ by a shear and a stretch of 2 v times
+duration over height, regardless of the drift in between. The velocity from the shear is free of a lattice's ambiguity;
+the velocity from the displacement between their middles is more precise.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from afspm.plugins.drift.registration import DriftScan, Estimator, Prior, Regist
 
 Array = NDArray[np.float64]
 
-_SAFETY = 2.0  # on the standard deviation of the shear, since it is derived from the displacement's
+_SAFETY = 2.0  # on the standard deviation of the shear, which is only derived from the displacement
 _CONTRADICTION = 16.0  # chi2 of the difference between both routes
 
 
@@ -33,12 +33,12 @@ class DriftVelocity:
     Attributes:
         accepted: whether the velocity may be used.
         reason: reason for a refusal, for people.
-        velocity_m_s: (2,) velocity; NaN if none was found.
+        velocity_m_s: (2,) velocity; NaN for a refusal.
         covariance: (2, 2) covariance of the velocity, (m/s)².
         time_s: middle of the two scans, for which the velocity holds.
         by_shear_m_s, by_displacement_m_s: (2,) velocity from shear alone and from displacement alone.
         by_shear_covariance: (2, 2) covariance of `by_shear_m_s`.
-        registration: the registration used, or the refused one.
+        registration: the registration used or refused; None if the pair was not registered.
     """
 
     accepted: bool
@@ -75,14 +75,14 @@ def slow_axis(scan: DriftScan) -> Array:
 
 
 def delay_per_length_s_m(scan: DriftScan) -> float | None:
-    """Return a, the delay of a position per length along the slow axis; None if the direction is unknown."""
+    """Return the delay per length along the slow axis, in s/m, negative when scanning down; None: unknown direction."""
     if scan.upwards is None:
         return None
     return (1.0 if scan.upwards else -1.0) * scan.duration_s / scan.region.size_m[1]
 
 
 def row_delay_s(scan: DriftScan, position_m: Array) -> float | None:
-    """Return the delay from a scan's middle to its pass over a position in tip coordinates; None: direction unknown."""
+    """Return the delay from a scan's middle to its pass over a position (tip coordinates); None: unknown direction."""
     a = delay_per_length_s_m(scan)
     return None if a is None else a * float(slow_axis(scan) @ (position_m - np.array(scan.region.center_m)))
 
@@ -94,7 +94,8 @@ def velocity_by_shear(reference: DriftScan, scan: DriftScan, found: Registration
     sqrt(12) / h times the uncertainty of the displacement.
 
     Returns:
-        None if both scans were sheared alike, a direction is unknown, or the registration is coarse.
+        None if the scans were sheared nearly alike, a direction or the covariance is unknown, the registration is
+        coarse, or the sample moved about as fast as the scan.
     """
     first, second = delay_per_length_s_m(reference), delay_per_length_s_m(scan)
     if first is None or second is None or not np.isfinite(found.covariance_m2).all():
@@ -120,10 +121,11 @@ def velocity_by_shear(reference: DriftScan, scan: DriftScan, found: Registration
 def velocity_from_up_down(up: DriftScan, down: DriftScan, estimator: Estimator) -> DriftVelocity:
     """Return the velocity from an up frame and a down frame, in either order, of about the same region.
 
-    The frames are first registered without a prior. If this is refused, or if displacement and shear contradict each
-    other (another site of a lattice, a picture with little shear), the velocity from either of them serves as a guess.
-    Both scans are corrected for the guessed drift and registered again with a prior from it, and the remaining
-    displacement and shear must agree.
+    The frames are first registered without a prior. If this registration is refused, or if displacement and shear
+    contradict each other (another site of a lattice, a picture with little shear), the velocity from the shear serves
+    as a guess, then the velocity from the displacement. Both scans are corrected for the guessed drift and registered
+    again with a prior from the guess; the remaining displacement and shear must agree. If this fails for both guesses,
+    the refusal without a prior is returned.
     """
     first, second = sorted((up, down), key=lambda scan: scan.mid_s)
     time_s = (first.mid_s + second.mid_s) / 2

@@ -23,10 +23,11 @@ def true_drift(run_dir: Path, scans: Sequence[DriftScan]) -> Array | None:
     """Return the sample's true displacement since the first scan, at each scan's centre, (n, 2), in m; None if unknown.
 
     The result includes displacement by rotation and expansion of the sample. The drift that the controller itself
-    compensates is subtracted, since tip coordinates move with it; it is interpolated between the ends of scans.
+    compensates is subtracted, since tip coordinates move with the compensation; the compensated drift is interpolated
+    between the starts and ends of scans. The result is None without the file or without scans.
 
     Raises:
-        FileError: the file does not describe a simulated run.
+        FileError: the file can't be read, or does not describe a simulated run.
     """
     path = run_dir / TRUTH_FILE
     if not path.exists() or not scans:

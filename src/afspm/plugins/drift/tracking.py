@@ -49,7 +49,7 @@ class Forecast(Protocol):
     """A tracker's predictions for any time: small, immutable and convertible to JSON, without the scans."""
 
     def at(self, time_s: float) -> Prediction:
-        """Return the prediction for any time; before the newest scan, its estimate is extrapolated backwards."""
+        """Return the prediction for any time; times before the newest scan are extrapolated backwards."""
         ...
 
     def to_dict(self) -> Plain:
@@ -65,7 +65,8 @@ class Update:
         key: key of the scan.
         before: prediction for the middle of the scan, without the scan.
         after: estimate for the same time, with the scan.
-        matched: whether the scan could be registered with any reference (the very first scan counts as matched).
+        matched: whether a registration determines the position of the scan; true for the very first scan. A
+            registration that the tracker does not use, such as a doubtful result, does not count.
         reason: reason why the scan did not match, or only coarsely, for people.
         lost: whether the position of the sample is unknown.
         registrations: registrations by key of the reference.
@@ -84,7 +85,7 @@ class Update:
 
     @property
     def outcome(self) -> RegistrationOutcome:
-        """Kind of determination of the scan's position."""
+        """Outcome for the position of the scan, judged by all its registrations."""
         found = self.registrations.values()
         if self.matched:
             accepted = [one for one in found if one.accepted]
@@ -97,7 +98,7 @@ class Update:
 
 
 def require_newer(scan: DriftScan, newest_s: float | None) -> None:
-    """Raise InvalidValue for a scan older than the newest one."""
+    """Raise InvalidValue for a scan with its middle before `newest_s`, the middle of the newest scan; None: no scan."""
     if newest_s is not None and scan.mid_s < newest_s:
         late = f"the middle of scan {scan.key!r} is at {scan.mid_s:g} s, and {newest_s:g} s was reached already"
         raise InvalidValue(late, hint="give a tracker its scans in the order of time")

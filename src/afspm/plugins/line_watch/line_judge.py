@@ -6,8 +6,9 @@ The remaining difference, relative to the usual difference of two good scans of 
 line raises no alarm, but ten slightly different lines do. Without an earlier scan of the place, nothing is judged.
 
 Each kind of scan (same size, angle, pixels and setpoint; decision 0044) has its own threshold: the highest sum of good
-scans, times a factor. A sum above the threshold raises `STOP`, a sum above 60 % of it `LOOK`. Before an alarm, a wider
-search for the shift shows whether the sample has jumped: then the template explains the lines again.
+scans, times a factor, and at least a fixed value. A sum above the threshold raises `STOP`, a sum above 60 % of the
+threshold `LOOK`, once enough lines since the change are known. Before an alarm, a wider search for the shift shows
+whether the sample has jumped: then the template explains the lines again.
 """
 
 from __future__ import annotations
@@ -43,15 +44,15 @@ REMEMBERED = 24  # lines for the search after a jump
 EXPLAINED = 1.5  # standard deviations beyond the usual, by the median of these lines, up to which a jump explains them
 NEWEST = 4  # lines since a change that a jump must explain, at least
 PER_PIXEL = 0.03  # standard deviations that a pixel of a jump costs: short jumps are likelier than long ones
-DRIFT = 1.0  # standard deviations that a line must exceed the usual by, for the sum to grow
+DRIFT = 1.0  # standard deviations above the usual difference beyond which a line lets the sum grow
 LEAST_PER_SLOPE = 0.06  # pixels: two scans without drift between them show too small a misfit of steep flanks
-SPIKE = 6.0  # the same for a single pixel
+SPIKE = 6.0  # standard deviations beyond which a single pixel of a good scan is removed as a spike
 SCAR = 4.0  # standard deviations beyond which a row of a good scan is no measure of later ones
 MOST = 6.0  # standard deviations that one line adds at most
 FLOOR, FACTOR = 15.0, 2.0  # least threshold, and its ratio to the highest sum of good scans
 FEWEST_SUSPECT = 6  # rows since a change before an alarm: fewer don't show whether the sample has jumped
-FEWEST_STOP = 10  # the same before a scan is stopped, after a second search for a jump with more lines
-LOOK = 0.6  # share of the threshold
+FEWEST_STOP = 10  # rows since a change before a scan is stopped, after a second search for a jump with more lines
+LOOK = 0.6  # share of the threshold above which a person should look
 GOOD_DECAY = 5.0  # assumed, not fitted: of the share of good scans that reach some evidence
 FEWEST_PAIRS = 2  # of good scans, before such scans are judged
 ENOUGH_PAIRS = 4  # for medians
@@ -120,7 +121,7 @@ class PairStatistics:
 
     Attributes:
         flat_m: standard deviation on flat pixels.
-        per_slope: further difference for each m per pixel of slope, in m.
+        per_slope: further difference in m for each m per pixel of slope, added in quadrature.
         usual, spread: centre and spread of `line_statistic`.
         highest: highest value of the CUSUM.
     """
@@ -139,7 +140,7 @@ class Place:
     Attributes:
         at_s: end of the scan.
         templates: trace and, if recorded, retrace.
-        slipped: how far the sample has jumped since the scan, besides its drift, in pixels.
+        slipped: displacement of the sample by jumps since the scan, besides its drift, in pixels (rows, columns).
     """
 
     region: Region
@@ -164,7 +165,7 @@ class KindReference:
     speeds: list[Shift] = field(default_factory=list)
 
     def place(self, region: Region) -> Place | None:
-        """Return the newest earlier scan that covers at least half the width and height of a region."""
+        """Return the newest earlier scan that covers at least half the width and height of a region, or None."""
         for place in reversed(self.places):
             if max(abs(away) for away in self._away(place, region)) <= 1.0 - LEAST_COMMON:
                 return place
@@ -206,7 +207,7 @@ class Cusum:
 
     Attributes:
         value: the sum.
-        since: index of the line at which the sum last left zero.
+        since: index of the line at which the sum last left zero; None while it is zero.
     """
 
     value: float = 0.0
@@ -233,7 +234,7 @@ class LineStatistic:
     """
 
     def __init__(self, pairs: Sequence[PairStatistics]) -> None:
-        # of few pairs the least alike: their median may lie well below what the next pair shows
+        # for few pairs the largest values: their median may lie well below the values of the next pair
         middle = np.median if len(pairs) >= ENOUGH_PAIRS else np.max
         self.flat_m, self.per_slope, self._usual, self._spread = (
             float(middle([getattr(pair, name) for pair in pairs]))
@@ -252,7 +253,7 @@ class LineStatistic:
 
 
 def line_statistic(fits: Sequence[RowFit], flat_m: float, per_slope: float) -> float:
-    """Return the mean squared difference of a line, relative to the usual one, with an upper limit per pixel."""
+    """Return the mean squared difference of a line, relative to the usual variance, with an upper limit per pixel."""
     means = []
     for fit in fits:
         square = (fit.residual / np.hypot(flat_m, per_slope * fit.steepness)) ** 2
@@ -282,7 +283,7 @@ class ScanJudge:
     """Judge of the lines of one scan, in order of arrival; see `LineJudge.begin`.
 
     Attributes:
-        alarm: the last alarm.
+        alarm: last alarm; None without an alarm so far.
         fitted: remaining differences from the template, by row.
     """
 
@@ -297,19 +298,19 @@ class ScanJudge:
 
     @property
     def threshold(self) -> float:
-        """Return the CUSUM at which a scan is stopped."""
+        """CUSUM at which a scan is stopped."""
         return self._statistic.threshold
 
     @property
     def evidence(self) -> float:
-        """Return the CUSUM relative to the threshold."""
+        """CUSUM relative to the threshold."""
         return self._cusum.value / self.threshold
 
     def add(self, row: int, line: Sequence[Array]) -> Alarm | None:
         """Judge a line; return an alarm if its level is higher than before, else None.
 
         Args:
-            row: its index in the scan.
+            row: index of the line in the scan.
             line: heights in m of trace and, if recorded, retrace.
         """
         level = [levelled(values)[0] for values in line]
@@ -438,7 +439,10 @@ class LineJudge:
         return None
 
     def lacking(self, region: Region, kind: Kind) -> str:
-        """Return the reason why the lines of a scan can't be judged, for people; empty if they can."""
+        """Return the reason why the lines of a scan can't be judged, for people; empty without a reason.
+
+        An earlier scan with another number of channels is no reason here, although `begin` then returns None.
+        """
         known = self._known(kind)
         if known is None or known.place(region) is None:
             return "no earlier scan of this size, angle, pixels and feedback shows the place"
@@ -458,11 +462,14 @@ class LineJudge:
     ) -> None:
         """Learn from a complete scan with a good tip.
 
+        A scan during which the sample has jumped is not used as a reference for its place.
+
         Args:
             picture: heights in m, [y, x], of trace and, if recorded, retrace.
             at_s: end of the scan.
             downwards: whether the lines arrived from last to first.
-            again: the process has learnt from this scan before its restart: use it only as a reference for its place.
+            again: whether the process has learnt from this scan before its restart; the scan then only becomes a
+                reference for its place.
         """
         known = self._known(kind) or self._new(kind)
         self._kinds.remove(known)

@@ -17,7 +17,7 @@ from afspm.model import ControlState, Feedback, Scan, ScanLines, ScopeState
 from afspm.plugins.line_watch.line_judge import Alarm, AlarmLevel, Kind, LineJudge, ScanJudge, confidence
 from afspm.plugins.line_watch.registration import Array
 
-KEPT_TIMES = 16  # of scans learnt from, which a restarted process may receive again
+KEPT_TIMES = 16  # number of scans learnt from whose times are saved: a restarted process may receive them again
 
 
 @dataclass
@@ -26,10 +26,10 @@ class _Lines:
 
     Attributes:
         began_ns: start time of the scan, as published with its lines.
-        judge: None if the scan is not judged.
-        pictures: by channel, [y, x] in m; NaN where not received.
+        judge: judge of the lines; None if the scan is not judged.
+        pictures: heights by channel, [y, x] in m; NaN where not received.
         taken: indices of the judged rows, in the order of judgement.
-        is_disturbed: a setting of the feedback has changed since its start.
+        is_disturbed: whether the feedback was changed or a problem was flagged since the start of the scan.
     """
 
     began_ns: int | None
@@ -48,8 +48,8 @@ class _Finished:
     """The newest complete scan, from which the judge learns when the next scan begins.
 
     Attributes:
-        is_whole: no alarm was raised, and no condition changed during the scan.
-        is_trusted: the tip counts as good so far.
+        is_whole: whether no alarm was raised, no problem flagged, and no feedback changed during the scan.
+        is_trusted: whether the tip counts as good so far.
     """
 
     pair: HeightPair
@@ -60,26 +60,27 @@ class _Finished:
 
 
 class LineWatch(Component):
-    """A watch on running scans: publishes the row from which their lines show that the tip has changed.
+    """A watch on running scans, which publishes the row at which their lines show that the tip has changed.
 
-    With `action = "stop"` it also flags `tip-shape-changed`: the scheduler stops the scan, so its remaining time is
-    saved. Each line is compared with an earlier scan of the place at the predicted drift; where there is none, nothing
-    is judged. It learns from the first scans of each size, number of pixels and setting of the feedback, so the tip
-    must be good then: scans are judged from the fourth of a place on. It learns nothing from a scan with an alarm, from
-    one during which a problem was flagged or the feedback was changed, or from one that a `TipClassifier` calls bad.
+    With `action = "stop"` an alarm of the higher level also flags `tip-shape-changed`: the scheduler stops the scan, so
+    its remaining time is saved. Each line is compared with an earlier scan of the place at the predicted drift; without
+    an earlier scan, nothing is judged. The component learns from the first scans of each size, angle, number of pixels
+    and setting of the feedback, so the tip must be good then: the first scan judged is the fourth of a place, at later
+    places the second. A scan teaches nothing if an alarm was raised, a problem flagged or the feedback changed during
+    the scan, or if a `TipClassifier` judges it as bad.
 
-    It publishes a `TipVerdict` with the row of the alarm, the first row with the change, and a confidence. The
-    confidence is 1 - exp(-5 evidence), where the evidence is relative to the threshold: an assumed decay, which ranks
-    alarms and is no measured probability. A `ScanSeries` with
-    `missed = "rest"` then measures only the rest of the scan. The microscope must publish lines of running scans. After
-    an alarm, a component that judges complete scans (the `TipClassifier`) finds when the tip is good again.
+    The component publishes a `TipVerdict` with the row of the alarm, the first row with the change, and a confidence.
+    The confidence is 1 - exp(-5 evidence), where the evidence is relative to the threshold: an assumed decay, which
+    ranks alarms and is no measured probability. A `ScanSeries` with `missed = "rest"` then measures only the rest of
+    the scan. The microscope must publish lines of running scans. After an alarm, a component that judges complete scans
+    (the `TipClassifier`) finds when the tip is good again.
 
     Args:
-        channel: of the heights.
-        retrace_channel: their retrace; empty if not recorded.
-        action: "look" only publishes the verdict, for a person; "stop" flags the problem, so that the scan is stopped:
-            in one good scan of ten without need, where samples jump or creep.
-        problem: the problem to flag.
+        channel: channel of the heights.
+        retrace_channel: channel of their retrace; empty if not recorded.
+        action: "look" only publishes the verdict, for a person; "stop" also flags the problem, so that the scan is
+            stopped. On samples that jump or creep, about one good scan in ten is stopped without need.
+        problem: problem to flag.
     """
 
     flags: ClassVar = ("tip-shape-changed",)

@@ -27,7 +27,7 @@ MOST_MOVED_PX = 1.5
 ROUNDS = (1, 3)  # of each fit; the second fit takes the template's slopes where the first one has moved the row
 PULL = 0.02  # cost of each squared pixel from the predicted shift, on ground too flat to show a shift
 STEADY = 0.75  # share of the cost that a shift elsewhere must stay below: on a lattice many shifts are nearly as good
-HALF_PX = 0.35  # standard deviation of a shift rounded to whole pixels, in both directions together
+HALF_PX = 0.35  # standard deviation of a shift rounded to whole pixels, both directions combined
 CANDIDATES = 6  # of a search: on a lattice many shifts are nearly as good
 CLIP_SIGMAS = 4.0  # of a slope in the cost of a shift, and of a pixel in a residual
 MAD_TO_SIGMA = 1.4826  # of normally distributed values
@@ -39,10 +39,10 @@ class RowTemplate:
 
     Attributes:
         heights: in m, [y, x], rows levelled, without holes.
-        slopes: differences along the rows, [y, x - 1].
+        slopes: differences of neighbouring pixels along the rows, [y, x - 1], in m.
         row_slopes, column_slopes: the gradient, in m per pixel.
         spline: cubic spline coefficients of the heights; linear interpolation would blur sharp features between pixels.
-        spread: typical size of a slope.
+        spread: standard deviation of the slopes, in m per pixel.
         trusted: by row; False for a row with a defect such as a scar, which other scans do not show.
     """
 
@@ -56,7 +56,7 @@ class RowTemplate:
 
     @classmethod
     def of(cls, heights: Array, doubtful: Collection[int] = ()) -> RowTemplate:
-        """Prepare a scan; rows without values are filled from their neighbours.
+        """Prepare a scan; doubtful rows and rows with few values are interpolated from their neighbours.
 
         Args:
             doubtful: rows to exclude from all comparisons.
@@ -112,7 +112,7 @@ class RowRegistration:
         self.shift: Shift = expected
 
     def follow(self, number: int, row: Array) -> None:
-        """Update the shift with a levelled row, given with its index in the scan."""
+        """Update the shift with a levelled row and its index in the scan, unless the row lies outside the template."""
         cost = self._costs(number, np.diff(row))
         if cost is None:
             return
@@ -120,10 +120,12 @@ class RowRegistration:
         self.shift = self._best(self._cost)
 
     def fit(self, number: int, row: Array, template: RowTemplate | None = None) -> RowFit | None:
-        """Return the difference of a levelled row from the template; None if the template does not cover the row.
+        """Return the difference of a levelled row from the template.
+
+        None if the template does not cover enough of the row, or has a doubtful row there.
 
         Args:
-            template: another channel of the same scan.
+            template: another channel of the template's scan; None: the template itself.
         """
         template, (down, along) = template or self._template, self.shift
         ny, nx = template.heights.shape
@@ -184,7 +186,7 @@ def likely_shifts(
     reach: tuple[int, int],
     flat_m: float,
 ) -> list[Shift]:
-    """Return the shifts in whole pixels with the best fit of some lines, best first.
+    """Return the six shifts in whole pixels with the best fit of some lines, best first.
 
     Unlike `RowRegistration`, this search compares heights: the flat ground beside a step shows shifts that its edge
     does not.
@@ -193,7 +195,7 @@ def likely_shifts(
         lines: (index in the scan, levelled row) of each line.
         about: centre of the search.
         reach: largest deviation from `about` that is searched, (rows, columns).
-        flat_m: usual difference on flat pixels.
+        flat_m: usual difference on flat pixels, in m.
     """
     (down, along), (ny, nx) = (round(at) for at in about), template.heights.shape
     rows, columns = np.arange(-reach[0], reach[0] + 1) + down, np.arange(nx + 2 * reach[1]) + along - reach[1]
@@ -228,7 +230,10 @@ def likely_shifts(
 
 
 def levelled(rows: Array) -> Array:
-    """Return rows without their offset and tilt, which come from z drift and the mounting of the sample."""
+    """Return rows without the offset of each row and the common tilt (z drift, mounting of the sample).
+
+    Holes are interpolated along the row; a row with at most half of its values becomes NaN.
+    """
     rows = np.array(rows, dtype=np.float64, ndmin=2)
     there = np.isfinite(rows)
     for row, good in zip(rows, there, strict=True):

@@ -25,8 +25,8 @@ def estimator(spec: str | PlainMapping | Estimator = DEFAULT, report: Report = l
 
     Args:
         spec: a name declared by a package, or "module.Name"; a table with such a name as its `class`, and the settings;
-            or an estimator.
-        report: called with each error; by default it is logged.
+            or an estimator. An estimator with a guard is returned as it is.
+        report: function called with each error; by default the error is logged.
 
     Raises:
         ConfigError: no such name, class or setting, a meaningless setting, or a missing library.

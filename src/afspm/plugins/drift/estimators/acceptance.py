@@ -19,7 +19,7 @@ Mask = NDArray[np.bool_]
 
 PARTS = 8  # of the overlap in each direction, at most
 PART_PX = 4  # smaller ones hold too little to correlate
-APART_PX = 4  # nearer than this a repetition is the match itself
+APART_PX = 4  # a nearer peak is the match itself
 FEW = 10  # with fewer repetitions a surface does not count as periodic
 MOST_REPEATS = 30.0  # standard deviations, from which a match counts as unique
 WRONG_AT_MOST = 0.05
@@ -35,9 +35,9 @@ class MatchEvidence:
     Attributes:
         overlap: area of the overlap, as share of the smaller scan.
         sd_px: largest standard deviation of the shift.
-        gap: log-likelihood of the match minus the highest one of any other shift, in nats.
+        gap: log-likelihood of the match minus the highest log-likelihood of any other shift, in nats.
         rival: log-likelihood of the best other shift over the log-likelihood of the match, both relative to no match.
-            Where equal features are far apart, one may fit another as well as itself, and only overlap less.
+            If equal features lie far apart, a match of two different features may fit as well, with less overlap.
         agreement: share of the featured parts of the overlap in which both scans correlate.
         above_repeats: standard deviations between the match and similar-looking sites around it. A prior selects one
             site, right or wrong. A wrong site is one of many, at a random distance from their mean; only the right one
@@ -57,7 +57,7 @@ class MatchEvidence:
     searched: float
 
     def features(self) -> dict[str, float]:
-        """Return the figures of merit on additive scales, limited to the range of real matches."""
+        """Return the figures of merit on the scales of the regression, limited to the range of real matches."""
         return {
             "overlap": math.log(max(self.overlap, 0.05)),
             "sd_px": math.log(min(max(self.sd_px, 1e-3), 10.0)),
@@ -70,7 +70,7 @@ class MatchEvidence:
         }
 
     def objections(self) -> dict[str, float]:
-        """Return the contribution of each figure to the log odds of a wrong match, relative to a typical match."""
+        """Return each figure's contribution to the log odds of a wrong match, relative to the median right match."""
         return {name: WEIGHTS[name] * (value - RIGHT[name]) for name, value in self.features().items()}
 
     @property
@@ -127,7 +127,7 @@ def above_repeats(found: Array, overlap: Array, origin: Array) -> float:
     """Return the height of a match above the repeats of a periodic surface, in standard deviations.
 
     Repeats are the peaks at least half as high as the match, with at least half the overlap. Coefficients are compared
-    by Fisher's atanh. Infinite if there are fewer peaks than a standard deviation needs.
+    by Fisher's atanh. Infinite with fewer than 10 repeats, since the surface then does not count as periodic.
 
     Args:
         found: the correlation of two aligned images, [y, x], with zero shift at `origin`.

@@ -33,9 +33,9 @@ ROUNDS = 4
 SETTLED_PX = 1e-3
 DIGITS = 1e-6  # of products of columns of 32 bits
 LEAST_CURVATURE = 0.4
-"""The least curvature H'QJ, as a share of H'QH, in any direction. On the worst pairs (one bar in view) it is a fifth to
-two fifths: most of H'QH is noise there, and a fit that took it for the surface was up to five times too certain of
-stretch. With 0.2 hard pairs get worse, since the share itself is then hardly known."""
+"""The least curvature H'QJ, as a share of H'QH, in any direction. On the worst pairs (one bar in view) the share is a
+fifth to two fifths: most of H'QH is noise there, and a fit that took this noise for the surface was up to five times
+too certain of stretch. With 0.2 hard pairs get worse, since the share itself is then hardly known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +54,9 @@ class Fit:
 
     Attributes:
         theta: (COUNT,), see `WarpedPair`.
-        curvature: (n, 8, 8), H'QJ.
-        spread: (n, 8, 8), H'QH, the covariance of `slope`.
-        slope: (n, 8), H'Qr.
+        curvature: (n, COUNT, COUNT), H'QJ, for n blocks of rows.
+        spread: (n, COUNT, COUNT), H'QH, the covariance of `slope`.
+        slope: (n, COUNT), H'Qr, with the residual r.
     """
 
     theta: Array
@@ -65,8 +65,7 @@ class Fit:
     slope: Array
 
     def information(self, believed: Believed) -> tuple[Array, Array]:
-        """Return the information M' S^-1 M about theta, and its product with the estimate of theta from the images
-        alone.
+        """Return the information M' S^-1 M about theta, and its product with the images' estimate of theta.
 
         M is the curvature and S the covariance of the slope (Godambe, Ann. Math. Stat. 31, 1208, 1960). Where M is less
         than S, M alone would count the noise in H as a surface.
@@ -80,7 +79,7 @@ class Fit:
 
 
 def least_squares(pair: WarpedPair, theta: Array, believed: Believed, free: Index, steps: int) -> Array:
-    """Return theta after `steps` Gauss-Newton steps with uniform weights, for the coarse stages."""
+    """Return theta after at most `steps` Gauss-Newton steps with uniform weights, for the coarse stages."""
     theta = theta.copy()
     for _ in range(steps):
         one, two, known = pair.warped(theta)
@@ -98,7 +97,10 @@ def least_squares(pair: WarpedPair, theta: Array, believed: Believed, free: Inde
 def generalised_least_squares(pair: WarpedPair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
     """Fit theta by iterated generalised least squares, with a low weight for scars.
 
-    Each round re-estimates gradient, noise and weights from the residual of the previous round.
+    Each of at most `ROUNDS` rounds estimates gradient, noise and weights from the residual of the previous round.
+
+    Raises:
+        Unusable: a step leaves the overlap.
     """
     for _ in range(ROUNDS):
         fit = _round(pair, theta, believed, seen_through)
@@ -208,8 +210,8 @@ class Doubt:
             and contrast act on the shift as well.
         sd_px: largest standard deviation by the model: the weaker the features, the more disturbances count.
         leverage: largest share, in any direction, of the information about the shift in one block of rows (MacKinnon,
-            Nielsen and Webb, J. Econometrics 235, 2001, 2023). A disturbance of these rows neither averages out nor
-            shows.
+            Nielsen and Webb, J. Econometrics 235, 2001, 2023). A disturbance of these rows does not average out, and
+            remains unnoticed.
     """
 
     varied: float
@@ -239,11 +241,15 @@ class Doubt:
 def covariance(fit: Fit, believed: Believed) -> tuple[Array, Doubt]:
     """Return the covariance (COUNT, COUNT) of theta, enlarged by `Doubt.spread`, and the doubt.
 
-    It is (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ (White, Econometrica 50, 1, 1982).
+    The covariance by the model is (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ and the precision P of
+    the prior (White, Econometrica 50, 1, 1982).
 
     The variance of the shift with blocks left out is the cluster jackknife (CV3; MacKinnon, Nielsen and Webb,
     J. Appl. Econom. 38, 671, 2023), which allows for noise that is correlated within a block. A few blocks hold most of
-    the features, so it scatters widely and is only one of the signs.
+    the features, so this variance scatters widely and is only one of the signs.
+
+    Raises:
+        Unusable: theta is not finite.
     """
     if not np.isfinite(fit.theta).all():
         raise Unusable("without a displacement that fits")

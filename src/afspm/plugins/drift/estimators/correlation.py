@@ -24,13 +24,12 @@ _GATE = 25.0  # chi² from the expectation, the limit of the search
 
 @dataclass(frozen=True)
 class Correlation:
-    """Estimator by masked normalised cross-correlation (Padfield 2012), with a parabola through the peak. Translation
-    only.
+    """Estimator of translations by masked normalised cross-correlation (Padfield 2012), with a parabola at the peak.
 
     Attributes:
         coefficient: least accepted correlation coefficient of the peak.
         height: least height of the peak, in standard deviations of all other shifts.
-        rival: largest accepted ratio of the next peak to the peak.
+        rival: largest accepted ratio of the height at any other shift, outside the peak, to the height of the peak.
         overlap: least overlap, as share of the smaller scan; with a prior, two thirds of this value.
 
     Raises:

@@ -1,7 +1,7 @@
 """Evidence of matched features: the probability of agreement by chance, and the uncertainty of the displacement.
 
-The number of matches excludes chance. No rival displacement with nearly as many matches excludes a periodic surface.
-Matches in several places exclude a single look-alike feature.
+A large number of agreeing matches excludes chance. A periodic surface is excluded if no other displacement has nearly
+as many matches. Matches in several places exclude a single look-alike feature.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from afspm.plugins.drift.registration import DriftScan, Matches, Prior, Registra
 
 Array = NDArray[np.float64]
 
-FINE_PX = 1.5  # how far a right pair lies from the transform
+FINE_PX = 1.5  # largest usual distance of a right pair from the transform
 GATE = 25.0  # chi² from the expectation, the limit of the search
 
 
@@ -34,12 +34,12 @@ class Features:
 
     Attributes:
         transform: "translation", "euclidean", "similarity" or "affine".
-        residual_threshold: largest distance of a RANSAC inlier from the transform, as share of the scan's resolution.
-        iterations: number of RANSAC iterations, each with a random minimal sample. A smaller share of right matches
-            needs more.
+        residual_threshold: largest distance of a RANSAC inlier from the transform, as share of the scans' mean side.
+        iterations: largest number of RANSAC iterations, each with a random minimal sample. A smaller share of right
+            matches needs more iterations.
         tighten: whether to drop inliers that are farther off than most; the paper keeps them.
-        max_keypoints: largest number of keypoints; the strongest are kept.
-        false_alarms: expected number of chance results for a pair without common features, at most.
+        max_keypoints: largest number of keypoints in each scan; the strongest are kept.
+        false_alarms: largest expected number of chance results for a pair without common features.
         inlier_share: least share of inliers among all matches.
         ambiguity: largest allowed consensus on another displacement, as share of the best.
         bend_max: largest allowed rotation, scale or shear between scans.

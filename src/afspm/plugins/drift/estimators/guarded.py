@@ -1,7 +1,7 @@
 """Guard around any estimator: distinguishes errors from refusals, reports errors, and replaces failed results.
 
-A refusal means that two scans can't be registered. An error of the estimator says nothing about the scans: it is
-reported with the pair. A plain correlation then replaces the result, if there is a prior and the peak is clear.
+A refusal means that two scans can't be registered. An error of the estimator says nothing about the scans, and
+is reported with the pair. A plain correlation then replaces the result, if there is a prior and the peak is clear.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from afspm.plugins.drift.overlap import overlap_ratio
 from afspm.plugins.drift.registration import DriftScan, Estimator, LinearSeen, Prior, Registration
 
 COARSE_SD_PX = 0.5
-"""Added to the standard deviation of the coarse estimate, in the larger pixel of both scans. The 95 % ellipses then
-contain at least 98 % of the accepted pairs of the families, and of zooms in their survey."""
+"""Standard deviation added in quadrature to the coarse estimate, in the larger pixel of both scans. The 95 % ellipses
+then contain at least 98 % of the accepted pairs of the families, and of zooms in their survey."""
 
 _log = logging.getLogger("afspm.plugins.drift")
 
@@ -57,14 +57,15 @@ def log_failure(failure: PairFailure) -> None:
 
 
 class Guarded:
-    """Guard that runs an estimator and validates its result, so that no caller needs to.
+    """Guard that runs an estimator and validates its result.
 
-    An exception, a result of the wrong type or shape, or an accepted result with impossible values is a failure: see
-    `Registration.failure`. A displacement without overlap, and a mirrored or much stretched sample, are refused. The
-    estimator receives copies of the values, so that its changes do not reach later comparisons.
+    An exception, a result of the wrong type or shape, an accepted result with invalid numbers, or a refusal without a
+    reason is a failure: see `Registration.failure`. A displacement without overlap, and a mirrored or much stretched
+    sample, are refused. The estimator receives copies of the values, so that its changes do not reach later
+    comparisons.
 
     Args:
-        report: called with each failure.
+        report: function called with each failure.
     """
 
     def __init__(self, inner: Estimator, name: str, report: Report = log_failure) -> None:

@@ -19,7 +19,7 @@ MOST_SATURATED = 0.6  # of the pixels at exactly the lowest or the highest value
 
 
 class Unusable(Exception):
-    """Error: a scan can't be registered with any other scan, for the reason in its text."""
+    """Error: a scan, or the overlap of two scans, can't be registered, for the reason in its text."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +27,9 @@ class Image:
     """An image prepared for registration.
 
     Attributes:
-        values: [y, x], finite everywhere: unmeasured pixels are filled from the nearest row.
-        known: [y, x], true for measured pixels, and for a single missing row between measured ones.
+        values: [y, x], finite everywhere: unmeasured pixels are filled from the nearest measured pixel.
+        known: [y, x], true for measured pixels of rows that are mostly measured, and for a single missing row between
+            measured rows.
         made_up: [y, x], true for values interpolated from neighbouring rows, which carry no information about a
             displacement; None: nowhere.
     """
@@ -42,8 +43,8 @@ def prepare(values: Array) -> Image:
     """Return an image with flattened rows, clipped outliers, mended scars, and a standard deviation of 1.
 
     Raises:
-        Unusable: fewer than half of the rows are measured, or the values are constant, saturated or without topography
-            (a crashed tip).
+        Unusable: fewer than half of the rows are measured, or the values are constant, saturated, only an offset and a
+            tilt in each row, or without topography (a crashed tip).
     """
     known = np.isfinite(values)
     known &= ~_unfinished(np.where(known, values, 0.0))[:, None]
@@ -100,7 +101,7 @@ def without_scars(values: Array) -> Array:
     """Replace scars by interpolation between the rows above and below.
 
     A scar is up to `SCAR_ROWS` rows thick. In each of its rows, most of `SCAR_PX` pixels are above both neighbouring
-    rows, or below both. No feature of a surface is as thin and much longer.
+    rows, or below both. No feature of a surface is as thin and as long.
     """
     level = levelled(values)
     scar = np.zeros(values.shape, dtype=bool)
@@ -222,8 +223,8 @@ class CommonGrid:
     Pixel coordinates (x, y) start at the centre of each scan and follow the axes of the reference.
 
     Attributes:
-        to_m: (2, 2) from pixels to metres in tip coordinates.
-        to_own: (2, 2) from pixels of the grid to pixels of the scan, along the scan's own axes.
+        to_m: (2, 2) matrix from pixels to metres in tip coordinates.
+        to_own: (2, 2) matrix from pixels of the grid to pixels of the scan, along the scan's own axes.
         reference_m, scan_m: (2,) the centres in tip coordinates.
     """
 

@@ -152,7 +152,9 @@ _CELLS = 1 << 20  # of the table of distances that exist at one time: 4 MB
 
 
 def matched(first: Descriptors, second: Descriptors, allowed: Allowed | None = None) -> NDArray[np.intp]:
-    """Return pairs of descriptors that are mutual nearest neighbours (Euclidean; the earlier one if equally near).
+    """Return pairs of descriptors that are mutual nearest neighbours by Euclidean distance.
+
+    Of equally near descriptors the first counts.
 
     Args:
         first, second: descriptors, (n, d) and (m, d).

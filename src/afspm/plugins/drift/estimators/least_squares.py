@@ -35,7 +35,7 @@ GAIN_SD = 1.0  # of the logarithm
 BEND_SD = 0.15
 BORDER_PX = 1  # filters and splines have no data beyond the border
 FARTHEST_PX = 8.0  # from the result of the search
-TURNED = 0.03  # angle in radians between the lines of two scans
+TURNED = 0.03  # sine of the angle between the lines of two scans, above which the lines cross
 ELSEWHERE_PX = 32  # the farthest shift that a match is compared with
 EXPECTED = 2.0
 """Factor on the allowed probability where a displacement is expected: nearly all wrong matches are of unrelated scans
@@ -48,7 +48,7 @@ which grows with doubt, would give the images too little weight there."""
 class LeastSquares:
     """Registration of two scans: I2(q + d/2) e^(-g/2) = I1(q - d/2) e^(g/2) + noise, d = u + A q + creep of the lines.
 
-    1. `prepare`: flatten rows, clip outliers, refuse scans without information. `grid`: a common pixel.
+    1. `prepare`: flatten rows, clip outliers, refuse scans without information. `onto_common_grid`: resample both.
     2. `search`: candidates by normalised cross-correlation, and the most likely candidate.
     3. `alignment`: Gauss-Newton, coarse to fine; the fine stage without `spikes`, filtered and weighted by rows
        according to their `noise`.
@@ -57,8 +57,8 @@ class LeastSquares:
     5. `acceptance`: refuse likely false matches.
 
     Args:
-        wrong_at_most: the largest accepted probability that a match is wrong by more than a pixel; doubled if there is
-            a prior for the displacement.
+        wrong_at_most: the largest accepted probability that a match is wrong by more than a pixel; doubled if a prior
+            limits the displacement to a part of the scan.
 
     Raises:
         ConfigError: `wrong_at_most` is not between 0 and 1.

@@ -29,12 +29,13 @@ class FineFilter:
     """Radial filter H = sqrt(2 S / (2 S + N)) exp(-2 pi² f² 0.45²), applied to both images in the fine alignment.
 
     Applied to two noisy images, H² weighs each frequency as the maximum-likelihood processor does (Hannan and Thomson,
-    Biometrika 58, 77, 1971; Knapp and Carter, IEEE Trans. ASSP 24, 320, 1976). S and N come from the radial mean of
-    both spectra. N is its floor in the top octave. S is the rest, taken flat below its peak: a filter that whitens low
-    frequencies would have a long impulse response, and the borders would leak across the image.
+    Biometrika 58, 77, 1971; Knapp and Carter, IEEE Trans. ASSP 24, 320, 1976). S comes from the radial
+    mean of both spectra, N from the median power in the top octave. S is the mean minus N, taken flat below its peak:
+    a filter that whitens low frequencies would have a long impulse response, and the borders would leak across the
+    image.
 
     Attributes:
-        frequency: in cycles per pixel, ascending.
+        frequency: frequencies in cycles per pixel, ascending.
         gain: sqrt(2 S / (2 S + N)) at each frequency.
     """
 
@@ -101,7 +102,7 @@ class CrossingLines:
     """The lines of a scan that is rotated against the grid; each line has its own unknown parabola.
 
     Attributes:
-        number: [y, x], number of the line nearest to each pixel of the grid, from 0.
+        number: [y, x], number of the line nearest to each pixel of the grid, in half lines from 0.
         along: [y, x], position of the pixel along its line, about -1 to 1.
     """
 
@@ -118,10 +119,9 @@ class CrossingLines:
         return cls(half - half.min(), 2.0 * (x - x.min()) / max(float(np.ptp(x)), 1.0) - 1.0)
 
     def seen(self, columns: NDArray[Real], weight: Array) -> NDArray[Real]:
-        """Return the result of the function `seen` for white noise, with the parabolas of the crossing lines removed,
-        too.
+        """Return the result of the function `seen` for white noise, also without the parabolas of the crossing lines.
 
-        Both sets are projected away in turn (von Neumann, Functional Operators II, 1950).
+        Both sets of parabolas are projected away in turn (von Neumann, Functional Operators II, 1950).
         """
         root = np.sqrt(weight)
         left = (columns * root[:, None, :]).astype(columns.dtype)
@@ -159,9 +159,9 @@ def seen(
 
     Generalised least squares row by row: each row has its own parabola, and correlated noise. A row takes seconds, and
     the next row has new offsets (feedback, flattening by up to the second order, drift of the z piezo). So nothing is
-    assumed about its parabola, and the noise within a row is white plus 1/f, with covariance C and Q = C^-1. The rest
-    of a row f after a fit of the nuisance B = [1, x, x²] in this metric, f - B (B'QB)^-1 B'Q f, carries all information
-    of the row (Frisch and Waugh, Econometrica 1, 387, 1933; Aitken, Proc. R. Soc. Edinb. 55, 42, 1936).
+    assumed about the parabola of a row, and the noise within a row is white plus 1/f, with covariance C and Q = C^-1.
+    The rest of a row f after a fit of the nuisance B = [1, x, x²] in this metric, f - B (B'QB)^-1 B'Q f, carries all
+    information of the row (Frisch and Waugh, Econometrica 1, 387, 1933; Aitken, Proc. R. Soc. Edinb. 55, 42, 1936).
 
     Args:
         columns: [y, column, x].
@@ -235,9 +235,10 @@ def products(one: NDArray[Real], two: NDArray[Real]) -> Array:
 
 
 def noise_metric(residual: Array, known: NDArray[np.bool_], seen_through: FineFilter) -> Array | None:
-    """Return the metric Q of white and 1/f noise; None if the noise is nearly white (b W <= 0.3 a).
+    """Return the metric Q of white and 1/f noise; None if the noise is nearly white (b W <= 0.3 a, with W the width).
 
-    N(f) = a + b / f is fitted to the median row spectrum of a residual, corrected for the filter.
+    The result is also None for small images and for a residual without noise. N(f) = a + b / f is fitted to the median
+    row spectrum of a residual, corrected for the filter.
     """
     from scipy.linalg import inv, toeplitz
     from scipy.optimize import nnls

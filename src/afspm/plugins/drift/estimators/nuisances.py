@@ -27,7 +27,7 @@ TURNS: Final = (0.0, 0.01)
 CREEP_AT: Final = ((0.6, None), (0.2, slice(0, len(CREEP_PX))), (0.2, slice(len(CREEP_PX), 2 * len(CREEP_PX))))
 """Probabilities of creep nowhere, at the left and at the right end of lines."""
 CREEP_SD_PX: Final = 0.5  # of each part
-NONE: Final = 1e-3  # px, or px over ten: counts as zero
+NONE: Final = 1e-3  # standard deviation of creep in px that counts as zero; a tenth of this for the linear map
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Shear:
 
     Attributes:
         aspect: height of a pixel over its width.
-        mean: (2, 2), in pixels.
+        mean: (2, 2) expected linear map, in pixels per pixel.
         sds: candidate standard deviations of the displacement per length along y.
     """
 
@@ -49,9 +49,9 @@ def averaged(information: Array, pull: Array, precision: Array, shear: Shear) ->
     """Return theta and its covariance, averaged over the models of linear map and creep.
 
     Args:
-        information: (n, n) about theta from the images (see `warp.WarpedPair`): their log-likelihood is
+        information: (n, n) information about theta from the images (see `warp.WarpedPair`): their log-likelihood is
             -theta' information theta / 2 + pull' theta.
-        pull: (n,); includes the prior mean of all parameters except linear map and creep.
+        pull: (n,) linear term; includes the prior mean of all parameters except linear map and creep.
         precision: (n, n), the inverse covariance of this prior.
     """
     weights, priors = _models(precision, shear)

@@ -85,7 +85,8 @@ class Form:
 
     Attributes:
         pairs: number of pairs needed to determine a transform.
-        linear: returns the least-squares 2 x 2 part, from points relative to their means; None if undetermined.
+        linear: function that returns the least-squares 2 x 2 part, from points relative to their means; None if
+            undetermined.
     """
 
     pairs: int
@@ -103,8 +104,8 @@ FORMS = {
 def fitted(a: Array, b: Array, form: Form, bend_max: float) -> Transform | None:
     """Return the least-squares transform from points `a` to `b`, (n, 2) each.
 
-    None if the points don't determine the transform, or if it rotates, scales or shears by more than `bend_max`, which
-    drift does not.
+    None if the points don't determine the transform, or if an element of its 2 x 2 part differs from the identity by
+    more than `bend_max`.
     """
     if len(a) < form.pairs:
         return None
@@ -142,7 +143,7 @@ class Search:
             radius: largest distance of an agreeing pair from the transform.
 
         Returns:
-            None if no transform was found.
+            The best consensus; None if no transform was found.
         """
         best: Consensus | None = None
         best_error = math.inf
@@ -172,9 +173,10 @@ def consensus(a: Array, b: Array, transform: Transform | None, radius: float) ->
 def tightened(
     a: Array, b: Array, start: Consensus, form: Form, *, least: float, most: float, bend_max: float
 ) -> Consensus:
-    """Refit to the nearest inliers until nothing changes, since a wide radius admits mismatches that bias the fit.
+    """Refit to the nearest inliers, since a wide radius admits mismatches that bias the fit.
 
-    The radius is three robust standard deviations of the inliers, between `least` and `most`.
+    The fit is repeated until the inliers stay the same, at most ten times. The radius is three robust standard
+    deviations of the inliers, between `least` and `most`.
     """
     best = start
     for _ in range(10):
@@ -192,7 +194,7 @@ def tightened(
 
 
 def log10_false_alarms(pairs: int, inliers: int, sample: int, chance: float) -> float:
-    """Return log10 of the expected number of equally large consensuses among unrelated pairs.
+    """Return log10 of the expected number of equally large consensuses among unrelated pairs; infinite if k <= s.
 
     A contrario (Moisan and Stival 2004): (n - s) C(n, k) C(k, s) p^(k - s).
 

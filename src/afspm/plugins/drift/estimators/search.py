@@ -58,8 +58,9 @@ class ExpectedShift:
 def shear_by_drift(prior: Prior | None, reference: DriftScan, scan: DriftScan) -> tuple[Array, float | None]:
     """Return the displacement of rows by drift, in m per m along the slow axis, and its standard deviation.
 
-    Drift displaces a row by v t, and t increases along the slow axis. The result is (zero, None) unless both scans have
-    the same direction, angle and pace, since the prior contains only the difference of their velocities.
+    Drift displaces a row by v t, and t increases along the slow axis. The result is (zero, None) unless the prior knows
+    the velocity and both scans have the same direction, angle and pace: the prior contains only the difference of
+    their velocities.
     """
     nothing = np.zeros(2), None
     if prior is None or prior.velocity_sd_m_s is None or reference.upwards is None:
@@ -76,7 +77,7 @@ Spectrum = NDArray[np.complexfloating[Any, Any]]
 
 LEAST_OVERLAP = 0.2  # of the smaller image
 PEAKS = 4  # of each channel
-APART_PX = 1.5  # nearer peaks are one
+APART_PX = 1.5  # nearer peaks count as the same peak
 
 
 def candidates(scene: Scene, prior: ExpectedShift | None) -> list[Array]:
@@ -144,7 +145,10 @@ class MaskedCorrelation:
         return shifts
 
     def peaks(self, one: Array, two: Array, prior: ExpectedShift | None) -> list[tuple[float, Array]]:
-        """Return the highest peaks, by atanh(c) sqrt(n), whose variance is the same for every overlap n (Fisher)."""
+        """Return the highest peaks as (height, shift in px), best first.
+
+        The height is atanh(c) sqrt(n), which has the same variance for every overlap n (Fisher).
+        """
         from scipy.ndimage import maximum_filter
 
         enough = self.overlap >= LEAST_OVERLAP * min(mask.sum() for mask in self._masks)
@@ -197,7 +201,7 @@ class Scorer:
         ]
 
     def best(self, shifts: list[Array]) -> tuple[Scored, float] | None:
-        """Return the most likely shift, and the likelihood of its best rival; None if no shift has enough overlap."""
+        """Return the most likely shift and the log-likelihood of its best rival; None without enough overlap."""
         scored = [s for s in map(self._score, shifts) if s is not None]
         if not scored:
             return None
@@ -211,7 +215,7 @@ class Scorer:
             return None
         theta = np.concatenate([shift, np.zeros(COUNT - 2)])
         theta = least_squares(WarpedPair(*self._scene.smooth_splines, box), theta, NOTHING_BELIEVED, SHIFT, steps=2)
-        if np.hypot(*(theta[:2] - shift)) > 4.0:
+        if np.hypot(*(theta[:2] - shift)) > 4.0:  # the steps have left the peak of this candidate
             theta[:2] = shift
         likelihood = 0.0 if self._expected is None else -0.5 * float(self._expected.chi2(theta[:2]))
         for splines, density in self._channels:

@@ -36,7 +36,9 @@ OWN = 0.6  # least share of that in the scan itself: else the scar is in the oth
 
 
 def without_scars_of_one(scene: Scene, theta: Array) -> Scene:
-    """Return two images without scars that only one of them shows; the replaced pixels are marked in `made_up`.
+    """Return two images without scars that only one of them shows; the scars are marked in `made_up`.
+
+    The pixels beside a scar are also replaced, but not marked.
 
     Args:
         theta: displacement, known to a fraction of a pixel; see `warp.WarpedPair`.
@@ -80,7 +82,7 @@ def _along(values: Array) -> Array:
 
 
 def without_spikes(scene: Scene, theta: Array) -> Scene:
-    """Return two images, with each spike replaced by the mean of its neighbours in the row.
+    """Return two images, with spikes that only one shows replaced by interpolation between the neighbours in the row.
 
     Args:
         theta: displacement, known to a pixel; see `warp.WarpedPair`.

@@ -22,7 +22,7 @@ class Spline:
     """Cubic spline interpolation of an image, at pixel coordinates (x, y) from its centre.
 
     Attributes:
-        known: mask of pixels that are more than two pixels from unknown ones, and not made up; None: all.
+        known: mask of pixels that are more than two pixels from unknown pixels, and not made up; None: all.
     """
 
     coefficients: Array
@@ -94,7 +94,7 @@ def _mirrored(index: NDArray[np.intp], size: int) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, eq=False)
 class OverlapBox:
-    """Rectangle of the mid grid in which two shifted images overlap: pixel coordinates (x, y) from its centre."""
+    """Rectangle in which two shifted images overlap: pixel coordinates (x, y) from half-way between their centres."""
 
     x: Array
     y: Array
@@ -127,7 +127,7 @@ LEAST_SEARCHED_PX = 32  # least side of the decimated smaller image: less may be
 CREEP_PX = (4.0, 9.0)  # lengths over which creep at the start of a line decays to 1/e
 LINEAR = slice(2, 6)  # the linear map among the parameters theta of a pair
 CREEP = slice(6, 6 + 2 * len(CREEP_PX))  # from the left and from the right, for each length
-SLOPES = CREEP.stop  # the first of them: they act through the gradient
+SLOPES = CREEP.stop  # number of the first parameters, which act through the gradient
 GAIN, BEND, COUNT = SLOPES, SLOPES + 1, SLOPES + 2
 
 
@@ -155,7 +155,9 @@ class WarpedPair:
     crossing: CrossingLines | None = None
 
     def warped(self, theta: Array) -> tuple[Array, Array, Mask]:
-        """Return I1(q - d/2) and I2(q + d/2), each with half of the other's contrast, and the mask known in both.
+        """Return I1(q - d/2) and I2(q + d/2) with equal contrast, and the mask of pixels known in both.
+
+        Each image is corrected by half of gain and curvature.
 
         Moving each image by half gives both the same interpolation noise. So the gradient of their mean is not
         correlated with the noise of their difference, and the shift is not biased towards whole pixels.
@@ -201,7 +203,7 @@ class WarpedPair:
     ) -> Columns:
         """Return the derivatives of the residual with respect to the free parameters, and the residual, [y, column, x].
 
-        They are 32-bit floats, since their products take most of the time, and are exact to a millionth.
+        The result has 32-bit floats, exact to a millionth, since products of columns take most of the time.
         """
         by = (*self._by_slopes(gx, gy), -mean, (mean, -mean / 2))
         return np.stack([*(_product(by[i]) for i in free), residual], axis=1, dtype=np.float32)

@@ -38,7 +38,7 @@ class RunPart:
         name: suffix for file names, such as "on".
         title: title in figures, such as "correction on".
         start, stop: range of scan indices; `stop` is excluded.
-        estimates: off-line registrations of each scan with the first one of the part; None without registrations.
+        estimates: off-line registrations of each scan with the first scan of the part; None without registrations.
     """
 
     name: str
@@ -56,7 +56,7 @@ class DriftRun:
         scans: scans in order of time.
         record: drift record of the tracker.
         parts: parts of the run in order of time.
-        matched: indices of two scans, and their registration with matched features; None without one.
+        matched: indices of two scans, and their registration with matched features; None without such a pair.
         truth_m: (n, 2) true drift, if known.
         simulated: whether the microscope was simulated.
     """
@@ -70,7 +70,7 @@ class DriftRun:
 
     @property
     def switched_on_s(self) -> float | None:
-        """Time at which correction was switched on: of the first scan after the first part; None without another."""
+        """Middle of the first scan after the first part, when correction was on; None with a single part."""
         return float(self.record.time_s[self.parts[0].stop]) if len(self.parts) > 1 else None
 
     def marked(self, title: str) -> str:

@@ -48,7 +48,7 @@ def draw_offsets(
 
     Args:
         record: drift record of the run.
-        truth_m: (n, 2) true drift, with any zero; None if unknown.
+        truth_m: (n, 2) true drift, from any origin; None if unknown.
         switched_on_s: time when drift correction was switched on.
     """
     with styled():
@@ -197,7 +197,7 @@ _MOST_BINS = 100
 
 
 def draw_histogram(record: DriftRecord, *, title: str = "") -> Figure:
-    """Draw histograms of x, y and distance for the accepted pairs; the first scan is left out."""
+    """Draw histograms of the displacement (x, y and distance) in the accepted pairs; the first scan is left out."""
     moved = record.misplacement_m[1:][record.matched[1:]]
     with styled():
         made = figure(WIDTH_IN, 2.2)
@@ -215,7 +215,9 @@ def draw_histogram(record: DriftRecord, *, title: str = "") -> Figure:
 
 
 def freedman_diaconis(values: Array) -> Array:
-    """Return the edges of histogram bins of width 2 IQR n^(-1/3), or of one bin if all values are equal.
+    """Return the edges of equal histogram bins, of width 2 IQR n^(-1/3) or slightly less.
+
+    There are at most 100 bins, and one bin if the interquartile range (IQR) is zero.
 
     This width makes the histogram close to the density in the mean square (D. Freedman, P. Diaconis, Z.
     Wahrscheinlichkeitstheorie verw. Gebiete 57, 453, 1981).
@@ -230,7 +232,7 @@ def freedman_diaconis(values: Array) -> Array:
 
 
 def round_bins(values: Array) -> Array:
-    """Return at least √n bins with round edges, no wider than the bins of `freedman_diaconis`."""
+    """Return the edges of at least √n bins of round width, no wider than the bins of `freedman_diaconis`."""
     edges = freedman_diaconis(values)
     span = float(edges[-1] - edges[0])
     width = round_length_m(min(float(edges[1] - edges[0]), span / np.sqrt(len(values))))
@@ -316,7 +318,7 @@ def draw_errors(record: DriftRecord, truth_m: Array, *, switched_on_s: float | N
 
     Args:
         record: drift record of the run.
-        truth_m: (n, 2) true displacement at the middle of each scan, with any zero.
+        truth_m: (n, 2) true displacement at the middle of each scan, from any origin.
         switched_on_s: time when drift correction was switched on.
     """
     with styled():

@@ -99,7 +99,7 @@ def show_scan(ax: Axes, scan: DriftScan, span: ValueRange) -> AxesImage:
 
 
 def colour_bar(ax: Axes, image: AxesImage, unit: str) -> None:
-    """Draw a colour bar with the unit of the values, as high as the image; none without a unit."""
+    """Draw a colour bar with the unit of the values, as high as the image; draw nothing without a unit."""
     if not unit:
         return
     factor, label = scale(max(abs(end) for end in image.get_clim()), unit)

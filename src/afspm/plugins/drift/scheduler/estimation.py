@@ -1,4 +1,4 @@
-"""The worker's task: registers scans one after the other, and remembers the last answers.
+"""The worker's task: registration of scans one after the other, with a memory of the last answers.
 
 After a kill of worker or scheduler, a scan may be requested again. The answer then comes from memory: no tracker may
 process a scan twice, and no scan has two mappings.
@@ -27,10 +27,10 @@ _ANSWERS = 16
 
 
 class Estimation:
-    """A tracker with the memory of its last answers.
+    """A tracker with a memory of its last answers.
 
     Args:
-        save: saves the state to disk, before a result is published.
+        save: function that saves the state, called before a result is returned.
         failures: the list to which the tracker's estimator adds its errors; it is emptied before each scan.
     """
 
@@ -82,7 +82,7 @@ class Estimation:
         """Take into account that the controller moves the tip with this velocity from `time_s` on.
 
         Raises:
-            ConfigError: the tracker can't take this into account.
+            ConfigError: the tracker can't take this into account. InvalidValue: as `BankTracker.compensated`.
         """
         compensated = getattr(self._tracker, "compensated", None)
         if compensated is None:

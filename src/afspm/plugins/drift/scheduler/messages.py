@@ -25,9 +25,9 @@ class Registered:
         matrix: 3 x 3 matrix of the mapping at this time.
         covariance_m2, rate_m_s, rate_covariance: see `drift.tracking.Prediction`; empty if unknown.
         outcome, lost, reason: see `drift.tracking.Update`.
-        residual_m: (x, y) measured minus predicted position of the sample.
-        references: names of the scans that this scan was registered with.
-        rescan: the reason for a rescan; empty if none is needed.
+        residual_m: (x, y) measured minus predicted position of the sample in tip coordinates; empty if unknown.
+        references: names of the scans with which this scan was registered successfully.
+        rescan: reason for a rescan; empty if the scan need not be repeated.
         forecast: the new forecast, for `forecast_from_dict`; None: unchanged.
         failures: errors of the estimator with this scan, each with its pair of scans.
     """
@@ -84,7 +84,7 @@ class NotRegistered:
 
 @dataclass(frozen=True)
 class WorkerGone:
-    """Report that the worker has ended."""
+    """Report that the worker has ended, or could not be started."""
 
     reason: str
 
@@ -117,14 +117,14 @@ class StartWorker:
 
 @dataclass(frozen=True)
 class Compensated:
-    """Information that the controller moves the tip with this velocity from this time on."""
+    """Job to follow a controller that moves the tip with this velocity from this time on."""
 
     time_s: float
     velocity_m_s: tuple[float, float]
 
 
 WorkerJob = StartWorker | ScanJob | Compensated
-"""Jobs for the worker. A repeated scan gets the first answer."""
+"""Jobs for the worker. A repeated job for a scan gets the answer of the first."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class DriftCodec(PlaceCodec, Protocol):
     """Part of the wire format that drift compensation needs."""
 
     def encode_mapping(self, registered: Registered, filename: str, center_m: XY, *, correcting: bool) -> bytes:
-        """Return a DriftMapping as the payload of a packet, for a scan with this file and centre at the tip."""
+        """Return the DriftMapping of a scan as the payload of a packet; `center_m` is in tip coordinates."""
 
     def encode_rescan(self, wanted: RescanWanted) -> bytes:
         """Return a DriftRescan as the payload of a packet."""

@@ -41,9 +41,9 @@ from afspm.scheduler.safety.parameter_values import number_of
 from afspm.wire.messages import PROBE_POSITION, SCAN_LINES, SCAN_PARAMETERS, SPECTRUM
 
 MOVES_PX = 0.01
-"""A region further off in tip coordinates is set again before its scan."""
+"""Offset in tip coordinates, in pixels, above which a region is set again before its scan."""
 MOVES_M = 1e-11
-"""The same bound for the probe: finer than any scanner's positioning."""
+"""The same bound for the probe, and for a region of unknown shape: finer than any scanner's positioning."""
 
 _REMEMBERED = 64
 _SET_SCAN, _SET_PROBE = int(ControlRequest.SET_SCAN_PARAMS), int(ControlRequest.SET_PROBE_POS)
@@ -51,12 +51,12 @@ _PARAM = int(ControlRequest.PARAM)
 _MESSAGES = {_SET_SCAN: "ScanParameters2d", _SET_PROBE: "ProbePosition"}
 
 MappingAt = Callable[[float], Mapping | None]
-"""The mapping from tip to sample coordinates at an experiment time, s; None: components are given tip coordinates."""
+"""Mapping from tip to sample coordinates at an experiment time in s; None while components use tip coordinates."""
 
 
 @dataclass(frozen=True)
 class SavedPlace:
-    """A `PositionPair` in the form of its two messages."""
+    """Saved form of a `PositionPair`: its two messages."""
 
     requested: bytes
     sent: bytes
@@ -78,6 +78,7 @@ class Places:
     Attributes:
         shape: current (rows, columns); None if unknown.
         upwards: current direction of the slow axis; None if unknown.
+        durations: durations of earlier scans, for the middle of the next scan.
         remembered: mapped forms of earlier requests, by client and id.
     """
 
@@ -91,7 +92,7 @@ class Places:
 
 @dataclass(frozen=True)
 class SavedPlaces:
-    """Saved form of `Places`, which survives a kill."""
+    """Saved form of `Places`, for a restart after a kill."""
 
     region: SavedPlace | None
     probe: SavedPlace | None
@@ -125,7 +126,7 @@ class PlaceMapper:
     """Mutable copy of `Places` during one step of the mapping.
 
     Args:
-        mapping_at: returns the mapping at a time, from the current drift forecast.
+        mapping_at: mapping at a time, from the current drift forecast.
     """
 
     region: TargetPosition[Region]

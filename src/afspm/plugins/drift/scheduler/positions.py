@@ -14,7 +14,7 @@ from afspm.scheduler.events import Codec
 P = TypeVar("P", bound=Region | ProbePosition)
 
 SAME = 1e-3
-"""Largest rounding by a controller, as a share of the region's size: within it, the reported region is the set one."""
+"""Largest rounding by a controller, as a share of the region's diagonal; a reported region within it is unchanged."""
 SAME_PLACE_M = 1e-9
 
 _CANDIDATES = 8
@@ -34,7 +34,10 @@ class PlaceCodec(Codec, Protocol):
         """Return a ScanParameters or ProbePosition as a message."""
 
     def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
-        """Return a message with its place taken from another message: a ScanParameters2d or a ProbePosition."""
+        """Return a message with its place replaced by the place in another message.
+
+        The other message is a ScanParameters2d or a ProbePosition.
+        """
 
 
 @dataclass(frozen=True)
@@ -70,13 +73,16 @@ class TargetPosition(Generic[P]):
         return replace(self, sent=(*self.sent, place)[-_CANDIDATES:])
 
     def was_set(self, sent: bytes) -> TargetPosition[P]:
-        """Return a copy with the place of an accepted message in force."""
+        """Return a copy with the place of an accepted message in force; an unknown message changes nothing."""
         return replace(self, current=next((place for place in reversed(self.sent) if place.sent == sent), self.current))
 
     def published(self, tip: P) -> TargetPosition[P] | None:
-        """Return a copy with the place published by the microscope in force; None if the scheduler has not set it."""
+        """Return a copy with the place published by the microscope in force.
+
+        None if the place is neither in force nor among the recently sent places, within a controller's rounding.
+        """
         known: list[PositionPair[P]] = [*self.sent] if self.current is None else [self.current, *self.sent]
-        near = [place for place in reversed(known) if is_same(place.tip, tip)]  # of equally near ones the newest
+        near = [place for place in reversed(known) if is_same(place.tip, tip)]  # of equally near places the newest
         return self.at(min(near, key=lambda place: away_m(place.tip, tip))) if near else None
 
 
@@ -102,7 +108,10 @@ def value_in(name: str, region: Region) -> float:
 
 
 def in_reported_unit(name: str, value: float, reported: Parameter | None) -> Parameter:
-    """Return a value in SI units as a parameter in the microscope's own unit."""
+    """Return a value in SI units as a parameter in the unit that the microscope reported.
+
+    Without a reported unit, angles are in degrees and all other values in SI units.
+    """
     unit = _unit(reported or Parameter(name))
     # 15 digits: a value set as 0.1 nm reads as 0.1, not as 0.09999999999999999
     return Parameter(name, f"{convert(value, BASE_PARAMETERS[name] or '', unit):.15g}", unit)

@@ -27,7 +27,7 @@ from afspm.scheduler.events import Announced, Delegate, ProblemSeen
 RESCAN = "DriftRescan"
 _DRIFT, _MALFUNCTION = int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFUNCTION)
 _MOST_UNREGISTERED = 3
-"""Unregistered scans in a row that count as a lost sample; the trackers use the same number."""
+"""Number of scans in a row without a result of the worker that counts as a lost sample, as in the trackers."""
 _AT_START = "a scan in the other direction gives the velocity of the drift"
 
 
@@ -154,13 +154,16 @@ class RateGiven:
 
 
 def restore_compensation(draft: DriftDraft) -> None:
-    """Set the controller to the compensation in force, initially zero: an earlier night may have left another rate."""
+    """Set the controller to the compensation in force, initially zero; an earlier night may have left another rate."""
     for axis, name in enumerate(_axes(draft)):
         _ask_rate(draft, RateGiven(axis, name, draft.duties.given_m_s[axis], is_new=False))
 
 
 def hand_over(draft: DriftDraft) -> None:
-    """Send the newest drift rate to the controller if it is significant, unless a person is in control."""
+    """Add the newest drift rate to the rate that the controller compensates, unless a person is in control.
+
+    Only a rate above its standard deviation is sent, and only while drift is corrected.
+    """
     predicted = draft.forecast.predicted(draft.now_ns * 1e-9)
     if draft.control.mode is ControlMode.MANUAL or predicted is None or not draft.corrects:
         return
@@ -173,7 +176,7 @@ def hand_over(draft: DriftDraft) -> None:
 
 
 def rate_answered(draft: DriftDraft, given: RateGiven, response: Response) -> None:
-    """Process the controller's answer for one axis; it may accept one axis and refuse the other."""
+    """Process the controller's answer for one axis; the controller may accept one axis and refuse the other."""
     if not response.ok:
         # NOT_FREE: a scan has already begun; the rate is handed over after the next one
         if response.code != ControlResponse.NOT_FREE:

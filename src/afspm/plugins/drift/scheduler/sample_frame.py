@@ -62,7 +62,7 @@ from afspm.scheduler.events import (
 
 @dataclass(frozen=True)
 class SampleFrame:
-    """The sample's implementation of `scheduler.coordinate_frame.CoordinateFrame`; created by `SampleFrame.initial`."""
+    """Implementation of `scheduler.coordinate_frame.CoordinateFrame` for a drifting sample."""
 
     env: DriftEnvironment
     state: DriftState

@@ -2,11 +2,11 @@
 
 | step | trigger | action |
 | --- | --- | --- |
-| held | its first channel arrives | all that follows waits in the gate |
-| registered | its channel for drift arrives | a job for the worker |
-| settled | the worker's report, an error, a time limit | its mapping is announced, and saved with the state |
-| released | at once | scan and followers are reconsidered, and pass in their order |
-| responded to | in a separate step | flags and rescans, after the scan was published |
+| hold | the first channel of the scan arrives | the scan and all later packets wait in the gate |
+| register | the channel for drift arrives | the worker gets a job |
+| settle | report of the worker, error, or time limit | the mapping of the scan is announced, and saved with the state |
+| release | directly after settling | the waiting packets are processed again, in their order |
+| respond | a later step, after the publication | problems are flagged, rescans requested |
 """
 
 from __future__ import annotations
@@ -68,16 +68,19 @@ _LEVELS = {
     RegistrationOutcome.NEW: "INFO",
 }
 _MOST_TRIES = 2
-"""Tries with a scan during which the worker ends."""
+"""Largest number of jobs for one scan, if the worker ends during each."""
 _MOST_ENDS = 4
-"""Ends of the worker in a row, without a registered scan in between, after which it is not restarted."""
+"""Number of ends of the worker, without a report about a scan in between, after which the worker is not restarted."""
 
 
 # --- packets ----------------------------------------------------------------------------------------------------------
 
 
 def take_packet(draft: DriftDraft, event: PacketIn) -> None:
-    """Pass a packet on, or hold it with the scan that it belongs to or follows."""
+    """Pass a packet on, or hold the packet until the current scan is released.
+
+    A late or repeated channel of a settled scan passes with the mapping of that scan.
+    """
     if (before := draft.gate.held) is not None:
         draft.gate = draft.gate.keep(event)
         _find_channel(draft, before, event)
@@ -220,7 +223,7 @@ def _worker_gone(draft: DriftDraft, report: WorkerGone) -> None:
 
 
 def expire(draft: DriftDraft) -> None:
-    """Publish a scan that has waited too long as predicted, and kill a worker that hangs."""
+    """Publish a scan that has waited too long as predicted, and restart a worker that hangs."""
     held = draft.gate.held
     if held is None or draft.now_s < held.until_s:
         return
@@ -267,7 +270,7 @@ def _give_up(draft: DriftDraft, key: str, why: str, level: str = "") -> None:
 
 
 def publish_as_predicted(draft: DriftDraft, held: HeldScan, why: str, level: str = "") -> None:
-    """Publish an unregistered scan at its predicted place."""
+    """Publish an unregistered scan at its predicted place, without correction at its place in tip coordinates."""
     mapping = draft.forecast.mapping_at(draft.env.settings, held.middle_s)
     draft.gate = draft.gate.settle(held.key, None if mapping is None else mapping.matrix.tolist())
     report = _predicted(draft, held, why)

@@ -39,7 +39,10 @@ class ScanStartTracker:
     is_scanning: bool = False
 
     def with_state(self, status: ScopeStatus, time_s: float, upwards: bool | None) -> ScanStartTracker:
-        """Process a scope state, with the scan direction in force. A disconnected microscope continues its scan."""
+        """Process a scope state, with the scan direction in force.
+
+        UNDEFINED is ignored, because a disconnected microscope continues its scan.
+        """
         if status.state is ScopeState.UNDEFINED:
             return self
         is_scanning, begun = status.state is ScopeState.SCANNING, self.begun
@@ -58,7 +61,7 @@ class ScanStartTracker:
         return self.begun if self.begun is not None and self.begun.time_s < end_s else None
 
     def middle_s(self, end_s: float, expected_s: float) -> float:
-        """Return the middle of the scan that ended at `end_s`, from its start or its expected duration."""
+        """Return the middle of the scan that ended at `end_s`, from its start or, if unknown, `expected_s`."""
         begun = self.of_scan(end_s)
         return end_s - expected_s / 2 if begun is None else (begun.time_s + end_s) / 2
 
@@ -85,9 +88,9 @@ class ScanDurations:
         return ScanDurations((*others, newest)[-_KEPT:])
 
     def expected_s(self, shape: Shape | None, size_m: XY) -> float:
-        """Return the expected duration of a scan; 0 if no scan has finished.
+        """Return the expected duration of a scan in s; 0 without a measured duration.
 
-        For an unknown size or shape, the duration of the latest scan is scaled by the total length of its lines.
+        For a new size or shape, the duration of the latest scan is scaled by the total length of its lines.
         """
         if not self.known:
             return 0.0

@@ -32,13 +32,15 @@ class DriftCompensatedScheduler(Scheduler):
     places are sent to the microscope where they will be under the tip.
 
     A `DriftMapping` is published for each scan, and a `DriftRescan` requests a rescan from the component `Rescanner`.
-    The scheduler flags thermal-drift when the sample is lost: it was not found, or three scans in a row could not be
-    registered. It flags device-malfunction when no more scans will be registered; clearing this problem starts another
-    try.
+    The scheduler flags thermal-drift when the sample is lost: its tracker reports so, three registrations in a row
+    failed, or too many of the last ten scans were not registered. It also flags thermal-drift until the first scan was
+    taken in both directions. It flags device-malfunction when no more scans will be registered; clearing this problem
+    restarts the worker. Without correction, no problem is flagged.
 
     Args:
-        drift: how drift is followed and corrected.
-        control, limits, cache: as for the Scheduler. Limits hold for requests to the microscope, in tip coordinates.
+        drift: settings of drift tracking and correction.
+        control, limits, cache, conditions: as for the Scheduler. Limits hold for requests to the microscope, in tip
+            coordinates.
     """
 
     frame: ClassVar = Frame.SAMPLE

@@ -19,10 +19,10 @@ class RescanRule:
     """Rule for requesting rescans from the Rescanner.
 
     Attributes:
-        rule: "tolerance": the offset plus two standard deviations exceeds `tolerance`; "paper": scan and requested
-            region share less than `f_rescan`; "never".
-        tolerance: largest tolerated offset; None: a tenth of the scan's smaller side.
-        f_rescan: share of the area (paper, "Overarching workflow").
+        rule: "tolerance": rescan if the offset of a corner plus two standard deviations exceeds `tolerance`; "paper":
+            rescan if scan and requested region share less than `f_rescan`; "never".
+        tolerance: largest tolerated offset, m; None: a tenth of the scan's smaller side.
+        f_rescan: smallest common area, as a share of the smaller region (paper, "Overarching workflow").
     """
 
     rule: Literal["tolerance", "paper", "never"] = "tolerance"
@@ -54,16 +54,17 @@ class DriftCompensationSettings:
 
     Attributes:
         estimator, tracker: a name, or a table with the name as its `class` and with its settings.
-        channel: of the scans that are compared; None: the first one published in a unit of length.
-        correct: whether components are given sample coordinates; else drift is only followed and published.
-        correct_after: time since the start of the experiment; until then as if `correct` were false.
-        rescan: when a rescan is requested.
-        most_unregistered: largest share of unregistered scans among the last ten; above it thermal-drift is flagged.
-            1: never.
-        at_start: "up-down": the first scan is followed by one in the other direction, which gives the velocity, if
-            a component solves thermal-drift and the microscope reports its direction; "nothing": it is not.
-        compensate: hands the velocity over to a controller with its own drift compensation.
-        longest_registration: real time for which packets of the microscope wait for a registration.
+        channel: channel of the scans that are compared; None: the first published channel in a unit of length.
+        correct: whether components use sample coordinates; otherwise drift is only tracked and published.
+        correct_after: time since the start of the experiment, s, before which `correct` has no effect.
+        rescan: rule for requesting rescans.
+        most_unregistered: largest share of unregistered scans among the last ten; above it thermal-drift is
+            flagged. 1: no limit.
+        at_start: "up-down": the first scan is followed by a scan in the other direction, which gives the velocity, if
+            a component solves thermal-drift and the microscope reports its direction; "nothing": no second scan.
+        compensate: parameters of a controller with its own drift compensation, which are set to the velocity; None:
+            the controller does not compensate.
+        longest_registration: longest real time, s, for which a scan and later packets wait for its registration.
     """
 
     estimator: str | Plain = "least-squares"

@@ -33,8 +33,8 @@ class CurrentForecast:
     """The newest forecast.
 
     Attributes:
-        start_s: experiment time at which the experiment began; None: before the start.
-        lost: whether the position of the sample was unknown at the newest registered scan.
+        start_s: experiment time at which the experiment began; None before the start.
+        lost: whether the position of the sample was unknown after the newest scan that the worker has processed.
         text: the forecast as JSON in its tracker's own form; None before the first forecast.
 
     Raises:
@@ -64,7 +64,10 @@ class CurrentForecast:
         return settings.correct and since_s >= settings.correct_after
 
     def mapping_at(self, settings: DriftCompensationSettings, time_s: float) -> DriftMapping | None:
-        """Return the mapping from tip to sample coordinates; None if components use tip coordinates."""
+        """Return the mapping from tip to sample coordinates; None if components use tip coordinates.
+
+        Before the first forecast the mapping is the identity.
+        """
         if not self.corrects(settings, time_s):
             return None
         predicted = self.predicted(time_s)
@@ -77,7 +80,7 @@ class HeldScan:
 
     Attributes:
         middle_s: middle of the scan in experiment time, for which its position holds.
-        until_s: real time limit of the wait.
+        until_s: end of the wait, real monotonic time.
         filename, center_m: file and centre (tip coordinates) of its first channel.
         asked: whether the worker has a job for this scan.
         tries: number of jobs for this scan so far.
@@ -96,12 +99,12 @@ class HeldScan:
 class ScanGate:
     """Gate that holds a scan, and all later packets of the microscope, until the scan's position is known.
 
-    So all channels of a scan get the same, best known mapping, and the order of packets is kept.
+    All channels of a scan thus get the same, best known mapping, and the order of packets is kept.
 
     Attributes:
         waiting: held inputs, oldest first.
         settled: mappings of the latest published scans, by key; None for a scan published unchanged.
-        channel: channel used for registration; None: the first one in a unit of length.
+        channel: channel used for registration; None: not chosen yet, the first channel in a unit of length.
     """
 
     channel: str | None = None
@@ -113,7 +116,7 @@ class ScanGate:
         return replace(self, waiting=(*self.waiting, event))
 
     def next_ns(self) -> int | None:
-        """Return the translator's time of the first held packet; None if there is none."""
+        """Return the translator's time of the first held packet; None without a held packet."""
         return next((event.packet.time_ns for event in self.waiting if isinstance(event, PacketIn)), None)
 
     def settle(self, key: str, matrix: Matrix | None) -> ScanGate:
@@ -122,7 +125,7 @@ class ScanGate:
         return replace(self, settled=dict([*others, (key, matrix)][-_SETTLED:]))
 
     def opened(self) -> ScanGate:
-        """Return the gate without held inputs; the caller processes `waiting` again."""
+        """Return the gate without held inputs; the caller must process the inputs in `waiting` again."""
         return replace(self, held=None, waiting=())
 
     def with_channel_of(self, scan: Scan) -> ScanGate:
@@ -136,8 +139,9 @@ class Duties:
     """Earlier responses that later responses depend on.
 
     Attributes:
-        started: whether the second scan in the other direction was requested, or is not needed.
-        unregistered: number of unregistered scans in a row.
+        started: whether the scan in the other direction at the start was requested, or is not needed.
+        unregistered: number of scans in a row without a result of the worker (error or time limit), while drift is
+            corrected and no person is in control.
         given_m_s: drift velocity that the controller compensates.
     """
 
@@ -152,8 +156,8 @@ class WorkerLife:
 
     Attributes:
         job: the scan being registered.
-        ends: number of ends of the worker since the last registered scan.
-        waits_for_person: whether the worker is only restarted when a person clears device-malfunction.
+        ends: number of ends of the worker since its last report about a scan.
+        waits_for_person: whether the worker stays ended until a person clears device-malfunction.
         slow_logged: whether a slow registration was logged.
     """
 

@@ -9,7 +9,7 @@ from afspm.basics.frozen import replace
 from afspm.model import RegistrationOutcome, registration_summary
 
 LATELY = 10
-"""Number of scans in the share of unregistered ones."""
+"""Number of latest scans that count in the share of unregistered scans."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,12 @@ class RegistrationTally:
         return registration_summary(outcome for outcome, count in self.counts.items() for _ in range(count))
 
     def exceeds(self, most_unregistered: float) -> bool:
-        """Return whether the share of unregistered scans among the last `LATELY` exceeds a limit."""
+        """Return whether the share of unregistered scans among the last `LATELY` exceeds a limit.
+
+        The share refers to `LATELY` scans even if fewer have been counted.
+        """
         return self.lately.count(False) > most_unregistered * LATELY
 
     def share_restarted(self) -> RegistrationTally:
-        """Return the tally with an empty share of unregistered scans, after a search for the sample has begun."""
+        """Return the tally with an empty share of unregistered scans, when a search for the sample begins."""
         return replace(self, lately=())

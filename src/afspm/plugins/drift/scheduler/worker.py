@@ -44,7 +44,7 @@ from afspm.transport.process.parent import leave_interrupts_to_parent
 
 @dataclass(frozen=True)
 class Complaint:
-    """Error report for the log; the worker continues."""
+    """Error of the worker for the log; the worker continues."""
 
     reason: str
 
@@ -56,14 +56,15 @@ class Reports(Protocol):
 
 
 class DriftWorkerInProcess:
-    """Worker without a separate process, for tests; see `scheduler.shell.FrameWorker`. `take` returns when the job is
-    done.
+    """Worker without a separate process, for tests; see `scheduler.shell.FrameWorker`.
+
+    `take` returns when the job is done.
 
     Args:
         file: file for the worker's state; None: the state is not saved.
 
     Attributes:
-        wake: called when there is a report.
+        wake: function called when a report is available.
     """
 
     def __init__(self, settings: DriftCompensationSettings, file: Path | None, log: logging.Logger) -> None:
@@ -97,7 +98,10 @@ class DriftWorkerInProcess:
 
 
 def main(jobs: Connection, reports: Connection, settings: DriftCompensationSettings, file: Path | None) -> None:
-    """Register scans until the connection for jobs closes."""
+    """Register scans until the connection for jobs closes.
+
+    A saved state that can't be used is reported as `WorkerGone`, and ends the process with exit code 1.
+    """
     leave_interrupts_to_parent()
     # a user's estimator may print: its output belongs with the errors
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())

@@ -33,8 +33,8 @@ class DriftWorkerProcess:
         file: file for the worker's state; None: the state is not saved.
 
     Attributes:
-        wake: called from another thread when there is a report.
-        late: slows simulated time down to real time while a scan is registered.
+        wake: function called from another thread when a report is available.
+        late: context that slows simulated time down to real time, entered while a scan is registered.
     """
 
     def __init__(self, settings: DriftCompensationSettings, file: Path | None, log: logging.Logger) -> None:
@@ -52,7 +52,7 @@ class DriftWorkerProcess:
         self._jobs: queue.SimpleQueue[object] = queue.SimpleQueue()
 
     def take(self, job: object) -> None:
-        """Queue a job for the worker, or restart the worker; return at once."""
+        """Queue a job for the worker, or restart the worker; do not wait for the result."""
         if isinstance(job, StartWorker):
             self._start()
             return
@@ -73,7 +73,7 @@ class DriftWorkerProcess:
                     self._late.close()
 
     def close(self) -> None:
-        """End the worker, whose state is on disk."""
+        """End the worker; kill it if it does not end within a second. Its state is on disk."""
         self._life += 1
         self._end(within_s=_FAREWELL_S)
 

@@ -25,7 +25,9 @@ class SettingsGrid:
 
     @classmethod
     def of(cls, given: Sequence[str]) -> SettingsGrid:
-        """Read a grid from a command line: files ending in .toml, and NAME=VALUE[,VALUE…], which override them.
+        """Read a grid from a command line: files ending in .toml, and NAME=VALUE[,VALUE…].
+
+        A later argument overrides the values of earlier arguments.
 
         Raises:
             ConfigError: an argument has another form, or the TOML is invalid. FileError: the file can't be read.
@@ -49,7 +51,9 @@ class SettingsGrid:
         return tuple(name for name, values in self.values.items() if len(values) > 1)
 
     def settings(self) -> Iterator[tuple[str, NightSettings]]:
-        """Yield each combination once, labelled by its varied settings; the defaults first.
+        """Yield each combination once, labelled by its varied settings.
+
+        The first combination has the defaults of all varied settings.
 
         Raises:
             ConfigError, InvalidValue: as `NightSettings.of`; or no night uses the estimator or tracker of a setting.

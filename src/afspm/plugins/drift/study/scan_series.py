@@ -33,7 +33,7 @@ def series(contents: Sequence[FileContent], channel: str = "") -> Series:
     """Return the scans of one channel; without a name, the most frequent topography channel.
 
     Raises:
-        InvalidValue: the channel has fewer than two scans.
+        InvalidValue: the channel has fewer than two scans, or no channel is given and no file has a topography.
     """
     name = channel or topography(contents)
     found: list[DriftScan] = []
@@ -68,7 +68,11 @@ def topography(contents: Sequence[FileContent]) -> str:
 
 
 def drift_scan(scan: Scan, content: FileContent) -> DriftScan:
-    """Return one channel of a file as a DriftScan. Without a start time, the scan's end counts as its start."""
+    """Return one channel of a file as a DriftScan. A missing start or end time is replaced by the other.
+
+    Raises:
+        InvalidValue: the file has neither time, or the scan can't be registered.
+    """
     end_ns = content.end_ns if content.end_ns is not None else content.start_ns
     start_ns = content.start_ns if content.start_ns is not None else end_ns
     if start_ns is None or end_ns is None:

@@ -22,13 +22,15 @@ class NightSettings:
         surface: kind of the sample, see `afspm.simulation`.
         size_m, pixels: side of the scanned square, in m and in pixels.
         every_s: time from the start of one scan to the start of the next.
-        line_s: time of trace and retrace together.
+        line_s: time of trace and retrace of one line together.
         hours: duration of the night.
-        drift_m: displacement of the sample at the end; the seed determines its direction and an added random walk.
-        rescan: when a rescan is taken, see `afspm.plugins.drift.overlap`: "tolerance", "paper" or "never".
+        drift_m: total displacement by the slow relaxation (time constant 3 h). A fast relaxation of a fifth, a daily
+            cycle of a tenth and a random walk are added; the seed determines all directions.
+        rescan: rule for rescans, see `afspm.plugins.drift.overlap`: "tolerance", "paper" or "never".
         tolerance_m: tolerance of the rule "tolerance"; None: a tenth of the size.
         f_rescan: limit of the rule "paper".
-        at_start: "up-down": the first scan is taken in both directions, as by the scheduler's default; "nothing".
+        at_start: "up-down": the first scan is taken in both directions, as by the scheduler's default, if both scans
+            fit into `every_s`; "nothing": in one direction only.
         estimator, tracker: tables of "class" and settings.
     """
 
@@ -65,11 +67,13 @@ class NightSettings:
 
     @classmethod
     def of(cls, names: Table) -> NightSettings:
-        """Return the settings by name: fields, and such as "paper.queue" for a setting of the chosen tracker or
-        estimator.
+        """Return the settings from a table of values by name.
+
+        Names are fields, or such as "paper.queue" for a setting of the chosen tracker or estimator. Settings of other
+        trackers and estimators are ignored.
 
         Raises:
-            ConfigError: a name is unknown. InvalidValue: values contradict each other.
+            ConfigError: a name, rule or start is unknown. InvalidValue: values contradict each other.
         """
         plain: Plain = {name: value for name, value in names.items() if "." not in name}
         known = [one.name for one in fields(cls)]

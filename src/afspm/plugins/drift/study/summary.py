@@ -9,7 +9,7 @@ from statistics import median
 import numpy as np
 
 BY = "misplaced rms"
-"""The metric of the ranking: misplacement of scans, once the rate is known."""
+"""Name of the metric for the ranking: rms misplacement of scans, once the rate is known."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Summary:
         failed: errors of the nights that were not completed.
         quartiles: lower quartile, median and upper quartile, by metric.
         is_default, is_best: whether these settings are the defaults, and whether they are the best.
-        holds: for the defaults, whether they are as good as the best: their median is not above its upper quartile.
+        holds: whether these are the defaults, and as good as the best: their median is not above its upper quartile.
     """
 
     label: str
@@ -45,7 +45,8 @@ def summarised(
     """Return one summary for each label, best first. The first label belongs to the defaults.
 
     Args:
-        metrics: metrics of each night, by label. A night that lost the sample counts as infinitely bad.
+        metrics: metrics of each night, by label. A night that lost the sample counts as infinitely bad in the ranking
+            metric.
         failed: errors of nights that were not completed, by label.
     """
     rows = [_row(label, metrics.get(label, ()), failed.get(label, ()), labels[0]) for label in labels]

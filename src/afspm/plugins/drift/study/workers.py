@@ -1,4 +1,7 @@
-"""Execution of many independent tasks on this computer's cores or a Dask cluster. A dead worker's task is repeated."""
+"""Execution of many independent tasks on this computer's cores or a Dask cluster.
+
+Tasks of dead workers are repeated.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +45,10 @@ def processes(asked: int | None, pixels: int) -> int:
 def on_cores(
     function: Callable[..., object], tasks: Sequence[tuple[object, ...]], *, jobs: int
 ) -> Iterator[TaskOutcome]:
-    """Yield the outcomes of `function(*task)` in any order, computed in `jobs` processes (1: in this process)."""
+    """Yield the outcomes of `function(*task)` in any order, computed in `jobs` processes (1: in this process).
+
+    After three deaths of workers in a row without a finished task, all remaining tasks fail.
+    """
     if jobs <= 1:
         for index, task in enumerate(tasks):
             yield _done(function, index, task)

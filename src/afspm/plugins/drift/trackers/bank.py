@@ -36,10 +36,10 @@ class BankState:
         similarity: rotation and scale; None if only translations are tracked.
         references: stored scans in order of time, as in the filters' state.
         compensation: velocity of tip coordinates, which follow the sample.
-        newest_s: middle of the newest scan, even if this was dropped.
+        newest_s: middle of the newest scan, even if the scan was dropped.
         scans: number of scans so far.
         unmatched: number of scans in a row that should have matched, but did not.
-        proven: whether any two scans have matched; until then, the first scan may be the unusable one.
+        proven: whether any two scans have matched; until then, the first scan itself may be unusable.
         doubted_m: (2,) measured minus expected position of the newest scan, if doubted; else None.
         matched_s: middle of the newest scan with a measured place.
         lost: see `Update`.
@@ -62,20 +62,20 @@ class BankTracker:
     """Tracker with a bank of filters: models of drift, weighted by the quality of their predictions.
 
     A scan is registered with several earlier scans: recent ones, and an anchor, the first scan of its part of the
-    sample, as long as this can be recognised. Each result measures the difference of two positions. The positions of
-    all stored scans are part of the filters' state, so they stay consistent and nothing is counted twice. A position
+    sample, as long as the anchor can be recognised. Each result measures the difference of two positions. The positions
+    of all stored scans are part of the filters' state, so they stay consistent and nothing is counted twice. A position
     holds for the middle of a scan; where the overlap lies elsewhere, the time of its rows counts.
 
     A result far from every prediction is used only if the next scan confirms it. A scan that matches no other is
-    adrift: it is stored at its predicted place, and neither it nor scans that match only scans adrift are evidence.
-    Their places relative to each other are still tracked. After several such scans in a row the tracker is lost. It is
-    lost after a single one if the standard deviation of its position exceeds half of the misplacement at which scans
-    can still be compared. A lost tracker searches everywhere, until a scan has a measured place again; this scan also
-    corrects the scans adrift.
+    adrift: it is stored at its predicted place, and neither this scan nor scans that match only scans adrift are
+    evidence. Their places relative to each other are still tracked. After several such scans in a row the tracker is
+    lost. A single such scan is enough if the standard deviation of its position exceeds half of the misplacement at
+    which scans can still be compared. A lost tracker searches everywhere, until a scan has a measured place again; this
+    scan also corrects the scans adrift.
 
     A scan that can't be compared with any other, such as a zoom too fine for the overview, starts a new series. A zoom
-    is searched in an overview only at its expected place, and the tracker is not lost if it is not recognised there,
-    since one particle looks like the next.
+    is searched in an overview only at its expected place, and the tracker is not lost if the zoom is not recognised
+    there, since one particle looks like the next.
 
     With the transform "similarity", rotation and scale are first removed from scans: see `Similarity`.
 
@@ -348,7 +348,7 @@ class BankTracker:
         return snapshot(self._state, "bank", VERSION)
 
     def restore(self, state: PlainMapping) -> None:
-        """Restore the result of `state`. Raises InvalidValue if it belongs to another tracker, or to other settings."""
+        """Restore the result of `state`. Raises InvalidValue for the state of another tracker or of other settings."""
         found = restored(BankState, state, "bank", VERSION)
         if (filters := found.filters) is not None:
             if (self._settings.transform == "similarity") != (found.similarity is not None):

@@ -36,14 +36,14 @@ class Models:
     def wandered_m2(self, duration_s: float) -> Array:
         """Return the variance (n,) of the mean position over the rows of a scan minus the position in its middle.
 
-        It is caused by a random walk of the position and a random acceleration.
+        The cause is a random walk of the position and a random acceleration.
         """
         return np.asarray(self.walk_m2_s * duration_s / 12 + self.density_m2_s3 * duration_s**3 / 320)
 
     def over(self, step_s: float) -> tuple[Array, Array]:
         """Return transition matrix and added covariance, (n, 4, 4) each, of a state (x, y, v_x, v_y) over a time step.
 
-        A negative step goes back in a straight line, and adds the same covariance.
+        A negative step goes back in a straight line, and adds the same variances.
         """
         a, q, t = self.fading_per_s, self.density_m2_s3, abs(step_s)
         reach_s = np.full_like(a, step_s)  # distance per initial velocity
@@ -137,7 +137,10 @@ class Filters:
         return replace(self, time_s=time_s, mean=mean, covariance=covariance)
 
     def widened(self, position_sd_m: float, velocity_sd_m_s: float, scans: Sequence[int] = ()) -> Filters:
-        """Return the filters with a less certain present; the given scans move by the same unknown distance."""
+        """Return the filters with less certain present position and velocity.
+
+        The positions of the given scans become uncertain by the same unknown distance.
+        """
         covariance = self.covariance.copy()
         for axis in range(2):
             together = [axis, *(4 + 4 * number + axis for number in scans)]
@@ -178,13 +181,14 @@ class Filters:
 
     def with_velocity(self, time_s: float, velocity_m_s: Array, covariance: Array, *, rarest: float) -> Filters:
         """Update with a velocity of the sample, measured at about the time of the filters."""
+        # between both times the velocity may have changed
         elsewhen = self.models.over(abs(self.time_s - time_s))[1][:, 2:, 2:]
         return self.updated(self.velocity_rows(), velocity_m_s, covariance + elsewhen, forget=1.0, rarest=rarest)
 
     def updated(self, rows: Array, measured: Array, noise: Array, *, forget: float, rarest: float) -> Filters:
         """Update with the measurement `measured` (m,) = `rows` (m, s) @ state + noise.
 
-        `noise` is a covariance (m, m), or one for each filter (n, m, m).
+        `noise` is a covariance (m, m), or a covariance for each filter (n, m, m).
 
         Args:
             forget: share of the logarithm of the old weights that is kept.

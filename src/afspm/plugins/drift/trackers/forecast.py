@@ -36,7 +36,7 @@ class Compensation:
         return np.array(velocity)
 
     def followed_m(self, from_s: float, to_s: float) -> Array:
-        """Return the movement (2,) of tip coordinates between two times in m; negative if the first time is later."""
+        """Return the movement (2,) of tip coordinates from one time to another in m; the second time may be earlier."""
         start_s, end_s = min(from_s, to_s), max(from_s, to_s)
         edges = [start_s, *(since_s for since_s, _, _ in self.changes if start_s < since_s < end_s), end_s]
         parts = [self.velocity_m_s(a) * (b - a) for a, b in itertools.pairwise(edges)]

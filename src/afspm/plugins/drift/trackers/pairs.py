@@ -32,7 +32,7 @@ class ObservationModel:
     """Observation model: the dependence of d on the state.
 
     Attributes:
-        number: number of the reference.
+        number: index of the reference.
         scan_delay_s, reference_delay_s: t_k and t_j.
         offset_m: (2,) the part of d independent of the state.
         noise_m2: (2, 2) covariance of the offset.
@@ -109,7 +109,10 @@ class NewestScan:
         return mean + link.offset_m, covariance + link.noise_m2
 
     def prior(self, number: int, reference: ReferenceScan, widening: float) -> Prior:
-        """Return the prior for an estimator, widened by half a pixel so that it searches around the expected value."""
+        """Return the prior for an estimator, widened by a factor and by half a pixel for the search.
+
+        The prior contains the velocity difference only if drift shears both scans alike.
+        """
         mean, covariance = self.expected(number, reference)
         half_px_m = max(*self.scan.pixel_m, *reference.scan.pixel_m) / 2
         covariance = widening * covariance + np.eye(2) * half_px_m**2
@@ -164,7 +167,7 @@ class PairMeasurement:
 
 
 def agreeing(measured: list[PairMeasurement], filters: Filters) -> list[PairMeasurement]:
-    """Return the largest consistent group of results; of equally large groups, the one of the best reference."""
+    """Return the largest consistent group of results; of equally large groups, the group of the best reference."""
     if len(measured) < 2:
         return measured
     states = filters.mean.shape[1]

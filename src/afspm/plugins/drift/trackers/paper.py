@@ -28,10 +28,9 @@ TRANSFORMS = ("translation", "euclidean", "similarity", "affine")
 
 
 def transform_between(found: Registration, form: str) -> Mapping:
-    """Return the transform from tip coordinates during the reference to tip coordinates during the scan, of a given
-    form.
+    """Return the transform from tip coordinates of the reference to tip coordinates of the scan.
 
-    It is the transform of this form nearest to the registration.
+    The result is the transform of the given form that is nearest to the registration.
     """
     linear = _of_form(np.eye(2) + found.linear, form)
     center = found.center_m if form != "translation" else np.zeros(2)
@@ -131,7 +130,7 @@ class PaperState:
     Attributes:
         forecast: forecast after the newest scan.
         newest_s: middle of the newest scan; None before the first.
-        residual_m2: mean square of the last residuals.
+        residual_m2: running mean square of the residuals; None before the first comparison.
         unmatched: number of scans in a row that should have matched, but did not.
         queue: the queue C, oldest scan first.
     """
@@ -149,7 +148,7 @@ class PaperTracker:
     Each scan is first predicted, M'_k = M_(k-1) dM^_k with dM^_k the rate of the last step times the time since, and
     then corrected by the residual dM~_k against the oldest scan of the queue for which estimation succeeds:
     M_k = M'_k dM~_k. Choices that the paper leaves open: times are the middles of the scans; without a rate the
-    prediction is the identity; an unmatched scan joins the queue at its predicted place. The paper defines no
+    predicted step is the identity; an unmatched scan joins the queue at its predicted place. The paper defines no
     uncertainty: here the variance of a prediction is the mean square of the last residuals.
 
     Args:

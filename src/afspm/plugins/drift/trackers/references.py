@@ -26,7 +26,7 @@ class ReferenceScan:
         anchor: whether the scan is the long-term reference for its part of the sample.
         adrift: whether the place of the scan is only predicted, since it matched no scan with a measured place.
         refusals: number of failed comparisons in a row, while another reference succeeded.
-        used: number of the scan last registered with this reference.
+        used: number of the newest scan registered with this reference.
     """
 
     scan: DriftScan
@@ -46,10 +46,10 @@ class Choice:
         recent: largest number of stored scans besides the anchors.
         anchors: largest number of anchors.
         most_bytes: largest memory for all stored values.
-        overlap_min: least overlap, as share of the smaller scan.
-        sr_norm_min: least ratio of the resolutions.
+        overlap_min: least expected overlap for a comparison, as share of the smaller scan.
+        sr_norm_min: least ratio of the resolutions for a comparison.
         stale_after: number of refusals in a row after which an anchor is removed.
-        alike: least overlap of a scan with an anchor, at half the resolution or better, without a new anchor.
+        alike: least overlap of a scan with an anchor of similar resolution at which the scan needs no new anchor.
     """
 
     compared: int = 5
@@ -78,8 +78,9 @@ class ReferenceScans:
     def candidates(self, scan: DriftScan, drift_m: Array, drifts_m: Array, *, anywhere: bool) -> list[int]:
         """Return the indices of the references to compare with a scan, best first.
 
-        Anchors of similar resolution come first, then the newest scans, which show recent changes. Scans adrift, which
-        are no evidence, come last.
+        References of similar resolution come first, and among these the largest expected overlap, in steps of a
+        quarter. At equal overlap, anchors come first, then the newest scans, which show recent changes. Scans adrift,
+        which are no evidence, come last.
 
         Args:
             drift_m: (2,) displacement expected in the scan.
@@ -108,7 +109,10 @@ class ReferenceScans:
         return _alike(self.kept[number].scan, scan) >= _LIKE
 
     def judged(self, tried: Table[int, bool], step: int) -> None:
-        """Update refusals and last use of each reference that was tried with the newest scan."""
+        """Update refusals and last use of each reference that was tried with the newest scan.
+
+        Refusals only count if another reference succeeded.
+        """
         for number, succeeded in tried.items():
             kept = self.kept[number]
             if succeeded:
@@ -131,7 +135,7 @@ class ReferenceScans:
         )
 
     def superfluous(self) -> int | None:
-        """Return the index of a reference to remove; None if all can stay. The newest always stays."""
+        """Return the index of a reference to remove; None if all can stay. The newest reference always stays."""
         old = list(enumerate(self.kept))[:-1]
         stale = [n for n, one in old if one.anchor and one.refusals >= self.choice.stale_after]
         if stale:

@@ -30,16 +30,17 @@ class BankSettings:
         fadings_s: time constants after which a velocity has decayed to 1/e; inf for a constant velocity.
         walks_m2_s: variances per second of a random walk of the position. There is one filter for each combination of
             density, fading and walk.
-        jitter_m: standard deviation of an error of a scan's position that registrations do not show.
+        jitter_m: standard deviation of an error in the position of a scan that registrations do not show.
         start_velocity_sd_m_s: standard deviation of the velocity at the start.
         start_px: standard deviation of the sample's position in the first scan, in its pixels.
         forget: share of the logarithm of the filters' weights that is kept from one scan to the next.
         rarest: least weight of a filter, relative to the largest.
         inflation: factor on an estimator's covariance, above 1. The excess over 1 is an error of the pair; the rest is
             divided equally between its scans.
-        widening: factor on the covariance of an expected displacement, for the estimator's search.
+        widening: factor on the covariance of an expected displacement, for the estimator's search; four times as large
+            for each unmatched scan in a row.
         doubt: chi² above which a result is ignored until the next scan confirms it.
-        second_looks: number of references searched without a prediction if none matched with one.
+        second_looks: largest number of references searched without a prediction, if none matched with a prediction.
         lost_after: number of scans in a row that should have matched, but did not, after which the tracker is lost.
         transform: "translation", or "similarity" to estimate rotation and scale as well.
         linear_walk_per_s: variance per second of the angle (rad) and of the logarithm of the scale.

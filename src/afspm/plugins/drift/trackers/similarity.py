@@ -1,8 +1,8 @@
 """Kalman filter for rotation and scale of the sample since the first scan.
 
 Both form one complex number, the logarithm of the scale plus i times the angle in rad, so that successive changes add
-up. Its model is a random walk from zero, so it stays near zero without evidence. The state contains the present value
-and a value for each stored reference, like the positions in the bank of filters.
+up. The model of this number is a random walk from zero, so the estimate stays near zero without evidence. The state
+contains the present value and a value for each stored reference, like the positions in the bank of filters.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 _SHEAR_SD = 0.03  # displacement per length along the slow axis, by unknown drift during the scans
 _LEAST_SD = 1e-5  # of a measurement
-_DOUBT = 25.0  # chi2 above which a measurement is not believed until the next one confirms it
+_DOUBT = 25.0  # chi2 above which a measurement is ignored until the next measurement confirms it
 _OF_SCALE, _OF_ANGLE = np.array([1.0, 0.0, 0.0, 1.0]), np.array([0.0, -1.0, 1.0, 0.0])
 
 
@@ -74,7 +74,10 @@ class Similarity:
         return np.asarray(np.eye(2) * (row @ self.covariance @ row) * (far_m @ far_m))
 
     def learned(self, number: int, seen: SimilarityMeasurement) -> Similarity:
-        """Update with a registration with a reference."""
+        """Update with the measurement from a registration with a reference.
+
+        A measurement far from its expected value is ignored, unless the measurement before was also far.
+        """
         row = self._row(number)
         crossed = self.covariance @ row
         expected = float(row @ crossed) + seen.variance
@@ -116,7 +119,7 @@ class SimilarityMeasurement:
 
     Attributes:
         value: logarithm of the scale, plus i times the angle in rad.
-        variance: variance of each of them.
+        variance: variance of the logarithm of the scale, and of the angle.
     """
 
     value: complex
