@@ -1,6 +1,6 @@
 """Optimisers that map a quantity over a region, behind the protocol of bluesky-adaptive 1.0: `suggest` and `ingest`.
 
-**Theory of operation.** The region carries nested lattices, each twice as fine as the one before. A round of
+**Theory of operation.** The region carries nested lattices, each twice as fine as the last. A round of
 `AdaptiveMap` takes positions of the next finer lattice, but only beside positions that are measured already, and only
 where the Gaussian process expects an error worth the seconds. On a map that is rough everywhere the whole lattice
 is taken, exactly as by a nested grid; on a map that is rough in a few places, mostly these places.

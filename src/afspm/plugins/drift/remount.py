@@ -43,7 +43,7 @@ class Remount:
     """Position and rotation of a remounted sample, relative to an earlier night.
 
     Attributes:
-        reason: reason why the sample was not found; empty if it was found. The numbers are valid only if it is empty.
+        reason: reason why the sample was not found; empty for a found sample. Only then are the numbers valid.
         angle_rad: rotation of the sample since the earlier night, counter-clockwise; angle_sd_rad: standard deviation.
         center_m, center_now_m: centre of the common area, in coordinates of the earlier night and of today.
         sd_m: standard deviation of `center_now_m` along its most uncertain axis.

@@ -1,4 +1,4 @@
-"""Shear of an image by drift during the scan, and the drift velocity from an up frame and a down frame.
+"""Shear of an image by drift during the scan, and drift velocity from an up frame and a down frame.
 
 Rows are scanned one after the other, so a feature at `p` in the middle of the scan is found at
 x = p + v a e.(x - c), with c the centre, e the direction of the slow axis and a the time per length along this axis,

@@ -207,7 +207,7 @@ class Cusum:
 
     Attributes:
         value: the sum.
-        since: index of the line at which the sum last left zero; None while it is zero.
+        since: index of the line at which the sum last left zero; None for a sum of zero.
     """
 
     value: float = 0.0

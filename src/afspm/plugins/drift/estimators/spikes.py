@@ -36,7 +36,7 @@ OWN = 0.6  # least share of that in the scan itself: else the scar is in the oth
 
 
 def without_scars_of_one(scene: Scene, theta: Array) -> Scene:
-    """Return two images without scars that only one of them shows; the scars are marked in `made_up`.
+    """Return two images without the scars that only one image shows; the scars are marked in `made_up`.
 
     The pixels beside a scar are also replaced, but not marked.
 
@@ -82,7 +82,7 @@ def _along(values: Array) -> Array:
 
 
 def without_spikes(scene: Scene, theta: Array) -> Scene:
-    """Return two images, with spikes that only one shows replaced by interpolation between the neighbours in the row.
+    """Return two images, with spikes of only one image replaced by interpolation between the neighbours in the row.
 
     Args:
         theta: displacement, known to a pixel; see `warp.WarpedPair`.

@@ -67,7 +67,7 @@ class BankTracker:
     holds for the middle of a scan; where the overlap lies elsewhere, the time of its rows counts.
 
     A result far from every prediction is used only if the next scan confirms it. A scan that matches no other is
-    adrift: it is stored at its predicted place, and neither this scan nor scans that match only scans adrift are
+    adrift: the scan is stored at its predicted place, and neither this scan nor scans that match only scans adrift are
     evidence. Their places relative to each other are still tracked. After several such scans in a row the tracker is
     lost. A single such scan is enough if the standard deviation of its position exceeds half of the misplacement at
     which scans can still be compared. A lost tracker searches everywhere, until a scan has a measured place again; this

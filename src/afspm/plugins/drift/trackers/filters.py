@@ -3,7 +3,7 @@
 The state of each filter is (x, y, v_x, v_y), the displacement of the sample and its velocity, followed by four values
 for each stored scan: displacement and velocity of the sample during this scan. These stay correlated with each other
 and with the drift, so repeated comparisons with one scan are not counted as independent, and later measurements correct
-earlier ones (as landmarks in simultaneous localisation and mapping: Smith, Self and Cheeseman 1990).
+earlier measurements (as landmarks in simultaneous localisation and mapping: Smith, Self and Cheeseman 1990).
 """
 
 from __future__ import annotations
