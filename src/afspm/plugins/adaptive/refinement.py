@@ -30,10 +30,10 @@ Point = Mapping[str, Any]
 
 ID: Final = "_id"
 COARSEST: Final = 5  # positions along the longer side of the first lattice
-LEVELS: Final = 6  # of refinement
+LEVELS: Final = 6  # number of refinements
 _MORE: Final = 1.2  # times as many measurements as at the last fit
 _PART: Final = 0.5  # share of the good positions in a round where ways cost little: the next round knows more
-_EVEN: Final = 0.6  # part of good positions above which a map is rough everywhere
+_EVEN: Final = 0.6  # share of good positions above which a map is rough everywhere
 _WORTH: Final = 0.2  # least gain of a good position, as a part of the gain of a typical good position
 
 

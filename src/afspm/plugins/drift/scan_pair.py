@@ -38,7 +38,7 @@ def _displacement(first: Array, region: Region, second: Array, other: Region) ->
 
 
 def _moved(values: Array, region: Region, displacement_m: tuple[float, float]) -> Array:
-    # takes the displacement back; NaN where nothing is known
+    # undoes the displacement; NaN where the second scan has no values
     from scipy import ndimage
 
     if displacement_m == (0.0, 0.0):

@@ -17,8 +17,8 @@ from afspm.plugins.drift.estimators.coefficients import INTERCEPT, RIGHT, WEIGHT
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-PARTS = 8  # of the overlap in each direction, at most
-PART_PX = 4  # smaller ones hold too little to correlate
+PARTS = 8  # largest number of parts of the overlap in each direction
+PART_PX = 4  # smaller parts hold too little to correlate
 APART_PX = 4  # a nearer peak is the match itself
 FEW = 10  # with fewer repetitions a surface does not count as periodic
 MOST_REPEATS = 30.0  # standard deviations, from which a match counts as unique

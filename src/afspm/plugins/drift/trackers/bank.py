@@ -24,7 +24,7 @@ from afspm.plugins.drift.tracking import Forecast, Prediction, Update, require_n
 Array = NDArray[np.float64]
 
 VERSION = 4
-_LIKE = 1.2  # largest relative difference of a second surprise that confirms the first: a new velocity doubles it
+_LIKE = 1.2  # largest relative difference of a second surprise that confirms the first (doubled by a new velocity)
 
 
 @dataclass(eq=False)
@@ -234,7 +234,7 @@ class BankTracker:
         return tried
 
     def _compared(self, newest: NewestScan, tried: Table[int, Registration]) -> Comparison | None:
-        # references adrift count only without others, and coarse results only without exact ones
+        # references adrift count only without others, and coarse results only without exact results
         kept, inflation = self._references.kept, self._settings.inflation
         measured = [
             PairMeasurement.of(newest, number, kept[number], found, inflation)
