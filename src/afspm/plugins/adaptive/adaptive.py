@@ -33,8 +33,8 @@ class Adaptive(Component):
     """A component that maps a quantity over a region: spectra on nested lattices, refined where the map is uncertain.
 
     A Gaussian process gives the map and its expected error, and follows drift from the values. Where the map is rough
-    everywhere, the complete lattices are measured, row by row; where it is rough in a few places, mostly these places.
-    No spectrum is taken twice, even if processes are killed.
+    everywhere, the complete lattices are measured, row by row; where the map is rough in a few places, mostly these
+    places. No spectrum is taken twice, even if processes are killed.
 
     The table `map.csv` and the picture `map.png` are written into the run folder at the end, from at least
     three spectra.

@@ -28,7 +28,7 @@ def draw_map(found: MapProgress, region: Region, path: Path, *, title: str = "",
     Args:
         region: region that was mapped.
         path: file of the picture; its suffix determines the format.
-        simulated: whether to mark the picture, so that it is not taken for a measurement.
+        simulated: whether to mark the picture as SIMULATED.
     """
     values, errors = _pictures(found, region)
     aspect = region.size_m[1] / region.size_m[0]

@@ -126,7 +126,7 @@ class MapProgress:
         self._look()
 
     def finished(self) -> str:
-        """Return the reason why the map is complete, for people; empty if it is not complete."""
+        """Return the reason why the map is complete, for people; empty for an incomplete map."""
         until, count = self.until, len(self.measured)
         if until.spectra is not None and count >= until.spectra:
             return f"{count} spectra are measured"

@@ -1,6 +1,6 @@
 """Optimisers that map a quantity over a region, behind the protocol of bluesky-adaptive 1.0: `suggest` and `ingest`.
 
-**Theory of operation.** The region carries nested lattices, each twice as fine as the one before. A round of
+**Theory of operation.** The region carries nested lattices, each twice as fine as the last. A round of
 `AdaptiveMap` takes positions of the next finer lattice, but only beside positions that are measured already, and only
 where the Gaussian process expects an error worth the seconds. On a map that is rough everywhere the whole lattice
 is taken, exactly as by a nested grid; on a map that is rough in a few places, mostly these places.
@@ -30,10 +30,10 @@ Point = Mapping[str, Any]
 
 ID: Final = "_id"
 COARSEST: Final = 5  # positions along the longer side of the first lattice
-LEVELS: Final = 6  # of refinement
+LEVELS: Final = 6  # number of refinements
 _MORE: Final = 1.2  # times as many measurements as at the last fit
 _PART: Final = 0.5  # share of the good positions in a round where ways cost little: the next round knows more
-_EVEN: Final = 0.6  # part of good positions above which a map is rough everywhere
+_EVEN: Final = 0.6  # share of good positions above which a map is rough everywhere
 _WORTH: Final = 0.2  # least gain of a good position, as a part of the gain of a typical good position
 
 

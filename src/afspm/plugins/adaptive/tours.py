@@ -13,7 +13,7 @@ from afspm.plugins.adaptive.gaussian_process import distances
 
 Floats = NDArray[np.float64]
 Cell = tuple[int, int]
-_PASSES: Final = 6  # of improvement of a tour
+_PASSES: Final = 6  # largest number of passes that improve a tour
 _REMEMBERED: Final = 60  # latest measurements, from which the costs are learnt
 
 

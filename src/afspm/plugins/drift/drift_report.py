@@ -15,7 +15,7 @@ from afspm.record.run import Run
 
 
 def draw(run: Run, title: str) -> None:
-    """Draw the drift into the run folder if no component has drawn it and at least two scans have a mapping."""
+    """Draw the drift of at least two mapped scans into the run folder, unless a component has drawn a figure."""
     if not is_ours(run.folder, OWN_OFFSET, OFFSET) or len(record := drift_of(run)) < 2:
         return
     from afspm.plugins.drift.figures import style

@@ -116,7 +116,7 @@ def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int | No
     """
     tracking = tracker(following, estimator(by))
     wanted = processes(jobs, sum(scan.values.size for scan in scans))
-    others = 1 if wanted == 1 else max(wanted - 1, 2)  # processes that compare; 1 is this one
+    others = 1 if wanted == 1 else max(wanted - 1, 2)  # processes that register pairs; 1: this process
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as progress, ThreadPoolExecutor(1) as beside:
         track = progress.add_task("followed", total=len(scans))

@@ -106,7 +106,7 @@ class LinearSeen:
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Result of the registration of two scans: their displacement, and whether it can be used.
+    """Result of the registration of two scans: displacement, uncertainty and acceptance.
 
     A feature at `x` of the reference is found at `x + displacement_m + linear @ (x - center_m)` in the scan, both in
     tip coordinates.

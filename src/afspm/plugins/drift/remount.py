@@ -30,7 +30,7 @@ COARSE_PX = 64
 STEP_RAD = math.radians(2.0)
 """Step between tried angles. The true angle is at most half a step from a tried angle: half a pixel at the border of a
 coarse image, and well within the reach of least squares."""
-TRIED = 3  # angles, the best by correlation
+TRIED = 3  # number of angles for least squares, the best by correlation
 ROUNDS = 3  # of least squares: each begins at the angle of the round before
 SETTLED_RAD = 1e-4
 SYSTEMATIC_PX = 0.08
@@ -43,7 +43,7 @@ class Remount:
     """Position and rotation of a remounted sample, relative to an earlier night.
 
     Attributes:
-        reason: reason why the sample was not found; empty if it was found. The numbers are valid only if it is empty.
+        reason: reason why the sample was not found; empty for a found sample. Only then are the numbers valid.
         angle_rad: rotation of the sample since the earlier night, counter-clockwise; angle_sd_rad: standard deviation.
         center_m, center_now_m: centre of the common area, in coordinates of the earlier night and of today.
         sd_m: standard deviation of `center_now_m` along its most uncertain axis.
@@ -143,7 +143,7 @@ def _angles(within_rad: float) -> Iterator[float]:
 
 
 def _registered(reference: DriftScan, scan: DriftScan, angle_rad: float) -> tuple[float, Registration]:
-    # the estimator's own rotation is pulled towards none: turned by it, the next round begins nearer
+    # the estimator's prior pulls its rotation towards zero, so each round begins at the rotation found before
     estimator = LeastSquares()
     found = estimator.register(reference, _turned_scan(scan, angle_rad))
     for _ in range(ROUNDS - 1):
@@ -158,7 +158,7 @@ def _registered(reference: DriftScan, scan: DriftScan, angle_rad: float) -> tupl
 
 
 def _remount(angle_rad: float, found: Registration, scan: DriftScan) -> Remount:
-    # the registration is of a scan turned about its centre: turned back, its positions are those of now
+    # the registered scan was turned about its centre: its positions are turned back to coordinates of today
     middle = np.array(scan.region.center_m)
     x, y = found.center_m
     x_now, y_now = _turned(found.center_m + found.displacement_m - middle, -angle_rad) + middle

@@ -17,8 +17,8 @@ _ALIKE = 1e-3
 def onto_first(first: Array, region: Region, second: Array, second_region: Region) -> tuple[Array, str]:
     """Return the second scan shifted onto the features of the first, and a text about the alignment.
 
-    Scans of equal size are registered relative to their frames, regardless of the positions of the frames. The result
-    is NaN where only the first scan was measured. Scans that can't be registered are not shifted.
+    Scans of equal size are registered relative to their frames, regardless of the positions and angles of the
+    frames. The result is NaN where only the first scan was measured. Scans that can't be registered are not shifted.
     """
     moved_m, words = _displacement(first, region, second, second_region)
     return _moved(second, region, moved_m), words
@@ -38,7 +38,7 @@ def _displacement(first: Array, region: Region, second: Array, other: Region) ->
 
 
 def _moved(values: Array, region: Region, displacement_m: tuple[float, float]) -> Array:
-    # takes the displacement back; NaN where nothing is known
+    # undoes the displacement; NaN where the second scan has no values
     from scipy import ndimage
 
     if displacement_m == (0.0, 0.0):

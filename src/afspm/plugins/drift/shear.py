@@ -1,4 +1,4 @@
-"""Shear of an image by drift during the scan, and the drift velocity from an up frame and a down frame.
+"""Shear of an image by drift during the scan, and drift velocity from an up frame and a down frame.
 
 Rows are scanned one after the other, so a feature at `p` in the middle of the scan is found at
 x = p + v a e.(x - c), with c the centre, e the direction of the slow axis and a the time per length along this axis,
@@ -152,7 +152,7 @@ def _guesses(first: DriftScan, second: DriftScan, free: Registration) -> list[Ar
 
 
 def _prior_from(first: DriftScan, second: DriftScan, free: Registration, guess: Array) -> Prior:
-    # as uncertain as the shear
+    # the prior is as uncertain as the velocity from the shear
     sheared = velocity_by_shear(first, second, free)
     covariance = np.zeros((2, 2)) if sheared is None else sheared[1]
     between_s = second.mid_s - first.mid_s
@@ -177,13 +177,13 @@ def _combined(first: DriftScan, second: DriftScan, found: Registration, freed_m_
         return DriftVelocity.refused(found.reason or "no shear between the scans can be found", time_s, found)
     by_shear, shear_covariance = sheared[0] + freed_m_s, sheared[1]
     between_s, middles_s = _between_s(first, second, found), second.mid_s - first.mid_s
-    # freed rows are as at the middle, except for the error of the guess
+    # corrected rows show the sample as at the middle of the scan, except for the error of the guess
     by_displacement = (found.displacement_m + freed_m_s * (between_s - middles_s)) / between_s
     covariance = found.covariance_m2 / between_s**2
     difference, both = by_displacement - by_shear, covariance + shear_covariance
     if float(difference @ np.linalg.solve(both, difference)) > _CONTRADICTION:
         return DriftVelocity.refused("the displacement between the scans contradicts their shear", time_s, found)
-    share = np.linalg.solve(both, covariance).T  # of the shear
+    share = np.linalg.solve(both, covariance).T  # weight of the velocity from the shear
     together = covariance - share @ covariance
     return DriftVelocity(
         accepted=True,

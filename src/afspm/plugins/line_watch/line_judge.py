@@ -49,16 +49,16 @@ LEAST_PER_SLOPE = 0.06  # pixels: two scans without drift between them show too 
 SPIKE = 6.0  # standard deviations beyond which a single pixel of a good scan is removed as a spike
 SCAR = 4.0  # standard deviations beyond which a row of a good scan is no measure of later ones
 MOST = 6.0  # standard deviations that one line adds at most
-FLOOR, FACTOR = 15.0, 2.0  # least threshold, and its ratio to the highest sum of good scans
+FLOOR, FACTOR = 15.0, 2.0  # least threshold, and ratio of a threshold to the highest sum of good scans
 FEWEST_SUSPECT = 6  # rows since a change before an alarm: fewer don't show whether the sample has jumped
 FEWEST_STOP = 10  # rows since a change before a scan is stopped, after a second search for a jump with more lines
 LOOK = 0.6  # share of the threshold above which a person should look
-GOOD_DECAY = 5.0  # assumed, not fitted: of the share of good scans that reach some evidence
-FEWEST_PAIRS = 2  # of good scans, before such scans are judged
-ENOUGH_PAIRS = 4  # for medians
+GOOD_DECAY = 5.0  # decay, with the evidence, of the share of good scans that reach it: assumed, not fitted
+FEWEST_PAIRS = 2  # least number of pairs of good scans before scans of their kind are judged
+ENOUGH_PAIRS = 4  # least number of pairs for medians
 KEPT_PAIRS, KEPT_SPEEDS = 16, 3
 MOST_KINDS, MOST_PLACES = 4, 8
-SAME_SIZE = 0.02  # relative difference within which sizes count as equal
+SAME_SIZE = 0.02  # relative difference of sizes, and of angles in rad, within which they count as equal
 LEAST_COMMON = 0.5  # share of width and height that an earlier scan must cover
 
 
@@ -207,7 +207,7 @@ class Cusum:
 
     Attributes:
         value: the sum.
-        since: index of the line at which the sum last left zero; None while it is zero.
+        since: index of the line at which the sum last left zero; None for a sum of zero.
     """
 
     value: float = 0.0
@@ -315,7 +315,7 @@ class ScanJudge:
         """
         level = [levelled(values)[0] for values in line]
         if not all(np.isfinite(values).all() for values in level):
-            return None  # a missing line says nothing of the tip
+            return None  # a missing line is no evidence about the tip
         self._comparer.follow(row, level)
         self._recent = [*self._recent, (row, level)][-REMEMBERED:]
         self._followed += 1

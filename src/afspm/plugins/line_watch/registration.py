@@ -29,8 +29,8 @@ PULL = 0.02  # cost of each squared pixel from the predicted shift, on ground to
 STEADY = 0.75  # share of the cost that a shift elsewhere must stay below: on a lattice many shifts are nearly as good
 HALF_PX = 0.35  # standard deviation of a shift rounded to whole pixels, both directions combined
 CANDIDATES = 6  # of a search: on a lattice many shifts are nearly as good
-CLIP_SIGMAS = 4.0  # of a slope in the cost of a shift, and of a pixel in a residual
-MAD_TO_SIGMA = 1.4826  # of normally distributed values
+CLIP_SIGMAS = 4.0  # limit of a slope in the cost of a shift, and of a pixel in a residual
+MAD_TO_SIGMA = 1.4826  # for normally distributed values
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +219,7 @@ def likely_shifts(
         square = np.minimum(off * off / (flat_m**2 + (HALF_PX * slopes) ** 2), CLIP_SIGMAS**2)
         share = counted.mean(axis=-1)
         total = np.where(counted, square, 0.0).mean(axis=-1) / np.maximum(share, LEAST_OVERLAP)
-        # a line that the template does not cover speaks neither for a shift nor against it
+        # a line that the template does not cover is evidence neither for a shift nor against it
         cost += np.where(share >= LEAST_OVERLAP, total, 2.0)
     found: list[Shift] = []
     for _ in range(CANDIDATES):

@@ -1,7 +1,7 @@
 """Acceptance of a match, since even scans of different places have a best match.
 
-A logistic regression turns the evidence into the probability that the match is wrong by more than a pixel. It is
-fitted by `python -m benchmarks.drift.fit`.
+A logistic regression turns the evidence into the probability that the match is wrong by more than a pixel. The
+coefficients are fitted by `python -m benchmarks.drift.fit`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from afspm.plugins.drift.estimators.coefficients import INTERCEPT, RIGHT, WEIGHT
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-PARTS = 8  # of the overlap in each direction, at most
-PART_PX = 4  # smaller ones hold too little to correlate
+PARTS = 8  # largest number of parts of the overlap in each direction
+PART_PX = 4  # smaller parts hold too little to correlate
 APART_PX = 4  # a nearer peak is the match itself
 FEW = 10  # with fewer repetitions a surface does not count as periodic
 MOST_REPEATS = 30.0  # standard deviations, from which a match counts as unique
@@ -80,7 +80,7 @@ class MatchEvidence:
         return 1.0 / (1.0 + math.exp(min(-odds, 700.0)))
 
     def refusal(self, wrong_at_most: float) -> str:
-        """Return the reason for refusing the match; empty if it is accepted."""
+        """Return the reason for refusing the match, for people; empty for an accepted match."""
         if self.wrong <= wrong_at_most:
             return ""
         objections = self.objections()

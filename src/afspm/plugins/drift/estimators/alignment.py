@@ -31,7 +31,7 @@ COARSE: Index = np.array([*range(LINEAR.stop), GAIN, BEND], dtype=np.intp)
 ALL: Index = np.arange(COUNT, dtype=np.intp)
 ROUNDS = 4
 SETTLED_PX = 1e-3
-DIGITS = 1e-6  # of products of columns of 32 bits
+DIGITS = 1e-6  # relative precision of products of 32-bit columns
 LEAST_CURVATURE = 0.4
 """The least curvature H'QJ, as a share of H'QH, in any direction. On the worst pairs (one bar in view) the share is a
 fifth to two fifths: most of H'QH is noise there, and a fit that took this noise for the surface was up to five times

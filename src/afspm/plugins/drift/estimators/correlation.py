@@ -16,7 +16,7 @@ from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 Array = NDArray[np.float64]
 
 _SMOOTH_PX = 1.0
-_APART_PX = 4.0  # from the highest peak: nearer ones belong to it
+_APART_PX = 4.0  # shifts nearer to the highest peak belong to this peak
 # Edges of the overlap, and remains of row flattening around high features, pull by about this much at any noise.
 _SYSTEMATIC_PX = 0.2
 _GATE = 25.0  # chi² from the expectation, the limit of the search

@@ -26,14 +26,14 @@ from afspm.plugins.drift.registration import Prior
 
 Array = NDArray[np.float64]
 
-_RADIUS_PX = 1.5  # keypoints need not be nearer to each other
-_REACH_PX = 4.0  # matches nearer to each other see the same feature
-_BLOCKS = 4  # the reference is divided into 4 x 4
+_RADIUS_PX = 1.5  # least radius of agreement for the chance and for rivals
+_REACH_PX = 4.0  # matches nearer to each other count as the same feature
+_BLOCKS = 4  # the reference is divided into 4 x 4 blocks
 _BLOCKS_MIN = 4
 _OVERLAP_MIN, _OVERLAP_MIN_WITH_PRIOR = 0.3, 0.2
 _UNSEEN_PX = 0.1  # common error of the keypoints of both scans, which no scatter shows
-_FEW_BLOCKS = 1.5  # the jackknife of so few has heavy tails
-_DEVIATIONS_MAX = 25.0  # squared, from the prior
+_FEW_BLOCKS = 1.5  # factor on the covariance: a jackknife of few blocks has heavy tails
+_DEVIATIONS_MAX = 25.0  # chi² from the prior, above which a result is refused
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class ConsensusEvidence:
 
     @property
     def radius_m(self) -> float:
-        """Largest distance of an agreeing pair from the transform."""
+        """Radius of agreement in the estimates of chance and rivals, at least 1.5 pixels."""
         return max(self.consensus.radius, _RADIUS_PX * self.pixel_m)
 
 
@@ -123,7 +123,7 @@ def _objection(
 
 
 def _log10_false_alarms(evidence: ConsensusEvidence, reference: Region, prior: Prior | None) -> float:
-    # several matches of one feature are not independent: one of them counts
+    # several matches of one feature are not independent, so only one match counts
     radius_m = evidence.radius_m
     # Two random places in the scans lie a given displacement apart with at most this density.
     area_m2 = reference.size_m[0] * reference.size_m[1]

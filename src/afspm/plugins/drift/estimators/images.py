@@ -13,9 +13,9 @@ from afspm.plugins.drift.registration import DriftScan
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-LEAST_ROWS = 0.5  # of a scan, measured
+LEAST_ROWS = 0.5  # least share of measured rows in a scan
 LEAST_TOPOGRAPHY = 0.1  # correlation of neighbouring rows; noise and streaks have none
-MOST_SATURATED = 0.6  # of the pixels at exactly the lowest or the highest value
+MOST_SATURATED = 0.6  # largest share of pixels at exactly the lowest or the highest value
 
 
 class Unusable(Exception):
@@ -94,7 +94,7 @@ def _less_lines(values: Array, weight: Array) -> Array:
 
 SCAR_PX = 15
 SCAR_ROWS = 2
-SCAR_SD = 2.5  # beyond the rows on both sides of it, in standard deviations of a pixel from their mean
+SCAR_SD = 2.5  # least height or depth relative to both neighbouring rows, in standard deviations of a pixel
 
 
 def without_scars(values: Array) -> Array:

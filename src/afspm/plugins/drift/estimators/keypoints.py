@@ -60,7 +60,7 @@ def sift(image: Image, count_max: int) -> Keypoints:
     values = _unit(image.values)
     if not _found(detector.detect, values):
         return _none(128)
-    # descriptors take the time, so only the kept keypoints get them
+    # descriptors take most of the time, so only the kept keypoints get descriptors
     kept = _strongest_blobs(image.values, detector, count_max)
     kept = kept[_known(image, detector.positions[kept], 2.0 * detector.sigmas[kept])]
     for name in ("keypoints", "positions", "sigmas", "scales", "orientations", "octaves"):
@@ -148,7 +148,7 @@ def _strongest_blobs(values: Array, detector: Any, count_max: int) -> NDArray[np
 Descriptors = NDArray[np.float32]
 Allowed = Callable[[slice], NDArray[np.bool_]]
 
-_CELLS = 1 << 20  # of the table of distances that exist at one time: 4 MB
+_CELLS = 1 << 20  # largest size of the table of distances in memory: 4 MB
 
 
 def matched(first: Descriptors, second: Descriptors, allowed: Allowed | None = None) -> NDArray[np.intp]:

@@ -31,12 +31,12 @@ from afspm.plugins.drift.registration import DriftScan, LinearSeen, Prior, Regis
 Array = NDArray[np.float64]
 
 WIDEST = (0.01, 0.03)  # prior standard deviations of shear and rotation in the first stage, by x and by y
-GAIN_SD = 1.0  # of the logarithm
+GAIN_SD = 1.0  # prior standard deviation of the logarithm of the gain
 BEND_SD = 0.15
 BORDER_PX = 1  # filters and splines have no data beyond the border
-FARTHEST_PX = 8.0  # from the result of the search
+FARTHEST_PX = 8.0  # largest distance of a fit from the result of the search
 TURNED = 0.03  # sine of the angle between the lines of two scans, above which the lines cross
-ELSEWHERE_PX = 32  # the farthest shift that a match is compared with
+ELSEWHERE_PX = 32  # largest distance of repeats with which a match is compared
 EXPECTED = 2.0
 """Factor on the allowed probability where a displacement is expected: nearly all wrong matches are of unrelated scans
 without a prior, and most doubtful right matches are zooms with one."""

@@ -90,11 +90,11 @@ def independent_values(first: Array, second: Array) -> float:
 
 
 BLOCK_ROWS = 8
-BLOCKS = 8  # at least, where rows are few, of two rows or more
-CACHED = 1 << 15  # numbers
+BLOCKS = 8  # least number of blocks if rows are few, each of two rows or more
+CACHED = 1 << 15  # numbers that fit into the processor's cache
 LEAST_NOISE = 1e-8
 """Least variance, with the scan's variance 1: scans have a few digits, and agreement beyond them means nothing."""
-HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it the filter leaves little of them
+HIGHEST_FREQUENCY = 0.22  # per pixel; above this frequency the filter leaves little of the residuals
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +207,7 @@ def _seen(columns: NDArray[Real], weight: Array, metric: NDArray[Real] | None) -
 
 
 def _along_rows(columns: NDArray[Real], metric: NDArray[Real]) -> NDArray[Real]:
-    # one large product takes a quarter of the time of one for each row
+    # one large product takes a quarter of the time of a product for each row
     return (columns.reshape(-1, metric.shape[0]) @ metric).reshape(columns.shape)
 
 
@@ -271,7 +271,7 @@ Small = NDArray[np.float32]
 PATCH_PX, STEP_PX = 8, 4
 TINY = np.finfo(np.float32).tiny
 ENOUGH_PATCHES = 1500
-CERTAIN = 9.0  # times its noise power, from which a coefficient is kept on its own
+CERTAIN = 9.0  # ratio to the noise power from which a coefficient is kept on its own
 
 
 def denoised(image: Array, noise: Array) -> tuple[Array, Array]:
@@ -299,7 +299,7 @@ def denoised(image: Array, noise: Array) -> tuple[Array, Array]:
     texture = np.maximum(_typical(c[::apart, ::apart] ** 2) - power, 0.0)
     garrote, wiener = 1.0 - CERTAIN * power / np.maximum(c**2, TINY), texture / (texture + power)
     gain = np.maximum(garrote, wiener)
-    change = np.where(garrote > wiener, 2.0 - gain, wiener)  # of c times its gain
+    change = np.where(garrote > wiener, 2.0 - gain, wiener)  # derivative of c times its gain
     return _image(c * gain, image.shape), _image(n * change, image.shape)
 
 

@@ -26,7 +26,7 @@ CALIBRATIONS: Final = (0.0, 0.01)
 TURNS: Final = (0.0, 0.01)
 CREEP_AT: Final = ((0.6, None), (0.2, slice(0, len(CREEP_PX))), (0.2, slice(len(CREEP_PX), 2 * len(CREEP_PX))))
 """Probabilities of creep nowhere, at the left and at the right end of lines."""
-CREEP_SD_PX: Final = 0.5  # of each part
+CREEP_SD_PX: Final = 0.5  # prior standard deviation of each amplitude of creep
 NONE: Final = 1e-3  # standard deviation of creep in px that counts as zero; a tenth of this for the linear map
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_ENOUGH = 0.9  # of all pairs: no better consensus is looked for
+_ENOUGH = 0.9  # share of agreeing pairs at which the search ends
 
 
 @dataclass(frozen=True, eq=False)

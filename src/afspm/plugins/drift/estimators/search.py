@@ -75,8 +75,8 @@ def shear_by_drift(prior: Prior | None, reference: DriftScan, scan: DriftScan) -
 
 Spectrum = NDArray[np.complexfloating[Any, Any]]
 
-LEAST_OVERLAP = 0.2  # of the smaller image
-PEAKS = 4  # of each channel
+LEAST_OVERLAP = 0.2  # share of the smaller image
+PEAKS = 4  # number of peaks kept for each channel (smooth, band)
 APART_PX = 1.5  # nearer peaks count as the same peak
 
 
@@ -178,7 +178,7 @@ class MaskedCorrelation:
 
 
 NOTHING_BELIEVED = Believed(np.zeros(COUNT), np.zeros((COUNT, COUNT)))
-OTHER_PX = 2.0  # a second best nearer than this is the same match
+OTHER_PX = 2.0  # a second-best shift nearer than this is the same match
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,19 +24,19 @@ from afspm.plugins.drift.estimators.warp import GAIN, LINEAR, Scene, Spline
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-SPIKE_PX = 2  # along its row
-LEAST_SD = 6.0  # above both neighbours, or below both, in standard deviations of the steps along the rows
-OTHER = 0.5  # largest share of that in the other scan
-LEAST_SHARED = 0.1  # of a row, for it to be compared
+SPIKE_PX = 2  # largest width of a spike along its row
+LEAST_SD = 6.0  # least height above both neighbours, or depth below both, in standard deviations of steps along rows
+OTHER = 0.5  # largest share of this height in the other scan
+LEAST_SHARED = 0.1  # least share of a row within both scans, for a comparison
 
 
 SCAR_ROWS = 3
-SCAR_SD = 3.0  # above the rows on both sides of it, or below, in the difference of the scans
-OWN = 0.6  # least share of that in the scan itself: else the scar is in the other scan, or is an edge
+SCAR_SD = 3.0  # least height above both neighbouring rows, or depth below both, in the difference of the scans
+OWN = 0.6  # least share of this height in the scan itself: otherwise the scar is in the other scan, or an edge
 
 
 def without_scars_of_one(scene: Scene, theta: Array) -> Scene:
-    """Return two images without scars that only one of them shows; the scars are marked in `made_up`.
+    """Return two images without the scars that only one image shows; the scars are marked in `made_up`.
 
     The pixels beside a scar are also replaced, but not marked.
 
@@ -82,7 +82,7 @@ def _along(values: Array) -> Array:
 
 
 def without_spikes(scene: Scene, theta: Array) -> Scene:
-    """Return two images, with spikes that only one shows replaced by interpolation between the neighbours in the row.
+    """Return two images, with spikes of only one image replaced by interpolation between the neighbours in the row.
 
     Args:
         theta: displacement, known to a pixel; see `warp.WarpedPair`.

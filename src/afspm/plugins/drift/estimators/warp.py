@@ -101,7 +101,7 @@ class OverlapBox:
 
     @classmethod
     def of_overlap(cls, shape1: tuple[int, int], shape2: tuple[int, int], shift_px: Array) -> OverlapBox | None:
-        """Return the overlap of two shifted images; None if it has fewer than 8 pixels on a side."""
+        """Return the overlap of two shifted images; None for an overlap below 8 pixels on a side."""
         axes = []
         for axis, shift in ((1, shift_px[0]), (0, shift_px[1])):
             half1, half2 = (shape1[axis] - 1) / 2, (shape2[axis] - 1) / 2

@@ -31,7 +31,7 @@ class Estimation:
 
     Args:
         save: function that saves the state, called before a result is returned.
-        failures: the list to which the tracker's estimator adds its errors; it is emptied before each scan.
+        failures: list to which the tracker's estimator adds its errors; emptied before each scan.
     """
 
     def __init__(

@@ -14,7 +14,7 @@ from afspm.scheduler.events import Codec
 P = TypeVar("P", bound=Region | ProbePosition)
 
 SAME = 1e-3
-"""Largest rounding by a controller, as a share of the region's diagonal; a reported region within it is unchanged."""
+"""Largest rounding by a controller, as a share of the region's diagonal; a smaller difference is no change."""
 SAME_PLACE_M = 1e-9
 
 _CANDIDATES = 8

@@ -27,7 +27,7 @@ from afspm.scheduler.events import Announced, Delegate, ProblemSeen
 RESCAN = "DriftRescan"
 _DRIFT, _MALFUNCTION = int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFUNCTION)
 _MOST_UNREGISTERED = 3
-"""Number of scans in a row without a result of the worker that counts as a lost sample, as in the trackers."""
+"""Number of unprocessed scans in a row that counts as a lost sample; trackers have the same default."""
 _AT_START = "a scan in the other direction gives the velocity of the drift"
 
 

@@ -3,7 +3,7 @@
 Theory of operation
 -------------------
 
-The frame is a part of the scheduler's state behind `scheduler.coordinate_frame`. It decides in three places:
+The frame is a part of the scheduler's state behind `scheduler.coordinate_frame`. Its decisions are in three modules:
 
 | decision | module |
 | --- | --- |

@@ -70,7 +70,7 @@ _LEVELS = {
 _MOST_TRIES = 2
 """Largest number of jobs for one scan, if the worker ends during each."""
 _MOST_ENDS = 4
-"""Number of ends of the worker, without a report about a scan in between, after which the worker is not restarted."""
+"""Number of ends of the worker without a report about a scan, after which the worker is not restarted."""
 
 
 # --- packets ----------------------------------------------------------------------------------------------------------

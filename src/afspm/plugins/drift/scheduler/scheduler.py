@@ -33,8 +33,8 @@ class DriftCompensatedScheduler(Scheduler):
 
     A `DriftMapping` is published for each scan, and a `DriftRescan` requests a rescan from the component `Rescanner`.
     The scheduler flags thermal-drift when the sample is lost: its tracker reports so, three registrations in a row
-    failed, or too many of the last ten scans were not registered. It also flags thermal-drift until the first scan was
-    taken in both directions. It flags device-malfunction when no more scans will be registered; clearing this problem
+    failed, or too many of the last ten scans were not registered. The flag also stands until the first scan was taken
+    in both directions. Device-malfunction is flagged when no more scans will be registered; clearing this problem
     restarts the worker. Without correction, no problem is flagged.
 
     Args:

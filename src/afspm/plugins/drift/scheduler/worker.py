@@ -1,7 +1,8 @@
 """Worker process that registers scans, so that errors and long computations don't stop the scheduler.
 
-The worker processes jobs one after the other, and saves its state before it reports. It ends when the connection for
-jobs closes, or with the scheduler's process, even during a registration: a restarted scheduler has its own worker.
+The worker processes jobs one after the other, and saves its state before it reports. The process ends when the
+connection for jobs closes, or with the scheduler's process, even during a registration: a restarted scheduler has its
+own worker.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ class DriftWorkerProcess:
                     self._late.close()
 
     def close(self) -> None:
-        """End the worker; kill it if it does not end within a second. Its state is on disk."""
+        """End the worker, after a second by a kill. The state of the worker is on disk."""
         self._life += 1
         self._end(within_s=_FAREWELL_S)
 

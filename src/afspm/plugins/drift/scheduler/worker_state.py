@@ -1,4 +1,4 @@
-"""State of the worker on disk: one .npz file of JSON and arrays, replaced as a whole. It contains no code."""
+"""State of the worker on disk: one .npz file of JSON and arrays, replaced as a whole, without code."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def _honest(metrics: Mapping[str, float], name: str) -> float:
 
 
 def _quartiles(values: Sequence[float]) -> tuple[float, float, float]:
-    # of the values themselves: interpolation with infinity is impossible
+    # quartiles are values of the data: interpolation with infinity is impossible
     lower = float(np.percentile(values, 25, method="lower"))
     upper = float(np.percentile(values, 75, method="higher"))
     return lower, float(median(values)), upper

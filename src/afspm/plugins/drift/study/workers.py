@@ -26,7 +26,7 @@ class TaskOutcome:
 
     Attributes:
         index: index of the task.
-        value: return value of the task; None if it failed.
+        value: return value of the task; None for a failed task.
         error: error text, for people; empty if the task succeeded.
     """
 

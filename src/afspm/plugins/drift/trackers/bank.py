@@ -24,7 +24,7 @@ from afspm.plugins.drift.tracking import Forecast, Prediction, Update, require_n
 Array = NDArray[np.float64]
 
 VERSION = 4
-_LIKE = 1.2  # largest relative difference of a second surprise that confirms the first: a new velocity doubles it
+_LIKE = 1.2  # largest relative difference of a second surprise that confirms the first (doubled by a new velocity)
 
 
 @dataclass(eq=False)
@@ -67,7 +67,7 @@ class BankTracker:
     holds for the middle of a scan; where the overlap lies elsewhere, the time of its rows counts.
 
     A result far from every prediction is used only if the next scan confirms it. A scan that matches no other is
-    adrift: it is stored at its predicted place, and neither this scan nor scans that match only scans adrift are
+    adrift: the scan is stored at its predicted place, and neither this scan nor scans that match only scans adrift are
     evidence. Their places relative to each other are still tracked. After several such scans in a row the tracker is
     lost. A single such scan is enough if the standard deviation of its position exceeds half of the misplacement at
     which scans can still be compared. A lost tracker searches everywhere, until a scan has a measured place again; this
@@ -234,7 +234,7 @@ class BankTracker:
         return tried
 
     def _compared(self, newest: NewestScan, tried: Table[int, Registration]) -> Comparison | None:
-        # references adrift count only without others, and coarse results only without exact ones
+        # references adrift count only without others, and coarse results only without exact results
         kept, inflation = self._references.kept, self._settings.inflation
         measured = [
             PairMeasurement.of(newest, number, kept[number], found, inflation)

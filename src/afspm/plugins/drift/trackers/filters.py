@@ -3,7 +3,7 @@
 The state of each filter is (x, y, v_x, v_y), the displacement of the sample and its velocity, followed by four values
 for each stored scan: displacement and velocity of the sample during this scan. These stay correlated with each other
 and with the drift, so repeated comparisons with one scan are not counted as independent, and later measurements correct
-earlier ones (as landmarks in simultaneous localisation and mapping: Smith, Self and Cheeseman 1990).
+earlier measurements (as landmarks in simultaneous localisation and mapping: Smith, Self and Cheeseman 1990).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_SHORT = 1e-2  # of the fading time: below, differences of exponentials lose digits, and a series is exact enough
+_SHORT = 1e-2  # share of the fading time: below, differences of exponentials lose digits, and a series is exact enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +199,7 @@ class Filters:
         expected = rows @ crossed + noise
         gain = np.linalg.solve(expected, crossed.transpose(0, 2, 1)).transpose(0, 2, 1)
         mean = self.mean + (gain @ innovation[..., None])[..., 0]
-        # Joseph's form stays positive
+        # Joseph's form keeps the covariance positive definite
         left = np.eye(self.mean.shape[1]) - gain @ rows
         covariance = left @ self.covariance @ left.transpose(0, 2, 1) + gain @ noise @ gain.transpose(0, 2, 1)
         covariance = (covariance + covariance.transpose(0, 2, 1)) / 2

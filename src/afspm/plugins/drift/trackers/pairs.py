@@ -90,7 +90,7 @@ class NewestScan:
         return ObservationModel(number, ours_s or 0.0, theirs_s or 0.0, offset, noise)
 
     def _either_way(self, scan: DriftScan, position_m: Array, number: int | None, compensated_m_s: Array) -> Array:
-        # (2, 2) of the displacement between a scan's middle and a position, with its direction unknown
+        # covariance (2, 2) of the displacement from a scan's middle to a position, for an unknown scan direction
         delay_s = row_delay_s(replace(scan, upwards=True), position_m) or 0.0  # later or earlier by the same time
         velocity, covariance = self.filters.velocity(number)
         velocity = velocity - compensated_m_s

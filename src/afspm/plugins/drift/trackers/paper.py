@@ -72,7 +72,7 @@ def exponential(matrix: Array) -> Array:
 
 
 VERSION = 2
-_MEMORY = 0.7  # of the mean square of the residuals from one scan to the next
+_MEMORY = 0.7  # weight of the previous mean square of the residuals
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Stored scans for comparison with later ones, and the choice of references for a scan."""
+"""Stored scans for comparison with later scans, and the choice of references for a scan."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ReferenceScan:
     Attributes:
         compensated_m_s: (2,) velocity of tip coordinates during the scan, which followed the sample.
         anchor: whether the scan is the long-term reference for its part of the sample.
-        adrift: whether the place of the scan is only predicted, since it matched no scan with a measured place.
+        adrift: whether the place of the scan is only predicted, since the scan matched no scan with a measured place.
         refusals: number of failed comparisons in a row, while another reference succeeded.
         used: number of the newest scan registered with this reference.
     """

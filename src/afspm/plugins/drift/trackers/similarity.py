@@ -68,7 +68,7 @@ class Similarity:
         return replace(self, covariance=covariance)
 
     def lever_m2(self, number: int, position_m: Array) -> Array:
-        """Return the covariance (2, 2) of a displacement from a reference, by uncertain rotation about the pivot."""
+        """Return the covariance (2, 2) of a displacement by uncertain rotation and scale about the pivot."""
         row = self._row(number)
         far_m = position_m - self.pivot_m
         return np.asarray(np.eye(2) * (row @ self.covariance @ row) * (far_m @ far_m))
