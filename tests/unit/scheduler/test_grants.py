@@ -46,7 +46,7 @@ from afspm.scheduler.settings import ControlSettings, RunFacts, SchedulerSetting
 
 AGENT, ADA, STOP = "agent:claude", "dashboard:Ada", HIGHEST_PROBLEM
 OK, REFUSED = ControlResponse.SUCCESS, ControlResponse.FAILURE
-UM = 1e-6
+UM, NO_ID = 1e-6, "none"
 HERE = Region((0.0, 0.0), (0.5 * UM, 0.5 * UM))
 FAR = Region((3 * UM, 0.0), (0.5 * UM, 0.5 * UM))
 ACTION, PARAM, SCAN = int(ControlRequest.ACTION), int(ControlRequest.PARAM), int(ControlRequest.SET_SCAN_PARAMS)
@@ -105,7 +105,7 @@ class AgentLab:
         """Send a request of the agent: the reason of its refusal; "" if the microscope got it."""
         self.ids += 1
         before = len(self.lab.forwarded)
-        effects = self.lab.ask(who, kind, subject, id_ or f"{who}/1/{self.ids}")
+        effects = self.lab.ask(who, kind, subject, "" if id_ == NO_ID else id_ or f"{who}/1/{self.ids}")
         left, low = (self.place.center_m[i] - self.place.size_m[i] / 2 for i in (0, 1))
         effects += self.lab.answer_reads(
             scan_size_x=str(self.place.size_m[0]), scan_size_y=str(self.place.size_m[1]),
@@ -413,6 +413,16 @@ def test_limits_of_a_role_hold_for_a_component_that_is_no_agent() -> None:
     assert agent.lab.take_control("series") is OK
     assert "above the highest" in agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "2", "V"), who="series")
     assert agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.5", "V"), who="series") == ""
+
+
+def test_actions_without_ids_count_within_the_hour() -> None:
+    # only agents must send ids
+    agent = AgentLab(replace(LIMITS, roles={"series": replace(ROLE, per_hour={names.START_SCAN: 2})}))
+    agent.place = HERE
+    assert agent.lab.take_control("series") is OK
+    asked = [agent.do(ACTION, names.START_SCAN, id_=NO_ID, who="series") for _ in range(3)]
+    assert asked[:2] == ["", ""]
+    assert "2 are allowed" in asked[2]
 
 
 # --- lease and stop -------------------------------------------------------------------------------------------------

@@ -412,7 +412,8 @@ class GrantChecker:
             return f"{action} is not among the actions of {who} ({role.source})"
         most = role.per_hour.get(action)
         lately = [one for one in self.book.spent.get(who, ()) if one.action == action and now_ns - one.at_ns < _HOUR_NS]
-        if most is not None and len(lately) >= most and self._spent(who, request.id) is None:
+        is_repeated = bool(request.id) and self._spent(who, request.id) is not None
+        if most is not None and len(lately) >= most and not is_repeated:
             return f"{who} has used {action} {len(lately)} times within an hour, {most} are allowed ({role.source})"
         return ""
 
