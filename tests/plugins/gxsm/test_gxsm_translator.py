@@ -165,6 +165,23 @@ def test_lines_are_published_during_a_scan(
         np.testing.assert_allclose(picture[there], whole.values[there], rtol=1e-6)
 
 
+def test_no_lines_of_an_upward_scan_are_published(bench: Make) -> None:
+    # GXSM counts its lines from the top: in an upward scan the rows above the current line are of the previous scan
+    made = bench(speed=5.0)
+    peer = made.start(live_lines_s=1.0)
+    ready(peer, shape=(40, 32))
+    scanned(peer)
+
+    def upward(emulator: Any) -> None:
+        program, down = emulator.program, emulator.program.y_current
+        program.y_current = lambda now_s: 39 - down(now_s) if program.scan.runs else down(now_s)
+
+    made.at_panel(upward)
+    assert peer.act(names.START_SCAN).ok
+    assert not any(isinstance(one, ScanLines) for one in peer.until(FREE))
+    made.until_logged("goes from bottom to top")
+
+
 # --- parameters ---
 
 

@@ -79,7 +79,7 @@ class ScanProgress:
         watch: direction of the lines; None before the first poll.
         goes_up: True if the top row of the picture is scanned last; None: unknown.
         settles_until_s, ended_ns: end of GXSM's own work after the scan, and end of the scan.
-        y_before, y_moved: last line of the previous scan, and whether GXSM has reported another line since.
+        lines: direction of the lines, counted from the last line of the previous scan; None before the first count.
         follows: True if the scan started before a poll showed the end of the previous scan.
     """
 
@@ -89,8 +89,7 @@ class ScanProgress:
     goes_up: bool | None = None
     settles_until_s: float = 0.0
     ended_ns: int = 0
-    y_before: int | None = None
-    y_moved: bool = False
+    lines: LineWatch | None = None
     follows: bool = False
 
 
@@ -179,7 +178,7 @@ class GxsmActivity(Activity):
         self._autosave.on = None  # unknown: a person may have switched Auto Save at the panel
         self._autosave.switch(on=False)
         self._begin_scan(self._clock.now_ns(), own=True)
-        self._scan.y_before = int(self.gxsm.ask.number("y_current"))
+        self._scan.lines = LineWatch(int(self.gxsm.ask.number("y_current")))
         rows, columns = self._set_frame()[1]
         # a scan that is stopped or does not start is recognised by rows that still hold the previous scan
         self._files.looked(looked_at(self.gxsm.ask, len(self._channels()), (0, rows - 1), columns), None)
@@ -242,13 +241,16 @@ class GxsmActivity(Activity):
     def lines_done(self) -> int:
         """Return the index of GXSM's current line: at least as many lines of the running scan are complete.
 
-        0 until GXSM reports another line than the previous scan's last.
+        0 until the lines are seen to go down. In a scan from bottom to top GXSM's index says how many are left.
         """
-        y = int(self.gxsm.ask.number("y_current"))
-        if self._scan.y_before is None:
-            self._scan.y_before = y
-        self._scan.y_moved = self._scan.y_moved or y != self._scan.y_before
-        return y if self._scan.y_moved else 0
+        line, rows = int(self.gxsm.ask.number("y_current")), self._files.scanning[1][0]
+        if self._scan.lines is None:
+            self._scan.lines = LineWatch(line)
+        was_up = self._scan.lines.step < 0
+        self._scan.lines.turned(line, rows)
+        if self._scan.lines.step < 0 and not was_up:
+            self._log.info("this scan goes from bottom to top: its lines are published only with the whole scan")
+        return line if self._scan.lines.step > 0 else 0
 
     def status(self) -> ScopeStatus:
         """Return the present state; register starts and ends of measurements, and start an awaited spectrum."""

@@ -18,6 +18,7 @@ from afspm.model import ControlResponse, Region, names
 from afspm.plugins.gxsm.errors import BadReply
 from afspm.plugins.gxsm.hardware import Doing
 from afspm.plugins.gxsm.link import Asking
+from afspm.translator.driver_base import ControllerLost
 from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.translator.setting_groups import FRAME, POSITION, SettingsGroup, frame, frame_values
 from afspm.translator.state import Kept
@@ -103,6 +104,8 @@ class ScanFrame:
         region = self.region()
         try:
             u_m, v_m = (number(self._ask, ref) * self._unit_m for ref in ("ScanX", "ScanY"))
+        except ControllerLost:
+            raise
         except AfspmError:
             return region.center_m
         return in_space(region, (u_m, v_m))

@@ -22,7 +22,7 @@ from afspm.translator.driver_base import ControllerLost
 HEADER_BYTES: Final = 40
 NEWEST: Final = 1 << 31
 """A release with all fields."""
-LARGEST_BODY: Final = 1 << 28
+LARGEST_BODY: Final = 1 << 29
 """Longest body in bytes that is accepted as a reply; a larger announced size counts as garbage."""
 
 # Big-endian: name padded with zeros, size of the body, 1 to request a reply, zero.

@@ -82,7 +82,10 @@ class Link:
         raw = self._connection.reply(what)
         if raw is None:
             return False, None
-        reply = _fields(raw)
+        try:
+            reply = _fields(raw)
+        except ControllerLost as error:
+            raise self._bad(error.what) from error
         return True, self._outcome(reply) if reply.get("value") else None
 
     def close(self) -> None:
