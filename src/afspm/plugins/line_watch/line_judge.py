@@ -438,14 +438,13 @@ class LineJudge:
             return ScanJudge(_Comparer(place, registration), LineStatistic(known.pairs), what)
         return None
 
-    def lacking(self, region: Region, kind: Kind) -> str:
-        """Return the reason why the lines of a scan can't be judged, for people; empty without a reason.
-
-        An earlier scan with another number of channels is no reason here, although `begin` then returns None.
-        """
+    def lacking(self, region: Region, kind: Kind, *, channels: int) -> str:
+        """Return the reason why `begin` returns None for a scan, for people; empty if the scan can be judged."""
         known = self._known(kind)
-        if known is None or known.place(region) is None:
+        if known is None or (place := known.place(region)) is None:
             return "no earlier scan of this size, angle, pixels and feedback shows the place"
+        if len(place.templates) != channels:
+            return f"the earlier scan of the place has {len(place.templates)} channels of heights, not {channels}"
         if len(known.pairs) < FEWEST_PAIRS:
             return f"{len(known.pairs) + 1} of {FEWEST_PAIRS + 1} good scans of its kind are known"
         return ""

@@ -184,7 +184,7 @@ class LineWatch(Component):
             self._lines.judge = self.judge.begin(
                 lines.region, kind, self._time_s(lines.began_ns), channels=len(self.channels)
             )
-            lacking = self.judge.lacking(lines.region, kind)
+            lacking = self.judge.lacking(lines.region, kind, channels=len(self.channels))
             if lacking and lacking not in self._not_judged:
                 self._not_judged.add(lacking)
                 self.log.info("the lines of this scan, and of others alike, are not judged: %s", lacking)
