@@ -46,7 +46,8 @@ class RunSummary:
     Attributes:
         folder: path of the run, relative to the folder of all runs, with "/".
         name: the name of the experiment.
-        began_ns, ended_ns: first control state, and end or last publication, in experiment time; None if there is none.
+        began_ns, ended_ns: first control state, and end, in experiment time, or else first and last publication; None
+            if nothing was published.
         state: running, ended or cut off, in words.
         metadata: sample, person, project, technique … where known.
         scans, spectra: the numbers of complete scans, and of spectra.
@@ -236,7 +237,7 @@ def _read(run: Run) -> RunSummary:
     return RunSummary(
         folder="",
         name=run.name,
-        began_ns=None if began is None else began.start_ns,
+        began_ns=(run.oldest_ns or None) if began is None else began.start_ns,
         ended_ns=overview.ended_ns or run.newest_ns or None,
         state=describe_state(run.folder),
         metadata=run.metadata,

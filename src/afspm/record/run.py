@@ -365,6 +365,11 @@ class Run:
         return str(self._note("experiment") or self.facts.get("name") or self.folder.name)
 
     @property
+    def oldest_ns(self) -> int:
+        """The time of the scheduler's first packet; 0 without packets."""
+        return int(self._query("SELECT coalesce(min(time_ns), 0) FROM packets WHERE source = ?", (SCHEDULER,))[0][0])
+
+    @property
     def newest_ns(self) -> int:
         """The time of the scheduler's last packet; 0 without packets."""
         return int(self._query("SELECT coalesce(max(time_ns), 0) FROM packets WHERE source = ?", (SCHEDULER,))[0][0])

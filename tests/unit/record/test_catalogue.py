@@ -86,6 +86,17 @@ def test_days_select_runs(root: Path) -> None:
     assert find_runs(root, since=next_day) == find_runs(root, until=date(2026, 3, 13)) == []
 
 
+def test_run_without_a_component_in_control_is_found_by_its_day(tmp_path: Path) -> None:
+    folder = tmp_path / "by-hand"
+    folder.mkdir()
+    (folder / RUN_FILE).write_text("{}", encoding="utf-8")
+    store = RecordStore(folder, ABOUT)
+    store.take(Night().whole_scan(1))
+    store.close()
+    day = date(2026, 3, 14)
+    assert [run.folder for run in find_runs(tmp_path, since=day, until=day)] == ["by-hand"]
+
+
 def test_only_changed_runs_are_read_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     find_runs(root)
     read: list[str] = []
