@@ -24,7 +24,8 @@ class ExperimentView:
     """The part of `Scope` that sends no requests.
 
     Args:
-        between: called after each outermost call, outside any measurement.
+        between: called after each successful measurement, request (except for control), `wait_until` or `sleep`;
+            never within one of them.
     """
 
     def __init__(self, link: ExperimentLink, problems: ProblemNames, between: Callable[[], None]) -> None:

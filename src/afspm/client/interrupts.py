@@ -41,7 +41,7 @@ class Interrupts:
 
     @contextmanager
     def deferred(self) -> Iterator[None]:
-        """Drop interrupts during the block, which must be short."""
+        """Ignore interrupts during the block, which must be short; they are not raised later."""
         self._is_deferred = True
         try:
             yield

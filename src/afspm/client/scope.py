@@ -76,7 +76,8 @@ class Scope(ExperimentView):
         link: connection to the experiment.
         problems: the problems of the experiment by name; None: only those of every experiment.
         state_dir: folder for keyed measurements; None: only in memory.
-        between: called after each outermost call, outside any measurement.
+        between: called after each successful measurement, request (except for control), `wait_until` or `sleep`;
+            never within one of them.
         frame: coordinate system of all places.
     """
 
@@ -441,7 +442,7 @@ class Scope(ExperimentView):
         self._link.relay(Progress(now_ns, self._link.name, done, of, left_s))
 
     def note(self, text: str, *, scan: HasTime | None = None, time_ns: int | None = None) -> None:
-        """Write a remark into the record of the run: on a scan, or on a moment (default: now). Needs no control.
+        """Write a note about a scan or a moment (default: now) into the record of the run. Needs no control.
 
             scope.note("the tip changed here", scan=scans)
 
@@ -451,7 +452,8 @@ class Scope(ExperimentView):
             time_ns: moment of the note, experiment time; None: the end of the scan, or now.
 
         Raises:
-            InvalidValue: the text is empty, is too long or has control characters; or the end of the scan is unknown.
+            InvalidValue: the text is empty, too long, or has control characters other than line feeds and tabs; or the
+                end of the scan is unknown.
         """
         if scan is not None and scan.time_ns is None:
             raise InvalidValue("the scan has no time of its end", hint="give time_ns instead")

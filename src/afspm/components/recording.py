@@ -91,7 +91,10 @@ class RecordWriter:
         self._inbox.put(SourcedPacket(packet, source), is_disk_full=self._told_full)
 
     def wants_replay(self) -> bool:
-        """Return once whether to request publishers' cached packets, after a full disk or a damaged journal."""
+        """Return whether to request publishers' cached packets, and reset the answer to False.
+
+        True after a full disk has caused packets to be dropped, once it has room again; and after a damaged journal.
+        """
         return self._inbox.wants_replay()
 
     def check(self) -> None:
@@ -291,7 +294,7 @@ class RecordInbox:
             return missed
 
     def wants_replay(self) -> bool:
-        """Return once whether to request publishers' cached packets."""
+        """Return whether to request publishers' cached packets, and reset the answer to False."""
         with self._changed:
             wanted, self._wants_replay = self._wants_replay, False
             return wanted

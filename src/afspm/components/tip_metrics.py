@@ -129,7 +129,10 @@ def metrics(of: Slopes, correlation: Array, expected: Array | None = None) -> Ti
 
 
 def ghost(correlation: Array, expected: Array | None = None) -> float:
-    """Return the largest correlation beside the centre, less the expected correlation."""
+    """Return the largest excess of the smoothed correlation over the expected correlation; 0 without an excess.
+
+    Lags within `CORE_PX` pixels of the centre are left out.
+    """
     beyond = _smoothed(correlation if expected is None else correlation - expected)
     reach = correlation.shape[0] - 1
     rows, columns = np.mgrid[0 : reach + 1, -reach : reach + 1]

@@ -77,9 +77,12 @@ class Converter(Protocol):
     def convert(self, tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
         """Return the components in afspm's form, by name; components already in this form are returned unchanged.
 
+        Components that afspm does not run are left out.
+
         Args:
             tables: components with their references replaced.
-            parts: the rest of the file; intermediaries and sections may be changed, as noted in `became`.
+            parts: the rest of the file. Intermediaries and sections are converted in place. Equivalents of lines are
+                added to `parts.became`, and tables without equivalent to `parts.instead`.
         """
 
 

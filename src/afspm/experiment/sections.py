@@ -85,13 +85,14 @@ class RestartSection(Section):
 
 
 class RecordSection(Section):
-    """[record]: contents of the record of a run, in addition to files that components write."""
+    """[record]: choice of the data that afspm records; files that components write themselves are always kept."""
 
     on: StrictBool = True
+    """Whether published packets are recorded."""
     scans: StrictBool = True
-    """Whether scans and spectra are recorded, too, each as a file."""
+    """Whether each scan and spectrum is also written to a file."""
     requests: StrictBool = False
-    """Whether inputs and requests of components and scheduler are recorded, too, for `afspm what-if`."""
+    """Whether inputs and requests of components and scheduler are recorded for `afspm what-if`; independent of `on`."""
 
 
 class MetadataSection(Section):

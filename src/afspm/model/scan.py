@@ -275,10 +275,10 @@ class Scan:
 
 
 class ScanSet(Mapping[str, Scan]):
-    """All channels of one scan: `scans["Height"]`, or `.first` for any channel.
+    """All channels of one scan: `scans["Height"]`, or `.first` for the channel published first.
 
     Attributes:
-        interruptions: texts about the interruptions before the scan succeeded, oldest first.
+        interruptions: time and reason of each interruption before the scan succeeded, as text, oldest first.
     """
 
     def __init__(self, scans: Iterable[Scan], interruptions: Iterable[str] = ()) -> None:

@@ -61,7 +61,7 @@ _BY_NAME: dict[str, type[Any]] = {one.__name__: one for one in _PLAIN}
 
 @dataclass(frozen=True)
 class Restored:
-    """The beginning of a scheduler's life: the state and the packets from its disk."""
+    """The state and packets that a scheduler restores from disk at its start; None and empty for a new run."""
 
     saved: SavedState | None = None
     cached: tuple[LoggedPacket, ...] = ()

@@ -332,17 +332,20 @@ class World:
         return outcome
 
     def crash(self, position_m: tuple[float, float], depth_m: float, speed_m_s: float, t_s: float) -> str:
-        """Drive the tip into the sample: a crash may cure or worsen the tip (`tip.crash_times`), and leaves a crater.
+        """Drive the tip into the sample. The crash leaves a crater, and may cure or worsen the tip.
 
-        The crater is shallower than the indentation (`tip.indented_m`), since a part springs back. Simulated:
-        material is pushed aside over three times the radius of contact, about as far as plastic flow reaches around an
-        indenter.
+        With even answers (`tip.TipRepairSettings`) both chances grow with the depth (`tip.crash_times`). The crater is
+        shallower than the indentation (`tip.indented_m`), since a part springs back. Simulated: material is pushed
+        aside within about three contact radii, as far as plastic flow reaches around an indenter.
 
         Args:
             depth_m: depth beyond the surface.
 
         Returns:
             "cured", "worsened" or "unchanged".
+
+        Raises:
+            InvalidValue: a value is not finite, depth or speed is not above zero, or the time is before the start.
         """
         if not (all(map(math.isfinite, (*position_m, depth_m, speed_m_s))) and min(depth_m, speed_m_s) > 0):
             what = f"a crash at {position_m}, {depth_m} m deep with {speed_m_s} m/s"

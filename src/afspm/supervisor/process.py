@@ -40,15 +40,15 @@ class Task:
     """One process to start, watch and restart.
 
     Attributes:
-        launch: line for its standard input; the supervisor adds the address for heartbeats.
+        launch: launch line, written to the process's standard input; the supervisor adds the address for heartbeats.
         command: program and arguments.
         role: scheduler, translator or component; the experiment can't go on without the first two.
         folder: working directory; None: the supervisor's.
         environment: variables in addition to the supervisor's.
         hidden: variables of the supervisor that the process does not get.
-        beats: whether it sends heartbeats; without heartbeats only an exit shows that a process is dead.
-        leaves_last: whether it stays until the other components have ended, to record their last packets.
-        acts: whether it follows a plan of its own (True if unknown), or only reacts.
+        beats: whether the process sends heartbeats; without heartbeats only an exit shows that a process is dead.
+        leaves_last: whether the process stays until the other components have ended, to record their last packets.
+        acts: whether the process follows a plan of its own (True if unknown), or only reacts.
     """
 
     launch: Launch

@@ -89,7 +89,11 @@ QUANTITIES: Final = {
 
 
 def evaluation(quantity: str, unit: str = "", kind: str | None = None) -> Evaluation:
-    """Return the evaluation of a named quantity, or of a function "module.name" with its unit.
+    """Return the evaluation of a named quantity, or of a function "module.name".
+
+    Args:
+        unit: unit of the function's values; empty for a named quantity.
+        kind: kind of spectrum; None: the quantity's own, or any for a function.
 
     Raises:
         ConfigError: there is no such quantity or function, or a unit is given for a named quantity.

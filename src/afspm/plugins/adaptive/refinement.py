@@ -83,7 +83,7 @@ class NestedLattices:
         return [cell for cell in self.cells(level) if self.level(cell) == level]
 
     def parents(self, cell: Cell, level: int) -> list[Cell]:
-        """Return the cells of the coarser level around a new cell of a level."""
+        """Return the cells of the next coarser level around a new cell of `level`."""
         coarse = self.stride(level - 1)
         columns = {cell[0] - cell[0] % coarse, cell[0] + -cell[0] % coarse}
         rows = {cell[1] - cell[1] % coarse, cell[1] + -cell[1] % coarse}

@@ -50,12 +50,12 @@ _log = logging.getLogger("afspm.plugins.agent")
 
 
 class Requests(Protocol):
-    """Sender of requests under agents' names, over the network in `web.persons.Persons`."""
+    """Sender of requests, each under its agent's name. `web.persons.Persons` implements it with network connections."""
 
     def name_of(self, person: str) -> str: ...
 
     def submit(self, person: str, action: Callable[[PersonCommands], T]) -> Future[T]:
-        """Start an action in the thread of an agent's name, and return its future."""
+        """Start an action in the thread that sends this agent's requests, and return its future."""
 
 
 @dataclass

@@ -211,7 +211,7 @@ def send(ask: Asking, ref: str, value: float) -> None:
 
 
 def in_frame(region: Region, xy_m: tuple[float, float]) -> tuple[float, float]:
-    """Convert (x, y) in m to coordinates in the frame: offsets from the centre along the sides, in m."""
+    """Convert (x, y) to coordinates of a scan region: offsets from its centre along its sides; all in m."""
     x, y = xy_m[0] - region.center_m[0], xy_m[1] - region.center_m[1]
     cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
     return cos * x + sin * y, cos * y - sin * x

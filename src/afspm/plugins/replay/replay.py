@@ -38,8 +38,9 @@ class ReplayOptions:
 
     Attributes:
         speed: experiment seconds per real second; None: as recorded.
-        only: names of messages; empty: all.
-        publish, serve: addresses; None: from the recorded experiment file, else free addresses.
+        only: names of the messages to publish; empty: all.
+        publish, serve: addresses for packets and for requests; None: the addresses in the recorded experiment file,
+            else free addresses.
         stay: whether to serve late joiners after the last packet.
         runs: parent folder of the replay's run folder.
     """

@@ -56,7 +56,7 @@ class Instrument(Component):
         self._report()
 
     def on_end(self) -> None:
-        """Disconnect; the server keeps its targets."""
+        """Disconnect; the server keeps the targets (setpoints) of its modules."""
         if self._lines is not None:
             self._lines.close()
 

@@ -202,12 +202,13 @@ class WebServer:
     """A server for an ASGI application.
 
     Args:
+        bound: the bound socket, which `stop` closes.
         certificate, key: PEM files, for https; None: http.
         most_requests: limit of simultaneous requests; further requests get the status 503. None: no limit.
         stalled_s, head_s: real seconds; see `STALLED_S` and `HEAD_S`.
 
     Raises:
-        ConfigError: the files are no certificate with its key.
+        ConfigError: the files are not a certificate and its key.
     """
 
     def __init__(

@@ -42,7 +42,7 @@ def sides(one: Difference) -> tuple[str, str]:
 
 
 def changed_fields(one: Difference) -> list[ChangedField]:
-    """Return the fields of a published message that differ; empty for requests, and if one side has no message."""
+    """Return the differing fields of a published message; empty for requests, and if one side has no message."""
     before, after = _fields(one.recorded), _fields(one.now)
     if not (before and after):
         return []

@@ -14,7 +14,7 @@ from afspm.record.tables import ScanRow, SpectrumRow
 class WorkComparison:
     """The planned and the measured work of a component.
 
-    The measured duration extends from the first start to the last end, with spectra and pauses.
+    The measured duration extends from the start of the first to the end of the last scan or spectrum, with pauses.
     """
 
     name: str

@@ -34,7 +34,7 @@ def send(draft: StateDraft) -> None:
 
 
 def settle(draft: StateDraft, job: ForwardedRequest, end: ForwardOutcome, response: Response) -> None:
-    """Process the answer to a safety command, or its failure."""
+    """Process the translator's answer to a safety command, or the failure to get an answer."""
     subject, now_s = str(job.request.subject), draft.now_s
     if end is ForwardOutcome.LATE:
         if response.ok and job.request.kind == ControlRequest.ACTION:

@@ -320,7 +320,7 @@ class Watchdog:
         return not self.tip.stops and microscope.state in STOPS and not self.unstoppable
 
     def answered(self, code: int, microscope: MicroscopeStatus, now_s: float) -> tuple[Watchdog, SafetyResult]:
-        """Process the translator's answer to the action that was sent (or NO_RESPONSE)."""
+        """Process the translator's answer to the sent action; `code` is NO_RESPONSE if there was no answer."""
         action, dog, is_retract = self.sent or "", replace(self, sent=None), self.tip.duty is TipDuty.ASKED
         if code == ControlResponse.SUCCESS:
             dog = replace(dog, starting=None)

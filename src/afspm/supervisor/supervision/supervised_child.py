@@ -111,8 +111,8 @@ class SupervisedChild:
 
     Attributes:
         starts, ordered: number of starts, and number of restarts ordered by a person.
-        rescued: whether it was started once more after the end of the experiment.
-        last_exit: description of its last exit.
+        rescued: whether the process was started once more after the end of the experiment.
+        last_exit: description of the last exit.
         unfinished: description of a stop before the process had finished; otherwise empty.
     """
 
@@ -133,8 +133,8 @@ class SupervisedChild:
     def may_still_finish(self, now_s: float, liveness: LivenessPolicy, *, can_hear: bool) -> bool:
         """Return whether the process may have work left.
 
-        True if the process is starting; if it is late with a heartbeat and can still be restarted; or if it was
-        restarted, and can still receive the packets that it missed.
+        True if a component with heartbeats is starting, is late with a heartbeat and can still be restarted, or was
+        restarted a short time ago and may still receive missed packets.
         """
         life = self.life
         if life is None or not self.spec.beats or self.spec.role is not Role.COMPONENT:

@@ -57,10 +57,10 @@ class StopRequested(BaseException):
 
 
 class ParentWatch:
-    """A watch over the parent, which runs callbacks in another thread when the parent ends or stops the process.
+    """A watch over the parent, which runs callbacks in another thread when the parent dies or stops this process.
 
-    A process that has not ended `END_WITHIN_S` later (a handler that computes, a library that hangs) is ended with the
-    exit code `code_if_late`; with the tip in danger, `TIP_WITHIN_S` later.
+    If this process still runs `END_WITHIN_S` later (a handler computes, a library hangs), the watch ends the process
+    with the exit code `code_if_late`. If the tip is in danger, the time limit is `TIP_WITHIN_S`.
 
     Args:
         pipe: descriptor of a pipe; the parent holds its other end.
@@ -91,7 +91,10 @@ class ParentWatch:
             callback()
 
     def tip_in_danger(self, whether: Callable[[], bool]) -> None:
-        """Register a function that returns whether the tip is in danger; it is called once, from another thread."""
+        """Register a function that returns whether the tip is in danger.
+
+        The function is called at most once, from another thread.
+        """
         self._tip_in_danger = whether
 
     def let_go(self) -> None:

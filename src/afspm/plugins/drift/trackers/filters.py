@@ -176,7 +176,10 @@ class Filters:
         return np.eye(self.mean.shape[1])[first : first + 2]
 
     def mixed(self, rows: Array) -> tuple[Array, Array]:
-        """Return mean (m,) and covariance (m, m) of `rows` (m, s) @ state over all filters."""
+        """Return mean (m,) and covariance (m, m) of the product `rows @ state`, as a mixture over all filters.
+
+        `rows` is (m, s).
+        """
         return mixed(self.weight, self.mean @ rows.T, rows @ self.covariance @ rows.T)
 
     def with_velocity(self, time_s: float, velocity_m_s: Array, covariance: Array, *, rarest: float) -> Filters:
