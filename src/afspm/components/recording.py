@@ -332,7 +332,7 @@ class LogProgress:
         return found
 
     def behind_bytes(self) -> int:
-        """Return the approximate size of the unread part of the log, in whole segments."""
+        """Return the nominal size in bytes of the unread segments, without the present and the newest segment."""
         return max(0, self._reader.newest - self._reader.position.segment - 1) * SEGMENT_BYTES
 
     def took(self, batch: list[SourcedPacket], waiting: list[Packet]) -> None:

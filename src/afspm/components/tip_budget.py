@@ -18,7 +18,7 @@ class RepairCost:
     Attributes:
         pulses: the number of pulses.
         depth_m: sum of the depths of crashes.
-        area_m2: the area of the used places, each a square with the distance between places as its side.
+        area_m2: total area of the treated places; each place counts as a square with side `place_spacing`.
         time_s: the time of repairs, from gaining control to releasing it.
     """
 

@@ -30,7 +30,7 @@ class Epoch:
     simulated: bool = False
 
     def is_followed_by(self, epoch: Epoch | None, run: str) -> bool:
-        """Return whether a sender is this scheduler, its later life, or a component of its run."""
+        """Return whether a sender is this life of the scheduler, a later life, or a component of the run."""
         return run == self.run and (epoch is None or epoch.life >= self.life)
 
     def encode(self) -> bytes:

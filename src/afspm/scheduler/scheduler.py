@@ -73,7 +73,7 @@ class Scheduler:
         self._instruments = _section(InstrumentSettings, conditions or {}, "conditions")
 
     def run_process(self, context: ProcessContext) -> int:
-        """Run until the experiment ends or the process is stopped; return ENDED or ORPHAN.
+        """Run the scheduler; return ENDED after the end of the experiment, ORPHAN if the process was stopped before.
 
         Raises:
             AfspmError: an address, a setting or the saved state can't be used.

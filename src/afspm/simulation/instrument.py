@@ -59,7 +59,7 @@ class InstrumentSetup:
         region, shape: frame of the next scan, and its (rows, columns).
         line_s: seconds of trace and retrace together.
         upwards: True if the next scan begins with the smallest y.
-        slope: compensation of tilt, (x, y).
+        slope: tilt compensation (dz/dx, dz/dy), without unit.
         move_speed_m_s: speed of the probe outside of scans.
         approach_s: duration of an approach or a withdrawal.
     """
@@ -188,7 +188,11 @@ class SimulatedInstrument:
         return self._probe_m
 
     def signals(self, now_s: float) -> Mapping[str, float]:
-        """Return the present value of each channel with its noise, during a scan or at rest."""
+        """Return the present value of each forward channel with its noise; noise alone while the tip is withdrawn.
+
+        During a retrace, a forward channel has the value of its recorded backward channel, if any. While a scan is
+        being computed, the previous values are returned, if any. An invalid feedback gives noise alone at rest.
+        """
         scan, place = self.scan, self.probe_at(now_s)
         if not self.engaged:
             return self._noise_alone()
@@ -457,7 +461,7 @@ class SimulatedInstrument:
     # -- the damage ledger
 
     def account(self, now_s: float) -> None:
-        """Count an ended measurement and the time since the last call in the ledger.
+        """Add to the ledger the time since the last call, and the measurement if it has ended.
 
         Call this method before a change of `setup.feedback` or `engaged`: the elapsed time counts with the old values.
         """

@@ -34,7 +34,7 @@ class FeedbackWatch:
         return self.is_off or bool(self._kept.get("may_have_switched"))
 
     def saw(self, on: bool | None) -> bool:
-        """Store the observed feedback; return True if a request has just switched it off."""
+        """Store the observed feedback; return True if the feedback went off after a request."""
         kept = self._kept
         # off without a request in between: switched off at the panel, where a person takes care of it (decision 0007)
         switched_off = on is False and bool(kept.get("feedback_was_on") and kept.get("may_have_switched"))

@@ -129,10 +129,12 @@ class ZmqPort(BasePort[Incoming]):
 
 
 def open_port(launch: Launch, clock: Clock) -> ZmqPort:
-    """Open a component's port for its launch line.
+    """Open a component's port, as its launch line describes.
 
     Raises:
         TransportError: an address can't be used.
+        ConfigError: a key is missing or can't be used, the prefixes are too long, or an address of another computer
+            needs keys.
     """
     sockets = launch.sockets
     return ZmqPort(

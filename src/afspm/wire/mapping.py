@@ -72,13 +72,13 @@ class FieldMapping(NamedTuple):
 
 
 class MessageMapping(Generic[T]):
-    """A model class and its message.
+    """The mapping between a model class and its message.
 
     None is sent as an absent field. An absent field is read as None if None is the attribute's default.
 
     Args:
         same: attributes with a field of the same name and type.
-        other: all other attributes.
+        other: all other attributes, each with the name of its field, or a `FieldMapping`.
     """
 
     def __init__(self, kind: type[T], message: type[Message], /, *same: str, **other: str | FieldMapping) -> None:

@@ -49,7 +49,7 @@ class Forecast(Protocol):
     """A tracker's predictions for any time: small, immutable and convertible to JSON, without the scans."""
 
     def at(self, time_s: float) -> Prediction:
-        """Return the prediction for any time; times before the newest scan are extrapolated backwards."""
+        """Return the prediction for any time; before the newest scan, by extrapolation backwards."""
         ...
 
     def to_dict(self) -> Plain:

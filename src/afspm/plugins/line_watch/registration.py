@@ -120,12 +120,14 @@ class RowRegistration:
         self.shift = self._best(self._cost)
 
     def fit(self, number: int, row: Array, template: RowTemplate | None = None) -> RowFit | None:
-        """Return the difference of a levelled row from the template.
+        """Fit a levelled row to the template, and return the residual.
 
-        None if the template does not cover enough of the row, or has a doubtful row there.
+        Offset, tilt and the rest of the shift are fitted. None if the template covers too little of the row, or if a
+        template row needed for the comparison is not trusted.
 
         Args:
-            template: another channel of the template's scan; None: the template itself.
+            number: index of the row in the scan.
+            template: another channel of the template's scan, for a row of that channel; None: the tracked template.
         """
         template, (down, along) = template or self._template, self.shift
         ny, nx = template.heights.shape

@@ -171,7 +171,10 @@ def length_m(value: str | float) -> float:
 
 
 def renamed_channels(components: Mapping[str, Table]) -> dict[str, str]:
-    """Return the afspm names of the channels of simulated pictures in a file, by their old names."""
+    """Return new channel names by old names, for the image translators among a file's components.
+
+    The new name is always `CHANNEL`.
+    """
     pictures = (table for table in components.values() if last(table) in _PICTURES)
     return {str(table["channel_id"]): CHANNEL for table in pictures if "channel_id" in table}
 

@@ -44,7 +44,7 @@ class PersonCommands:
     # --- the experiment ---
 
     def request_control(self, problem: int = 0) -> Response:
-        """Request control, to solve a problem (0: none)."""
+        """Request control; `problem` is the number of the problem to solve, 0 for none."""
         return self._ask(ControlRequest.REQUEST_CTRL, problem)
 
     def renew(self, lease_s: float) -> Response:

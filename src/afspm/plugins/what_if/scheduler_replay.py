@@ -96,7 +96,7 @@ def replay(recorded: Iterable[tuple[MakeCore, Restored] | Step]) -> SchedulerRep
     """Feed recorded inputs to new scheduler cores, and compare the effects.
 
     Args:
-        recorded: for each life a function that makes its core, with the restored state, followed by the steps.
+        recorded: for each life, first the function that makes its core and the restored state, then the steps.
     """
     before, now = list[Output](), list[Output]()
     core: SchedulerCore | None = None

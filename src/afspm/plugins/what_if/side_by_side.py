@@ -62,7 +62,7 @@ def message_name(one: Difference) -> str:
 
 
 def where(one: Difference) -> str:
-    """Return time and packet of a difference."""
+    """Return the time (UTC) and the packet of a difference, as text."""
     at = day_and_time(one.at_ns, UTC)
     return f"{at}, at the packet {one.packet.envelope}" if one.packet else f"{at}, before the first packet"
 

@@ -125,13 +125,13 @@ class CacheRule:
 
 @dataclass(frozen=True)
 class CacheSettings:
-    """The packets that the scheduler keeps for late joiners.
+    """The section [cache]: envelopes of published packets, and numbers of packets kept for late joiners.
 
     Attributes:
         history: number of packets kept for each envelope, by message: `{ Scan2d = 10 }`.
-        rules: list of tables; the first that matches a packet names the envelope under which it is published and kept.
-        mapping: `"module.function"`: names the envelope of a packet from its header (`message`, `channel`, `size_m`,
-            `kind`), instead of the rules.
+        rules: list of tables; the first matching rule sets a packet's envelope and the number of packets kept.
+        mapping: `"module.function"`: a function from a packet's header (`message`, `channel`, `size_m`, `kind`) to its
+            envelope; replaces the envelopes of rules and defaults, not the rules' numbers.
     """
 
     history: Mapping[str, Count] = field(default_factory=dict)

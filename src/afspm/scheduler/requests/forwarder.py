@@ -52,20 +52,23 @@ OwnPurpose = ReadForTurn | MoveForTurn | ReadAhead | AskForFrame
 
 
 class ForwardedRequest(NamedTuple):
-    """A request for the translator.
+    """A request for the translator or an instrument.
 
     Attributes:
         client: the name of the client; empty for a request of the scheduler itself.
-        command: whether the request may change the microscope, and is authorised again before it is sent; True for all
-            requests of the scheduler itself, which need no authorisation.
+        command: for a client's request, whether it may change the microscope or an instrument; if so, it is authorised
+            again before sending. Always True for the scheduler's own requests, even reads; these are sent without
+            authorisation.
         deadline_s: the deadline of the answer, real; 0: no deadline yet.
         sent_s: the real time of sending; None while the request waits.
-        answered: whether the client has got "no response", since the answer was overdue.
+        answered: whether "no response" was returned in place of an overdue answer; False again once the client repeats
+            the request.
         connection: the connection over which the request arrived.
-        states_seen: the number of states that the microscope had reported at sending.
+        states_seen: for a client's request to the translator, the number of microscope states reported before sending.
         mapped: the request in the coordinates of the microscope, if they differ.
         heard_s: the real time of arrival.
-        sent_ns: the experiment time of the first sending; None if not sent.
+        sent_ns: for a client's request, the experiment time of the first sending; None before. Never set for the
+            scheduler's own requests.
         is_repeated: whether the request was sent before under its id, with an unknown outcome.
         purpose: the purpose of a request of the scheduler itself; None: the tip's safety, or a client's request.
     """

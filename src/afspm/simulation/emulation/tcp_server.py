@@ -40,8 +40,8 @@ class TcpServer:
     Args:
         ports: listening ports; 0 selects a free port.
         stream_port: port for clients that only read; 0: any free port; None: no such port.
-        one_each: True if a port serves one client at a time; other clients wait until the connection ends.
-        wakes: an object with a `fileno` that ends `poll`.
+        one_each: True if each of `ports` serves one client at a time; other clients wait until the connection ends.
+        wakes: an object with a `fileno`; `poll` returns once it is readable.
         on_bytes: called with a connection after new bytes in `received`.
     """
 

@@ -15,7 +15,7 @@ _STUCK = 10_000
 
 
 class GoesInCircles(Exception):
-    """The error that events repeat without time passing."""
+    """The error for events that repeat while time stands still."""
 
 
 class Timer:

@@ -31,7 +31,7 @@ class SettingsBefore:
 
     @classmethod
     def of(cls, client: CheckClient, support: Support) -> SettingsBefore:
-        """Return the settings published when the checks began."""
+        """Return the newest published settings, and the parameter values queried at the start of the session."""
         return cls(
             client.observations.newest(ScanParameters),
             client.observations.newest(Feedback),

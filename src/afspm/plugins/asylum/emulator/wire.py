@@ -151,7 +151,8 @@ def success(function: IgorFunction, given_back: Any, message_id: str | None) -> 
     """Encode the reply with a function's result.
 
     Raises:
-        UnicodeEncodeError: a text is not UTF-8. The real XOP swallows this error and never replies.
+        UnicodeEncodeError: a text in the result can't be encoded as UTF-8. The real XOP swallows this error and never
+            replies.
     """
     by_reference = [kind.lower() for kind in function.takes if kind.isupper()]
     results, passed = given_back if by_reference else (given_back, ())

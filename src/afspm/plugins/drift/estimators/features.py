@@ -39,14 +39,16 @@ class Features:
             matches needs more iterations.
         tighten: whether to drop inliers that are farther off than most; the paper keeps them.
         max_keypoints: largest number of keypoints in each scan; the strongest are kept.
-        false_alarms: largest expected number of chance results for a pair without common features.
+        false_alarms: largest accepted number of false alarms: the number of equally large consensuses expected by
+            chance between two scans without common features.
         inlier_share: least share of inliers among all matches.
-        ambiguity: largest allowed consensus on another displacement, as share of the best.
-        bend_max: largest allowed rotation, scale or shear between scans.
+        ambiguity: largest accepted size of the second-best consensus, at another displacement, as share of the best.
+        bend_max: largest deviation of an element of the transform's 2 x 2 matrix from the identity; limits rotation,
+            scale and shear.
         seed: seed of the random samples; equal scans give equal results.
 
     Raises:
-        ConfigError: a meaningless setting.
+        ConfigError: an unknown transform, or a number out of its range.
     """
 
     transform: str = "translation"

@@ -32,7 +32,7 @@ _AT_START = "a scan in the other direction gives the velocity of the drift"
 
 
 def respond(draft: DriftDraft, what: FollowUp) -> None:
-    """Carry out a response that was deferred until its scan was published."""
+    """Carry out a deferred response: to a report on a scan, an abandoned registration, or the worker's last end."""
     match what:
         case RespondToScan():
             _respond_to_scan(draft, what)

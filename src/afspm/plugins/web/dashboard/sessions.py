@@ -29,7 +29,7 @@ class Session:
     Attributes:
         person: empty for a viewer who may only look.
         proof: derived from the password at the beginning of the session.
-        generation: how often the person signed out everywhere.
+        generation: number of the person's sign-outs everywhere before the session.
         since_s: beginning of the session, real time.
     """
 

@@ -57,7 +57,11 @@ class GatewayServices:
         return self.persons.name_of(person)
 
     async def do(self, asked: Request, action: Callable[[PersonCommands], T]) -> T:
-        """Carry out an action under the client's name. Raises RefusedRequest."""
+        """Carry out an action under the client's name.
+
+        Raises:
+            RefusedRequest: the client gave no name, too many of its requests wait, or the action failed.
+        """
         self.who(asked)
         return await self._carry_out(self.person_of(asked), action)
 
