@@ -7,7 +7,6 @@ import math
 from typing import Any
 
 import numpy as np
-from afspm.wire.generated.spectroscopy_pb2 import ProbePosition as ProbePositionMessage
 
 from afspm import wire
 from afspm.model import (
@@ -66,6 +65,7 @@ from afspm.scheduler.safety.limits import ExperimentLimits
 from afspm.scheduler.saved_state import KIND, VERSION, SavedState
 from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.scheduler.settings import SchedulerSettings
+from afspm.wire.generated.spectroscopy_pb2 import ProbePosition as ProbePositionMessage
 
 NS = 10**9
 START_S = 1_750_000_000.0

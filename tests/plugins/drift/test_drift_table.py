@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from afspm.wire.generated.drift_pb2 import DriftMapping
 
 from afspm.model import RegistrationOutcome
 from afspm.plugins.drift.drift_pictures import COLUMNS, DriftTable, drift_row
 from afspm.plugins.drift.record import DriftRecord
+from afspm.wire.generated.drift_pb2 import DriftMapping
 
 
 def mapping(number: int, *, matched: bool = True) -> DriftMapping:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from afspm.wire.generated import analysis_pb2
 from tests.plugins.what_if import what_if_lab as lab
 from typer.testing import CliRunner
 
@@ -26,6 +25,7 @@ from afspm.plugins.what_if.side_by_side import ChangedField, changed_fields
 from afspm.plugins.what_if.what_if import WhatIf
 from afspm.record.run import open_run
 from afspm.storage.memory import Memory
+from afspm.wire.generated import analysis_pb2
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
-from afspm.wire.generated import control_pb2, scan_pb2
 from bridged_rig import BridgedRig
 from tests.system.published.version_1 import REQUEST, Client, Subscriber
 
@@ -19,6 +18,7 @@ from afspm.basics.launch import Sockets
 from afspm.model import ControlRequest, ControlResponse, Region, Request, Response, Scan, ScopeState, ScopeStatus
 from afspm.supervisor.ports import FreePorts
 from afspm.transport import keys
+from afspm.wire.generated import control_pb2, scan_pb2
 
 SUCCESS = int(ControlResponse.SUCCESS)
 PAUSE_S = 0.4

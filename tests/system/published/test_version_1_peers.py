@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
-from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 from tests.system.published.version_1 import END, PARAM, RELEASE, REQUEST, Client, Router, Server, Subscriber
 
 from afspm import wire
@@ -39,6 +38,7 @@ from afspm.supervisor.reporter import Reporter, ReportFailed
 from afspm.transport.network import Network
 from afspm.transport.port import Killed
 from afspm.transport.zmq_port import ZmqPort
+from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 
 CLOCK = ExperimentClock.real()
 SUCCESS, NOT_IN_CONTROL = int(ControlResponse.SUCCESS), int(ControlResponse.NOT_IN_CONTROL)

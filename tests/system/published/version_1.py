@@ -7,9 +7,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import zmq
-from afspm.wire.generated import analysis_pb2, control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
+
+from afspm.wire.generated import analysis_pb2, control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 
 MESSAGES: dict[str, type[Message]] = {
     made.DESCRIPTOR.name: made

@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 import zmq
-from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
+from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 
 DEADLINE_S = 30.0
 MESSAGES: dict[str, Any] = {

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 import zmq
-from afspm.wire.generated import control_pb2
 
 from afspm import wire
+from afspm.wire.generated import control_pb2
 
 FREE, SCANNING, INTERRUPTED = 3, 2, 4
 OK, FAILURE, START_SCAN = 0, 1, "start-scan"

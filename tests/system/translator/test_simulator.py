@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
 from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 
 MOVING, SCANNING, FREE, INTERRUPTED, SPEC = 1, 2, 3, 4, 7

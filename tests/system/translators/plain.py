@@ -13,8 +13,9 @@ import time
 from typing import Any
 
 import zmq
-from afspm.wire.generated import control_pb2, scan_pb2
 from google.protobuf.timestamp_pb2 import Timestamp
+
+from afspm.wire.generated import control_pb2, scan_pb2
 
 SUCCESS, NOT_SUPPORTED, NOT_FREE, NO_PARAM, PARAM_ERROR, NO_ACTION = 0, 2, 7, 8, 9, 11
 SCANNING, FREE, INTERRUPTED, MOVING = 2, 3, 4, 1

@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from afspm.wire.generated.analysis_pb2 import SpatialPointWithScoreList
-from afspm.wire.generated.feedback_pb2 import FeedbackAnalysis
 from tests.unit.client.client_lab import EPOCH_S, OTHER_REGION, REGION, Lab, Nothing, context_of, run
 
 from afspm import model, wire
@@ -28,6 +26,8 @@ from afspm.model import (
     ScopeStatus,
 )
 from afspm.transport.process.failure import take_fault
+from afspm.wire.generated.analysis_pb2 import SpatialPointWithScoreList
+from afspm.wire.generated.feedback_pb2 import FeedbackAnalysis
 
 TIP, TIP_NAME = Problem.TIP_SHAPE_CHANGED, "tip-shape-changed"
 

@@ -6,8 +6,6 @@ import json
 from pathlib import Path
 
 import pytest
-from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
-from afspm.wire.generated.scan_pb2 import ScanParameters2d
 from tests.unit.client.client_lab import REGION, Lab, run
 
 from afspm import wire
@@ -25,6 +23,8 @@ from afspm.model import (
     names,
 )
 from afspm.plugins.drift.rescanner import Rescanner
+from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
+from afspm.wire.generated.scan_pb2 import ScanParameters2d
 
 DRIFT, MALFUNCTION = Problem.THERMAL_DRIFT, Problem.DEVICE_MALFUNCTION
 ELSEWHERE = Region((3e-6, 1e-6), (1e-6, 0.5e-6), 0.2)

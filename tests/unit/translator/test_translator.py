@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from afspm.wire.generated import feedback_pb2, scan_pb2
 
 from afspm import wire
 from afspm.basics.errors import ConfigError, WireError
@@ -34,6 +33,7 @@ from afspm.model import (
 from afspm.storage.memory import Memory
 from afspm.transport.port import ParentGone, RequestReceived, SubscriberJoined
 from afspm.transport.process.parent import TIP_WITHIN_S
+from afspm.wire.generated import feedback_pb2, scan_pb2
 
 ACTION, PARAM, SUPPORT = ControlRequest.ACTION, ControlRequest.PARAM, ControlRequest.ACTION_SUPPORT
 FRAME, POSITION = ControlRequest.SET_SCAN_PARAMS, ControlRequest.SET_PROBE_POS

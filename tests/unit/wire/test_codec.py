@@ -6,7 +6,6 @@ import contextlib
 
 import numpy as np
 import pytest
-from afspm.wire.generated import journal_pb2
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 from google.protobuf.timestamp_pb2 import Timestamp
@@ -35,6 +34,7 @@ from afspm.model import (
     Spectrum,
 )
 from afspm.wire.frames import decode_time, encode_subject, encode_time
+from afspm.wire.generated import journal_pb2
 
 SCAN = Scan(
     Region((1e-6, -2e-6), (2e-6, 1e-6), 0.25), "Height", "m", np.arange(12.0).reshape(3, 4), 1_700_000_000_000_000_001

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from afspm.wire.generated.scan_pb2 import Scan2d
 
 from afspm import wire
 from afspm.basics.errors import WireError
 from afspm.model import ProbePosition, Region, Scan, ScanParameters, Spectrum
+from afspm.wire.generated.scan_pb2 import Scan2d
 from afspm.wire.values import with_zeros, without_values
 
 HERE = Region((1e-6, 2e-6), (3e-6, 1e-6), 0.1)
