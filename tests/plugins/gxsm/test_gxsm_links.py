@@ -28,7 +28,8 @@ from afspm.plugins.gxsm.activity import LineWatch
 from afspm.plugins.gxsm.bridge_client import BridgeLink
 from afspm.plugins.gxsm.errors import BadReply, GxsmError
 from afspm.plugins.gxsm.hardware import Doing, Hardware, decoded, recognised
-from afspm.plugins.gxsm.link import Address, open_link
+from afspm.plugins.gxsm.link import Address, Asking, open_link
+from afspm.plugins.gxsm.settings import ANGSTROM_M, ScanFrame
 from afspm.translator.driver_base import ControllerLost
 
 VALUES: list[Any] = [
@@ -433,3 +434,41 @@ def test_uninitialised_memory_is_no_set_of_bits(slots: list[float]) -> None:
 def test_lines_against_their_direction_belong_to_another_scan(lines: list[int], turns: int) -> None:
     watch = LineWatch(lines[0])
     assert sum(watch.turned(line, 60) for line in lines[1:]) == turns
+
+
+class Targetless:
+    """A GXSM with a frame of 1000 x 1000 Å about (200, 100) Å, and no usable target of the tip."""
+
+    def __init__(self, target: float | Exception) -> None:
+        self.target = target
+
+    def call(self, method: str, *arguments: str | int | float) -> Any:
+        ref = str(arguments[0])
+        if ref in ("ScanX", "ScanY"):
+            if isinstance(self.target, Exception):
+                raise self.target
+            return self.target
+        return {
+            "PointsX": 8.0,
+            "PointsY": 8.0,
+            "RangeX": 1000.0,
+            "RangeY": 1000.0,
+            "OffsetX": 200.0,
+            "OffsetY": 100.0,
+        }.get(ref, 0.0)
+
+    def working_folder(self) -> Path | None:
+        return None
+
+    def close(self) -> None: ...
+
+
+@pytest.mark.parametrize("target", [math.nan, GxsmError("no such entry")], ids=["nan", "refused"])
+def test_missing_target_of_the_tip_is_the_centre_of_the_frame(target: float | Exception) -> None:
+    frame = ScanFrame(Asking(Targetless(target)), ANGSTROM_M)
+    assert frame.tip() == pytest.approx((200.0 * ANGSTROM_M, 100.0 * ANGSTROM_M))
+
+
+def test_lost_link_is_no_missing_target_of_the_tip() -> None:
+    with pytest.raises(ControllerLost, match="gone"):
+        ScanFrame(Asking(Targetless(ControllerLost("gone"))), ANGSTROM_M).tip()

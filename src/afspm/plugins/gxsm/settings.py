@@ -15,10 +15,9 @@ from afspm.basics import units
 from afspm.basics.errors import AfspmError, Refused
 from afspm.basics.formatting import position_text
 from afspm.model import ControlResponse, Region, names
-from afspm.plugins.gxsm.errors import BadReply
+from afspm.plugins.gxsm.errors import BadReply, GxsmError
 from afspm.plugins.gxsm.hardware import Doing
 from afspm.plugins.gxsm.link import Asking
-from afspm.translator.driver_base import ControllerLost
 from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.translator.setting_groups import FRAME, POSITION, SettingsGroup, frame, frame_values
 from afspm.translator.state import Kept
@@ -104,9 +103,7 @@ class ScanFrame:
         region = self.region()
         try:
             u_m, v_m = (number(self._ask, ref) * self._unit_m for ref in ("ScanX", "ScanY"))
-        except ControllerLost:
-            raise
-        except AfspmError:
+        except (GxsmError, BadReply):
             return region.center_m
         return in_space(region, (u_m, v_m))
 
