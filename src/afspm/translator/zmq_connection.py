@@ -101,17 +101,21 @@ class ZmqConnection:
         except zmq.ZMQError as error:
             raise self._broken("a reply", error) from error
 
-    def reply(self, what: str) -> bytes | None:
-        """Return the reply to `begin`; None until the reply has arrived.
+    def reply(self, what: str, parse: Callable[[bytes], T]) -> T | None:
+        """Return the reply to `begin`, decoded by `parse`; None until the reply has arrived.
 
         Raises:
-            ControllerLost
+            ControllerLost: the connection was lost, or `parse` rejects the reply.
         """
         try:
             if not self._socket.poll(0):
                 return None
             with self._trace.answering() as traced:
-                return self._taken(traced)
+                raw = self._taken(traced)
+            return parse(raw)
+        except ControllerLost:  # also of `parse`
+            self.close()
+            raise
         except zmq.ZMQError as error:
             raise self._broken(what, error) from error
 

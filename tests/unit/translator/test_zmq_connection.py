@@ -63,6 +63,21 @@ def test_reply_of_several_frames_closes_the_connection(controller: zmq.Socket[by
     controller.send_multipart([who, b"", b"one", b"two"])
     connection.wait(5.0)
     with pytest.raises(ControllerLost, match="3 frames"):
-        connection.reply("a scan")
+        connection.reply("a scan", bytes)
+    with pytest.raises(ControllerLost, match="was lost"):
+        connection.begin("another", b"scan")
+
+
+def test_reply_that_can_not_be_decoded_closes_the_connection(controller: zmq.Socket[bytes]) -> None:
+    def parse(raw: bytes) -> bytes:
+        raise ControllerLost(f"garbage: {raw!r}")
+
+    connection = ZmqConnection(address(controller), 5.0, time.monotonic, HINTS)
+    connection.begin("a scan", b"scan")
+    who, *_ = controller.recv_multipart()
+    controller.send_multipart([who, b"", b"?"])
+    connection.wait(5.0)
+    with pytest.raises(ControllerLost, match="garbage"):
+        connection.reply("a scan", parse)
     with pytest.raises(ControllerLost, match="was lost"):
         connection.begin("another", b"scan")

@@ -79,13 +79,9 @@ class Link:
         Raises:
             SmartScanError: the script failed. ControllerLost.
         """
-        raw = self._connection.reply(what)
-        if raw is None:
+        reply = self._connection.reply(what, _fields)
+        if reply is None:
             return False, None
-        try:
-            reply = _fields(raw)
-        except ControllerLost as error:
-            raise self._bad(error.what) from error
         return True, self._outcome(reply) if reply.get("value") else None
 
     def close(self) -> None:
