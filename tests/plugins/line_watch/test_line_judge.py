@@ -19,7 +19,8 @@ from tests.plugins.line_watch.line_scans_lab import (
 )
 
 from afspm.model import Region
-from afspm.plugins.line_watch.line_judge import FLOOR, Alarm, AlarmLevel, Kind, LineJudge
+from afspm.plugins.line_watch.line_judge import Alarm, AlarmLevel, Kind, LineJudge, LineStatistic, PairStatistics
+from afspm.plugins.line_watch.registration import RowTemplate
 
 Heights = list[np.ndarray[tuple[int, int], np.dtype[np.float64]]]
 KIND = Kind.of(HOME, (ROWS, ROWS), "")
@@ -120,7 +121,7 @@ def test_scan_with_a_jump_is_a_measure_of_the_next_one() -> None:
     judge.learn(heights(pictures[LEARNT]), HOME, KIND, LEARNT * PERIOD_S)
     running = judge.begin(HOME, KIND, (LEARNT + 1) * PERIOD_S, channels=2)
     assert running is not None
-    assert running.threshold < 2.0 * FLOOR
+    assert running.threshold == 20.0, "of the rows at the jump two are a measure, the rest is registered again"
     assert stopped(judge, heights(pictures[-1]), (LEARNT + 1) * PERIOD_S) is None
 
 
@@ -138,6 +139,28 @@ def test_scan_after_a_jump_is_compared_with_the_scan_before_it() -> None:
         assert running.add(row, [values[row] for values in slipped]) is None
         evidence = max(evidence, running.evidence)
     assert evidence < 0.3
+
+
+def test_missing_rows_of_a_reference_are_interpolated() -> None:
+    rows, columns = np.mgrid[0:16, 0:12].astype(np.float64)
+    holed = np.sin(0.6 * columns) * rows
+    holed[[0, 5, 6]] = np.nan
+    template = RowTemplate.of(holed, doubtful=[10])
+    assert set(np.flatnonzero(~template.trusted)) == {0, 5, 6, 10}
+    assert np.isfinite(template.heights).all()
+    for at, low, high in ((5, 4, 7), (6, 4, 7), (10, 9, 11)):
+        share = (at - low) / (high - low)
+        between = (1.0 - share) * template.heights[low] + share * template.heights[high]
+        np.testing.assert_allclose(template.heights[at], between, atol=1e-12)
+    np.testing.assert_array_equal(template.heights[0], template.heights[1])
+
+
+def test_few_pairs_are_judged_by_the_least_alike_one() -> None:
+    alike, unlike = (
+        PairStatistics(flat_m=one, per_slope=0.1, usual=one, spread=0.1, highest=1.0) for one in (1.0, 2.0)
+    )
+    assert LineStatistic([alike, alike, unlike]).flat_m == 2.0
+    assert LineStatistic([alike, alike, alike, unlike]).flat_m == 1.0
 
 
 def test_tip_that_spoils_some_lines_is_no_jump() -> None:
