@@ -343,7 +343,10 @@ class RampNight:
                 self.alive["scheduler"] = False
             case "panel":
                 self.panel_s, self.budget_k = self.now_s, 2.5 * RATE_K_S
-                self.cryostat.target_k = self.panel_k = 4.2 + self.chance.choice((0.0, 0.5))
+                target_k = 4.2 + self.chance.choice((0.0, 0.5))
+                # no client can see a change to the same target
+                self.panel_k = target_k if target_k != self.cryostat.target_k else None
+                self.cryostat.target_k = target_k
             case _:
                 self.cryostat.fault = fault
 

@@ -6,12 +6,13 @@
 from __future__ import annotations
 
 import os
+import random
 from collections.abc import Callable
 
 import pytest
-from tests.plugins.secop.ramp_night import FAULTS, RampNight
+from tests.plugins.secop.ramp_night import FAULTS, RATE_K_S, Cryostat, RampNight
 
-from afspm.model import InstrumentOrder
+from afspm.model import InstrumentOrder, Parameter
 from afspm.plugins.secop.lines import SecopLine
 from afspm.plugins.secop.secop_client import SecopClient
 from afspm.scheduler.instruments import known_instruments
@@ -29,6 +30,31 @@ def test_nothing_is_measured_outside_the_band_over_faults(share: int) -> None:
     assert sum(night.scans for night in nights) > len(nights)
     assert sum(night.moved_k > 0.1 for night in nights) > len(nights) / 4
     assert all(night.flags for night in nights if night.fault == "hung")
+
+
+@pytest.mark.parametrize(
+    ("target_k", "value_k", "first_k"),
+    [(4.2, 4.9, 4.2), (4.21, 4.2, 4.21), (300.0, 5.0, 5.0)],
+    ids=["disturbed", "a near target set at the panel", "on the way to a far target set at the panel"],
+)
+def test_steps_begin_at_the_target_unless_another_client_has_set_it_far_away(
+    target_k: float, value_k: float, first_k: float
+) -> None:
+    cryostat, client = Cryostat(has_ramp=False, chance=random.Random(1)), SecopClient({"cryo.t": "tt"})
+    changes: list[str] = []
+
+    def exchange(lines: list[str], now_s: float) -> None:
+        for line in lines:
+            changes.extend([line] if line.startswith("change ") else [])
+            for answer in cryostat.answer(line):
+                exchange(client.take(answer, now_s), now_s)
+
+    exchange(client.connected(0.0), 0.0)
+    exchange(client.tick(1.0), 1.0)
+    cryostat.target_k, cryostat.value_k = target_k, value_k
+    exchange(client.tick(2.0), 2.0)
+    exchange(client.order(InstrumentOrder(1, "series/1", Parameter("cryo.t", "5.5", "K"), RATE_K_S, "K"), 2.0), 2.0)
+    assert float(changes[0].split()[2]) == pytest.approx(first_k, abs=0.01)
 
 
 def _believe_old_readings(patch: pytest.MonkeyPatch) -> None:

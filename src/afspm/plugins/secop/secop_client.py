@@ -49,6 +49,7 @@ class Channel:
         measured_s: time of the request for the newest value.
         last_answer: (server's own time, value) of the last answer.
         changed_s: time when the target was set; target_answered_s: time of the last answer with the target.
+        nearest: least distance of the value from the target `nearest_to` so far; 0 if afspm moved it there in steps.
         fault: reason why there is no value.
         fault_of_status: reason to distrust the value, from the module's status.
     """
@@ -70,6 +71,8 @@ class Channel:
     target_answered_s: float = -math.inf
     newest: float | None = None
     newest_target: float | None = None
+    nearest: float = math.inf
+    nearest_to: float = math.nan
     is_busy: bool = False
     fault: str = "not connected yet"
     fault_of_status: str = ""
@@ -78,6 +81,13 @@ class Channel:
     def unit_fault(self) -> str:
         is_same = self.first_unit in (None, self.unit)
         return "" if is_same else f"its unit changed from {self.first_unit!r} to {self.unit!r}"
+
+    def note_distance(self) -> None:
+        """Compare the newest value with the newest target."""
+        if self.newest is None or self.newest_target is None:
+            return
+        distance, is_same = abs(self.newest - self.newest_target), _is_close(self.newest_target, self.nearest_to)
+        self.nearest, self.nearest_to = min(distance, self.nearest) if is_same else distance, self.newest_target
 
 
 @dataclass
@@ -241,6 +251,7 @@ class SecopClient:
                 self._take_value(channel, line)
             if specifier == channel.target and not line.action.startswith("error"):
                 channel.newest_target = _number(line.value)
+                channel.note_distance()
                 if line.action == "changed":
                     channel.changed_s = now_s
                 if line.action == "reply":
@@ -261,6 +272,7 @@ class SecopClient:
             channel.fault = f"the server answers {line.value!r}"
             return
         channel.newest, channel.fault = number, ""
+        channel.note_distance()
         if asked_s is None:
             return
         # the same value of the same time as in the answer before: the server is alive, its instrument is not. A
@@ -361,14 +373,11 @@ class SecopClient:
         return [lines.change(channel.target, number)]
 
     def _start_of_steps(self, channel: Channel, rate_per_s: float) -> float:
-        # a regulated value is at its target; else the target may be far away, and the way begins at the value
+        # at the target, since a disturbance may keep the value away from it, and a set point that jumps to the value is
+        # too fast; but at the value where another client has set a target far away, to which the way must not lead
         assert channel.newest is not None
-        is_there = (
-            not channel.is_busy
-            and channel.newest_target is not None
-            and abs(channel.newest_target - channel.newest) <= 2.0 * rate_per_s * STEP_S
-        )
-        return channel.newest_target if is_there and channel.newest_target is not None else channel.newest
+        target = channel.newest_target
+        return target if target is not None and channel.nearest <= 2.0 * rate_per_s * STEP_S else channel.newest
 
     def _go_on(self, line: SecopLine, now_s: float) -> list[str]:
         progress, text = self._progress, f"{line.action} {line.specifier}"
@@ -454,6 +463,7 @@ class SecopClient:
                 continue
             confirmed = _number(line.value)
             ramp.sent, ramp.sent_s, ramp.in_flight = ramp.sent if confirmed is None else confirmed, now_s, False
+            self.channels[name].nearest, self.channels[name].nearest_to = 0.0, ramp.sent
             if ramp.ideal == ramp.final:
                 del self._ramps[name]
 
