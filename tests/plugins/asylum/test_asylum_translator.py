@@ -268,6 +268,17 @@ def test_switching_feedback_on_waits_for_the_tip(bench: Make) -> None:
     assert made.emulator.rig.engaged
 
 
+def test_feedback_that_stays_off_is_an_error(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = bench()
+    peer = made.start(reply_timeout_s=1.0)
+    peer.until(FREE)
+    assert peer.set(names.FEEDBACK_ON, False).ok
+    monkeypatch.setattr(made.emulator.controller, "engage", lambda _now_s: None)
+    response = peer.set(names.FEEDBACK_ON, True)
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "set False instead of True" in response.reason
+
+
 @pytest.mark.parametrize("scanning", [False, True])
 def test_tip_without_feedback_is_retracted_at_the_end_of_a_run(bench: Make, scanning: bool) -> None:
     made = bench(speed=5.0)
