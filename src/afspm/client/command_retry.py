@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 from afspm import wire
@@ -47,6 +48,7 @@ _NO_STATE = (
     "waiting for the microscope, which has published no state yet: is its translator running? If it does not "
     "publish its state when a scheduler connects: restart it, or scan once by hand"
 )
+_NUMBERS = re.compile(r"[-+]?\d[\d.e+-]*")
 NOT_IN_CONTROL = {ControlResponse.NOT_IN_CONTROL, ControlResponse.WRONG_CONTROL_MODE}
 
 
@@ -56,6 +58,7 @@ class CommandRetry:
     def __init__(self, link: ExperimentLink, control: ControlHold) -> None:
         self._link = link
         self._control = control
+        self._logged_reason = ""
 
     def ask(self, kind: ControlRequest, subject: object = None, *, until_s: float | None = None) -> Response:
         """Send a command until it succeeds, inside a block with control; after a loss of control, wait to regain it.
@@ -162,6 +165,8 @@ class CommandRetry:
             if is_repeated and response.code in NOT_IN_CONTROL:
                 self._control.lost(response.reason)
                 return Response(ControlResponse.NO_RESPONSE, reason=response.reason, id=request_id)
+            if response.ok:
+                self._logged_reason = ""
             if response.code != ControlResponse.NO_RESPONSE or self._control.was_lost:
                 return response
             if is_seen():
@@ -196,6 +201,7 @@ class CommandRetry:
         if response.code in NOT_IN_CONTROL:
             self._control.lost(response.reason)
         elif response.code == ControlResponse.NOT_FREE:
+            self._log_reason(response.reason)
             self._wait_free(states, until_s)
         else:
             raise refused(kind, response, self._link.name)
@@ -207,6 +213,13 @@ class CommandRetry:
         if link.view.status is None:
             link.log.warning("%s", _NO_STATE)
             link.wait(lambda: link.view.status is not None, give_up_s)
+
+    def _log_reason(self, reason: str) -> None:
+        # a busy microscope is seen in its state; a condition that does not hold is seen nowhere else
+        kind = _NUMBERS.sub("", reason)
+        if self._link.view.state is ScopeState.FREE and kind != self._logged_reason:
+            self._link.log.info("waiting: %s", reason)
+            self._logged_reason = kind
 
     def _wait_free(self, states: int, until_s: float | None) -> None:
         # a state later than `states`; with a time limit, in case the state FREE is lost

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from pathlib import Path
 
@@ -316,6 +317,21 @@ def test_request_waits_for_a_busy_microscope(lab: Lab, scope: Scope) -> None:
     assert lab.begun_scans == 1
     assert lab.clock.passed_s > 12.0 + SCAN_S
     assert lab.count(ControlRequest.SET_SCAN_PARAMS) <= 4, "asked when it is free, not again and again"
+
+
+def test_condition_that_is_waited_for_is_logged_once(lab: Lab, scope: Scope, caplog: pytest.LogCaptureFixture) -> None:
+    warm = ["8.2 K", "7.9 K", "6 K"]
+
+    def refuse_while_warm(request: model.Request) -> Response | str:
+        if request.subject == "start-scan" and warm:
+            return Response(ControlResponse.NOT_FREE, reason=f"the condition cold does not hold: it is {warm.pop(0)}")
+        return "go on"
+
+    lab.intercept = refuse_while_warm
+    with caplog.at_level(logging.INFO):
+        scope.scan(REGION)
+    waits = [message for message in caplog.messages if message.startswith("waiting")]
+    assert waits == ["waiting: the condition cold does not hold: it is 8.2 K"]
 
 
 def test_a_lost_answer_repeats_the_request_with_its_id_and_executes_it_once(lab: Lab, scope: Scope) -> None:
