@@ -154,7 +154,7 @@ class Night:
             # a spectrum two scan widths away, just before
             world.spectrum("IV", (2.0 * self.size_m, self.size_m), at_s - 2.0)
         if negative == "setpoint":
-            other = Feedback(setpoint=0.8 * world.settings.feedback.setpoint)
+            other = Feedback(setpoint=0.8 * world.settings.feedback.first_setpoint)
             adjusted = [Adjustment(at_s + self.row * self.line_s, other, 0.1)]
         channels = self._taken(world, at_s, adjusted)
         if negative == "jump":

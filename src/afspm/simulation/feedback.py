@@ -86,6 +86,7 @@ class FeedbackSettings:
         mode: "amplitude" (tapping; the setpoint is an amplitude in V), "current" (tunnelling; in A) or
             "frequency-shift" (non-contact; in Hz, below zero).
         integral_gain: in 1/s: an error decays in about 1 / gain.
+        setpoint: None: 0.7 V, 100 pA or half of the largest frequency shift, by the mode.
         free_amplitude_v: amplitude far from the sample.
         sensitivity_m_per_v: sensitivity of the detector.
         lag_s, delay_s: lag of the actuator, delay of the loop; integral gains above about 1 / delay_s oscillate.
@@ -100,7 +101,7 @@ class FeedbackSettings:
     on: bool = True
     proportional_gain: float = 0.1
     integral_gain: float = 1500.0
-    setpoint: float = 0.7
+    setpoint: float | None = None
     free_amplitude_v: float = 1.0
     sensitivity_m_per_v: float = 60e-9
     lag_s: float = 0.12e-3
@@ -115,8 +116,15 @@ class FeedbackSettings:
         one_of(self.mode, MODES, "mode")
         check(self, above_zero="free_amplitude_v sensitivity_m_per_v lag_s delay_s range_m decay_m current_floor_a")
         check(self, from_zero="proportional_gain integral_gain")
-        if refusal := self.refusal_of(self.setpoint):
+        if refusal := self.refusal_of(self.first_setpoint):
             raise ConfigError(refusal, where="setpoint")
+
+    @property
+    def first_setpoint(self) -> float:
+        """The setpoint until another is set."""
+        if self.setpoint is not None:
+            return self.setpoint
+        return {"amplitude": 0.7, "current": 100e-12}.get(self.mode, self.sensor.largest_hz / 2.0)
 
     def refusal_of(self, setpoint: float) -> str:
         """Return the reason why a setpoint is impossible in this mode; empty for a possible setpoint."""
@@ -148,8 +156,12 @@ class Loop:
         said = feedback or Feedback()
         on = settings.on if said.on is None else said.on
         p, i, setpoint = (
-            getattr(settings, name) if getattr(said, name) is None else float(getattr(said, name))
-            for name in ("proportional_gain", "integral_gain", "setpoint")
+            before if asked is None else float(asked)
+            for before, asked in (
+                (settings.proportional_gain, said.proportional_gain),
+                (settings.integral_gain, said.integral_gain),
+                (settings.first_setpoint, said.setpoint),
+            )
         )
         if not (math.isfinite(p) and math.isfinite(i) and p >= 0 and i >= 0):
             raise InvalidValue(f"feedback gains are zero or more, not {p:g} and {i:g}", where="feedback")

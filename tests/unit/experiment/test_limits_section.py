@@ -183,7 +183,7 @@ SIMULATED = '[scheduler]\ncomponent = true\nclass = "Scheduler"\n[microscope]\nc
     [
         ("", "0.9 V", ""),
         ("", "1 nA", "nA can't be converted to V"),
-        ('feedback = { mode = "current", setpoint = 1e-10 }\n', "1 nA", ""),
+        ('feedback = { mode = "current" }\n', "1 nA", ""),
         ('surface = "lattice"\n', "1 nA", ""),  # by default it tunnels
     ],
 )

@@ -10,7 +10,7 @@ import pytest
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.model import Feedback, Region
 from afspm.simulation import World
-from afspm.simulation.feedback import FeedbackSettings, Loop, SensorSettings
+from afspm.simulation.feedback import MODES, FeedbackSettings, Loop, SensorSettings
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))
 DT = 1e-4
@@ -165,6 +165,13 @@ def test_impossible_frequency_shift_is_refused_as_setpoint(setpoint_hz: float) -
         Loop.of(settings, Feedback(setpoint=setpoint_hz))
     with pytest.raises(ConfigError, match="between -18"):
         FeedbackSettings(mode="frequency-shift", setpoint=setpoint_hz)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_each_mode_alone_has_a_setpoint_that_reaches_the_surface(mode: str) -> None:
+    first = Loop.of(FeedbackSettings(mode=mode), None)
+    assert first.settings.refusal_of(first.setpoint) == ""
+    assert first.engages
 
 
 def test_feedback_error_is_seen_in_the_frequency_shift() -> None:

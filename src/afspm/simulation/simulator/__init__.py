@@ -196,7 +196,7 @@ class Simulator(Driver):
             FEEDBACK_ON: loop.on,
             names.ZCTRL_PGAIN: loop.proportional_gain,
             names.ZCTRL_IGAIN: loop.integral_gain,
-            names.ZCTRL_SETPOINT: loop.setpoint,
+            names.ZCTRL_SETPOINT: loop.first_setpoint,
         }
         at_first = {name: value for name, value in {**_AT_FIRST, **in_force}.items() if name in self.table}
         with errors:
