@@ -303,7 +303,14 @@ class Scope(ExperimentView):
             on: whether the feedback regulates; if False, the tip is held at its height.
             proportional_gain, integral_gain: gains in the controller's own units.
             setpoint: in the unit of the operating mode: A for a tunnelling current; V, m, Hz or N in force microscopy.
+
+        Raises:
+            InvalidValue: a gain or the setpoint is text.
         """
+        for name, value in (("proportional", proportional_gain), ("integral", integral_gain), ("setpoint", setpoint)):
+            if isinstance(value, str):
+                hint = f'scope.set("zctrl-setpoint", {value!r}) takes a text with a unit' if name == "setpoint" else ""
+                raise InvalidValue(f"{value!r} is text, not a number", where=name, hint=hint)
         with self._call():
             feedback = Feedback(on, proportional_gain, integral_gain, setpoint)
             until_s = self._link.until(timeout_s)

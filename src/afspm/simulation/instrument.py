@@ -69,7 +69,9 @@ class InstrumentSetup:
         self.shape = (128, 128)
         self.line_s = 1.0
         self.upwards = True
-        self.feedback = Feedback(feedback.on, feedback.proportional_gain, feedback.integral_gain, feedback.first_setpoint)
+        self.feedback = Feedback(
+            feedback.on, feedback.proportional_gain, feedback.integral_gain, feedback.first_setpoint
+        )
         self.bias_v = 0.1
         self.slope = (0.0, 0.0)
         self.move_speed_m_s = 5e-6

@@ -698,6 +698,12 @@ def test_reading_takes_control_if_the_scheduler_requires_it(lab: Lab, scope: Sco
     assert scope.get("tip-bias-voltage") == 0.5
 
 
+def test_feedback_as_text_is_refused_with_the_call_that_takes_it(scope: Scope) -> None:
+    with pytest.raises(InvalidValue, match="'80 pA' is text") as caught:
+        scope.set_feedback(setpoint="80 pA")  # type: ignore[arg-type]
+    assert "scope.set(\"zctrl-setpoint\", '80 pA')" in caught.value.hint
+
+
 def test_set_feedback_returns_when_the_feedback_is_published(lab: Lab, scope: Scope) -> None:
     scope.set_feedback(on=False, setpoint=2.0)
     assert scope.feedback == model.Feedback(on=False, setpoint=2.0)

@@ -159,7 +159,7 @@ class FeedbackSwitch(SettingsGroup):
     """The z feedback switch. A write waits for the new state of the feedback, as the tip may have to travel.
 
     Args:
-        wait_for: waits for a condition, up to a time limit; afterwards the read-back decides whether the write succeeded.
+        wait_for: waits for a condition, up to a time limit; afterwards the read-back of the write decides.
     """
 
     names = (FEEDBACK_ON,)
