@@ -104,6 +104,8 @@ class ConditionsReader:
                     raise AfspmError("not a quantity")
                 if key == "for" and not isinstance(value, str):
                     raise AfspmError("a time without a unit", hint='e.g. "60 s"')
+                if isinstance(value, str) and not parse_quantity(value)[1]:
+                    raise AfspmError("a text without a unit", hint=f'e.g. "{value} K"; a number has no unit')
                 read[key] = si(value, wanted)
                 if not math.isfinite(read[key]):
                     raise AfspmError("not a finite number")

@@ -56,6 +56,7 @@ def test_limit_of_an_instrument_is_in_the_unit_as_written(write: Write) -> None:
         ('[conditions.cold]\n"cryo.temperature" = { from = "5 K", to = "4 K" }\n', "from must be less than to"),
         ('[conditions.cold]\n"cryo.temperature" = { from = "4 K", to = "5 V" }\n', "to = '5 V'"),
         ('[conditions.cold]\n"cryo.temperature" = { from = "4 K", for = 60 }\n', "a time without a unit"),
+        ('[conditions.cold]\n"cryo.temperature" = { to = "5" }\n', "a text without a unit"),
         ("[conditions.cold]\n", "names no parameter of an instrument"),
         (COLD + 'problem = "too-warm"\n', "the experiment knows no problem 'too-warm'"),
         (COLD + 'while = ["strat-scan"]\n', "there is no action 'strat-scan'"),
