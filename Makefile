@@ -28,13 +28,17 @@ $(SETUP): $(SOURCES)
 	@$(PYTHON) tools/bootstrap.py all
 	@touch $(DEMO) $(TEST) $@
 
+NEXT = echo "Next: source .venv/bin/activate (it gives this shell the command afspm), and open $$(ls -t runs/*/report.html | head -1)"
+
 ## the paper's control transfer: a night of scans, a tip that changes, and its repair
 demo: $(DEMO)
 	@$(BIN)/afspm demo
+	@$(NEXT)
 
 ## the paper's drift correction: a night on a sample that drifts, two hours without correction and sixteen with it
 demo-drift: $(DEMO)
 	@$(BIN)/afspm demo --drift
+	@$(NEXT)
 
 ## the tests of every change, in four minutes on two idle cores: units, decisions in simulated nights, protocols, and the
 ## processes that everything else stands on. More at a time than there are cores, since many of them wait
