@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import metadata
 
 from afspm.basics.errors import ConfigError
@@ -34,6 +35,20 @@ def require_installed(what: str, *requirements: str) -> None:
         packages = ", ".join(dict.fromkeys(package for missing in lacking.values() for package in missing))
         command = "pip install " + " ".join(f'"{one}"' for one in lacking)
         raise ConfigError(f"{what} needs packages that are not installed: {packages}", hint=command)
+
+
+@contextmanager
+def imports_of_extra(extra: str, what: str) -> Iterator[None]:
+    """Import packages of an extra of afspm, needed by `what`, within this context.
+
+    Raises:
+        ConfigError: a package is not installed, with the command that installs the extra as the hint.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        hint = f'pip install "afspm[{extra}]"'
+        raise ConfigError(f"{what} needs {error.name}, which is not installed", hint=hint) from None
 
 
 def _missing(requirement: str) -> Iterator[str]:

@@ -26,7 +26,7 @@ from bluesky.utils import FailedStatus, RequestAbort, RunEngineInterrupted
 from event_model import DocumentNames, schema_validators
 from ophyd_async.core import init_devices
 
-from afspm.plugins.bluesky import Microscope
+from afspm.plugins.bluesky.microscope import Microscope
 
 pytestmark = [pytest.mark.timeout(180), pytest.mark.filterwarnings("ignore")]
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "bluesky.md"

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from site_folder import EXAMPLE_MAKER, EXAMPLE_PLUGIN, install
 from systems import PATIENCE
 
@@ -147,6 +149,22 @@ def test_everything_that_afspm_declares_can_be_loaded() -> None:
     ours = [one for one in entry_points.inventory() if one.package.startswith("afspm ")]
     assert {one.group for one in ours} == set(entry_points.GROUPS)
     assert [one for one in ours if one.problem] == []
+
+
+def test_everything_that_afspm_declares_can_be_loaded_without_extras() -> None:
+    wanted = (Requirement(text) for text in metadata.requires("afspm") or ())
+    of_extras = {canonicalize_name(one.name) for one in wanted if one.marker and "extra" in str(one.marker)} - {"afspm"}
+    owners = metadata.packages_distributions().items()
+    modules = sorted(module for module, names in owners if of_extras & {*map(canonicalize_name, names)})
+    assert "bluesky" in modules
+    look = f"""
+import sys
+sys.modules.update(dict.fromkeys({modules}))
+from afspm.basics import entry_points
+print([one for one in entry_points.inventory() if one.package.startswith("afspm ") and one.problem])
+"""
+    done = subprocess.run([sys.executable, "-c", look], capture_output=True, encoding="utf-8", timeout=PATIENCE * 60)
+    assert done.stdout == "[]\n", done.stdout + done.stderr
 
 
 def test_inventory_lists_unusable_names_with_reasons(site: Path) -> None:

@@ -5,7 +5,7 @@ from importlib import metadata
 import pytest
 
 from afspm.basics.errors import ConfigError
-from afspm.basics.requirements import require
+from afspm.basics.requirements import imports_of_extra, require
 
 
 class Needy:
@@ -53,6 +53,14 @@ def test_missing_packages_are_named_with_the_install_command(
     assert (refused.value.what, refused.value.hint) == (
         f"Needy needs packages that are not installed: {packages}",
         command,
+    )
+
+
+def test_missing_package_of_an_extra_is_named_with_the_install_command() -> None:
+    with pytest.raises(ConfigError) as refused, imports_of_extra("xarray", "to_xarray"):
+        import no_such_package  # type: ignore[import-not-found] # noqa: F401
+    assert str(refused.value) == (
+        'to_xarray needs no_such_package, which is not installed (pip install "afspm[xarray]")'
     )
 
 
