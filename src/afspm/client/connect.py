@@ -149,7 +149,8 @@ def find_run(where: Path) -> Path:
         return where.resolve() if where.is_symlink() else where
     if (latest := latest_run(where)) is not None:
         return latest
-    raise FileError("there is no run here", where=str(where), hint="name the folder of a run, e.g. runs/…")
+    hint = "start one: afspm run experiment.toml; or name the folder of a run, e.g. runs/…"
+    raise FileError("there is no run here", where=str(where), hint=hint)
 
 
 def _newest(runs: Path, name: str, file: Path) -> Path | None:

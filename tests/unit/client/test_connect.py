@@ -51,6 +51,12 @@ def run_folder(runs: Path, name: str, origin_s: float = 0.0) -> Path:
     return folder
 
 
+def test_refusal_of_a_folder_without_runs_says_how_to_start_one(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="there is no run here") as refused:
+        afspm.connect(tmp_path)
+    assert "afspm run experiment.toml" in refused.value.hint
+
+
 @pytest.mark.parametrize("damaged", ["{", "[]", ""])
 def test_an_old_run_that_is_damaged_does_not_hide_the_newest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damaged: str
