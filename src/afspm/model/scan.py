@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from afspm.basics.clock import utc_time
 from afspm.basics.entry_points import DISPLAYS, required
 from afspm.basics.errors import InvalidValue, NoSuchItem
+from afspm.basics.requirements import imports_of_extra
 from afspm.model.geometry import XY, Region, RegionChange
 
 if TYPE_CHECKING:
@@ -249,7 +250,9 @@ class Scan:
         The coordinates are x and y of the unrotated rectangle; `angle_rad` is in the attributes. NaN without values.
         """
         import numpy as np
-        import xarray
+
+        with imports_of_extra("xarray", "to_xarray"):
+            import xarray
 
         (left, low), (width, height) = self.region.top_left_m, self.region.size_m
         ny, nx = self.shape
@@ -325,7 +328,8 @@ class ScanSet(Mapping[str, Scan]):
 
     def to_xarray(self) -> xarray.Dataset:
         """Return all channels as an xarray Dataset (needs the extra `xarray`)."""
-        import xarray
+        with imports_of_extra("xarray", "to_xarray"):
+            import xarray
 
         return xarray.Dataset({channel: scan.to_xarray() for channel, scan in self.items()})
 

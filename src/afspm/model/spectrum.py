@@ -10,6 +10,7 @@ from afspm.basics.clock import utc_time
 from afspm.basics.entry_points import DISPLAYS, required
 from afspm.basics.errors import InvalidValue, NoSuchItem
 from afspm.basics.plain_data import Plain
+from afspm.basics.requirements import imports_of_extra
 from afspm.model.geometry import XY, Frame
 
 if TYPE_CHECKING:
@@ -70,7 +71,8 @@ class Spectrum:
 
     def to_xarray(self) -> xarray.Dataset:
         """Return an xarray Dataset over the first variable (needs the extra `xarray`)."""
-        import xarray
+        with imports_of_extra("xarray", "to_xarray"):
+            import xarray
 
         swept, *rest = self.names
         columns: Plain = {

@@ -291,7 +291,7 @@ def _write_mp4(path: Path, images: Sequence[Image.Image], frames_per_s: float) -
         raise FileError(
             "writing .mp4 needs PyAV, which is not installed",
             where=str(path),
-            hint="pip install afspm[film]; or a .gif",
+            hint='pip install "afspm[film]", or write a .gif',
         ) from error
     from fractions import Fraction
 

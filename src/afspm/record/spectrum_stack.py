@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.basics.errors import InvalidValue
+from afspm.basics.requirements import imports_of_extra
 from afspm.model.geometry import Frame, Region
 from afspm.model.scan import Scan
 from afspm.model.spectrum import Spectrum
@@ -65,7 +66,8 @@ class SpectrumStack:
 
     def to_xarray(self) -> xarray.Dataset:
         """Return the arrays with their coordinates (needs the extra `xarray`)."""
-        import xarray
+        with imports_of_extra("xarray", "stacking spectra"):
+            import xarray
 
         points = self.points
         return xarray.Dataset(

@@ -11,8 +11,8 @@ from enum import Enum
 from html import escape
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar, overload
 
-from afspm.basics.errors import FileError
 from afspm.basics.formatting import day_and_time, quantity, scale
+from afspm.basics.requirements import imports_of_extra
 from afspm.model import ControlState, Frame, ProcessCondition, Region, RegistrationOutcome
 from afspm.model.geometry import XY
 
@@ -200,16 +200,16 @@ class Table(Sequence[T], Generic[T]):
 
     def to_xarray(self) -> xarray.Dataset:
         """Return a Dataset over `row` (needs the extra `xarray`)."""
-        import xarray
+        with imports_of_extra("xarray", "to_xarray"):
+            import xarray
 
         return xarray.Dataset({name: ("row", _array(name, values)) for name, values in self.columns().items()})
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return a DataFrame with the columns of `to_numpy` (needs the extra `xarray`)."""
-        try:
+        with imports_of_extra("xarray", "to_pandas"):
             import pandas
-        except ImportError:
-            raise FileError("to_pandas needs pandas", hint='pip install "afspm[xarray]"') from None
+
         return pandas.DataFrame({name: _array(name, values) for name, values in self.columns().items()})
 
     def _repr_html_(self) -> str:

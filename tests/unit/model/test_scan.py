@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
-from afspm.basics.errors import InvalidValue
+from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.model import ProblemNames, Region, Scan, ScanParameters, ScanSet, Spectrum
 
 REGION = Region.from_top_left((0.0, 1e-6), (3e-6, 2e-6))
 SCAN = Scan(REGION, "Height", "m", np.arange(12.0).reshape(3, 4), 1_767_225_600_000_000_000, "a.nc")
+SPECTRUM = Spectrum((0.0, 0.0), "IV", ("Bias", "Current"), ("V", "A"), np.array([[-1.0, 2.0], [1.0, 4.0]]), 0)
 
 
 def test_xarray_has_coordinates_in_metres() -> None:
@@ -18,6 +22,15 @@ def test_xarray_has_coordinates_in_metres() -> None:
     np.testing.assert_allclose(array.y, [1e-6, 2e-6, 3e-6])
     assert (array.name, array.attrs["units"]) == ("Height", "m")
     assert float(array.sel(x=1e-6, y=3e-6, method="nearest")) == SCAN.values[2, 1]
+
+
+@pytest.mark.parametrize("convert", [SCAN.to_xarray, ScanSet([SCAN]).to_xarray, SPECTRUM.to_xarray])
+def test_conversion_without_xarray_is_refused_with_the_extra(
+    convert: Callable[[], object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(ConfigError, match=r'pip install "afspm\[xarray\]"'):
+        convert()
 
 
 def test_a_scan_without_values_has_the_shape_that_it_was_taken_with() -> None:
@@ -72,10 +85,9 @@ def test_channels_are_shown_in_a_row_each_with_its_colour_bar() -> None:
 
 
 def test_a_spectrum_gives_its_variables_by_name() -> None:
-    spectrum = Spectrum((0.0, 0.0), "IV", ("Bias", "Current"), ("V", "A"), np.array([[-1.0, 2.0], [1.0, 4.0]]), 0)
-    np.testing.assert_array_equal(spectrum["Current"], [2.0, 4.0])
-    assert spectrum.to_xarray().Current.sel(Bias=1.0) == 4.0
-    assert "polyline" in spectrum._repr_html_()
+    np.testing.assert_array_equal(SPECTRUM["Current"], [2.0, 4.0])
+    assert SPECTRUM.to_xarray().Current.sel(Bias=1.0) == 4.0
+    assert "polyline" in SPECTRUM._repr_html_()
     with pytest.raises(InvalidValue, match="fit together"):
         Spectrum(None, "IV", ("Bias",), ("V", "A"), np.zeros((2, 2)))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import h5py
@@ -10,7 +11,7 @@ import pytest
 from tests.unit.record.record_lab import Given, Night
 
 import afspm
-from afspm.basics.errors import InvalidValue
+from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.model import (
     ControlResponse,
     JournalEntries,
@@ -82,6 +83,18 @@ def test_table_becomes_a_data_frame(night: Night, store: RecordStore, tmp_path: 
     assert list(frame.number) == [1, 2]
     assert frame.width_m.mean() == pytest.approx(1e-6)
     assert str(frame.time_ns.dtype) == "datetime64[ns]"
+
+
+def test_tables_and_stacks_without_their_packages_are_refused_with_the_extra(
+    night: Night, store: RecordStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store.take([*night.whole_scan(1), night.spectrum()])
+    run = afspm.open_run(tmp_path)
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    for convert in (run.scans.to_xarray, run.scans.to_pandas, run.spectra.stack):
+        with pytest.raises(ConfigError, match=r'pip install "afspm\[xarray\]"'):
+            convert()
 
 
 def test_spectra_of_one_place_are_repeats(night: Night, store: RecordStore, tmp_path: Path) -> None:
