@@ -22,6 +22,9 @@ class MyComponent(Component):
     def on_scan(self, scan: Scan) -> None:
         if scan.channel != self.channel:
             return
+        if scan.time_ns and scan.time_ns <= self.memory.get("newest_ns", -1):
+            return  # handled before a restart: the cached scans arrive again
+        self.memory["newest_ns"] = scan.time_ns or -1
         found = self.memory.setdefault("rms_nm", [])  # kept on disk: it survives a restart
         found.append(1e9 * roughness(scan.values))
         self.log.info("scan %d: %.2f nm rms", len(found), found[-1])
