@@ -97,8 +97,9 @@ class ScriptedPerson(Component):
     listens = ("Proposal",)
 
     def on_proposal(self, proposal):
-        if not proposal.preflight:
-            return
+        if not proposal.preflight or proposal.time_ns <= self.memory.get("newest_ns", -1):
+            return  # not simulated yet, or approved before a restart
+        self.memory["newest_ns"] = proposal.time_ns
         grant, plan = of_plan(proposal, Frame.TIP)
         self.log.info("approves %s of %s: %d requests", plan.id, proposal.who, len(grant.steps))
         self.scope.approve(grant)
