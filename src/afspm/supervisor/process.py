@@ -70,6 +70,11 @@ class Task:
         """Whether the experiment can't go on without the process."""
         return self.role is not Role.COMPONENT
 
+    @property
+    def has_user_code(self) -> bool:
+        """Whether the class, or the program, is not part of afspm."""
+        return not self.launch.class_.startswith("afspm.")
+
 
 def from_start(start: ProcessStart) -> Task:
     """Return the task for a process to start: Python classes run in `host`, other languages under `foreign`."""

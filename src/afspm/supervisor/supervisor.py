@@ -109,7 +109,10 @@ class Supervisor:
         self._may_begin = threading.Event()
         if not awaits_scheduler:
             self._may_begin.set()
-        specs = [ChildSpec(task.name, task.role, task.beats, task.leaves_last, task.acts) for task in tasks]
+        specs = [
+            ChildSpec(task.name, task.role, task.beats, task.leaves_last, task.acts, has_user_code=task.has_user_code)
+            for task in tasks
+        ]
         self._core = SupervisorCore(specs, policy, awaits_scheduler=awaits_scheduler, ends_idle=ends_idle)
 
     def _with_heartbeat(self, task: Task) -> Task:

@@ -99,6 +99,26 @@ def test_crashing_process_is_restarted() -> None:
     assert run.core.children["series"].last_exit == "crashed: it breaks"
 
 
+@pytest.mark.parametrize("code", [ExitCode.CRASHED, ExitCode.OWN_FAULT])
+def test_first_crash_of_user_code_is_followed_by_a_remedy_once(code: ExitCode) -> None:
+    run = Run(*SPECS[:2], ChildSpec("series", has_user_code=True))
+    run.exits("series", code)
+    assert run.lines[-1].text.startswith("correct the file")
+    assert "`afspm restart series`" in run.lines[-1].text
+    run.exits("series", code)
+    run.step(RestartOrdered("series"))
+    run.exits("series", code)
+    assert sum("correct the file" in line.text for line in run.lines) == 1
+
+
+@pytest.mark.parametrize(("has_user_code", "code"), [(False, ExitCode.CRASHED), (True, -signal.SIGKILL)])
+def test_kill_or_a_crash_of_afspms_code_is_followed_by_no_remedy(has_user_code: bool, code: int) -> None:
+    run = Run(*SPECS[:2], ChildSpec("series", has_user_code=has_user_code))
+    run.exits("series", code)
+    assert any("restarting" in line.text for line in run.lines)
+    assert not any("correct the file" in line.text for line in run.lines)
+
+
 def test_exit_of_an_earlier_process_is_ignored() -> None:
     run = Run()
     run.exits("series", 1)

@@ -25,6 +25,7 @@ class ChildSpec:
         beats: whether it sends heartbeats; without heartbeats only an exit shows that a process is dead.
         leaves_last: whether it stays until the other components have ended, to record their last packets.
         acts: whether it follows a plan of its own, as a series does (True if unknown), or only reacts.
+        has_user_code: whether its class, or its program, is not part of afspm.
     """
 
     name: str
@@ -32,6 +33,7 @@ class ChildSpec:
     beats: bool = True
     leaves_last: bool = False
     acts: bool = False
+    has_user_code: bool = False
 
     @property
     def essential(self) -> bool:
@@ -112,6 +114,7 @@ class SupervisedChild:
     Attributes:
         starts, ordered: number of starts, and number of restarts ordered by a person.
         rescued: whether the process was started once more after the end of the experiment.
+        advised: whether the remedy for a crash has been logged.
         last_exit: description of the last exit.
         unfinished: description of a stop before the process had finished; otherwise empty.
     """
@@ -123,6 +126,7 @@ class SupervisedChild:
     ordered: int = 0
     rescued: bool = False
     given_up: bool = False
+    advised: bool = False
     last_exit: str = ""
     unfinished: str = ""
 

@@ -217,6 +217,8 @@ class SupervisorCore:
             self._apply(child, child.watch.exited(ExitCode.CRASHED, self._now_s, told))
         else:
             self._apply(child, child.watch.exited(code, self._now_s, how, exited.fault))
+            if has_crashed:
+                self._advise(child)
             if code == ExitCode.ENDED:
                 self._end_announced()
             elif code == ExitCode.CONFIG:
@@ -316,6 +318,13 @@ class SupervisorCore:
             is_last = child.spec.acts and all(other.is_over for other in self.children.values() if other.spec.acts)
             rest = f"the run ends in {IDLE_AFTER_S:.0f} s" if is_last and self._idle.ends else "the rest goes on"
             self._log(LOGGED_AS, "CRITICAL", f"gave up {name}; {rest}: {why}; {again}")
+
+    def _advise(self, child: SupervisedChild) -> None:
+        if child.spec.has_user_code and not (child.spec.essential or child.advised or child.given_up):
+            child.advised = True
+            name = child.spec.name
+            later = f"if {name} is given up, `afspm restart {name}` starts it again"
+            self._log(name, "INFO", f"correct the file, and the next restart loads it; {later}")
 
     def _end(self, why: EndReason, text: str) -> None:
         self._release()
