@@ -61,8 +61,8 @@ class Nanonis(Driver):
     """The driver of a microscope with a Nanonis controller.
 
     Args:
-        address: "host:port,port": two of the ports at File > Settings > TCP; each port serves one client. An emulator
-            needs a single port.
+        address: "host:port,port": two of the ports at File > Settings Options > TCP Programming Interface; each port
+            serves one client. An emulator needs a single port.
         session_dir: local path of Nanonis' session folder. Default: the path that Nanonis reports. Data in unreachable
             files is fetched over TCP.
         release: release of Nanonis' software (Help > Info), if the software reports none or a wrong release.

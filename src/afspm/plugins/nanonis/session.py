@@ -24,7 +24,7 @@ _WITHOUT_VERSION: Final = 10862
 _WAIT_MS: Final = 1000
 _LONGEST_CURVE_S: Final = 24 * 3600.0
 _HINTS: Final = (
-    "is Nanonis running, with its TCP programming interface on this port (File > Settings > TCP)?",
+    "is Nanonis running, with this port open (File > Settings Options > TCP Programming Interface)?",
     "Nanonis is silent while a dialog waits for an answer on its screen",
 )
 
