@@ -179,7 +179,7 @@ def of_versions(ours: Versions, theirs: Versions | None) -> Diagnosis:
     what = f"{here}; the scheduler's computer: {there}"
     if theirs.afspm == ours.afspm:
         return fine("versions", "this computer", what)
-    remedy = f"install the same on both: pip install afspm=={theirs.afspm}"
+    remedy = f"install the same on both: afspm {theirs.afspm}"
     return Diagnosis("versions", Severity.WARNING, "this computer", what, remedy)
 
 

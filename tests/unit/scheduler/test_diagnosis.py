@@ -55,7 +55,7 @@ def test_only_a_different_afspm_version_is_warned_of() -> None:
     assert diagnosis.of_versions(OURS, None).severity is Severity.FINE
     assert diagnosis.of_versions(OURS, Versions("0.2.0", "3.13.0", "4.3.5")).severity is Severity.FINE
     found = diagnosis.of_versions(OURS, Versions("0.1.0", "3.12.1", "4.3.5"))
-    assert (found.severity, found.remedy) == (Severity.WARNING, "install the same on both: pip install afspm==0.1.0")
+    assert (found.severity, found.remedy) == (Severity.WARNING, "install the same on both: afspm 0.1.0")
 
 
 @pytest.mark.parametrize(
