@@ -6,13 +6,14 @@ import importlib
 import json
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from afspm.basics.plain_data import Plain
 from afspm.client.component import Component
 from afspm.components import tip_verdict
 from afspm.components.line_file import LineFile
-from afspm.model import ControlState, RescanKind, Scan, ScopeState, ScopeStatus
+from afspm.model import ControlEvent, ControlState, JournalEntries, RescanKind, Scan, ScopeState, ScopeStatus
+from afspm.model.problems import CONDITIONS
 from afspm.record.night_record import NightRecord, control_entry, mark_entry, scan_entry
 
 
@@ -27,6 +28,8 @@ class NightPicture(Component):
         file: the picture's name in the run folder.
         title: title above the picture.
     """
+
+    listens: ClassVar = ("",)  # also the journal, which names the problems of conditions
 
     def __init__(self, channel: str = "Height", file: str = "night.png", title: str = "") -> None:
         self.channel, self.file, self.title = channel, file, title
@@ -63,6 +66,10 @@ class NightPicture(Component):
         by = envelope.partition("_")[2]
         if envelope.startswith("DriftRescan") and message.kind == RescanKind.OPPOSITE:
             self._add({"kind": "routine", "time_ns": message.timestamp.ToNanoseconds()})
+        elif isinstance(message, JournalEntries):
+            for entry in message.entries:
+                if entry.event is ControlEvent.PROBLEM_FLAGGED and entry.who == CONDITIONS:
+                    self._add({"kind": "condition", "time_ns": entry.time_ns, "problem": entry.problem})
         elif envelope.startswith("ActionMsg"):
             self._add(mark_entry(by, message.action, self._packet_ns()))
         elif envelope.startswith(tip_verdict.MESSAGE) and (verdict := tip_verdict.read_verdict(message)) is not None:

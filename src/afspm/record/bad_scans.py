@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from afspm.model import Problem
@@ -28,17 +28,20 @@ def bad_scans(
     verdicts: Iterable[tuple[int, float]],
     flagged_ns: Mapping[int, Iterable[int]],
     interrupted_ns: Iterable[int] = (),
+    of_conditions: Collection[int] = (),
 ) -> frozenset[int]:
     """Return the times of the bad scans.
 
     A scan is bad if it was interrupted, or if the last verdict on it is bad. In a run without verdicts on these scans,
-    the newest scan before each flagged problem is bad, except before thermal drift and device-malfunction.
+    the newest scan before each flagged problem is bad, except before thermal drift, device-malfunction and the problems
+    of conditions.
 
     Args:
         times_ns: ends of scans, or their interruptions.
         verdicts: time of the scan and score, in the order of arrival.
         flagged_ns: the times at which each problem was flagged, by its number.
         interrupted_ns: the times of the interruptions.
+        of_conditions: the numbers of the problems flagged by conditions, which judge other instruments.
     """
     judged: dict[int, float] = {}
     for of_ns, score in verdicts:
@@ -48,7 +51,8 @@ def bad_scans(
     bad |= set(times_ns) & set(interrupted_ns)
     if judged:
         return frozenset(bad)
-    for flag_ns in (flag for number, flags in flagged_ns.items() if number not in _NOT_OF_A_SCAN for flag in flags):
+    silent = _NOT_OF_A_SCAN.union(of_conditions)
+    for flag_ns in (flag for number, flags in flagged_ns.items() if number not in silent for flag in flags):
         newest_ns = max((time_ns for time_ns in times_ns if time_ns <= flag_ns), default=None)
         bad |= set() if newest_ns is None else {newest_ns}
     return frozenset(bad)

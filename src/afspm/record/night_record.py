@@ -76,6 +76,7 @@ class NightRecord:
 
     Attributes:
         routine: times at which thermal-drift was flagged in the normal course of a run; see `Overview.is_routine`.
+        of_conditions: the numbers of the problems flagged by conditions.
         scans_taken: the number of scans, if `shots` is not complete.
     """
 
@@ -84,6 +85,7 @@ class NightRecord:
     marks: list[NightMark] = field(default_factory=list)
     interruptions: list[int] = field(default_factory=list)
     routine: list[int] = field(default_factory=list)
+    of_conditions: set[int] = field(default_factory=set)
     end_ns: int = 0
     scans_taken: int | None = None
     _known: set[str] = field(default_factory=set, repr=False)
@@ -107,7 +109,7 @@ class NightRecord:
             ValueError, KeyError, TypeError: the entry is malformed or of an unknown kind.
         """
         kind, time_ns = entry["kind"], int(entry["time_ns"])
-        identity = f"{kind} {time_ns} {entry.get('by', '')}"
+        identity = f"{kind} {time_ns} {entry.get('by', '')}{entry.get('problem', '')}"
         if identity in self._known:
             return False
         if kind == "scan":
@@ -124,6 +126,8 @@ class NightRecord:
             self.interruptions.append(time_ns)
         elif kind == "routine":
             self.routine.append(time_ns)
+        elif kind == "condition":
+            self.of_conditions.add(int(entry["problem"]))
         else:
             raise ValueError(kind)
         self._known.add(identity)
@@ -174,7 +178,8 @@ class NightRecord:
     def bad_ns(self) -> frozenset[int]:
         verdicts = [(m.of_ns, m.score) for m in self.marks if m.of_ns is not None and m.score is not None]
         flagged_ns = {number: [span.start_ns for span in self.problem_spans(number)] for number in self.problems}
-        return bad_scans([shot.time_ns for shot in self.shots], verdicts, flagged_ns, self.interruptions)
+        times_ns = [shot.time_ns for shot in self.shots]
+        return bad_scans(times_ns, verdicts, flagged_ns, self.interruptions, self.of_conditions)
 
     def _spans(self, holds: Callable[[ControlState], bool], label: str = "") -> list[Span]:
         timeline = Timeline()

@@ -43,6 +43,7 @@ from afspm.model import (
     registration_summary,
 )
 from afspm.model.events import PERSON
+from afspm.model.problems import CONDITIONS
 from afspm.record.measurement_history import (
     SOON_NS,
     DriftPoint,
@@ -170,6 +171,7 @@ class Overview:
         instruments: the curve of each instrument parameter, by its name.
         proposals: the proposals of agents by id, newest last, bounded.
         approvals: the approvals in force.
+        of_conditions: the numbers of the problems flagged by conditions.
         log, notes, entries, refusals: newest last, bounded.
     """
 
@@ -184,6 +186,7 @@ class Overview:
         self.progress_reports: dict[str, Progress] = {}
         self.proposals: dict[str, Proposal] = {}
         self.approvals = Approvals()
+        self.of_conditions: set[int] = set()
         self.log: deque[LogLine] = deque(maxlen=MOST_LINES)
         self.notes: deque[Note] = deque(maxlen=most_entries)
         self.entries: deque[JournalEntry] = deque(maxlen=most_entries)
@@ -398,6 +401,8 @@ class Overview:
                 lanes.mode.change(entry.mode.name.lower(), entry.time_ns)
             case ControlEvent.PROBLEM_FLAGGED | ControlEvent.PROBLEM_CLEARED if entry.problem is not None:
                 is_flagged = entry.event is ControlEvent.PROBLEM_FLAGGED
+                if is_flagged and entry.who == CONDITIONS:
+                    self.of_conditions.add(entry.problem)
                 label = self.problems.name(entry.problem) if is_flagged else None
                 lanes.problems[entry.problem].change(label, entry.time_ns, by=entry.who)
 

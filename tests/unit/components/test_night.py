@@ -18,7 +18,20 @@ from afspm import wire
 from afspm.basics.exit_codes import ExitCode
 from afspm.components.night_picture import NightPicture
 from afspm.components.tip_verdict import BAD, MESSAGE, verdict_message
-from afspm.model import ControlMode, ControlState, Problem, Region, RescanKind, Scan, ScopeState, ScopeStatus
+from afspm.model import (
+    ControlEvent,
+    ControlMode,
+    ControlState,
+    JournalEntries,
+    JournalEntry,
+    Problem,
+    Region,
+    RescanKind,
+    Scan,
+    ScopeState,
+    ScopeStatus,
+)
+from afspm.model.problems import CONDITIONS
 from afspm.record.drawing.palette import LEVELS, UNMEASURED
 from afspm.record.night_record import (
     THUMBNAIL_PX,
@@ -77,6 +90,25 @@ def test_thermal_drift_until_the_first_scan_was_taken_both_ways_is_left_out_of_t
     (span,) = picture.record.problem_spans(drift)
     assert span.start_ns == lab.clock.now_ns() - 60 * 10**9
     assert picture.record.problems == [drift]
+
+
+def test_scan_before_the_problem_of_a_condition_is_not_framed(tmp_path: Path) -> None:
+    lab = Lab()
+    warm = 11
+    lab.at(10.0, lambda: lab.publish_scan(REGION))
+    lab.at(20.0, lambda: lab.publish(ControlState(problems=(warm,))))
+    entry = JournalEntry(
+        lab.clock.now_ns(), "control", CONDITIONS, "", event=ControlEvent.PROBLEM_FLAGGED, problem=warm
+    )
+    lab.at(21.0, lambda: lab.publish(JournalEntries((entry,))))
+    lab.at(60.0, lab.kill)
+    picture = NightPicture()
+    assert picture.listens == ("",), "by default a component does not get the journal"
+    assert run(picture, lab, tmp_path / "state", run_dir=str(tmp_path)) == ExitCode.ENDED
+    assert (len(picture.record.shots), picture.record.problems) == (1, [warm])
+    assert picture.record.bad_ns() == frozenset()
+    saved = (tmp_path / "state" / f"{picture.name}.night.jsonl").read_text(encoding="utf-8").splitlines()
+    assert NightRecord.from_lines(saved).bad_ns() == frozenset(), "also after a restart"
 
 
 def test_spans_of_control_and_problems_are_read_from_the_states() -> None:

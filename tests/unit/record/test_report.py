@@ -19,6 +19,7 @@ from afspm import model, wire
 from afspm.basics.errors import FileError
 from afspm.components.tip_verdict import OF_LINES, LineVerdict, line_verdict_message
 from afspm.model import ControlMode, ControlState, ProcessCondition, RegistrationOutcome, ScopeState
+from afspm.model.problems import CONDITIONS
 from afspm.record.bad_scans import BAD, VERDICT_MESSAGE
 from afspm.record.report import REPORT_FILE, page, pictures, story, write
 from afspm.record.run import open_run
@@ -320,6 +321,29 @@ def test_page_and_picture_of_the_night_frame_the_same_scans_by_their_verdicts(ru
         read = story.read(opened)
         record = pictures.night_of(opened, read, pictures.of_scans(opened, read.scans))
     assert record.bad_ns() == {whole[1], whole[4]}
+
+
+def test_problem_of_a_condition_frames_no_scan(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path, RecordSettings({"experiment": "cold"}))
+    warm = 100
+    flagged: dict[str, Any] = {"event": model.ControlEvent.PROBLEM_FLAGGED, "problem": warm}
+    things = [
+        (1, ControlState(ControlMode.AUTOMATED, "series")),
+        (10, model.ScopeStatus(ScopeState.SCANNING)),
+        (80, scan(80)),
+        (82, model.ScopeStatus(ScopeState.FREE)),
+        (90, ControlState(ControlMode.AUTOMATED, None, (warm,))),
+        (91, entry(90, "control", CONDITIONS, "flagged too-warm", **flagged)),
+    ]
+    store.take([(model.Packet(*wire.encode(thing), START + at_s * S), "") for at_s, thing in things])
+    store.flush()
+    store.close()
+    assert framed(tmp_path) == []
+    with open_run(tmp_path) as opened:
+        read = story.read(opened)
+        record = pictures.night_of(opened, read, pictures.of_scans(opened, read.scans))
+    assert record.problems == [warm]
+    assert record.bad_ns() == frozenset()
 
 
 def test_row_with_a_changed_tip_is_a_dashed_line_in_its_scan(run: Path) -> None:

@@ -86,7 +86,8 @@ def bad_ns(run: Run, story: RunStory) -> frozenset[int]:
     lanes = story.overview.timelines.problems.items()
     flagged_ns = {number: [span.start_ns for span in lane.spans] for number, lane in lanes}
     interrupted_ns = [row.time_ns for row in story.scans if row.interrupted]
-    return bad_scans([row.time_ns for row in story.scans], run.verdicts(), flagged_ns, interrupted_ns)
+    times_ns = [row.time_ns for row in story.scans]
+    return bad_scans(times_ns, run.verdicts(), flagged_ns, interrupted_ns, story.overview.of_conditions)
 
 
 def chosen(rows: Sequence[ScanRow], most: int = MOST, kept_ns: Collection[int] = ()) -> list[ScanRow]:
@@ -159,6 +160,7 @@ def night_of(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -
         (story.start_ns, ControlState(ControlMode.UNDEFINED))
     ]
     record.routine = [span.start_ns for span in story.overview.routine_spans]
+    record.of_conditions = set(story.overview.of_conditions)
     record.interruptions = [row.time_ns for row in story.scans if row.interrupted]
     record.marks = [NightMark(of_ns, "", "verdict", score, of_ns) for of_ns, score in run.verdicts()]
     record.marks += [

@@ -14,8 +14,6 @@ from afspm.scheduler.safety.limits import ExperimentLimits
 
 OLDEST_S = 4.0
 """A reading older than this, real, does not count: a lost instrument is noticed within 5 s."""
-CONDITIONS = "conditions"
-"""The name under which the scheduler flags the problem of a condition."""
 
 
 @dataclass(frozen=True)

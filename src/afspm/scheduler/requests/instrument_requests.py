@@ -27,10 +27,10 @@ from afspm.model import (
 )
 from afspm.model.idempotency_cache import RequestStatus
 from afspm.model.instruments import PARTS
+from afspm.model.problems import CONDITIONS
 from afspm.scheduler.control import control_change
 from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlInput
 from afspm.scheduler.events import RequestIn
-from afspm.scheduler.instruments.conditions import CONDITIONS
 from afspm.scheduler.instruments.known_instruments import OpenOrder
 from afspm.scheduler.publishing import own_packets as publishing
 from afspm.scheduler.requests import answers
