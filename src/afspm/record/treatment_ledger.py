@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import UnitError
@@ -18,6 +19,13 @@ KEEP_AWAY_M = 500e-9
 XY = tuple[float, float]
 
 
+class TreatmentPlace(NamedTuple):
+    """The action of a treatment, such as "x-pulse", and the position of the probe."""
+
+    action: str
+    xy_m: XY
+
+
 @dataclass(frozen=True)
 class TreatmentLedger:
     """Totals of the treatments in a run.
@@ -29,6 +37,7 @@ class TreatmentLedger:
         in_keep_away: treatments nearer than the given distance to a region scanned before.
         feedback_off_s: time in which the published feedback was off, without the time after requested retractions.
         by: number of treatments of each author.
+        places: the treatments with a known position, in the order of time.
     """
 
     pulses: int = 0
@@ -39,6 +48,7 @@ class TreatmentLedger:
     in_keep_away: int = 0
     feedback_off_s: float = 0.0
     by: dict[str, int] = field(default_factory=dict)
+    places: tuple[TreatmentPlace, ...] = ()
 
     @property
     def treatments(self) -> int:
@@ -72,8 +82,15 @@ def treatment_ledger(
         elif entry.request == ControlRequest.ACTION and entry.subject in (names.RETRACT, names.ENGAGE):
             retracted.append((entry.time_ns, entry.subject == names.RETRACT))
         elif entry.request == ControlRequest.ACTION and entry.subject in (names.PULSE, names.CRASH):
-            near = _is_near(entry, positions, scanned, keep_away_m)
-            ledger = _with_treatment(ledger, entry, values, near=near)
+            done_ns = entry.sent_ns if entry.sent_ns is not None else entry.time_ns
+            place = next((xy_m for time_ns, xy_m in reversed(positions) if time_ns <= done_ns), None)
+            if place is not None:
+                near = any(
+                    _distance_m(place, region) < keep_away_m for began_ns, region in scanned if began_ns <= done_ns
+                )
+                places = (*ledger.places, TreatmentPlace(entry.subject, place))
+                ledger = replace(ledger, in_keep_away=ledger.in_keep_away + near, places=places)
+            ledger = _with_treatment(ledger, entry, values)
     return replace(ledger, feedback_off_s=_off_s(feedback, retracted, end_ns))
 
 
@@ -85,11 +102,8 @@ def _keep_value(values: dict[str, float], entry: JournalEntry) -> None:
         values.pop(entry.subject, None)  # a text, or a unit of another kind: no number of a treatment
 
 
-def _with_treatment(
-    ledger: TreatmentLedger, entry: JournalEntry, values: dict[str, float], *, near: bool
-) -> TreatmentLedger:
-    by = {**ledger.by, entry.who: ledger.by.get(entry.who, 0) + 1}
-    ledger = replace(ledger, by=by, in_keep_away=ledger.in_keep_away + near)
+def _with_treatment(ledger: TreatmentLedger, entry: JournalEntry, values: dict[str, float]) -> TreatmentLedger:
+    ledger = replace(ledger, by={**ledger.by, entry.who: ledger.by.get(entry.who, 0) + 1})
     if entry.subject == names.CRASH:
         depth_m = values.get(names.CRASH_DEPTH)
         unknown, depth_m = depth_m is None, depth_m or 0.0
@@ -103,19 +117,6 @@ def _with_treatment(
         pulses=ledger.pulses + 1,
         pulse_v_s=ledger.pulse_v_s + pulse_v_s,
         unknown=ledger.unknown + (not known),
-    )
-
-
-def _is_near(
-    entry: JournalEntry,
-    positions: Sequence[tuple[int, XY]],
-    scanned: Sequence[tuple[int, Region]],
-    keep_away_m: float,
-) -> bool:
-    done_ns = entry.sent_ns if entry.sent_ns is not None else entry.time_ns
-    where = [xy_m for time_ns, xy_m in positions if time_ns <= done_ns]
-    return bool(where) and any(
-        _distance_m(where[-1], region) < keep_away_m for began_ns, region in scanned if began_ns <= done_ns
     )
 
 

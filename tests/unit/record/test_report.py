@@ -18,14 +18,15 @@ import pytest
 from afspm import model, wire
 from afspm.basics.errors import FileError
 from afspm.components.tip_verdict import OF_LINES, LineVerdict, line_verdict_message
-from afspm.model import ControlMode, ControlState, ProcessCondition, RegistrationOutcome, ScopeState
+from afspm.model import ControlMode, ControlState, ProcessCondition, RegistrationOutcome, ScopeState, names
 from afspm.model.problems import CONDITIONS
 from afspm.record.bad_scans import BAD, VERDICT_MESSAGE
-from afspm.record.report import REPORT_FILE, page, pictures, story, write
+from afspm.record.report import REPORT_FILE, page, pictures, sample, story, write
 from afspm.record.run import open_run
 from afspm.record.run_json import EXPERIMENT_FILE, UNFINISHED
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.record.timeline import Span
+from afspm.record.treatment_ledger import TreatmentLedger, TreatmentPlace
 
 S = 1_000_000_000
 START = 1_700_000_000 * S
@@ -300,6 +301,12 @@ def framed(run: Path) -> list[int]:
     return [int(number) for number in re.findall(r'<figure id="scan-(\d+)" class="scan bad"', text)]
 
 
+def test_legend_of_the_scans_explains_no_mark_without_drift(report: Path) -> None:
+    text = report.read_text(encoding="utf-8")
+    assert "share one range of heights.</p>" in text
+    assert "only estimated" not in text
+
+
 def test_scan_before_a_flag_and_interrupted_scan_are_framed(run: Path) -> None:
     assert framed(run) == [3, 4]
 
@@ -489,6 +496,32 @@ def test_map_shows_pictures_at_their_position_the_newest_on_top(tmp_path: Path) 
     assert "µm" in sample
 
 
+def test_sums_of_treatments_name_what_they_sum(run: Path) -> None:
+    ledger = TreatmentLedger(pulses=3, pulse_v_s=1.05, crashes=2, crash_depth_m=1e-8)
+    with open_run(run) as opened:
+        text = page.html(replace(story.read(opened), ledger=ledger), [], [], [])
+    assert "<td>3, voltage × time together 1.05 V s</td>" in text
+    assert "<td>2, depth together 10 nm</td>" in text
+
+
+def test_map_marks_near_treatments_and_lists_those_far_away() -> None:
+    def mapped(*treated: tuple[str, tuple[float, float]]) -> str:
+        places = [TreatmentPlace(*one) for one in treated]
+        return sample.sample_map([], [(0.0, 0.0), (1e-6, 1e-6)], places, model.Frame.TIP)
+
+    beside = mapped((names.PULSE, (2e-6, 0.0)), (names.CRASH, (2e-6, 1e-6)))
+    assert re.findall(r'<u [^>]*title="(\w+ at [^"]*)">(.)</u>', beside) == [
+        ("pulse at (2, 0) µm", "+"),
+        ("crash at (2, 1) µm", "×"),
+    ]
+    assert "; + pulse; × crash.</p>" in beside
+    assert "Outside" not in beside
+    far = mapped((names.PULSE, (8e-6, 0.0)), (names.PULSE, (9e-6, -1e-6)), (names.CRASH, (0.5e-6, 0.5e-6)))
+    assert far.count("<u ") == 1
+    assert "; × crash. Outside the map: 2 pulses between (8, −1) µm and (9, 0) µm.</p>" in far
+    assert "Outside the map: 1 crash at (8, 0) µm." in mapped((names.CRASH, (8e-6, 0.0)))
+
+
 def test_invalid_figure_is_left_out(run: Path) -> None:
     (run / "half.png").write_bytes(b"\x89PNG but no more")
     assert "half.png" not in write(run).read_text(encoding="utf-8")
@@ -523,6 +556,8 @@ def test_poorly_registered_scans_are_listed_with_their_uncertainty(tmp_path: Pat
     assert "&lt;oh&gt;" in row
     assert "± 30 nm, failed, by dead reckoning: &lt;oh&gt;" in text
     assert "± 30 nm, registered" in text
+    assert "is only estimated, from earlier drift: <b>failed</b>: an error, a time limit" in text
+    assert "<b>refused</b>:" not in text, "no scan has this mark"
 
 
 def test_first_thermal_drift_is_shown_as_routine(tmp_path: Path) -> None:
@@ -561,6 +596,7 @@ def test_planned_work_stands_beside_the_measured_work(run: Path) -> None:
     Page(text)
     head = "<td>series &lt;b&gt;</td><td>planned</td><td>4</td><td>0</td><td>128 µm</td><td>30 min</td>"
     measured = "<td></td><td>measured</td><td>3</td><td>0</td><td>96 µm</td><td>22 min</td>"
+    assert "<th>tip path</th><th>duration</th>" in text
     assert f"<tr>{head}</tr><tr>{measured}</tr>" in re.sub(r"\s*\n\s*", "", text)
     assert "tuner" not in text, "it has no estimate to compare"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from afspm.model import ControlRequest, ControlResponse, JournalEntry, Region, names
-from afspm.record.treatment_ledger import TreatmentLedger, treatment_ledger
+from afspm.record.treatment_ledger import TreatmentLedger, TreatmentPlace, treatment_ledger
 
 S = 1_000_000_000
 
@@ -69,6 +69,16 @@ def test_treatment_near_a_region_counts_only_after_its_scan_began() -> None:
     assert ledger_of(acts(4, names.PULSE), at_m=near).in_keep_away == 0
     assert ledger_of(acts(6, names.PULSE), at_m=near).in_keep_away == 1
     assert ledger_of(acts(6, names.PULSE), at_m=(1.1e-6, 0.0)).in_keep_away == 0
+
+
+def test_place_of_a_treatment_is_the_last_position_before_it() -> None:
+    place = (2e-6, 1e-6)
+    assert ledger_of(acts(4, names.PULSE), acts(5, names.CRASH), at_m=place).places == (
+        TreatmentPlace(names.PULSE, place),
+        TreatmentPlace(names.CRASH, place),
+    )
+    unknown = treatment_ledger([acts(4, names.PULSE)], [(5 * S, place)], [], [], 9 * S, 500e-9)
+    assert (unknown.pulses, unknown.places) == (1, ())
 
 
 def test_time_with_the_feedback_off_excludes_a_retracted_tip() -> None:

@@ -41,7 +41,7 @@ def html(
         section("Agents", agents.html(story.agents, clock)),
         section("Drift", _drift(story, clock)),
         section("Notes", _notes(story, clock)),
-        section("On the sample", sample.sample_map(shown, places, story.frame)),
+        section("On the sample", sample.sample_map(shown, places, story.ledger.places, story.frame)),
         section("Scans", sample.sheet(story, shown, clock)),
         section("Spectra", curves.html(spectra, clock)),
         section("Figures", _unfinished(story) + _figures(figures)),
@@ -206,8 +206,8 @@ def _treatments(story: RunStory) -> str:
     if not ledger.treatments and not ledger.feedback_off_s:
         return ""
     rows = [
-        ["pulses", f"{ledger.pulses}, together {quantity(ledger.pulse_v_s, 'V s')}"],
-        ["crashes", f"{ledger.crashes}, together {quantity(ledger.crash_depth_m, 'm')} deep"],
+        ["pulses", f"{ledger.pulses}, voltage × time together {quantity(ledger.pulse_v_s, 'V s')}"],
+        ["crashes", f"{ledger.crashes}, depth together {quantity(ledger.crash_depth_m, 'm')}"],
         ["by", escape(", ".join(f"{who} {count}" for who, count in sorted(ledger.by.items()))) or "none"],
         ["within 500 nm of a region scanned before", str(ledger.in_keep_away)],
         ["feedback off", duration_text(ledger.feedback_off_s)],

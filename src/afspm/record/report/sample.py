@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from html import escape
 
@@ -10,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.basics.clock import NS_PER_S
-from afspm.basics.formatting import duration_text, quantity, scale, typeset_area, typeset_position
+from afspm.basics.formatting import counted, duration_text, quantity, scale, typeset_area, typeset_position
 from afspm.model import Frame, RegistrationOutcome
 from afspm.model.geometry import XY
+from afspm.model.names import CRASH, PULSE
 from afspm.record.drawing.chart import Axis
 from afspm.record.drawing.image_html import data_url, scale_bar
 from afspm.record.report import markup
@@ -20,12 +22,22 @@ from afspm.record.report.markup import PageTimes
 from afspm.record.report.pictures import TopographyPicture
 from afspm.record.report.story import RunStory, colours
 from afspm.record.tables import ScanRow
+from afspm.record.treatment_ledger import TreatmentPlace
 
 _LEGEND = (
     "Click a picture to enlarge it. The bar below it has the colour of who was in control; framed: "
-    "bad or interrupted; refused, failed, new: its place on the sample is dead reckoning. Topography, rows brought to "
-    "one height, without its plane; scans of one size share one range of heights."
+    "bad or interrupted. Topography, rows brought to one height, without its plane; scans of one size share one range "
+    "of heights."
 )
+_OUTCOMES = {
+    RegistrationOutcome.REFUSED: "it was recognised in no earlier scan of its place",
+    RegistrationOutcome.FAILED: "an error, a time limit or a missing channel prevented the comparison",
+    RegistrationOutcome.NEW: "no earlier scan shows its part of the sample",
+}
+"""The reason for each mark of a scan whose place is extrapolated from earlier drift."""
+_MARKS = {PULSE: ("+", "pulse", "pulses"), CRASH: ("×", "crash", "crashes")}
+_WIDENED = 3.0
+"""The map grows at most by this factor to include treatments; otherwise its scans would get too small."""
 _MARGIN = 0.04
 _HIDDEN_BEHIND = 40  # most pictures on the map: older pictures disappear beneath newer pictures
 
@@ -39,24 +51,61 @@ def sheet(story: RunStory, shown: Sequence[TopographyPicture], clock: PageTimes)
     figures = [_figure(one, story, styles, clock, (names[index], names[index + 2])) for index, one in enumerate(shown)]
     left_out = len(story.scans) - len(shown)
     note = f'<p class="note">{left_out} more are not shown.</p>' if left_out else ""
-    return f'<div class="sheet">{"".join(figures)}</div>{note}<p class="note">{_LEGEND}</p>'
+    return f'<div class="sheet">{"".join(figures)}</div>{note}<p class="note">{_LEGEND}{_estimated(shown)}</p>'
 
 
-def sample_map(shown: Sequence[TopographyPicture], spectra_m: Sequence[XY], frame: Frame) -> str:
-    """Return an HTML map of the newest scans, with the newest on top, and of all spectra; empty without positions."""
+def _estimated(shown: Sequence[TopographyPicture]) -> str:
+    marks = {one.row.registration for one in shown}
+    meanings = [f"<b>{outcome.label}</b>: {reason}" for outcome, reason in _OUTCOMES.items() if outcome in marks]
+    text = f" The place on the sample is only estimated, from earlier drift: {'; '.join(meanings)}." if meanings else ""
+    if RegistrationOutcome.COARSE in marks:
+        text += f" <b>{RegistrationOutcome.COARSE.label}</b>: the place was measured, but less accurately."
+    return text
+
+
+def sample_map(
+    shown: Sequence[TopographyPicture], spectra_m: Sequence[XY], treated: Sequence[TreatmentPlace], frame: Frame
+) -> str:
+    """Return an HTML map of the newest scans, with the newest on top, and of all spectra; empty without both.
+
+    Treatments of the tip are marked, or listed below the map if they are too far away.
+    """
     pictures = _topmost(shown)
     corners = [one.row.region.corners_m() for one in pictures if one.row.region is not None]
     corners += [np.array([position]) for position in spectra_m]
     if not corners:
         return ""
-    view = _View(np.concatenate(corners))
+    measured_m = np.concatenate(corners)
+    view = _View(measured_m)
+    if treated:
+        wider = _View(np.concatenate([measured_m, np.array([one.xy_m for one in treated])]))
+        view = wider if max(wider.width, wider.height) <= _WIDENED * max(view.width, view.height) else view
+    marked = [one for one in treated if view.contains(one.xy_m)]
     images = "".join(view.image(one) for one in pictures)
     points = "".join(view.point(position) for position in spectra_m)
+    points += "".join(view.mark(one) for one in marked)
     places = "sample coordinates" if frame is Frame.SAMPLE else "coordinates of the scanner"
     points_told = "; the points are spectra" if spectra_m else ""
     scans_told = ", the newest scan on top; click one to see it" if pictures else ""
-    note = f'<p class="note">{places.capitalize()}{scans_told}{points_told}.</p>'
-    return f"{view.frame(images + points)}{note}"
+    legend = f"{places.capitalize()}{scans_told}{points_told}{_marks_text(marked)}."
+    far = _far_text([one for one in treated if one not in marked])
+    return f'{view.frame(images + points)}<p class="note">{legend}{far}</p>'
+
+
+def _marks_text(marked: Sequence[TreatmentPlace]) -> str:
+    made = {one.action for one in marked}
+    return "".join(f"; {sign} {one}" for action, (sign, one, _) in _MARKS.items() if action in made)
+
+
+def _far_text(far: Sequence[TreatmentPlace]) -> str:
+    if not far:
+        return ""
+    counts = Counter(one.action for one in far)
+    what = " and ".join(counted(counts[action], *words[1:]) for action, words in _MARKS.items() if counts[action])
+    (left, low), (right, high) = (edge(np.array([one.xy_m for one in far]), axis=0) for edge in (np.min, np.max))
+    if (left, low) == (right, high):
+        return f" Outside the map: {what} at {typeset_position((left, low))}."
+    return f" Outside the map: {what} between {typeset_position((left, low))} and {typeset_position((right, high))}."
 
 
 class _View:
@@ -103,6 +152,16 @@ class _View:
         x, y = position_m
         title = f"spectrum at {typeset_position(position_m)}"
         return f'<b style="left:{self._x(x):.3f}%;top:{self._y(y):.3f}%" title="{title}"></b>'
+
+    def mark(self, treatment: TreatmentPlace) -> str:
+        x, y = treatment.xy_m
+        sign, what, _ = _MARKS[treatment.action]
+        title = f"{what} at {typeset_position(treatment.xy_m)}"
+        return f'<u style="left:{self._x(x):.3f}%;top:{self._y(y):.3f}%" title="{title}">{sign}</u>'
+
+    def contains(self, position_m: XY) -> bool:
+        x, y = position_m
+        return 0.0 <= self._x(x) <= 100.0 and 0.0 <= self._y(y) <= 100.0
 
     def _x(self, x_m: float) -> float:
         return 100.0 * (x_m - self.left) / self.width

@@ -46,6 +46,8 @@ font-variant-numeric:tabular-nums}
 .map>a.bad{outline-color:var(--problem)}.map img{width:100%;height:100%;display:block}
 .map>b{position:absolute;width:9px;height:9px;margin:-4.5px 0 0 -4.5px;border-radius:50%;background:var(--c3);
 border:1.5px solid #fff;outline:1px solid #000}
+.map>u{position:absolute;transform:translate(-50%,-50%);text-decoration:none;font:bold 17px/1 system-ui,sans-serif;
+color:#c9304a;text-shadow:0 0 2px #fff,0 0 2px #fff,0 0 2px #fff}
 .map>s{position:absolute;text-decoration:none;font-size:11.5px;color:var(--soft);white-space:nowrap}
 .map>s.x{top:100%;transform:translate(-50%,3px)}.map>s.y{right:100%;transform:translate(-5px,-50%)}
 .sheet{display:grid;grid-template-columns:repeat(auto-fill,minmax(104px,1fr));gap:.7rem;align-items:start}
