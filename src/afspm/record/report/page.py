@@ -14,7 +14,7 @@ from afspm.record.allowed_bands import instrument_curves
 from afspm.record.drawing import timeline
 from afspm.record.drawing.image_html import data_url
 from afspm.record.overview import ROUTINE
-from afspm.record.report import agents, curves, estimate, markup, sample
+from afspm.record.report import agents, curves, estimate, markup, parameters, sample
 from afspm.record.report.curves import SpectrumGroup
 from afspm.record.report.markup import PageTimes, document, section, table
 from afspm.record.report.pictures import FigurePicture, TopographyPicture
@@ -38,6 +38,7 @@ def html(
         section("Time line", f'<div class="scroll">{_timeline(story)}</div>{_zones(clock)}'),
         section("Problems and repairs", _problems(story, clock)),
         section("Treatments of the tip", _treatments(story)),
+        section("Parameters changed", parameters.html(story.changes, clock)),
         section("Agents", agents.html(story.agents, clock)),
         section("Drift", _drift(story, clock)),
         section("Notes", _notes(story, clock)),

@@ -22,7 +22,7 @@ from afspm.record.allowed_bands import AllowedBands, allowed_bands
 from afspm.record.drawing.timeline import TimelineRow
 from afspm.record.expected_end import plans_of
 from afspm.record.overview import Overview, ProcessRestart
-from afspm.record.report import agents
+from afspm.record.report import agents, parameters
 from afspm.record.report.work_comparison import WorkComparison, compare
 from afspm.record.run import Run
 from afspm.record.run_json import REAL_S, UNFINISHED
@@ -63,6 +63,7 @@ class RunStory:
         ledger: totals of the treatments of tip and sample.
         comparisons: planned and measured work of each component with a plan.
         agents: the work of each agent.
+        changes: the changed parameters, except the place of scans and spectra.
         bands: the values of other instruments that the conditions allowed.
         unfinished: how each unfinished component was stopped, as text by name.
     """
@@ -85,6 +86,7 @@ class RunStory:
     ledger: TreatmentLedger
     comparisons: Sequence[WorkComparison] = ()
     agents: Sequence[agents.AgentWork] = ()
+    changes: Sequence[parameters.ParameterChange] = ()
     bands: AllowedBands = field(default_factory=dict)
     unfinished: Mapping[str, str] = field(default_factory=dict)
 
@@ -182,6 +184,7 @@ def read(run: Run) -> RunStory:
         seen_late=list({entry.problem: entry for entry in reversed(late)}.values()),
         comparisons=compare(plans_of(run.facts), scans, run.spectra),
         agents=agents.read(run),
+        changes=parameters.read(run),
         bands=allowed_bands(run.folder),
         unfinished=run.facts.get(UNFINISHED) or {},
     )

@@ -39,6 +39,7 @@ i.c1{background:var(--c1)}i.c2{background:var(--c2)}i.c3{background:var(--c3)}i.
 table{border-collapse:collapse;width:100%}th{text-align:left;font-weight:600;color:var(--soft)}
 td,th{padding:.25rem .6rem .25rem 0;border-bottom:1px solid var(--rule);vertical-align:top;
 font-variant-numeric:tabular-nums}
+details>summary{cursor:pointer}details table{width:auto;margin:.2rem 0 .4rem}
 .text{white-space:pre-wrap;overflow-wrap:anywhere}
 .shares td:nth-child(n+3){white-space:nowrap}.shares td:nth-child(2){width:40%}
 .map{position:relative;max-width:560px;margin:0 0 1.6rem 3.2rem;background:var(--panel);outline:1px solid var(--rule)}
