@@ -15,7 +15,23 @@ from afspm.basics.clock import iso_utc
 from afspm.basics.exit_codes import ExitCode
 from afspm.components.line_file import LineFile
 from afspm.components.metadata import COLUMNS, Metadata
-from afspm.model import ControlMode, ControlState, Note, Problem, Scan, ScopeState, ScopeStatus, Spectrum
+from afspm.model import (
+    ControlEvent,
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    ControlState,
+    Feedback,
+    JournalEntries,
+    JournalEntry,
+    Note,
+    Problem,
+    Scan,
+    ScopeState,
+    ScopeStatus,
+    Spectrum,
+    names,
+)
 from afspm.scheduler.control import arbitration as a
 
 
@@ -223,6 +239,114 @@ def test_times_keep_their_microseconds_and_columns_their_order() -> None:
     assert iso_utc(1_700_000_000_123_456_789) == "2023-11-14T22:13:20.123456Z"
     assert iso_utc(None) == ""
     assert COLUMNS[:4] == ("time", "measurement", "filename", "channel")
+
+
+BIAS, SETPOINT = names.TIP_BIAS_VOLTAGE, names.ZCTRL_SETPOINT
+PARAM, ACTION = int(ControlRequest.PARAM), int(ControlRequest.ACTION)
+
+
+def journal(lab: Lab, at_s: float, *, later_s: float = 0.1, response: int = 0, **codes: Any) -> None:
+    """Publish the journal entry of an event at `at_s`, `later_s` after the event."""
+    made = lab.clock.now_ns() + round(at_s * 1e9)
+    entry = JournalEntry(made, "request", "series", "x", response, sent_ns=made, **codes)
+    lab.at(at_s + later_s, lambda: lab.publish(JournalEntries((entry,))))
+
+
+def measured_with(lab: Lab, at_s: float, later_s: float = 0.2) -> None:
+    """Let another client request and take a scan of 100 s."""
+    journal(lab, at_s - 0.01, later_s=later_s, request=ACTION, subject=names.START_SCAN)
+    scanned(lab, at_s)
+
+
+def settings_of(folder: Path) -> list[tuple[str, ...]]:
+    """Bias and setpoint with their units, for each scan."""
+    columns = ("bias", "bias_units", "setpoint", "setpoint_units")
+    return [tuple(row[name] for name in columns) for row in rows(folder) if row["channel"] == "Height"]
+
+
+def test_row_has_the_requested_bias_and_the_published_setpoint_at_the_beginning(tmp_path: Path) -> None:
+    lab = Lab("metadata")
+    lab.publish(Feedback(setpoint=0.7))
+    measured_with(lab, 10.0)
+    journal(lab, 199.9, request=PARAM, subject=BIAS, value="-50", unit="mV")
+    measured_with(lab, 200.0)
+    journal(lab, 250.0, request=PARAM, subject=BIAS, value="1", unit="V")  # while the scan runs
+    journal(lab, 310.0, request=PARAM, subject=BIAS, value="9", unit="V", response=int(ControlResponse.PARAM_ERROR))
+    journal(lab, 320.0, request=PARAM, subject=SETPOINT, value="500", unit="mV")
+    lab.at(320.0, lambda: lab.publish(Feedback(setpoint=0.5)))
+    measured_with(lab, 400.0)
+    lab.at(600.0, lab.kill)
+    run(Metadata(), lab, run_dir=str(tmp_path))
+    assert settings_of(tmp_path) == [
+        ("", "", "0.7", ""),
+        ("-0.05", "V", "0.7", ""),
+        ("1", "V", "0.5", "V"),
+    ]
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        {"request": PARAM, "subject": BIAS, "value": "2", "unit": "V", "response": int(ControlResponse.NO_RESPONSE)},
+        {"event": ControlEvent.MODE_CHANGED, "mode": ControlMode.MANUAL},
+        {"event": ControlEvent.RESTARTED},
+    ],
+    ids=["unanswered", "manual", "scheduler killed"],
+)
+def test_bias_is_unknown_after_what_may_have_changed_it_until_the_next_request(
+    tmp_path: Path, event: dict[str, Any]
+) -> None:
+    lab = Lab("metadata")
+    journal(lab, 5.0, request=PARAM, subject=BIAS, value="1", unit="V")
+    measured_with(lab, 10.0)
+    journal(lab, 150.0, **event)
+    measured_with(lab, 200.0)
+    journal(lab, 350.0, request=PARAM, subject=BIAS, value="3", unit="V")
+    measured_with(lab, 400.0)
+    lab.at(600.0, lab.kill)
+    run(Metadata(), lab, run_dir=str(tmp_path))
+    assert [row[0] for row in settings_of(tmp_path)] == ["1", "", "3"]
+
+
+def test_bias_is_unknown_for_a_lost_controller_and_a_scan_begun_at_the_panel(tmp_path: Path) -> None:
+    lab = Lab("metadata")
+    journal(lab, 5.0, request=PARAM, subject=BIAS, value="1", unit="V")
+    scanned(lab, 10.0)
+    measured_with(lab, 200.0)
+    lab.at(350.0, lambda: lab.publish(ScopeStatus(ScopeState.UNDEFINED)))
+    measured_with(lab, 400.0)
+    lab.at(600.0, lab.kill)
+    run(Metadata(), lab, run_dir=str(tmp_path))
+    assert [row[0] for row in settings_of(tmp_path)] == ["", "1", ""]
+
+
+def test_bias_is_unknown_if_the_journal_comes_after_the_scan(tmp_path: Path) -> None:
+    lab = Lab("metadata")
+    journal(lab, 5.0, request=PARAM, subject=BIAS, value="1", unit="V")
+    journal(lab, 199.0, later_s=110.0, request=PARAM, subject=BIAS, value="2", unit="V")
+    measured_with(lab, 200.0, later_s=110.0)
+    lab.at(600.0, lab.kill)
+    run(Metadata(), lab, run_dir=str(tmp_path))
+    assert [row[0] for row in settings_of(tmp_path)] == [""]
+
+
+@pytest.mark.parametrize(("missed", "bias"), [(False, "1"), (True, "")])
+def test_bias_survives_a_restart_unless_a_part_of_the_journal_is_missing(
+    tmp_path: Path, missed: bool, bias: str
+) -> None:
+    lab = Lab("metadata")
+    journal(lab, 5.0, request=PARAM, subject=BIAS, value="1", unit="V")
+    first_life = context_of(lab, tmp_path / "state", run_dir=str(tmp_path))
+    lab.at(20.0, lab.parent_goes)
+    assert Metadata().run_process(first_life) == ExitCode.ORPHAN
+    lab.restart_component()
+    if missed:  # the cache keeps the newest entries only
+        lab._inbox.clear()
+        lab.connect()
+    measured_with(lab, 100.0)
+    lab.at(500.0, lab.kill)
+    run(Metadata(), lab, tmp_path / "state", run_dir=str(tmp_path))
+    assert [row[0] for row in settings_of(tmp_path)] == [bias]
 
 
 def note_at(lab: Lab, at_s: float, text: str) -> None:
