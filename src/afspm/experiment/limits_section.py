@@ -210,12 +210,15 @@ class LimitsReader:
 
     def _range(self, name: str, pair: tuple[Quantity, Quantity], path: tuple[str, ...]) -> Limit | None:
         place = (*path, "parameters", name)
-        if name not in self.parameters:
+        of_instruments = [one for parameters in self.instruments.values() for one in parameters]
+        if name not in (*self.parameters, *of_instruments):
             what = f"[{'.'.join(path)}] there is no parameter {name!r}"
-            self.document.error(what, *place, hint=nearest(name, self.parameters))
+            self.document.error(what, *place, hint=nearest(name, [*self.parameters, *of_instruments]))
             return None
         given = dict(zip(("min", "max"), pair, strict=True))
-        unit = self.parameters.get(name) or _unit_given(given, si_unit) or ""
+        # of an instrument as written, as in `_unit`
+        as_unit = si_unit if name in self.parameters else str
+        unit = self.parameters.get(name) or _unit_given(given, as_unit) or ""
         low, high = (self._in(value, key, unit, place) for key, value in given.items())
         if low is not None and high is not None and low > high:
             self.document.error(f"{name_of(place)}: the first value is above the second", *place)

@@ -251,3 +251,15 @@ def test_a_planned_scan_that_the_limits_would_refuse_is_an_error(
 
 def test_settings_that_do_not_fit_together_are_an_error_of_the_component(write: Write) -> None:
     assert "`end_when_done` without an end" in only_error(write(SERIES + "end_when_done = true\n")).what
+
+
+def test_role_bounds_parameters_of_an_instrument_in_their_written_unit(write: Write) -> None:
+    experiment = write(
+        CORRECTOR
+        + '[magnet]\ncomponent = true\nclass = "Instrument"\naddress = "secop://localhost"\n'
+        + 'parameters = { "magnet.field" = "mf" }\n'
+        + '[limits.roles.repair]\nparameters = { "magnet.field" = ["-500 mT", "0.5 T"] }\n'
+    )
+    assert not errors(experiment)
+    limit = experiment.resolved.limits.roles["repair"].limits.parameters["magnet.field"]
+    assert (limit.low, limit.high, limit.unit) == (-500.0, 500.0, "mT")

@@ -25,7 +25,11 @@ from afspm.model import (
     GrantedCount,
     GrantedRange,
     GrantedStep,
+    InstrumentOrder,
+    InstrumentReading,
+    InstrumentReadings,
     Note,
+    OrderOutcome,
     Parameter,
     Problem,
     ProblemNames,
@@ -40,6 +44,7 @@ from afspm.model import (
 )
 from afspm.scheduler.control.arbitration import RoleTable
 from afspm.scheduler.events import Forward, Tick
+from afspm.scheduler.instruments.conditions import InstrumentSettings
 from afspm.scheduler.safety.grants import limits_digest
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit, RoleLimits
 from afspm.scheduler.settings import ControlSettings, RunFacts, SchedulerSettings
@@ -423,6 +428,76 @@ def test_actions_without_ids_count_within_the_hour() -> None:
     asked = [agent.do(ACTION, names.START_SCAN, id_=NO_ID, who="series") for _ in range(3)]
     assert asked[:2] == ["", ""]
     assert "2 are allowed" in asked[2]
+
+
+# --- parameters of other instruments --------------------------------------------------------------------------------
+
+
+class MagnetLab(AgentLab):
+    """An agent beside an instrument, which reports the field of a magnet."""
+
+    def __init__(self, limits: ExperimentLimits = LIMITS) -> None:
+        super().__init__(limits)
+        self.settings = replace(self.settings, instruments=InstrumentSettings(("magnet",)))
+        self.lab = Lab(self.settings)
+        self.lab.translator()
+        self.token = 0
+        for _ in range(2):  # only the second report repeats a token
+            self.report()
+
+    def report(self, *outcomes: OrderOutcome) -> tuple[InstrumentOrder, ...]:
+        reading = InstrumentReading(FIELD, 0.0, "T", 0.1, 0.0)
+        report = InstrumentReadings(self.lab.now_ns, "magnet", (reading,), outcomes, self.token)
+        relayed = RelayedMessage("InstrumentReadings", self.lab.codec.encode(report))
+        answer = replies(self.lab.ask("magnet", RELAY_REQUEST, relayed))[-1].response
+        orders = self.lab.codec.decode(answer.payload)
+        self.token = orders.token
+        return tuple(orders.orders)
+
+    def set_field(self, value: str, unit: str = "T", who: str = AGENT) -> str:
+        """Set the field: the reason of the refusal; "" if the instrument has carried it out."""
+        self.ids += 1
+        self.lab.ask(who, PARAM, Parameter(FIELD, value, unit), f"{who}/1/{self.ids}")
+        before = len(self.lab.effects)
+        if not (orders := self.report()):
+            return replies(self.lab.effects[before:])[0].response.reason
+        assert self.report(OrderOutcome(orders[0].number, OK)) == ()
+        return ""
+
+
+FIELD = "magnet.field"
+OF_FIELD = ExperimentLimits(parameters={FIELD: Limit(-1.0, 1.0, unit="T")})
+
+
+def test_agent_sets_a_parameter_of_an_instrument_only_in_an_approved_plan() -> None:
+    agent = MagnetLab()
+    agent.begin(agent.grant())
+    assert "the grant does not include magnet.field" in agent.set_field("0.5")
+    field, bias = Parameter(FIELD, "0.5", "T"), Parameter(names.TIP_BIAS_VOLTAGE, "2", "V")
+    agent.give(agent.plan((PARAM, field), (PARAM, bias)))
+    assert agent.set_field("0.5") == ""
+    assert "not request 2" in agent.set_field("0.5")
+    assert agent.do(PARAM, bias) == ""
+    assert "the grant does not include" in agent.set_field("0.5")
+
+
+def test_range_of_a_grant_has_no_unit_and_allows_no_value_of_an_instrument_with_one() -> None:
+    agent = MagnetLab()
+    agent.begin(agent.grant(ranges=(GrantedRange(FIELD, -0.5, 0.5),)))
+    assert "can't be converted" in agent.set_field("0.4", "kT")
+
+
+def test_limits_of_a_role_hold_for_a_parameter_of_an_instrument() -> None:
+    agent = MagnetLab(replace(LIMITS, roles={"series": RoleLimits(OF_FIELD, parameters_only=True), "other": ROLE}))
+    for who in ("series", "other"):
+        assert agent.lab.take_control(who) is OK
+        refusals = [agent.set_field(value, who=who) for value in ("0.5", "9")]
+        agent.lab.says(who, ControlRequest.RELEASE_CTRL)
+        if who == "series":
+            assert refusals[0] == ""
+            assert "above the highest allowed, 1 T" in refusals[1]
+        else:
+            assert all("not among the parameters of other" in why for why in refusals)
 
 
 # --- lease and stop -------------------------------------------------------------------------------------------------

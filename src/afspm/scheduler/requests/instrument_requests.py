@@ -1,9 +1,9 @@
 """Requests for parameters of other instruments, their reports, and the problems of conditions.
 
 A request to set a parameter waits for the next report of its instrument. When the report arrives, the request is
-authorised again and checked against its limits. The answer to the report carries it as an order. An order is repeated
-in each answer until a report contains its outcome; the instrument carries out an id once. A limited rate is not checked
-here: the order carries the rate, and the instrument keeps to the rate on its way to the target.
+authorised again and checked against its limits and approvals. The answer to the report carries it as an order. An order
+is repeated in each answer until a report contains its outcome; the instrument carries out an id once. A limited rate is
+not checked here: the order carries the rate, and the instrument keeps to the rate on its way to the target.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlInput
 from afspm.scheduler.events import RequestIn
 from afspm.scheduler.instruments.known_instruments import OpenOrder
 from afspm.scheduler.publishing import own_packets as publishing
-from afspm.scheduler.requests import answers
+from afspm.scheduler.requests import answers, approvals
 from afspm.scheduler.requests.forwarder import ForwardedRequest
 from afspm.scheduler.safety.limit_checker import is_get
 from afspm.scheduler.state import SchedulerState, StateDraft
@@ -133,7 +133,7 @@ def _next_order(draft: StateDraft, instrument: str, may_send: MaySend) -> Instru
     while (first := draft.instruments.first(instrument)) is not None:
         if first.order is not None:
             return first.order
-        refusal = may_send(draft, first.job) or _limit_refusal(draft, first.job)
+        refusal = may_send(draft, first.job) or _limit_refusal(draft, first.job) or _approval_refusal(draft, first.job)
         if refusal is None:
             return _hand_out(draft, instrument, first)
         draft.log("WARNING", f"refused {first.job.client}: {refusal.reason}")
@@ -155,6 +155,11 @@ def _limit_refusal(draft: StateDraft, job: ForwardedRequest) -> Response | None:
     return draft.limits.check(job.client, request, draft.now_ns, is_repeated=job.is_repeated)
 
 
+def _approval_refusal(draft: StateDraft, job: ForwardedRequest) -> Response | None:
+    why = approvals.refused(draft, job)
+    return Response(int(ControlResponse.PARAM_ERROR), b"", why, job.request.id) if why else None
+
+
 def _hand_out(draft: StateDraft, instrument: str, waiting: OpenOrder) -> InstrumentOrder:
     job, wanted = waiting.job, waiting.job.request.subject
     limit = draft.env.settings.limits.parameters.get(wanted.name)
@@ -168,6 +173,7 @@ def _hand_out(draft: StateDraft, instrument: str, waiting: OpenOrder) -> Instrum
     )
     sent = job._replace(sent_s=draft.now_s, sent_ns=draft.now_ns)
     draft.limits = draft.limits.sending(job.client, job.request, draft.now_ns)
+    approvals.sending(draft, job)
     if job.request.id and draft.limits.counts(job.request):
         draft.idempotency = draft.idempotency.sent(job.client, job.request)
     draft.instruments = draft.instruments.handed_out(instrument, OpenOrder(sent, order))
@@ -180,6 +186,7 @@ def _settle(draft: StateDraft, instrument: str, found: OpenOrder, outcome: Order
     payload = b""
     if outcome.response == ControlResponse.SUCCESS:
         draft.limits = draft.limits.carried_out(job.request, draft.now_ns, who=job.client)
+        approvals.done(draft, job)
         if job.client == draft.control.holder:
             draft.lease = draft.lease.commanded(draft.now_ns, draft.now_s)
         target = draft.instruments.reading(wanted.name, draft.now_s)

@@ -36,6 +36,7 @@ from afspm.model import (
     Request,
     ScanParameters,
     component_of,
+    instrument_of,
     names,
 )
 from afspm.model.geometry import XY
@@ -479,9 +480,15 @@ def _less(held: Mapping[str, HeldGrant], agent: str) -> dict[str, HeldGrant]:
 
 
 def _limits_of(grant: Grant) -> ExperimentLimits:
+    # a range has no unit of its own: a value of an instrument with a unit is outside
     return ExperimentLimits(
         parameters={
-            one.parameter: Limit(one.low, one.high, unit=BASE_PARAMETERS.get(one.parameter), source="the grant")
+            one.parameter: Limit(
+                one.low,
+                one.high,
+                unit=BASE_PARAMETERS.get(one.parameter, "" if instrument_of(one.parameter) else None),
+                source="the grant",
+            )
             for one in grant.ranges
         },
         region=grant.region,
