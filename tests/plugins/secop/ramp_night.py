@@ -70,6 +70,7 @@ class Cryostat:
         has_ramp: the server keeps a ramp; else the set point jumps to each target.
         setpoint_k: follows the target; value_k: the true temperature.
         fault: of FAULTS, while it lasts.
+        is_busy: the status; None: busy while the temperature is away from the target.
     """
 
     has_ramp: bool
@@ -79,6 +80,7 @@ class Cryostat:
     setpoint_k: float = 4.2
     ramp_k_min: float = 0.0
     fault: str = "none"
+    is_busy: bool | None = None
     unit: str = "K"
     disturbance_k: float = 0.0
     clock_s: float = 1e9
@@ -118,7 +120,8 @@ class Cryostat:
 
     def _report(self, action: str, accessible: str) -> str:
         if accessible == "status":
-            code = 300 if abs(self.value_k - self.target_k) > 0.02 else 100
+            is_away = abs(self.value_k - self.target_k) > 0.02
+            code = 300 if (is_away if self.is_busy is None else self.is_busy) else 100
             return f'{action} tt:status [[{code}, ""], {{}}]'
         if accessible == "target":
             return f"{action} tt:target [{self.target_k * self._factor!r}, {{}}]"

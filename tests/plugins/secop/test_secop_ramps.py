@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import random
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import pytest
 from tests.plugins.secop.ramp_night import FAULTS, RATE_K_S, Cryostat, RampNight
@@ -32,29 +33,79 @@ def test_nothing_is_measured_outside_the_band_over_faults(share: int) -> None:
     assert all(night.flags for night in nights if night.fault == "hung")
 
 
-@pytest.mark.parametrize(
-    ("target_k", "value_k", "first_k"),
-    [(4.2, 4.9, 4.2), (4.21, 4.2, 4.21), (300.0, 5.0, 5.0)],
-    ids=["disturbed", "a near target set at the panel", "on the way to a far target set at the panel"],
-)
-def test_steps_begin_at_the_target_unless_another_client_has_set_it_far_away(
-    target_k: float, value_k: float, first_k: float
-) -> None:
-    cryostat, client = Cryostat(has_ramp=False, chance=random.Random(1)), SecopClient({"cryo.t": "tt"})
-    changes: list[str] = []
+@dataclass
+class Bench:
+    """A client at a simulated server without a ramp.
 
-    def exchange(lines: list[str], now_s: float) -> None:
+    Attributes:
+        changes: the targets that the client has set.
+        now_s: the time of the last exchange.
+    """
+
+    cryostat: Cryostat = field(default_factory=lambda: Cryostat(has_ramp=False, chance=random.Random(1)))
+    client: SecopClient = field(default_factory=lambda: SecopClient({"cryo.t": "tt"}))
+    changes: list[float] = field(default_factory=list)
+    now_s: float = 0.0
+
+    def exchange(self, lines: list[str]) -> None:
         for line in lines:
-            changes.extend([line] if line.startswith("change ") else [])
-            for answer in cryostat.answer(line):
-                exchange(client.take(answer, now_s), now_s)
+            self.changes.extend([float(line.split()[2])] if line.startswith("change ") else [])
+            for answer in self.cryostat.answer(line):
+                self.exchange(self.client.take(answer, self.now_s))
 
-    exchange(client.connected(0.0), 0.0)
-    exchange(client.tick(1.0), 1.0)
-    cryostat.target_k, cryostat.value_k = target_k, value_k
-    exchange(client.tick(2.0), 2.0)
-    exchange(client.order(InstrumentOrder(1, "series/1", Parameter("cryo.t", "5.5", "K"), RATE_K_S, "K"), 2.0), 2.0)
-    assert float(changes[0].split()[2]) == pytest.approx(first_k, abs=0.01)
+    def later(self, seconds: float) -> None:
+        self.now_s += seconds
+        self.exchange(self.client.tick(self.now_s))
+
+    def order(self, kelvin: str, number: int = 1) -> None:
+        order = InstrumentOrder(number, f"series/{number}", Parameter("cryo.t", kelvin, "K"), RATE_K_S, "K")
+        self.exchange(self.client.order(order, self.now_s))
+
+
+@pytest.fixture
+def bench() -> Bench:
+    made = Bench()
+    made.exchange(made.client.connected(0.0))
+    made.later(1.0)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("target_k", "value_k", "is_busy", "first_k"),
+    [
+        (4.2, 4.9, True, 4.2),
+        (4.21, 4.2, False, 4.21),
+        (300.0, 5.0, True, 5.0),
+        (4.2, 9.0, False, 9.0),
+    ],
+    ids=["disturbed", "a near target set at the panel", "on the way to a far target set at the panel", "moved away"],
+)
+def test_steps_begin_at_the_target_if_it_is_in_force(
+    bench: Bench, target_k: float, value_k: float, is_busy: bool, first_k: float
+) -> None:
+    bench.cryostat.target_k, bench.cryostat.value_k, bench.cryostat.is_busy = target_k, value_k, is_busy
+    bench.later(1.0)
+    bench.order("5.5")
+    assert bench.changes[0] == pytest.approx(first_k, abs=0.01)
+
+
+def test_steps_begin_at_the_value_while_the_control_loop_is_off(bench: Bench) -> None:
+    bench.cryostat.value_k = 9.0
+    bench.later(1.0)
+    bench.exchange(bench.client.take("update tt:control_active [false, {}]", bench.now_s))
+    bench.order("8")
+    assert bench.changes[0] == pytest.approx(9.0, abs=0.01)
+
+
+def test_steps_continue_from_the_target_while_the_value_lags_behind(bench: Bench) -> None:
+    bench.order("4.3", 1)
+    for _ in range(10):
+        bench.cryostat.value_k -= 0.1  # the sample is slow
+        bench.later(1.0)
+    bench.cryostat.is_busy = False
+    bench.later(1.0)
+    bench.order("4.5", 2)
+    assert bench.changes[-1] == pytest.approx(4.3)
 
 
 def _believe_old_readings(patch: pytest.MonkeyPatch) -> None:

@@ -49,7 +49,9 @@ class Channel:
         measured_s: time of the request for the newest value.
         last_answer: (server's own time, value) of the last answer.
         changed_s: time when the target was set; target_answered_s: time of the last answer with the target.
-        nearest: least distance of the value from the target `nearest_to` so far; 0 if afspm moved it there in steps.
+        nearest: least distance of the value from the target `nearest_to` so far.
+        is_led: whether afspm moved the target to `nearest_to` in steps.
+        is_controlled: whether the module regulates to its target (`control_active`).
         fault: reason why there is no value.
         fault_of_status: reason to distrust the value, from the module's status.
     """
@@ -73,6 +75,8 @@ class Channel:
     newest_target: float | None = None
     nearest: float = math.inf
     nearest_to: float = math.nan
+    is_led: bool = False
+    is_controlled: bool = True
     is_busy: bool = False
     fault: str = "not connected yet"
     fault_of_status: str = ""
@@ -88,6 +92,7 @@ class Channel:
             return
         distance, is_same = abs(self.newest - self.newest_target), _is_close(self.newest_target, self.nearest_to)
         self.nearest, self.nearest_to = min(distance, self.nearest) if is_same else distance, self.newest_target
+        self.is_led = self.is_led and is_same
 
 
 @dataclass
@@ -258,6 +263,8 @@ class SecopClient:
                     channel.target_answered_s = now_s
             elif specifier == channel.status and not line.action.startswith("error"):
                 self._take_status(channel, line.value)
+            elif specifier == f"{channel.module}:control_active" and not line.action.startswith("error"):
+                channel.is_controlled = line.value is not False
 
     def _take_value(self, channel: Channel, line: SecopLine) -> None:
         is_answer = line.action in ("reply", "error_read")
@@ -322,6 +329,7 @@ class SecopClient:
         settable = wanted if channel.accessible else "target"
         channel.target = f"{channel.module}:{settable}" if _is_settable(accessibles, settable) else ""
         channel.status = f"{channel.module}:status" if "status" in accessibles else ""
+        channel.is_controlled = True
         channel.ramp, channel.per_s = "", 0.0
         per_s = _per_s(_info(accessibles, "ramp"), channel.unit) if _is_settable(accessibles, "ramp") else None
         if per_s is not None and not channel.accessible:
@@ -373,11 +381,17 @@ class SecopClient:
         return [lines.change(channel.target, number)]
 
     def _start_of_steps(self, channel: Channel, rate_per_s: float) -> float:
-        # at the target, since a disturbance may keep the value away from it, and a set point that jumps to the value is
-        # too fast; but at the value where another client has set a target far away, to which the way must not lead
+        # At the target, if it is in force: a set point that jumps to the value is too fast. Else at the value: the
+        # target of a heater that was switched off, or of a magnet that was moved at its panel, may be anywhere.
         assert channel.newest is not None
-        target = channel.newest_target
-        return target if target is not None and channel.nearest <= 2.0 * rate_per_s * STEP_S else channel.newest
+        target, near = channel.newest_target, 2.0 * rate_per_s * STEP_S
+        if target is None or not channel.is_controlled:
+            return channel.newest
+        is_near, was_near = abs(target - channel.newest) <= near, channel.nearest <= near
+        # a value that has left its target is disturbed while the module is busy; a value that has never been there lags
+        # behind steps of afspm, or is on its way to the target of another client, to which the way must not lead
+        is_in_force = is_near or (channel.is_busy if was_near else channel.is_led)
+        return target if is_in_force else channel.newest
 
     def _go_on(self, line: SecopLine, now_s: float) -> list[str]:
         progress, text = self._progress, f"{line.action} {line.specifier}"
@@ -463,7 +477,7 @@ class SecopClient:
                 continue
             confirmed = _number(line.value)
             ramp.sent, ramp.sent_s, ramp.in_flight = ramp.sent if confirmed is None else confirmed, now_s, False
-            self.channels[name].nearest, self.channels[name].nearest_to = 0.0, ramp.sent
+            self.channels[name].is_led = True
             if ramp.ideal == ramp.final:
                 del self._ramps[name]
 
