@@ -108,6 +108,23 @@ def test_steps_continue_from_the_target_while_the_value_lags_behind(bench: Bench
     assert bench.changes[-1] == pytest.approx(4.3)
 
 
+def test_steps_wait_for_a_module_that_takes_no_target_while_it_moves(bench: Bench) -> None:
+    bench.order("4.3")
+    answer = bench.cryostat.answer
+    is_busy = 'error_change tt:target ["IsBusy", "it is on its way to 4.2", {}]'
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bench.cryostat, "answer", lambda line: [is_busy] if line.startswith("change") else answer(line))
+        for _ in range(5):
+            bench.later(1.0)
+    (reading,) = bench.client.readings(bench.now_s)
+    assert (reading.target, reading.busy) == (4.3, True)
+    bench.later(1.0)
+    assert bench.cryostat.target_k - 4.2 <= 2.0 * RATE_K_S
+    for _ in range(5):
+        bench.later(1.0)
+    assert bench.cryostat.target_k == 4.3
+
+
 def _believe_old_readings(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(known_instruments, "OLDEST_S", 60.0)
 

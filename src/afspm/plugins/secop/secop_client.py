@@ -27,6 +27,7 @@ STEP_S = 1.0
 """The least time between two steps of a target, where the server has no ramp of its own."""
 _IDLE, _BUSY, _ERROR = 100, 300, 400
 _NUMBERS = ("double", "int")
+_IS_BUSY = "IsBusy"  # the error class of a module that takes no target while it moves
 _ROUNDED = 1e-6  # relative: a server may keep a value in single precision
 _MOST_DONE = 64
 _PER_TIME = re.compile(r"(.*)/\s*(s|sec|min|h|hr)")
@@ -396,7 +397,7 @@ class SecopClient:
     def _go_on(self, line: SecopLine, now_s: float) -> list[str]:
         progress, text = self._progress, f"{line.action} {line.specifier}"
         if line.action in ("error_change", "error_do") or line.action.startswith("error_change"):
-            return self._take_refusal(line)
+            return self._take_refusal(line, now_s)
         if line.action == "changed":
             self._take_step(line, now_s)
         if progress is None or text != progress.waits_for:
@@ -428,10 +429,13 @@ class SecopClient:
         progress.waits_for = f"changed {channel.target}"
         return [lines.change(channel.target, progress.wanted)]
 
-    def _take_refusal(self, line: SecopLine) -> list[str]:
+    def _take_refusal(self, line: SecopLine, now_s: float) -> list[str]:
         progress = self._progress
         for name, ramp in list(self._ramps.items()):
             if line.specifier == self.channels[name].target and ramp.in_flight:
+                if line.error.startswith(_IS_BUSY):  # the module takes the step once it has arrived at the one before
+                    ramp.sent, ramp.ideal, ramp.sent_s, ramp.in_flight = ramp.before, ramp.before, now_s, False
+                    continue
                 del self._ramps[name]
                 self.log.append(f"{name} stays at {ramp.before:.6g}: the server refused a step ({line.error})")
         if progress is not None and line.specifier in (progress.channel.ramp, progress.channel.target):
