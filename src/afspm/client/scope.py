@@ -56,6 +56,7 @@ Place = tuple[float | str, float | str]
 SET_BACK_WITHIN_S = 60.0
 """Limit on the wait for control after a failed sweep, real time."""
 _LOOK_S = 0.5
+_ROUNDED = 1e-3  # relative: an instrument may round a target, also at the end of a ramp in steps
 """Real time between two readings of a value that has not arrived at its target."""
 ANSWER_S = 60.0  # default of readings; calls that wait for control or a measurement have no limit by default
 
@@ -260,7 +261,7 @@ class Scope(ExperimentView):
         link, name = self._link, asked.name
         while True:
             found = {part: self._read_again(f"{name}.{part}", asked.unit, until_s) for part in ("target", "busy")}
-            if found["target"] is not None and not math.isclose(float(found["target"]), target, rel_tol=1e-5):
+            if found["target"] is not None and not math.isclose(float(found["target"]), target, rel_tol=_ROUNDED):
                 what = f"{name} does not go to {asked.value} {asked.unit or ''} any more"
                 raise NoResponse(what, where=link.name, hint=f"its target is {found['target']:g} now")
             value = self._read_again(name, asked.unit, until_s)

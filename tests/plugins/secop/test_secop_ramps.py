@@ -108,6 +108,25 @@ def test_steps_continue_from_the_target_while_the_value_lags_behind(bench: Bench
     assert bench.changes[-1] == pytest.approx(4.3)
 
 
+def test_steps_go_on_at_a_server_that_rounds_a_target_after_its_answer(bench: Bench) -> None:
+    change = bench.cryostat._change
+
+    def rounded(specifier: str, value: float) -> str:
+        answer = change(specifier, value)
+        bench.cryostat.target_k = round(value, 2)
+        return answer
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bench.cryostat, "_change", rounded)
+        bench.order("4.4123")
+        for _ in range(10):
+            bench.later(1.0)
+    assert bench.changes[-1] == 4.4123
+    bench.later(1.0)
+    (reading,) = bench.client.readings(bench.now_s)
+    assert (reading.target, bench.client.log) == (4.41, [])
+
+
 def test_steps_wait_for_a_module_that_takes_no_target_while_it_moves(bench: Bench) -> None:
     bench.order("4.3")
     answer = bench.cryostat.answer

@@ -855,3 +855,11 @@ def test_states_and_modes_are_shown_by_their_names(lab: Lab, scope: Scope) -> No
 def test_properties_of_a_scope_show_the_present_state(lab: Lab, scope: Scope) -> None:
     lab.flag(TIP)
     assert "tip-shape-changed is flagged" in repr(scope)
+
+
+def test_wait_accepts_a_target_that_the_instrument_has_rounded(lab: Lab, scope: Scope) -> None:
+    lab.values |= {"source.bias.target": "0.1667", "source.bias.busy": "false"}
+    assert scope.set("source.bias", 1 / 6, "V", wait=True) == pytest.approx(1 / 6)
+    lab.values["source.bias.target"] = "0.2"
+    with pytest.raises(NoResponse, match=r"its target is 0\.2 now"):
+        scope.set("source.bias", 1 / 6, "V", wait=True)

@@ -412,9 +412,9 @@ class SecopClient:
                 ramp = progress.ramp
                 self._ramps[channel.name] = RampInSteps(ramp.final, ramp.rate_per_s, start, now_s, ramp.ideal)
             if channel.status:
-                # the module is busy before it answers; its status comes next
+                # the module is busy before it answers; its status comes next, after the target as the module rounded it
                 progress.waits_for = f"reply {channel.status}"
-                return [lines.read(channel.status)]
+                return [lines.read(channel.target), lines.read(channel.status)]
         self._finish(progress.order, ControlResponse.SUCCESS)
         return []
 
@@ -447,14 +447,16 @@ class SecopClient:
             return []
         if ramp.in_flight or channel.newest_target is None:
             return []
-        if ramp.is_interrupted:
-            # the last step may have been lost with the connection
-            known = (one for one in (ramp.sent, ramp.before) if _is_close(channel.newest_target, one))
-            ramp.sent, ramp.sent_s, ramp.is_interrupted = next(known, math.nan), now_s, False
-            ramp.ideal = ramp.sent
-        if not _is_close(channel.newest_target, ramp.sent):
+        candidates = [ramp.sent]
+        if ramp.is_interrupted:  # the last step may have been lost with the connection
+            candidates.append(ramp.before)
+        # a server may round a step after its answer; other targets are of another client
+        if not any(abs(channel.newest_target - one) <= ramp.rate_per_s * STEP_S for one in candidates):
             self._leave(channel, ramp)
             return []
+        ramp.sent = channel.newest_target
+        if ramp.is_interrupted:
+            ramp.ideal, ramp.sent_s, ramp.is_interrupted = ramp.sent, now_s, False
         passed_s = now_s - ramp.sent_s
         if passed_s < STEP_S:
             return []
