@@ -68,6 +68,7 @@ class Cryostat:
 
     Attributes:
         has_ramp: the server keeps a ramp; else the set point jumps to each target.
+        ramp_switch: the parameter that switches the ramp on, off at first; empty: the ramp is always on.
         setpoint_k: follows the target; value_k: the true temperature.
         fault: of FAULTS, while it lasts.
         is_busy: the status; None: busy while the temperature is away from the target.
@@ -75,6 +76,8 @@ class Cryostat:
 
     has_ramp: bool
     chance: random.Random
+    ramp_switch: str = ""
+    is_ramp_on: bool = False
     value_k: float = 4.2
     target_k: float = 4.2
     setpoint_k: float = 4.2
@@ -88,7 +91,7 @@ class Cryostat:
 
     def run(self, dt_s: float) -> None:
         self.clock_s += dt_s
-        if self.has_ramp and self.ramp_k_min > 0.0:
+        if self.has_ramp and self.ramp_k_min > 0.0 and (self.is_ramp_on or not self.ramp_switch):
             way, most = self.target_k - self.setpoint_k, self.ramp_k_min / 60.0 * dt_s
             self.setpoint_k += max(-most, min(most, way))
         else:
@@ -108,15 +111,17 @@ class Cryostat:
         if action == "read":
             return [self._report("reply", specifier.partition(":")[2])]
         if action == "change":
-            return [self._change(specifier, float(data))]
+            return [self._change(specifier, json.loads(data))]
         return [f'error_{action} {specifier} ["ProtocolError", "no such action", {{}}]']
 
     def _change(self, specifier: str, value: float) -> str:
         if specifier == "tt:ramp":
             self.ramp_k_min = value
+        elif specifier == f"tt:{self.ramp_switch}":
+            self.is_ramp_on = bool(value)
         else:
             self.target_k = value
-        return f"changed {specifier} [{value!r}, {{}}]"
+        return f"changed {specifier} [{json.dumps(value)}, {{}}]"
 
     def _report(self, action: str, accessible: str) -> str:
         if accessible == "status":
@@ -151,6 +156,8 @@ class Cryostat:
         }
         if self.has_ramp:
             accessibles["ramp"] = number(f"{self.unit}/min", readonly=False)
+        if self.ramp_switch:
+            accessibles[self.ramp_switch] = {"datainfo": {"type": "bool"}, "readonly": False}
         return {"modules": {"tt": {"accessibles": accessibles}}}
 
 

@@ -9,6 +9,7 @@ import os
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import pytest
 from tests.plugins.secop.ramp_night import FAULTS, RATE_K_S, Cryostat, RampNight
@@ -49,13 +50,17 @@ class Bench:
 
     def exchange(self, lines: list[str]) -> None:
         for line in lines:
-            self.changes.extend([float(line.split()[2])] if line.startswith("change ") else [])
+            self.changes.extend([float(line.split()[2])] if line.startswith("change tt:target ") else [])
             for answer in self.cryostat.answer(line):
                 self.exchange(self.client.take(answer, self.now_s))
 
     def later(self, seconds: float) -> None:
         self.now_s += seconds
         self.exchange(self.client.tick(self.now_s))
+
+    def connect(self) -> None:
+        self.exchange(self.client.connected(self.now_s))
+        self.later(1.0)
 
     def order(self, kelvin: str, number: int = 1) -> None:
         order = InstrumentOrder(number, f"series/{number}", Parameter("cryo.t", kelvin, "K"), RATE_K_S, "K")
@@ -65,8 +70,7 @@ class Bench:
 @pytest.fixture
 def bench() -> Bench:
     made = Bench()
-    made.exchange(made.client.connected(0.0))
-    made.later(1.0)
+    made.connect()
     return made
 
 
@@ -125,6 +129,32 @@ def test_steps_go_on_at_a_server_that_rounds_a_target_after_its_answer(bench: Be
     bench.later(1.0)
     (reading,) = bench.client.readings(bench.now_s)
     assert (reading.target, bench.client.log) == (4.41, [])
+
+
+@pytest.mark.parametrize("switch", ["ramp_enable", "use_ramp"])
+def test_ramp_of_the_server_is_switched_on_before_the_target_is_set(switch: str) -> None:
+    bench = Bench(Cryostat(has_ramp=True, chance=random.Random(1), ramp_switch=switch))
+    bench.connect()
+    bench.order("20")
+    assert bench.changes == [20.0]
+    bench.cryostat.run(1.0)
+    assert bench.cryostat.setpoint_k == pytest.approx(4.2 + RATE_K_S)
+
+
+def test_target_is_moved_in_steps_if_the_ramp_can_not_be_switched_on() -> None:
+    bench = Bench(Cryostat(has_ramp=True, chance=random.Random(1), ramp_switch="ramp_enable"))
+    describe = bench.cryostat._description
+
+    def read_only() -> object:
+        told: Any = describe()
+        told["modules"]["tt"]["accessibles"]["ramp_enable"]["readonly"] = True
+        return told
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bench.cryostat, "_description", read_only)
+        bench.connect()
+    bench.order("20")
+    assert bench.changes == [pytest.approx(4.2, abs=0.01)]
 
 
 def test_steps_wait_for_a_module_that_takes_no_target_while_it_moves(bench: Bench) -> None:

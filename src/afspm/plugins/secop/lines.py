@@ -60,5 +60,9 @@ def change(specifier: str, value: float) -> str:
     return f"change {specifier} {json.dumps(value)}"
 
 
+def switch_on(specifier: str) -> str:
+    return f"change {specifier} true"
+
+
 def read(specifier: str) -> str:
     return f"read {specifier}"

@@ -30,6 +30,8 @@ _NUMBERS = ("double", "int")
 _IS_BUSY = "IsBusy"  # the error class of a module that takes no target while it moves
 _ROUNDED = 1e-6  # relative: a server may keep a value in single precision
 _MOST_DONE = 64
+_RAMP_SWITCHES = ("ramp_enable", "use_ramp")
+"""Names of the parameter of a module that switches its ramp on and off: of SECoP, and of frappy."""
 _PER_TIME = re.compile(r"(.*)/\s*(s|sec|min|h|hr)")
 _SECONDS = {"s": 1.0, "sec": 1.0, "min": 60.0, "h": 3600.0, "hr": 3600.0}
 
@@ -43,7 +45,7 @@ class Channel:
     """One parameter of the experiment, with its accessibles at the server.
 
     Attributes:
-        value, target, status, ramp: "module:accessible"; empty if the module has none.
+        value, target, status, ramp, ramp_switch: "module:accessible"; empty if the module has none.
         first_unit: unit in the first description; a later change of unit is a fault.
         per_s: factor from the unit of `ramp` to `unit` per second.
         asked_s: time of the unanswered request for the value; None if there is none.
@@ -64,6 +66,7 @@ class Channel:
     target: str = ""
     status: str = ""
     ramp: str = ""
+    ramp_switch: str = ""
     unit: str = ""
     first_unit: str | None = None
     per_s: float = 0.0
@@ -81,6 +84,10 @@ class Channel:
     is_busy: bool = False
     fault: str = "not connected yet"
     fault_of_status: str = ""
+
+    @property
+    def set_by_orders(self) -> tuple[str, ...]:
+        return self.ramp, self.ramp_switch, self.target
 
     @property
     def unit_fault(self) -> str:
@@ -331,10 +338,13 @@ class SecopClient:
         channel.target = f"{channel.module}:{settable}" if _is_settable(accessibles, settable) else ""
         channel.status = f"{channel.module}:status" if "status" in accessibles else ""
         channel.is_controlled = True
-        channel.ramp, channel.per_s = "", 0.0
+        channel.ramp, channel.ramp_switch, channel.per_s = "", "", 0.0
         per_s = _per_s(_info(accessibles, "ramp"), channel.unit) if _is_settable(accessibles, "ramp") else None
-        if per_s is not None and not channel.accessible:
+        switch = next((one for one in _RAMP_SWITCHES if one in accessibles and not _is_on(accessibles, one)), "")
+        # without a ramp that is certainly on, the target is moved in steps
+        if per_s is not None and not channel.accessible and (not switch or _is_settable(accessibles, switch)):
             channel.ramp, channel.per_s = f"{channel.module}:ramp", per_s
+            channel.ramp_switch = f"{channel.module}:{switch}" if switch else ""
 
     # --- orders ---
 
@@ -405,6 +415,8 @@ class SecopClient:
         channel = progress.channel
         if progress.ramp_limit is not None and text == f"changed {channel.ramp}":
             return self._ramp_set(progress, _number(line.value))
+        if text == f"changed {channel.ramp_switch}":
+            return self._ramp_switched(progress, line.value)
         if text == f"changed {channel.target}":
             if progress.ramp is not None:
                 confirmed = _number(line.value)
@@ -426,6 +438,18 @@ class SecopClient:
             why = f"{channel.ramp} should be {limit:.6g}, the server set {confirmed}"
             self._finish(progress.order, ControlResponse.PARAM_ERROR, why)
             return []
+        if channel.ramp_switch:
+            progress.waits_for = f"changed {channel.ramp_switch}"
+            return [lines.switch_on(channel.ramp_switch)]
+        progress.waits_for = f"changed {channel.target}"
+        return [lines.change(channel.target, progress.wanted)]
+
+    def _ramp_switched(self, progress: OrderInProgress, confirmed: object) -> list[str]:
+        channel = progress.channel
+        if confirmed not in (True, 1):
+            why = f"{channel.ramp_switch} should be true, the server set {confirmed}"
+            self._finish(progress.order, ControlResponse.PARAM_ERROR, why)
+            return []
         progress.waits_for = f"changed {channel.target}"
         return [lines.change(channel.target, progress.wanted)]
 
@@ -438,7 +462,7 @@ class SecopClient:
                     continue
                 del self._ramps[name]
                 self.log.append(f"{name} stays at {ramp.before:.6g}: the server refused a step ({line.error})")
-        if progress is not None and line.specifier in (progress.channel.ramp, progress.channel.target):
+        if progress is not None and line.specifier in progress.channel.set_by_orders:
             self._finish(progress.order, ControlResponse.PARAM_ERROR, line.error)
         return []
 
@@ -522,6 +546,12 @@ def _info(accessibles: Mapping[str, object], name: str) -> Mapping[str, object] 
 def _is_settable(accessibles: Mapping[str, object], name: str) -> bool:
     found = accessibles.get(name)
     return isinstance(found, dict) and not found.get("readonly", True) and _info(accessibles, name) is not None
+
+
+def _is_on(accessibles: Mapping[str, object], name: str) -> bool:
+    # a switch with a constant value
+    found = accessibles.get(name)
+    return isinstance(found, dict) and found.get("constant") is True
 
 
 def _per_s(info: Mapping[str, object] | None, unit: str) -> float | None:
