@@ -129,9 +129,11 @@ def _write_surroundings(sample: h5py.Group, readings: Sequence[PlainMapping]) ->
         if one.get("age_s") is not None:
             values(sensor, "value_age", float(one["age_s"]), "s")
         _write_texts(sensor, {"reason": one.get("reason")})
-        quantity = _OF_SAMPLE.get(name.rpartition("_")[2])
-        if quantity is not None and one.get("value") is not None and quantity not in sample:
-            values(sample, quantity, float(one["value"]), str(one["unit"]))
+    for word, quantity in _OF_SAMPLE.items():
+        found = [one for one in readings if re.split(r"\W|_", str(one["name"]))[-1] == word]
+        # of two sensors neither is the sample's for certain: a file must not have the one, and the next file the other
+        if len(found) == 1 and found[0].get("value") is not None:
+            values(sample, quantity, float(found[0]["value"]), str(found[0]["unit"]))
 
 
 def group(parent: h5py.Group, name: str, nexus_class: str) -> h5py.Group:

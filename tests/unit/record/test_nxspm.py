@@ -105,3 +105,14 @@ def test_readings_of_other_instruments_are_in_the_sample() -> None:
     sensor = sample["environment/cryo_temperature"]
     assert said(sensor, "value", "target", "lowest", "highest", "value_age") == [4.2, 4.2, 4.1, 4.3, 0.5]
     assert said(sample["environment/magnet_field"], "reason") == ["no sensor"]
+
+
+@pytest.mark.parametrize("kelvin", [4.2, None], ids=["both sensors", "one sensor without a value"])
+def test_sample_has_no_temperature_if_two_instruments_have_one(kelvin: float | None) -> None:
+    readings = [
+        {"name": "cryo.temperature", "value": kelvin, "unit": "K", "age_s": 0.5},
+        {"name": "head.temperature", "value": 77.0, "unit": "K", "age_s": 0.5},
+    ]
+    sample = opened(encode_scan([SCAN], FileProvenance(0, None, {"instruments": readings})))["sample"]
+    assert "temperature" not in sample
+    assert said(sample["environment/head_temperature"], "value") == [77.0]
