@@ -10,6 +10,7 @@ from typing import Final, Literal, get_args
 
 from afspm.basics.errors import InvalidValue, UnitError
 from afspm.basics.units import convert, parse_quantity, require_unit, si_unit
+from afspm.model.instruments import instrument_of
 from afspm.model.names import BASE_PARAMETERS
 from afspm.model.requests import Parameter
 
@@ -43,8 +44,14 @@ class SweepAxis:
         """Read the values of a parameter from a list or a range.
 
         Raises:
-            InvalidValue, UnitError: there are no values, a value twice, or values that this parameter can't have.
+            InvalidValue, UnitError: there are no values, a value twice, values that this parameter can't have, or a
+                parameter of another instrument.
         """
+        if instrument_of(name) and not name.startswith("x-"):
+            raise InvalidValue(
+                f"{name} is a parameter of another instrument, and a sweep does not wait for it",
+                hint=f'set it with scope.set("{name}", ..., wait=True), and take a scan or a sweep at each value',
+            )
         if isinstance(given, Mapping):
             unit, values = (
                 _unit_of(name, [given[end] for end in ("from", "to") if end in given]),
