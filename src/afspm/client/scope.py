@@ -12,7 +12,7 @@ from typing import Literal
 from afspm import wire
 from afspm.basics.errors import ExperimentEnded, InvalidValue, NoResponse, RequestError
 from afspm.basics.plain_data import Plain
-from afspm.client.command_retry import CommandRetry, refused
+from afspm.client.command_retry import PATIENCE_S, CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.events import Events, PublishedEvent
 from afspm.client.experiment_link import ExperimentLink
@@ -249,7 +249,8 @@ class Scope(ExperimentView):
                 `value`. The call then returns the measured value. The wait needs no control.
 
         Raises:
-            NoResponse: with `wait`, the target was changed meanwhile, or was not reached within the timeout.
+            NoResponse: with `wait`, the target was changed meanwhile, was not reached within the timeout, or the
+                instrument has had no value for a minute.
         """
         with self._call():
             asked, until_s = to_parameter(parameter, value, unit), self._link.until(timeout_s)
@@ -259,26 +260,32 @@ class Scope(ExperimentView):
 
     def _arrived(self, asked: Parameter, target: float, until_s: float | None) -> Value:
         link, name = self._link, asked.name
+        lost_s: float | None = None
         while True:
-            found = {part: self._read_again(f"{name}.{part}", asked.unit, until_s) for part in ("target", "busy")}
+            found = {part: self._read_again(f"{name}.{part}", asked.unit, until_s)[0] for part in ("target", "busy")}
             if found["target"] is not None and not math.isclose(float(found["target"]), target, rel_tol=_ROUNDED):
                 what = f"{name} does not go to {asked.value} {asked.unit or ''} any more"
                 raise NoResponse(what, where=link.name, hint=f"its target is {found['target']:g} now")
-            value = self._read_again(name, asked.unit, until_s)
+            value, why = self._read_again(name, asked.unit, until_s)
             if found["busy"] is False and found["target"] is not None and value is not None:
                 return value
+            now_s = link.clock.monotonic_s()
+            lost_s = None if value is not None else now_s if lost_s is None else lost_s
+            if lost_s is not None and now_s - lost_s > PATIENCE_S:
+                what = f"{name} has had no value for {PATIENCE_S:g} s on its way to {asked.value} {asked.unit or ''}"
+                raise NoResponse(what, where=link.name, hint=why)
             link.wait(lambda: False, link.earlier(_LOOK_S, until_s))
             if until_s is not None and link.clock.monotonic_s() >= until_s:
                 raise NoResponse(f"{name} has not arrived at {asked.value} {asked.unit or ''} in time", where=link.name)
 
-    def _read_again(self, name: str, unit: str | None, until_s: float | None) -> Value | None:
-        # None while the instrument has no recent reading: the wait outlasts a restart of its server
+    def _read_again(self, name: str, unit: str | None, until_s: float | None) -> tuple[Value | None, str]:
+        # None, and why, while the instrument has no recent reading: the wait outlasts a restart of its server
         response = self._commands.read(ControlRequest.PARAM, Parameter(name), until_s)
         if response.code == ControlResponse.PARAM_ERROR:
-            return None
+            return None, response.reason
         if not response.ok:
             raise refused(ControlRequest.PARAM, response, name)
-        return value_in(response, Parameter(name), unit)
+        return value_in(response, Parameter(name), unit), ""
 
     def get(self, parameter: str, unit: str | None = None, *, timeout_s: float | None = ANSWER_S) -> Value:
         """Return a parameter's value in `unit`; without `unit`, in SI for base parameters, else as received."""

@@ -863,3 +863,20 @@ def test_wait_accepts_a_target_that_the_instrument_has_rounded(lab: Lab, scope: 
     lab.values["source.bias.target"] = "0.2"
     with pytest.raises(NoResponse, match=r"its target is 0\.2 now"):
         scope.set("source.bias", 1 / 6, "V", wait=True)
+
+
+def test_wait_outlasts_a_restart_of_the_instrument_but_not_an_error(lab: Lab, scope: Scope) -> None:
+    lab.values |= {"source.bias.target": "0.25", "source.bias.busy": "false"}
+    begun_s, lasts_s = lab.clock.passed_s, 30.0
+    unknown = Response(ControlResponse.PARAM_ERROR, reason="source.bias is not known: status 400: no sensor")
+
+    def answer(request: model.Request) -> Response | str:
+        is_read = request.kind == ControlRequest.PARAM and request.subject.value is None
+        return unknown if is_read and lab.clock.passed_s - begun_s < lasts_s else "go on"
+
+    lab.intercept = answer
+    assert scope.set("source.bias", 0.25, "V", wait=True) == 0.25
+    assert lab.clock.passed_s - begun_s > lasts_s
+    lasts_s = math.inf
+    with pytest.raises(NoResponse, match=r"no value for 60 s .* status 400: no sensor"):
+        scope.set("source.bias", 0.25, "V", wait=True)
