@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import random
 from dataclasses import dataclass
+from typing import Any
 
 from tests.unit.scheduler.logic_lab import as_saved
 
@@ -71,6 +72,7 @@ class Cryostat:
         ramp_switch: the parameter that switches the ramp on, off at first; empty: the ramp is always on.
         setpoint_k: follows the target; value_k: the true temperature.
         fault: of FAULTS, while it lasts.
+        range_k: lowest and highest target; None: no bounds.
         is_busy: the status; None: busy while the temperature is away from the target.
     """
 
@@ -83,6 +85,7 @@ class Cryostat:
     setpoint_k: float = 4.2
     ramp_k_min: float = 0.0
     fault: str = "none"
+    range_k: tuple[float, float] | None = None
     is_busy: bool | None = None
     unit: str = "K"
     disturbance_k: float = 0.0
@@ -146,7 +149,7 @@ class Cryostat:
         return 1000.0 if self.unit == "mK" else 1.0
 
     def _description(self) -> object:
-        def number(unit: str, *, readonly: bool) -> dict[str, object]:
+        def number(unit: str, *, readonly: bool) -> dict[str, Any]:
             return {"datainfo": {"type": "double", "unit": unit}, "readonly": readonly}
 
         accessibles = {
@@ -154,6 +157,8 @@ class Cryostat:
             "target": number(self.unit, readonly=False),
             "status": {"datainfo": {"type": "tuple"}, "readonly": True},
         }
+        if self.range_k is not None:
+            accessibles["target"]["datainfo"] |= dict(zip(("min", "max"), self.range_k, strict=True))
         if self.has_ramp:
             accessibles["ramp"] = number(f"{self.unit}/min", readonly=False)
         if self.ramp_switch:

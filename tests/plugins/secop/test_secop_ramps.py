@@ -157,6 +157,20 @@ def test_target_is_moved_in_steps_if_the_ramp_can_not_be_switched_on() -> None:
     assert bench.changes == [pytest.approx(4.2, abs=0.01)]
 
 
+def test_steps_stay_within_the_range_of_the_server() -> None:
+    bench = Bench()
+    bench.cryostat.range_k, bench.cryostat.value_k = (4.0, 300.0), 3.9
+    bench.cryostat.target_k, bench.cryostat.is_busy = 20.0, False
+    bench.connect()
+    bench.order("301", 1)
+    (refused,) = bench.client.outcomes()
+    assert "cryo.t = 301 must be between 4 and 300 K" in refused.reason
+    bench.order("10", 2)
+    assert bench.changes == [4.0]
+    bench.order("301", 3)
+    assert bench.client.readings(bench.now_s)[0].target == 10.0
+
+
 def test_steps_wait_for_a_module_that_takes_no_target_while_it_moves(bench: Bench) -> None:
     bench.order("4.3")
     answer = bench.cryostat.answer

@@ -48,6 +48,7 @@ class Channel:
         value, target, status, ramp, ramp_switch: "module:accessible"; empty if the module has none.
         first_unit: unit in the first description; a later change of unit is a fault.
         per_s: factor from the unit of `ramp` to `unit` per second.
+        low, high: range of the target, as described by the server.
         asked_s: time of the unanswered request for the value; None if there is none.
         measured_s: time of the request for the newest value.
         last_answer: (server's own time, value) of the last answer.
@@ -70,6 +71,8 @@ class Channel:
     unit: str = ""
     first_unit: str | None = None
     per_s: float = 0.0
+    low: float = -math.inf
+    high: float = math.inf
     asked_s: float | None = None
     measured_s: float = -math.inf
     last_answer: tuple[object, float] | None = None
@@ -336,6 +339,9 @@ class SecopClient:
             self.log.append(f"{channel.name}: {channel.unit_fault}; it is not believed until the unit is back")
         settable = wanted if channel.accessible else "target"
         channel.target = f"{channel.module}:{settable}" if _is_settable(accessibles, settable) else ""
+        bounds = _info(accessibles, settable) or {}
+        low, high = (_number(bounds.get(one)) for one in ("min", "max"))
+        channel.low, channel.high = -math.inf if low is None else low, math.inf if high is None else high
         channel.status = f"{channel.module}:status" if "status" in accessibles else ""
         channel.is_controlled = True
         channel.ramp, channel.ramp_switch, channel.per_s = "", "", 0.0
@@ -378,6 +384,11 @@ class SecopClient:
     def _begin(
         self, order: InstrumentOrder, channel: Channel, number: float, rate_per_s: float | None, now_s: float
     ) -> list[str]:
+        is_in_steps = rate_per_s is not None and not channel.ramp
+        if is_in_steps and not channel.low <= number <= channel.high:  # the server would refuse the last steps only
+            why = f"{channel.name} = {number:.6g} must be between {channel.low:.6g} and {channel.high:.6g}"
+            self._finish(order, ControlResponse.PARAM_ERROR, f"{why} {channel.unit} (the range of the server)")
+            return []
         before = self._ramps.pop(channel.name, None)  # a new target replaces the steps to the one before
         if rate_per_s is not None and channel.ramp:
             limit = rate_per_s / channel.per_s
@@ -385,6 +396,7 @@ class SecopClient:
             return [lines.change(channel.ramp, limit)]
         if rate_per_s is not None:
             start = self._start_of_steps(channel, rate_per_s) if before is None else before.sent
+            start = min(max(start, channel.low), channel.high)  # the value itself may be just outside
             ramp = RampInSteps(number, rate_per_s, start, now_s, start)
             self._progress = OrderInProgress(order, channel, f"changed {channel.target}", start, ramp)
             return [lines.change(channel.target, start)]
