@@ -72,6 +72,7 @@ class Cryostat:
         ramp_switch: the parameter that switches the ramp on, off at first; empty: the ramp is always on.
         setpoint_k: follows the target; value_k: the true temperature.
         fault: of FAULTS, while it lasts.
+        fastest_k_min: highest rate of the ramp.
         range_k: lowest and highest target; None: no bounds.
         is_busy: the status; None: busy while the temperature is away from the target.
     """
@@ -85,6 +86,7 @@ class Cryostat:
     setpoint_k: float = 4.2
     ramp_k_min: float = 0.0
     fault: str = "none"
+    fastest_k_min: float = 10.0
     range_k: tuple[float, float] | None = None
     is_busy: bool | None = None
     unit: str = "K"
@@ -119,6 +121,9 @@ class Cryostat:
 
     def _change(self, specifier: str, value: float) -> str:
         if specifier == "tt:ramp":
+            if value > self.fastest_k_min:
+                why = f"{value} must be between 0 and {self.fastest_k_min}"
+                return f'error_change {specifier} ["RangeError", "{why}", {{}}]'
             self.ramp_k_min = value
         elif specifier == f"tt:{self.ramp_switch}":
             self.is_ramp_on = bool(value)
@@ -161,6 +166,7 @@ class Cryostat:
             accessibles["target"]["datainfo"] |= dict(zip(("min", "max"), self.range_k, strict=True))
         if self.has_ramp:
             accessibles["ramp"] = number(f"{self.unit}/min", readonly=False)
+            accessibles["ramp"]["datainfo"]["max"] = self.fastest_k_min
         if self.ramp_switch:
             accessibles[self.ramp_switch] = {"datainfo": {"type": "bool"}, "readonly": False}
         return {"modules": {"tt": {"accessibles": accessibles}}}

@@ -141,6 +141,14 @@ def test_ramp_of_the_server_is_switched_on_before_the_target_is_set(switch: str)
     assert bench.cryostat.setpoint_k == pytest.approx(4.2 + RATE_K_S)
 
 
+def test_ramp_of_the_server_may_be_slower_than_the_limit() -> None:
+    bench = Bench(Cryostat(has_ramp=True, chance=random.Random(1), fastest_k_min=1.0))
+    bench.connect()
+    bench.order("20")
+    assert bench.changes == [20.0]
+    assert bench.cryostat.ramp_k_min == 1.0
+
+
 def test_target_is_moved_in_steps_if_the_ramp_can_not_be_switched_on() -> None:
     bench = Bench(Cryostat(has_ramp=True, chance=random.Random(1), ramp_switch="ramp_enable"))
     describe = bench.cryostat._description

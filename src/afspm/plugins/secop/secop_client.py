@@ -48,6 +48,7 @@ class Channel:
         value, target, status, ramp, ramp_switch: "module:accessible"; empty if the module has none.
         first_unit: unit in the first description; a later change of unit is a fault.
         per_s: factor from the unit of `ramp` to `unit` per second.
+        fastest: highest `ramp`, as described by the server.
         low, high: range of the target, as described by the server.
         asked_s: time of the unanswered request for the value; None if there is none.
         measured_s: time of the request for the newest value.
@@ -71,6 +72,7 @@ class Channel:
     unit: str = ""
     first_unit: str | None = None
     per_s: float = 0.0
+    fastest: float = math.inf
     low: float = -math.inf
     high: float = math.inf
     asked_s: float | None = None
@@ -350,6 +352,8 @@ class SecopClient:
         # without a ramp that is certainly on, the target is moved in steps
         if per_s is not None and not channel.accessible and (not switch or _is_settable(accessibles, switch)):
             channel.ramp, channel.per_s = f"{channel.module}:ramp", per_s
+            fastest = _number((_info(accessibles, "ramp") or {}).get("max"))
+            channel.fastest = math.inf if fastest is None else fastest
             channel.ramp_switch = f"{channel.module}:{switch}" if switch else ""
 
     # --- orders ---
@@ -391,7 +395,7 @@ class SecopClient:
             return []
         before = self._ramps.pop(channel.name, None)  # a new target replaces the steps to the one before
         if rate_per_s is not None and channel.ramp:
-            limit = rate_per_s / channel.per_s
+            limit = min(rate_per_s / channel.per_s, channel.fastest)
             self._progress = OrderInProgress(order, channel, f"changed {channel.ramp}", number, ramp_limit=limit)
             return [lines.change(channel.ramp, limit)]
         if rate_per_s is not None:
@@ -475,7 +479,7 @@ class SecopClient:
                 del self._ramps[name]
                 self.log.append(f"{name} stays at {ramp.before:.6g}: the server refused a step ({line.error})")
         if progress is not None and line.specifier in progress.channel.set_by_orders:
-            self._finish(progress.order, ControlResponse.PARAM_ERROR, line.error)
+            self._finish(progress.order, ControlResponse.PARAM_ERROR, f"{line.specifier}: {line.error}")
         return []
 
     def _next_step(self, channel: Channel, ramp: RampInSteps, now_s: float) -> list[str]:
