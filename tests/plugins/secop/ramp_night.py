@@ -382,7 +382,9 @@ class RampNight:
             for line in delayed:
                 self.inbox += self.cryostat.answer(line)
         if fault == "instrument killed":
+            unfinished = self.client.unfinished()
             self._new_instrument()
+            self.client.go_on_with(unfinished)
             self.connections.pop("cryo", None)
         if fault == "scheduler killed":
             saved = as_saved(self.core.snapshot())

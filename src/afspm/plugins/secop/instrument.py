@@ -17,6 +17,10 @@ from afspm.plugins.secop.secop_client import SecopClient, ServerUnfit
 PORT = 10767
 AGAIN_S = 2.0
 CONNECT_S = 1.0
+GOES_ON_WITHIN_S = 60.0
+"""Real time after which a restarted process does not continue steps of a target: a person may have seen them halt."""
+_KEPT_AGAIN_S = 20.0
+_STEPS = "steps"
 
 
 class Instrument(Component):
@@ -46,6 +50,18 @@ class Instrument(Component):
         self._last_fault = ""
         self._token = 0
 
+    def on_start(self) -> None:
+        """Continue the steps of a target that the kill of an earlier process has interrupted."""
+        kept = self.memory.get(_STEPS) or {}
+        if not kept.get("of"):
+            return
+        names = ", ".join(kept["of"])
+        if self._real_s_since(kept["at_ns"]) > GOES_ON_WITHIN_S:
+            self.log.warning("the steps of %s ended with the process before: set the target again", names)
+            return
+        self.log.info("going on with the steps of %s", names)
+        self._client.go_on_with(kept["of"])
+
     def on_tick(self) -> None:
         """Exchange lines with the server, then report to the scheduler."""
         self._serve(self._receive)
@@ -53,10 +69,14 @@ class Instrument(Component):
         for text in self._client.log:
             self.log.warning("%s", text)
         self._client.log.clear()
+        self._keep_steps()
         self._report()
 
     def on_end(self) -> None:
-        """Disconnect; the server keeps the targets (setpoints) of its modules."""
+        """Disconnect; the server keeps the targets (setpoints) of its modules, and steps of a target halt."""
+        if steps := self._client.unfinished():
+            self.log.warning("the steps of %s halt here: set the target again", ", ".join(steps))
+        self.memory.pop(_STEPS, None)
         if self._lines is not None:
             self._lines.close()
 
@@ -70,6 +90,14 @@ class Instrument(Component):
         self._token = answer.token
         for order in answer.orders:
             self._serve(lambda order=order: client.order(order, self.clock.monotonic_s()))  # type: ignore[misc]
+
+    def _keep_steps(self) -> None:
+        kept, steps = self.memory.get(_STEPS) or {"of": {}, "at_ns": 0}, self._client.unfinished()
+        if steps != kept["of"] or (steps and self._real_s_since(kept["at_ns"]) > _KEPT_AGAIN_S):
+            self.memory[_STEPS] = {"at_ns": self.clock.now_ns(), "of": steps}
+
+    def _real_s_since(self, time_ns: int) -> float:
+        return self.clock.real_s((self.clock.now_ns() - time_ns) * 1e-9)
 
     def _receive(self) -> list[str]:
         now_s, out = self.clock.monotonic_s(), list[str]()

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from afspm.basics.errors import ConfigError, UnitError
+from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.basics.units import convert
 from afspm.model import ControlResponse, InstrumentOrder, InstrumentReading, OrderOutcome
 from afspm.plugins.secop import lines
@@ -239,6 +240,29 @@ class SecopClient:
             if line.specifier == self.channels[name].target and not ramp.in_flight:
                 out += self._next_step(self.channels[name], ramp, now_s)
         return out
+
+    # --- over a restart of the process ---
+
+    def unfinished(self) -> Plain:
+        """Return the targets that are moved in steps, in JSON's types, for `go_on_with`."""
+        return {
+            name: {
+                "unit": self.channels[name].first_unit or "",
+                **{key: getattr(ramp, key) for key in ("final", "rate_per_s", "sent", "ideal")},
+            }
+            for name, ramp in self._ramps.items()
+        }
+
+    def go_on_with(self, unfinished: PlainMapping) -> None:
+        """Continue the steps of an earlier process, unless the target read first is another one."""
+        for name, kept in unfinished.items():
+            if (channel := self.channels.get(name)) is None:
+                continue
+            channel.first_unit = str(kept["unit"])
+            final, rate_per_s, sent, ideal = (float(kept[key]) for key in ("final", "rate_per_s", "sent", "ideal"))
+            ramp = RampInSteps(final, rate_per_s, sent, -math.inf, ideal, is_interrupted=True)
+            ramp.before = ideal  # the last step may have been on its way
+            self._ramps[name] = ramp
 
     # --- readings ---
 
@@ -491,7 +515,7 @@ class SecopClient:
         if ramp.is_interrupted:  # the last step may have been lost with the connection
             candidates.append(ramp.before)
         # a server may round a step after its answer; other targets are of another client
-        if not any(abs(channel.newest_target - one) <= ramp.rate_per_s * STEP_S for one in candidates):
+        if not any(abs(channel.newest_target - one) <= 2.0 * ramp.rate_per_s * STEP_S for one in candidates):
             self._leave(channel, ramp)
             return []
         ramp.sent = channel.newest_target

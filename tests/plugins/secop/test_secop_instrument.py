@@ -1,0 +1,101 @@
+"""The component of a SECoP server over a restart of its process."""
+
+from __future__ import annotations
+
+import logging
+import random
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from tests.plugins.secop.ramp_night import RATE_K_S, Cryostat
+from tests.unit.client.client_lab import FakeClock
+
+from afspm.model import InstrumentOrder, InstrumentOrders, InstrumentReadings, Parameter
+from afspm.plugins.secop import instrument
+from afspm.plugins.secop.instrument import GOES_ON_WITHIN_S, Instrument
+
+
+class Cryo:
+    """An experiment of one cryostat, whose component can be killed and started again."""
+
+    def __init__(self) -> None:
+        self.cryostat = Cryostat(has_ramp=False, chance=random.Random(1))
+        self.clock = FakeClock()
+        self.memory: dict[str, Any] = {}
+        self.orders: tuple[InstrumentOrder, ...] = ()
+        self.answers: list[str] = []
+        self.reports: list[InstrumentReadings] = []
+        self.start()
+
+    def start(self) -> None:
+        self.component = Instrument("secop://cryo-pc", {"cryo.t": "tt"})
+        log = logging.getLogger("cryo")
+        vars(self.component).update(name="cryo", log=log, clock=self.clock, memory=self.memory, scope=self)
+        self.component.on_start()
+
+    def connect(self, host: str, port: int) -> SimpleNamespace:
+        self.answers = []
+        return SimpleNamespace(receive=self.receive, send=self.send, close=lambda: None)
+
+    def send(self, lines: list[str]) -> None:
+        self.answers += [answer for line in lines for answer in self.cryostat.answer(line)]
+
+    def receive(self) -> list[str]:
+        received, self.answers = self.answers, []
+        return received
+
+    def report_readings(self, report: InstrumentReadings) -> InstrumentOrders:
+        self.reports.append(report)
+        orders, self.orders = self.orders, ()
+        return InstrumentOrders(1, orders)
+
+    def later(self, seconds: float) -> None:
+        for _ in range(round(seconds / 0.25)):
+            self.clock.passed_s += 0.25
+            self.component.on_tick()
+
+
+@pytest.fixture
+def cryo(monkeypatch: pytest.MonkeyPatch) -> Cryo:
+    made = Cryo()
+    monkeypatch.setattr(instrument, "LineSocket", made.connect)
+    made.later(2.0)
+    made.orders = (InstrumentOrder(1, "series/1", Parameter("cryo.t", "4.5", "K"), RATE_K_S, "K"),)
+    made.later(4.0)
+    assert 4.2 < made.cryostat.target_k < 4.5
+    return made
+
+
+def test_steps_go_on_after_a_kill(cryo: Cryo) -> None:
+    cryo.clock.passed_s += GOES_ON_WITHIN_S / 2.0
+    before_k = cryo.cryostat.target_k
+    cryo.start()
+    cryo.later(2.5)
+    assert before_k < cryo.cryostat.target_k <= before_k + 2.0 * RATE_K_S
+    assert (cryo.reports[-1].readings[0].target, cryo.reports[-1].readings[0].busy) == (4.5, True)
+    cryo.later(15.0)
+    assert cryo.cryostat.target_k == 4.5
+    assert not cryo.memory["steps"]["of"]
+
+
+def test_steps_do_not_go_on_if_another_target_was_set_meanwhile(cryo: Cryo) -> None:
+    cryo.cryostat.target_k = 5.0
+    cryo.start()
+    cryo.later(5.0)
+    assert cryo.cryostat.target_k == 5.0
+
+
+@pytest.mark.parametrize("is_stopped", [True, False], ids=["stopped", "away for long"])
+def test_steps_halt_if_the_component_is_stopped_or_away_for_long(
+    cryo: Cryo, is_stopped: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    before_k = cryo.cryostat.target_k
+    if is_stopped:
+        cryo.component.on_end()
+    else:
+        cryo.clock.passed_s += GOES_ON_WITHIN_S + 1.0
+    cryo.start()
+    cryo.later(5.0)
+    assert cryo.cryostat.target_k == before_k
+    assert "the steps of cryo.t" in caplog.text
