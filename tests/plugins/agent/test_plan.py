@@ -130,6 +130,7 @@ def test_grant_of_a_table() -> None:
         {"for": "2"},
         {"for": "0 s"},
         {"counts": {"start-scan": True}},
+        {"parameters": {"magnet.field": ["-1", "1"]}},
         {"counts": {"start-scan": 1.5}},
         {"region": {"x": ["0 um", "1 um"]}},
         {"region": {"x": ["1 um", "0 um"], "y": ["0 um", "1 um"]}},
