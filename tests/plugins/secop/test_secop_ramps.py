@@ -101,15 +101,25 @@ def test_steps_begin_at_the_value_while_the_control_loop_is_off(bench: Bench) ->
     assert bench.changes[0] == pytest.approx(9.0, abs=0.01)
 
 
-def test_steps_continue_from_the_target_while_the_value_lags_behind(bench: Bench) -> None:
-    bench.order("4.3", 1)
-    for _ in range(10):
-        bench.cryostat.value_k -= 0.1  # the sample is slow
+def test_steps_begin_at_the_target_while_the_value_lags_behind(bench: Bench) -> None:
+    bench.order("4.5", 1)
+    for _ in range(15):
         bench.later(1.0)
-    bench.cryostat.is_busy = False
+    bench.cryostat.value_k, bench.cryostat.is_busy = 4.25, False  # the sample is slow
     bench.later(1.0)
-    bench.order("4.5", 2)
-    assert bench.changes[-1] == pytest.approx(4.3)
+    bench.order("5", 2)
+    assert bench.changes[-1] == pytest.approx(4.5)
+
+
+def test_steps_begin_at_a_value_that_was_moved_away_from_beside_the_target(bench: Bench) -> None:
+    bench.order("4.5", 1)
+    for _ in range(15):
+        bench.later(1.0)
+    for value_k in (4.4, 9.0):  # the sensor reads 0.1 K too little; then the cryostat is warmed up by hand
+        bench.cryostat.value_k, bench.cryostat.is_busy = value_k, False
+        bench.later(1.0)
+    bench.order("8", 2)
+    assert bench.changes[-1] == pytest.approx(9.0, abs=0.01)
 
 
 def test_steps_go_on_at_a_server_that_rounds_a_target_after_its_answer(bench: Bench) -> None:

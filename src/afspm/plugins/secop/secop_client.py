@@ -438,11 +438,13 @@ class SecopClient:
         target, near = channel.newest_target, 2.0 * rate_per_s * STEP_S
         if target is None or not channel.is_controlled:
             return channel.newest
-        is_near, was_near = abs(target - channel.newest) <= near, channel.nearest <= near
-        # a value that has left its target is disturbed while the module is busy; a value that has never been there lags
-        # behind steps of afspm, or is on its way to the target of another client, to which the way must not lead
-        is_in_force = is_near or (channel.is_busy if was_near else channel.is_led)
-        return target if is_in_force else channel.newest
+        distance = abs(target - channel.newest)
+        # behind steps of afspm the value may lag, or stay beside the target; it comes no nearer after it has left
+        is_behind = channel.is_led and distance <= channel.nearest + near
+        # a value that has left its target is disturbed while the module is busy; a value that has never been there may
+        # be on its way to the target of another client, to which the way must not lead
+        is_disturbed = channel.is_busy and (channel.is_led or channel.nearest <= near)
+        return target if distance <= near or is_behind or is_disturbed else channel.newest
 
     def _go_on(self, line: SecopLine, now_s: float) -> list[str]:
         progress, text = self._progress, f"{line.action} {line.specifier}"
