@@ -56,8 +56,8 @@ Place = tuple[float | str, float | str]
 SET_BACK_WITHIN_S = 60.0
 """Limit on the wait for control after a failed sweep, real time."""
 _LOOK_S = 0.5
-_ROUNDED = 1e-3  # relative: an instrument may round a target, also at the end of a ramp in steps
 """Real time between two readings of a value that has not arrived at its target."""
+_ROUNDED = 1e-3  # relative: an instrument may round a target, also at the end of a ramp in steps
 ANSWER_S = 60.0  # default of readings; calls that wait for control or a measurement have no limit by default
 
 
