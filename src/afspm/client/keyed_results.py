@@ -72,6 +72,15 @@ class KeyedResults:
         path = None if intent is None else self._path(intent["key"])
         return None if path is not None and path.exists() else intent
 
+    def next_attempt(self, before: int) -> int:
+        """Return an attempt number above `before` and above all numbers so far; `intend` saves it.
+
+        A key may come again, after `forget` or after a measurement that was given up. With an old number the request
+        would have an old id, be answered from the cache, and start nothing.
+        """
+        self._memory["attempts"] = attempt = max(before, int(self._memory.get("attempts", 0))) + 1
+        return attempt
+
     def intend(self, intent: Plain) -> None:
         """Save the intent of a measurement, before the measurement is requested."""
         self._memory["pending"] = intent
@@ -133,6 +142,8 @@ class KeyedResults:
         """Remove the saved result of a key; the next request with this key measures again."""
         path = self._path(key)
         if path is not None:
+            # without its file the saved intent would look unfulfilled after a restart, and get the old scan
+            self._memory.save(synced=False)
             with suppress(OSError):  # a file that stays only takes space
                 path.unlink(missing_ok=True)
 

@@ -209,7 +209,7 @@ class MeasurementRunner:
         if task.watch is not None and task.watch.is_over():
             return  # the measurement had begun, and ended during the wait for control
         if is_new:
-            task.attempt += 1
+            task.attempt = task.attempt + 1 if task.key is None else self._results.next_attempt(task.attempt)
             self._write_down(task)
         with link.clock.late():
             self._setup.prepare(target, task.key or "", until_s)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.unit.client.client_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, LabPort
 
-from afspm.basics.errors import InvalidValue, NoResponse, Refused
+from afspm.basics.errors import ControlLost, InvalidValue, NoResponse, Refused
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
 from afspm.model import ControlRequest, ControlResponse, Problem, Request, Response, ScanSet
@@ -269,6 +269,30 @@ def test_forgotten_key_is_measured_again_and_takes_no_space(tmp_path: Path) -> N
     assert lab.finished == [*TILES, TILES[1]]
     with pytest.raises(InvalidValue, match="can't be a key"):
         scope.forget("../tile-1")
+
+
+def test_forgotten_key_may_be_used_in_a_loop(tmp_path: Path) -> None:
+    lab = Lab()
+    for life in range(3):
+        scope = scope_of(lab, tmp_path, life)
+        for _ in range(3):
+            assert scope.scan(TILES[0], shape=(8, 8), key="reference").interruptions == ()
+            scope.forget("reference")
+        lab.restart_component()
+    assert lab.begun_scans == 9
+    assert lab.clock.passed_s < 9 * SCAN_S + 20.0, "no request had an old id, which starts nothing"
+
+
+def test_measurement_given_up_for_another_is_taken_at_once_later(tmp_path: Path) -> None:
+    lab = Lab()
+    scope = scope_of(lab, tmp_path, 0)
+    lab.at(50.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
+    lab.at(60.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    with pytest.raises(ControlLost):
+        scope.scan(TILES[0], shape=(8, 8), key="whole", repeat=False)
+    scope.scan(TILES[1], shape=(8, 8), key="rest")
+    assert scope.scan(TILES[0], shape=(8, 8), key="whole").interruptions == ()
+    assert lab.begun_scans == 3
 
 
 @pytest.mark.parametrize("left", [0.0, 0.5, 0.99])
