@@ -14,11 +14,11 @@ from afspm.basics.errors import ConfigError, ControlLost, InvalidValue, Refused,
 from afspm.basics.formatting import day_and_time
 from afspm.basics.units import Angle, Length, Period, convert, si
 from afspm.client.component import Component
-from afspm.client.events import Events
+from afspm.client.events import PublishedEvent
 from afspm.client.parameter_text import to_parameter
 from afspm.components import tip_verdict
 from afspm.components.scan_plan import XY, PlanRest, PlanStep, RoundSchedule, ScanPlan, grid_centers, rounds_within
-from afspm.model import Region, ScanSet, names
+from afspm.model import Region, ScanSet, ScopeState, ScopeStatus, names
 from afspm.model.names import BASE_PARAMETERS
 from afspm.model.planned_work import PlannedWork, planned_rounds
 
@@ -28,6 +28,7 @@ FRAME = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.SCAN_SIZE_X, names.
 
 
 Missed = Literal["extend", "catch-up", "skip", "rest"]
+_SCANNING = ScopeState.SCANNING
 _MISSED: dict[Missed, str] = {
     "extend": "to be taken at the end",
     "rest": "to be taken at the end",
@@ -181,26 +182,36 @@ class PlannedScans(Component):
         rows, _ = step.shape or (0, 0)
         kept = self.memory.get("rest")
         rest = PlanRest(*kept) if kept else PlanRest(0, rows - 1)
-        with self.scope.events(tip_verdict.OF_LINES) as verdicts:
+        with self.scope.events(tip_verdict.OF_LINES, "ScopeStateMsg") as events:
             while True:
-                part = rest.of(step)
+                part, lasted_ns = rest.of(step), None
+                seen: list[PublishedEvent] = []
                 try:
                     return self._scan(part, repeat=False)
                 except ControlLost as lost:
                     self._round_began_s = None
                     self.log.warning("%s: %s", part.key, lost.what)
+                    seen += events.waiting()
+                    lasted_ns = _newest_scan_ns(seen)
                 except Refused as refused:
                     if part is step:
                         raise
                     self.log.warning("%s can't be taken alone: %s; all rows are taken again", part.key, refused.reason)
                     rest = PlanRest(0, rows - 1)
+                    self.memory.pop("rest", None)
+                    self.memory.save()
                 with self.scope.control():  # in control again: the tip is repaired, and all verdicts have arrived
                     pass
-                rest = self._since_change(rest, part, verdicts)
+                seen += events.waiting()
+                rest = self._since_change(rest, part, seen, lasted_ns)
 
-    def _since_change(self, rest: PlanRest, part: PlanStep, verdicts: Events) -> PlanRest:
-        found = [tip_verdict.read_line_verdict(event.message) for event in verdicts.waiting()]
-        stopping = [one for one in found if one is not None and one.stops and one.shape == part.shape]
+    def _since_change(
+        self, rest: PlanRest, part: PlanStep, seen: Sequence[PublishedEvent], lasted_ns: tuple[int, int] | None
+    ) -> PlanRest:
+        messages = (event.message for event in seen if not isinstance(event.message, ScopeStatus))
+        found = [one for one in map(tip_verdict.read_line_verdict, messages) if one is not None and one.stops]
+        # of this scan only: a verdict on an earlier scan, or on another component's, would leave out rows of this one
+        stopping = [one for one in found if one.shape == part.shape and _is_of(one, lasted_ns)]
         if not stopping:
             return rest
         rest = rest.since(stopping[-1].since_row, downwards=stopping[-1].downwards)
@@ -328,6 +339,22 @@ class RegionGrid(PlannedScans):
         points = grid_centers(pair(center), (counts[0], counts[1]), pair(spacing or size), angle)
         self.plan = _plan(tuple(Region(point, pair(size), angle) for point in points), pixels, rounds)
         self.beat_s = period(every)
+
+
+def _newest_scan_ns(seen: Sequence[PublishedEvent]) -> tuple[int, int] | None:
+    # start and end by the published states; None if no start was seen
+    states = [(one.message.state, one.time_ns) for one in seen if isinstance(one.message, ScopeStatus) and one.time_ns]
+    known = [(state, at_ns) for state, at_ns in states if state is not ScopeState.UNDEFINED]
+    before = (ScopeState.UNDEFINED, *(state for state, _ in known))
+    starts = [at_ns for was, (state, at_ns) in zip(before, known, strict=False) if was is not state is _SCANNING]
+    return (starts[-1], known[-1][1]) if starts else None
+
+
+def _is_of(verdict: tip_verdict.LineVerdict, lasted_ns: tuple[int, int] | None) -> bool:
+    if verdict.began_ns is None:
+        return True
+    # the lines' start is read from the clock just after the time of the published state
+    return lasted_ns is not None and lasted_ns[0] - NS_PER_S <= verdict.began_ns <= lasted_ns[1]
 
 
 def pair(values: Sequence[float]) -> XY:

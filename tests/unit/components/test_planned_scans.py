@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.unit.client.client_lab import SCAN_S, Kill9, Lab, LabPort, context_of, run
+from tests.unit.client.client_lab import EPOCH_S, SCAN_S, Kill9, Lab, LabPort, context_of, run
 
 from afspm import wire
 from afspm.basics.errors import ConfigError
@@ -295,14 +295,15 @@ def test_a_series_without_a_sensible_period_is_refused(every: float) -> None:
         ScanSeries(size=(1e-6, 1e-6), every=every)
 
 
-def line_verdict(shape: tuple[int, int], row: int, *, stops: bool) -> LineVerdict:
+def line_verdict(shape: tuple[int, int], row: int, *, stops: bool, began_ns: int | None = None) -> LineVerdict:
     where = Region((0.0, 0.0), (1e-6, 1e-6))
-    return LineVerdict(where, shape, "Height", None, row + 3, row, downwards=False, confidence=0.99, stops=stops)
+    return LineVerdict(where, shape, "Height", began_ns, row + 3, row, downwards=False, confidence=0.99, stops=stops)
 
 
-def stop_at_row(lab: Lab, row: int, shape: tuple[int, int] = (32, 8)) -> None:
-    """Publish a verdict on the running scan, and flag the tip."""
-    verdict = line_verdict(shape, row, stops=True)
+def stop_at_row(lab: Lab, row: int, shape: tuple[int, int] = (32, 8), *, began_s: float | None = None) -> None:
+    """Publish a verdict on the running scan, or on the scan that began at `began_s`, and flag the tip."""
+    began_ns = None if began_s is None else round((EPOCH_S + began_s) * 1e9)
+    verdict = line_verdict(shape, row, stops=True, began_ns=began_ns)
     lab.publish(line_verdict_message(verdict), "TipVerdict_line_watch")
     lab.flag(Problem.TIP_SHAPE_CHANGED)
 
@@ -332,6 +333,17 @@ def test_whole_scan_is_taken_again_after_an_interruption_without_a_row() -> None
     assert [region.size_m for region in lab.finished] == [pytest.approx((1e-6, 1e-6))] * 2
 
 
+@pytest.mark.parametrize(("began_s", "rest_nm"), [(2.0, 1000), (110.0, 419)])
+def test_only_a_verdict_on_the_stopped_scan_shortens_it(began_s: float, rest_nm: int) -> None:
+    lab = Lab("series")
+    # the second scan is running: a verdict on the first one came late
+    lab.at(140.0, lambda: stop_at_row(lab, 20, began_s=began_s))
+    lab.at(400.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    series = ScanSeries(size=(1e-6, 1e-6), pixels=(8, 32), scans=2, end_when_done=True, missed="rest")
+    assert run(series, lab) == ExitCode.ENDED
+    assert [round(region.size_m[1] * 1e9) for region in lab.finished] == [1000, rest_nm]
+
+
 def test_verdict_for_a_person_does_not_shorten_a_scan() -> None:
     lab = Lab("series")
     look = line_verdict((32, 8), 18, stops=False)
@@ -342,7 +354,7 @@ def test_verdict_for_a_person_does_not_shorten_a_scan() -> None:
     assert [region.size_m for region in lab.finished] == [pytest.approx((1e-6, 1e-6))] * 2
 
 
-def test_refused_rest_is_replaced_by_the_whole_scan() -> None:
+def test_refused_rest_is_replaced_by_the_whole_scan(tmp_path: Path) -> None:
     lab = Lab("series")
 
     def no_fewer_rows(request: Request) -> Response | str:
@@ -354,8 +366,9 @@ def test_refused_rest_is_replaced_by_the_whole_scan() -> None:
     lab.intercept = no_fewer_rows
     lab.at(40.0, lambda: stop_at_row(lab, 20))
     lab.at(400.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
-    assert run(rest_series(), lab) == ExitCode.ENDED
+    assert run(rest_series(), lab, tmp_path) == ExitCode.ENDED
     assert [region.size_m for region in lab.finished] == [pytest.approx((1e-6, 1e-6))] * 2
+    assert not list(tmp_path.rglob("scan-*")), "no result is kept"
 
 
 def test_rest_is_taken_once_over_a_kill(tmp_path: Path) -> None:
