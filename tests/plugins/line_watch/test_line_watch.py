@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from tests.plugins.line_watch.line_scans_lab import (
     CHANGED_ROW,
+    CHANNELS,
     HOME,
     LEARNT,
     LINE_S,
@@ -18,13 +19,15 @@ from tests.plugins.line_watch.line_scans_lab import (
     night,
     publish_lines,
     publish_scan,
+    scan_at,
+    world_with,
 )
 from tests.unit.client.client_lab import Lab, run
 
 from afspm import wire
 from afspm.basics.exit_codes import ExitCode
 from afspm.components.tip_verdict import BAD, LineVerdict, read_line_verdict, verdict_message
-from afspm.model import ControlRequest, Feedback, Problem, Scan, ScopeState, ScopeStatus
+from afspm.model import ControlRequest, Feedback, Problem, Scan, ScanLines, ScopeState, ScopeStatus
 from afspm.plugins.line_watch.line_watch import LineWatch
 
 TIP = Problem.TIP_SHAPE_CHANGED
@@ -157,3 +160,71 @@ def test_alarm_that_comes_after_the_scan_flags_nothing() -> None:
     run(LineWatch(action="stop"), lab)
     assert verdicts(lab)
     assert flags(lab) == 0
+
+
+def test_alarm_that_comes_during_the_next_scan_does_not_stop_that() -> None:
+    lab = Lab("line_watch")
+    for number, picture in enumerate(night()[: LEARNT + 1]):
+        tell(lab, number, picture)
+    at_s = 100.0 + (LEARNT + 1) * PERIOD_S
+    lab.at(at_s - 1.0, partial(lab.publish, ScopeStatus(ScopeState.SCANNING)))
+
+    def arrive_together() -> None:
+        for row in range(ROWS):
+            for channel in CHANNELS:
+                values = night()[-1][channel][row : row + 1]
+                lab.publish(ScanLines(HOME, (ROWS, ROWS), channel, "m", row, values, began_ns(LEARNT + 1)))
+        lab.publish(ScopeStatus(ScopeState.FREE))
+        lab.publish(ScopeStatus(ScopeState.SCANNING))
+
+    lab.at(at_s, arrive_together)
+    lab.at(900.0, lab.kill)
+    run(LineWatch(action="stop"), lab)
+    assert verdicts(lab)
+    assert not any(one.stops for one in verdicts(lab))
+    assert flags(lab) == 0
+
+
+@pytest.mark.parametrize("is_killed", [False, True])
+def test_scans_before_a_repair_are_no_measure_of_those_after_it(tmp_path: Path, *, is_killed: bool) -> None:
+    # the last scan before the repair is learnt from only when the next one begins
+    lab = Lab("line_watch")
+    for number, picture in enumerate(night()[: LEARNT + 1]):
+        tell(lab, number, picture)
+    repair_s = 100.0 + (LEARNT + 0.8) * PERIOD_S
+    lab.at(repair_s, lambda: lab.flag(TIP))
+    lab.at(repair_s + 5.0, lambda: lab.clear(TIP))
+    if is_killed:
+        lab.at(repair_s + 6.0, lab.kill)
+        run(LineWatch(action="stop"), lab, tmp_path)
+        lab = Lab("line_watch")
+        for number, picture in enumerate(night()[: LEARNT + 1]):
+            publish_scan(lab, picture, number, 10.0)
+    changed = scan_at(world_with("double", (LEARNT + 0.5) * PERIOD_S), LEARNT + 1, "up")
+    tell(lab, LEARNT + 1, changed, complete=False)
+    lab.at(900.0, lab.kill)
+    run(LineWatch(action="stop"), lab, tmp_path)
+    assert verdicts(lab) == []
+
+
+@pytest.mark.parametrize("at_once", [1, 30])
+def test_row_of_a_downward_scan_does_not_depend_on_how_many_lines_come_at_once(at_once: int) -> None:
+    lab = Lab("line_watch")
+    changed = scan_at(world_with("double", (LEARNT + 1) * PERIOD_S + 8 * LINE_S), LEARNT + 1, "down")
+    for number, picture in enumerate([*night("double", "down")[: LEARNT + 1], changed]):
+        at_s = 100.0 + number * PERIOD_S
+        lab.at(at_s, partial(lab.publish, ScopeStatus(ScopeState.SCANNING)))
+        for stop in range(ROWS, 0, -at_once):
+            first = max(0, stop - at_once)
+            for channel in CHANNELS:
+                values = picture[channel][first:stop]
+                lines = ScanLines(HOME, (ROWS, ROWS), channel, "m", first, values, began_ns(number))
+                lab.at(at_s, partial(lab.publish, lines))
+        if number <= LEARNT:
+            publish_scan(lab, picture, number, at_s + 30.0)
+    lab.at(900.0, lab.kill)
+    run(LineWatch(action="stop"), lab)
+    last = verdicts(lab)[-1]
+    assert last.stops
+    assert last.downwards
+    assert last.row < last.since_row <= ROWS - 8

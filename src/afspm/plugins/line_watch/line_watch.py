@@ -11,6 +11,7 @@ from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import UnitError
 from afspm.basics.units import convert
 from afspm.client.component import Component
+from afspm.client.events import PublishedEvent
 from afspm.components import tip_verdict
 from afspm.components.channel_pairs import ChannelPairing, HeightPair, MissingChannels
 from afspm.model import ControlState, Feedback, Scan, ScanLines, ScopeState
@@ -100,6 +101,7 @@ class LineWatch(Component):
         self.judge = LineJudge()
         self._lines: _Lines | None = None
         self._finished: _Finished | None = None
+        self._seen_ns: int | None = None  # time of the newest complete scan
         self._problems: tuple[int, ...] | None = None  # not known yet
         self._condition = ""
         self._refused: set[str] = set()
@@ -107,15 +109,19 @@ class LineWatch(Component):
 
     def on_start(self) -> None:
         self.expected = MissingChannels(self.channels, self.log)
+        self._states = self.scope.events("ScopeStateMsg")
+        self._later_states: list[PublishedEvent] = []
         if "judge" in self.memory:
             self.judge.restore(self.memory["judge"])
 
     def on_control(self, control_state: ControlState) -> None:
         was, before = self._is_flagged, self._problems
         self._problems = control_state.problems
+        if self._is_flagged and not was:
+            self._finished = None  # perhaps with the bad tip
         if was and not self._is_flagged:
             self.log.info("the tip is another one now: earlier scans are no measure of it")
-            self.judge.forget_places()
+            self._forget()
         if self._problems and not before and self._lines is not None:
             self._lines.is_disturbed, self._lines.judge = True, None
 
@@ -163,6 +169,9 @@ class LineWatch(Component):
         if pair is None:
             return
         running, self._lines = self._lines, None
+        if scan.time_ns is not None and scan.time_ns <= self.memory.get("forgotten_ns", -1):
+            return
+        self._seen_ns = scan.time_ns
         if scan.time_ns is not None and scan.time_ns <= self.memory.get("newest_ns", -1):
             if scan.time_ns in self.memory.get("learnt_ns", ()):
                 self._learn(_Finished(pair, self._kind(pair.trace)), again=True)
@@ -172,12 +181,21 @@ class LineWatch(Component):
         downwards = running is not None and running.downwards
         self._finished = _Finished(pair, self._kind(scan), downwards, is_whole, is_whole and self._problems == ())
 
+    def _forget(self) -> None:
+        self.judge.forget_places()
+        # a restarted process receives the earlier scans again; only a test scan that ended the repair shows this tip
+        finished = self._finished
+        shows_tip = finished is not None and finished.is_trusted and finished.pair.trace.time_ns == self._seen_ns
+        if self._seen_ns is not None:
+            self.memory["forgotten_ns"] = self._seen_ns - shows_tip
+
     @property
     def _is_flagged(self) -> bool:
         return self.scope.problems.number(self.problem) in (self._problems or ())
 
     def _begin(self, lines: ScanLines) -> None:
         self._learn_finished()
+        self._states_since_packet()
         self._lines = _Lines(lines.began_ns, None)
         if self._problems == ():  # the scans of a repair are not the experiment's
             kind = Kind.of(lines.region, lines.shape, self._condition)
@@ -192,7 +210,10 @@ class LineWatch(Component):
     def _judge(self, lines: ScanLines, running: _Lines) -> None:
         # a line is judged when all its channels have come; lines come in the order of the scan
         newest = range(lines.first_row, lines.first_row + len(lines.values))
-        downwards = running.taken and newest.stop <= running.taken[-1]
+        if running.taken:
+            downwards = newest.stop <= running.taken[-1]
+        else:  # the first lines of a scan may be many
+            downwards = newest.start > 0 and newest.stop == lines.shape[0]
         for row in reversed(newest) if downwards else newest:
             line = [running.pictures[channel][row] for channel in self.channels if channel in running.pictures]
             if row in running.taken or len(line) < len(self.channels) or not all(map(_is_there, line)):
@@ -204,6 +225,8 @@ class LineWatch(Component):
 
     def _announce(self, lines: ScanLines, running: _Lines, alarm: Alarm) -> None:
         stops = alarm.level is AlarmLevel.STOP and self.action == "stop"
+        is_late = stops and self._is_late()
+        stops = stops and not is_late
         self.log.warning(
             "row %d: %s%s", alarm.row, alarm.why, "; the scan is not worth finishing" if stops else "; have a look"
         )
@@ -221,13 +244,24 @@ class LineWatch(Component):
         )
         # published first: a series that loses its scan looks for the row
         self.publish(tip_verdict.line_verdict_message(verdict), f"{tip_verdict.OF_LINES}_{self.name}")
-        if not stops:
-            return
-        # on a busy computer lines wait here, while the scan may end, and others find and repair the tip
-        if self.scope.state is not ScopeState.SCANNING or self.scope.control_state.problems:
+        if is_late:
             self.log.warning("row %d came late: the scan is over already, and nothing is flagged", alarm.row)
-            return
-        self.scope.flag(self.problem)
+        elif stops:
+            self.scope.flag(self.problem)
+
+    def _is_late(self) -> bool:
+        # On a busy computer lines wait here, while the scan may end, the next one begin, and others find and repair the
+        # tip. A flag would then stop a scan whose lines are not judged yet.
+        if self.scope.state is not ScopeState.SCANNING or self.scope.control_state.problems:
+            return True
+        return any(event.message.state is not ScopeState.SCANNING for event in self._states_since_packet())
+
+    def _states_since_packet(self) -> list[PublishedEvent]:
+        # states arrive while the packets before them still wait to be handled
+        now_ns = (self.packet.time_ns if self.packet is not None else None) or 0
+        self._later_states += self._states.waiting()
+        self._later_states = [one for one in self._later_states if (one.time_ns or 0) > now_ns]
+        return self._later_states
 
     def _learn_finished(self) -> None:
         finished, self._finished = self._finished, None
