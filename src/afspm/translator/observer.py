@@ -152,6 +152,8 @@ class Observer:
         if published.state in MEASURING and self._polled_for not in MEASURING:
             self._polled_for = published.state
             self._polling.began(object(), self._clock.monotonic_s())
+            if published.state is ScopeState.SCANNING:  # of an earlier process: its lines come again, from the first
+                self._live.begin(self._clock.now_ns())
 
     def publish(self, thing: setting_groups.Published | ScopeStatus) -> None:
         self._port.publish(*self._packet(thing))

@@ -78,6 +78,22 @@ def test_the_next_scan_begins_with_its_first_line(live: Any, scan: Any) -> None:
     assert again.began_ns == began_ns + 3_000_000_000
 
 
+def test_restarted_translator_publishes_the_lines_of_a_running_scan_from_its_first(live: Any) -> None:
+    live.ask(ControlRequest.ACTION, names.START_SCAN)
+    live.there = 3
+    live.look(1.0)
+    live.start()
+    live.there = 5
+    live.look(1.0)
+    assert [(lines.first_row, len(lines.values)) for lines in published(live)] == [(0, 5), (0, 5)]
+    live.microscope.state = ScopeState.FREE
+    live.look(20.0)
+    live.look(20.0)
+    live.start()
+    live.look(20.0)
+    assert published(live) == []
+
+
 def test_lines_are_not_cached_for_late_joiners(live: Any) -> None:
     live.ask(ControlRequest.ACTION, names.START_SCAN)
     live.heard()
