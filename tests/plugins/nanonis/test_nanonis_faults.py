@@ -10,7 +10,17 @@ import pytest
 from tests.plugins.nanonis.nanonis_bench import Bench
 from tests.plugins.vendor_bench import SOON, scans, small, states
 
-from afspm.model import ControlRequest, ControlResponse, ProbePosition, Response, Scan, ScopeState, Spectrum, names
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    ProbePosition,
+    Response,
+    Scan,
+    ScanLines,
+    ScopeState,
+    Spectrum,
+    names,
+)
 from afspm.supervisor.ports import FreePorts
 
 Make = Callable[..., Bench]
@@ -168,6 +178,18 @@ def test_late_scan_is_published(bench: Make, kinds: tuple[str, ...]) -> None:
     second = scans(received)
     assert len(second) == len(first)
     assert all(scan.filename.endswith("unnamed002.sxm") for scan in second)
+
+
+def test_lines_of_a_late_scan_are_not_those_of_the_previous_one(bench: Make) -> None:
+    made = bench(speed=SEEN)
+    peer = small(made, live_lines_s=0.5)
+    assert peer.act(names.START_SCAN).ok
+    peer.until(FREE)
+    made.strike("late-start", duration_s=4.0)
+    assert peer.act(names.START_SCAN).ok
+    lines = [one for one in peer.until(FREE) if isinstance(one, ScanLines) and one.channel == "Z Forward"]
+    assert len(lines) > 1
+    assert [one.first_row for one in lines] == [sum(len(one.values) for one in lines[:n]) for n in range(len(lines))]
 
 
 def test_lost_start_does_not_publish_the_previous_scan(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
