@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from tests.plugins.nanonis.nanonis_bench import Bench
-from tests.plugins.vendor_bench import FLAT, SHAPE, TURNED, left_in_danger, moved, ready, scanned, states
+from tests.plugins.nanonis.nanonis_bench import Bench, Emulated
+from tests.plugins.vendor_bench import FLAT, SHAPE, TURNED, left_in_danger, moved, ready, scanned, scans, states
 
 from afspm.basics.exit_codes import ExitCode
 from afspm.model import (
@@ -356,6 +357,27 @@ def test_continuous_scan_without_saving_is_switched_off(bench: Make) -> None:
     assert scanned(peer)["Z Forward"].filename.endswith(".sxm")
     left_behind = made.emulator.software.scans.properties
     assert (left_behind.continuous, left_behind.bouncy, left_behind.autosave) == (False, False, "all")
+
+
+def test_every_whole_frame_of_a_continuous_scan_at_the_panel_is_published(bench: Make) -> None:
+    made = bench(speed=10.0)
+    peer = made.start(live_lines_s=1.0)
+    ready(peer, shape=(40, 32))
+
+    def scan_on(emulator: Emulated) -> None:
+        emulator.software.scans.properties.continuous = True
+        emulator.software.scans.start(upwards=True)
+
+    made.at_panel(scan_on)
+    received = peer.until(FREE) + peer.until(FREE)
+    made.at_panel(lambda emulator: emulator.software.core.rig.stop_scan(made.clock.now_s()))
+    last = peer.until(FREE)
+    assert states(received + last) == ["SCANNING", "FREE", "SCANNING", "FREE", "SCANNING", "INTERRUPTED", "FREE"]
+    files = [Path(scan.filename).name for scan in scans(received) if scan.channel == "Z Forward"]
+    assert files == ["unnamed001.sxm", "unnamed002.sxm"]
+    assert not scans(last)
+    began = {one.began_ns for one in received if isinstance(one, ScanLines)}
+    assert len(began) == 2, "the lines of each frame by themselves"
 
 
 def test_saving_can_be_left_alone(bench: Make) -> None:

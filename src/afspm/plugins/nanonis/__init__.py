@@ -161,6 +161,9 @@ class Nanonis(Driver):
     def results(self) -> Sequence[str]:
         return self._files.results(self.clock.now_s(), self._fetch)
 
+    def followed(self) -> bool | None:
+        return self._files.followed()
+
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         return self._files.load(result)
 

@@ -194,7 +194,9 @@ class NanonisActivity(Activity):
             raise Refused(ControlResponse.ACTION_ERROR, reason)
 
     def _scanning(self, path: str | None) -> ScopeStatus:
-        if path:  # a continuous scan: one frame has ended, the next is running
+        if path and self._ask("Scan.PropsGet")[0]:  # a continuous scan: one frame has ended, the next is running
+            self._files.end_followed(self._clock.now_ns(), self._clock.now_s(), path)
+        elif path:
             self.end(path)
         self.follow(SCAN)
         if not self._stopping:

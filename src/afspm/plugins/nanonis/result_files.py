@@ -48,7 +48,9 @@ class NanonisFiles(ResultFiles):
         self._session_dir = session_dir
         self._own_folder = own_folder
         self._patience_s = patience_s
+        self._has_followed = False
         kept.setdefault("fetched", 0)
+        kept.setdefault("followed", None)
 
     def begin(self, what: str, session: str, taken: Mapping[str, object]) -> None:
         """Register the start of a measurement.
@@ -91,6 +93,26 @@ class NanonisFiles(ResultFiles):
             if not path:
                 ended["fetch_at_s"] = now_s
 
+    def end_followed(self, now_ns: int, now_s: float, path: str) -> None:
+        """Register the end of a scan, and that the next scan of a continuous series is running already.
+
+        Args:
+            path: file path reported by Nanonis. A file from before the scan is left out: the report came late.
+        """
+        self.end(now_ns, now_s, path)
+        ended = self._kept["ended"]
+        if ended is not None and self._file(ended) is not None:
+            self._kept["followed"], self._kept["ended"] = ended, None
+
+    def followed(self) -> bool | None:
+        """Return True once for each scan registered by `end_followed`, when its file is read; None otherwise."""
+        found, self._has_followed = self._has_followed, False
+        return found or None
+
+    def forget(self) -> None:
+        self._kept["followed"], self._has_followed = None, False
+        super().forget()
+
     def has_file(self) -> bool:
         """Return True if a file of the running measurement has appeared."""
         running = self._kept["running"]
@@ -98,7 +120,7 @@ class NanonisFiles(ResultFiles):
 
     def next_s(self) -> float | None:
         """Return the time from which awaited data is fetched instead, in experiment time; None: no data is awaited."""
-        ended = self._kept["ended"]
+        ended = self._kept["followed"] or self._kept["ended"]
         return None if ended is None else float(ended["fetch_at_s"])
 
     def results(self, now_s: float, fetch: Fetch) -> list[str]:
@@ -108,8 +130,10 @@ class NanonisFiles(ResultFiles):
             fetch: fetches the data of a measurement from Nanonis' memory.
         """
         self.broken_off = False
-        ended = self._kept["ended"]
-        if ended is not None:
+        followed, ended = self._kept["followed"], self._kept["ended"]
+        if followed is not None:
+            self._take_followed(followed, now_s)
+        elif ended is not None:
             file = self._file(ended)
             if file is not None and (content := self._whole(file, ended)) is not None:
                 self._take(file, ended, content)
@@ -143,6 +167,15 @@ class NanonisFiles(ResultFiles):
         path = self._own_folder / f"nanonis-{self._kept['fetched']:04d}.nc"
         fetched.write(path, content, ended["end_ns"])
         self._take(path, ended, _content(path, ended))
+
+    def _take_followed(self, followed: Entry, now_s: float) -> None:
+        file = self._file(followed)
+        if file is not None and (content := self._whole(file, followed)) is not None:
+            self._add(str(file), followed, {}, content)
+            self._kept["followed"], self._has_followed = None, True
+        elif now_s >= followed["fetch_at_s"]:
+            self._kept["followed"] = None
+            self._log.error("the scan before the present one is lost: its file %s is incomplete", followed["reported"])
 
     def _take(self, file: Path, ended: Entry, content: Content) -> None:
         self._add(str(file), ended, {}, content)
