@@ -106,6 +106,8 @@ class PlannedScans(Component):
             self.scope.end_experiment()
 
     def _set_parameters(self) -> None:
+        if not self.parameters:
+            return  # control would be released, perhaps during a scan from before a restart: no flag would stop that
         with self.clock.late(), self.scope.control():
             for name, quantity in self.parameters.items():
                 self.scope.set(name, quantity)

@@ -175,6 +175,27 @@ def test_no_scan_is_missing_or_repeated_after_a_kill_anywhere(
         assert len(lab.finished) == 3, f"killed at call {call}"
 
 
+def test_scan_that_runs_over_a_restart_is_still_stopped_by_a_problem(tmp_path: Path) -> None:
+    lab = Lab("series")
+    port = LabPort(lab)
+
+    def die() -> None:
+        port.is_dead = True
+        lab.wake_up()
+
+    lab.at(30.0, die)
+    context = context_of(lab, tmp_path)
+    context.open_port, context.session = lambda: port, "killed"
+    with pytest.raises(Kill9):
+        series().run_process(context)
+    lab.restart_component()
+    lab.at(20.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
+    lab.at(300.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    run(series(), lab, tmp_path)
+    assert lab.begun_scans == 4
+    assert len(lab.finished) == 3
+
+
 def test_saved_state_of_a_series_does_not_grow(tmp_path: Path) -> None:
     """Otherwise a night of a thousand scans would keep each of them twice."""
     kept: list[int] = []
