@@ -100,6 +100,19 @@ def test_lines_are_published_during_a_scan(bench: Make) -> None:
     np.testing.assert_allclose(picture[there], whole.values[there], rtol=1e-6)
 
 
+def test_lines_lie_in_the_frame_of_their_scan_though_a_person_has_set_another(bench: Make) -> None:
+    made = bench(speed=5.0)
+    peer = made.start(live_lines_s=1.0)
+    ready(peer, shape=(40, 32))
+    assert peer.act(names.START_SCAN).ok
+    received = peer.until(lambda one: isinstance(one, ScanLines))
+    made.at_panel(lambda emulator: emulator.software.scans.set_frame(0.0, 0.0, 500e-9, 500e-9, 0.0))
+    received += peer.until(FREE)
+    lines = [one for one in received if isinstance(one, ScanLines)]
+    assert len({one.first_row for one in lines}) > 2
+    assert {one.region for one in lines} == {TURNED}
+
+
 def test_pixels_that_nanonis_would_round_are_refused(bench: Make) -> None:
     peer = bench().start()
     ready(peer)

@@ -178,10 +178,11 @@ class Nanonis(Driver):
 
     def lines(self, start: int) -> Sequence[ScanLines]:
         """Return new lines from Nanonis' memory, in which lines not yet scanned are NaN."""
-        if not self._files.was_seen:  # the memory may still hold the previous scan, all of whose lines would be new
-            return ()
-        region, _ = frame(self.in_force(FRAME))
-        return fetched.new_lines(fetched.images(self._ask, self._grabbing), region, start)
+        # not the frame in force, which a person may have changed for the next scan
+        kept = self._files.frame
+        if kept is None or not self._files.was_seen:
+            return ()  # the memory may still hold the previous scan, all of whose lines would be new
+        return fetched.new_lines(fetched.images(self._ask, self._grabbing), as_region(kept), start)
 
     # --- actions ---
 
