@@ -51,6 +51,7 @@ class Observer:
         self.values: dict[str, Value] = {}
         self._polled_for = ScopeState.UNDEFINED
         self._all_at_s = 0.0
+        self._result_since_s: float | None = None
         self._replayed = False
 
     def begin(self) -> None:
@@ -109,10 +110,21 @@ class Observer:
         # a fast simulated clock waits here: otherwise much experiment time would pass before the results are published
         with self._clock.late() if is_over else nullcontext():
             results = self._outbox.look()
-            is_whole = self._driver.followed()
+            is_whole = True if self._is_of_earlier_scan(status, results) else self._driver.followed()
             steps = [] if is_whole is None else self._state.sequence.follow(is_whole=is_whole)
             steps += self._state.sequence.observe(status, results and not steps, self._clock.now_s())
             self.play(steps)
+
+    def _is_of_earlier_scan(self, status: ScopeStatus, results: bool) -> bool:
+        # A controller that repeats scans at the panel may never be free: a result that has waited for long during a
+        # scan is of the scan before. Without this it would wait for the last scan's end, and be lost if that is a stop.
+        published, now_s = self._state.sequence.published.state, self._clock.now_s()
+        if not (results and status.state is published is ScopeState.SCANNING):
+            self._result_since_s = None
+            return False
+        if self._result_since_s is None:
+            self._result_since_s = now_s
+        return now_s - self._result_since_s >= self._driver.patience_s(self._driver.common.result_timeout_s / 2)
 
     def play(self, steps: Sequence[SequenceStep]) -> None:
         """Carry out the steps of a status sequence: save all their changes at once, then publish.

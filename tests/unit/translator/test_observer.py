@@ -156,3 +156,20 @@ def test_a_simulated_microscope_publishes_lines_by_real_time(given: float | None
     live = LiveLines(driver)
     live.begin(0)
     assert live.due_s == every_s
+
+
+def test_result_of_a_scan_that_the_next_followed_at_once_is_published_during_that(make_bench: Any, scan: Any) -> None:
+    bench = make_bench()
+    bench.heard()
+    bench.microscope.state = ScopeState.SCANNING  # at the panel, which repeats it
+    bench.look()
+    assert bench.heard() == ["SCANNING"]
+    bench.microscope.files["a"] = [scan()]
+    bench.look(4.0)
+    bench.look(4.0)
+    assert bench.heard() == [], "the scan may be ending just now"
+    bench.look(4.0)
+    assert bench.heard() == ["Scan2d", "FREE", "SCANNING"]
+    assert bench.ask(ControlRequest.ACTION, names.STOP_SCAN).ok
+    bench.look()
+    assert bench.heard() == ["INTERRUPTED", "FREE"]
