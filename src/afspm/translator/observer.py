@@ -77,8 +77,18 @@ class Observer:
         elif (status := self._status()) != published:
             # the end of a measurement changes no setting; any other change of state may
             self.observe(values=published.state not in MEASURING, status=status)
-        for name, payload in self._live.look(self._clock.now_s()):
+        for name, payload in self._new_lines():
             self._port.publish(name, payload, self._state.stamp()[0], keep=False)
+
+    def _new_lines(self) -> list[tuple[str, bytes]]:
+        try:
+            return self._live.look(self._clock.now_s())
+        except LOST:
+            raise
+        except Exception as error:  # a driver may raise anything: without its lines the scan itself is as good
+            self._live.end()
+            self._log.error("no more lines of this scan are published, since they can't be read: %s", error)
+            return []
 
     def wait_s(self) -> float:
         """Return the real seconds until the next reading is due."""

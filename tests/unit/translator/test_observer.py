@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from afspm.basics.clock import ExperimentClock
-from afspm.basics.errors import ConfigError
+from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.model import ControlRequest, Region, ScanLines, ScopeState, names
 from afspm.simulation.simulator import Simulator
 from afspm.translator.observer import LiveLines
@@ -92,6 +92,26 @@ def test_restarted_translator_publishes_the_lines_of_a_running_scan_from_its_fir
     live.start()
     live.look(20.0)
     assert published(live) == []
+
+
+def test_lines_that_cannot_be_read_do_not_lose_the_controller(
+    live: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    live.ask(ControlRequest.ACTION, names.START_SCAN)
+    live.heard()
+
+    def refuse(self: Any, start: int) -> list[ScanLines]:
+        raise InvalidValue("the channel is not acquired")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(live.microscope), "lines", refuse)
+        for _ in range(5):
+            live.look(1.0)
+    assert live.heard() == []
+    assert caplog.text.count("no more lines of this scan are published") == 1
+    live.microscope.lost = True
+    live.look(1.0)
+    assert live.heard() == ["UNDEFINED"]
 
 
 def test_lines_are_not_cached_for_late_joiners(live: Any) -> None:
