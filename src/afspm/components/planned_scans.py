@@ -216,7 +216,9 @@ class PlannedScans(Component):
         stopping = [one for one in found if one.shape == part.shape and _is_of(one, lasted_ns)]
         if not stopping:
             return rest
-        rest = rest.since(stopping[-1].since_row, downwards=stopping[-1].downwards)
+        # a restarted watch, or a second one, may have seen the change later
+        rests = [rest.since(one.since_row, downwards=one.downwards) for one in stopping]
+        rest = max(rests, key=lambda one: one.last - one.first)
         self.log.info("%s: rows %d to %d are left", part.key, rest.first, rest.last)
         # saved before the request: after a kill the same rows are requested, under the same key
         self.memory["rest"] = [rest.first, rest.last]

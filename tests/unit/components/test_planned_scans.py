@@ -365,6 +365,15 @@ def test_only_a_verdict_on_the_stopped_scan_shortens_it(began_s: float, rest_nm:
     assert [round(region.size_m[1] * 1e9) for region in lab.finished] == [1000, rest_nm]
 
 
+def test_rest_begins_at_the_first_change_of_several_verdicts() -> None:
+    lab = Lab("series")
+    lab.at(35.0, lambda: lab.publish(line_verdict_message(line_verdict((32, 8), 12, stops=True)), "TipVerdict_second"))
+    lab.at(40.0, lambda: stop_at_row(lab, 20))
+    lab.at(400.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    assert run(rest_series(), lab) == ExitCode.ENDED
+    assert lab.finished[0].size_m == pytest.approx((1e-6, 21 / 31 * 1e-6))
+
+
 def test_verdict_for_a_person_does_not_shorten_a_scan() -> None:
     lab = Lab("series")
     look = line_verdict((32, 8), 18, stops=False)
