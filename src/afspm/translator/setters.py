@@ -17,6 +17,7 @@ from afspm.model import (
     ProbePosition,
     Request,
     ScanParameters,
+    names,
 )
 from afspm.model.positions import scan_values
 from afspm.translator.driver_base import LOST, DriverBase
@@ -68,7 +69,9 @@ def apply(driver: DriverBase, values: Mapping[str, Value], about_to_act: Callabl
     # the whole frame: when a part of it is set, a controller may change the rest
     framed = FRAME if not values.keys().isdisjoint(FRAME) else ()
     whole = {*values, *(name for name in framed if name in table)}
-    before = driver.in_force(whole)
+    # a controller with lines per second, and half a frame set, has another speed: it is restored with the frame
+    speed = {names.SCAN_SPEED} & table.keys() if framed else set()
+    before = driver.in_force(whole | speed)
     wanted = {**before, **values}
     check_together(wanted, table, driver.max_pixels)
     former = {name: value for name, value in before.items() if not table[name].read_only}
@@ -82,10 +85,10 @@ def apply(driver: DriverBase, values: Mapping[str, Value], about_to_act: Callabl
         with contextlib.suppress(Exception):  # a driver may raise anything; the first error is reported
             driver.put_in_force(former)
         raise
-    for name, value in wanted.items():
-        if not driver.same(name, after[name], value, after):
+    for name in whole:
+        if not driver.same(name, after[name], wanted[name], after):
             driver.put_in_force(former)
-            made, asked = (table[name].quantity(one) for one in (after[name], value))
+            made, asked = (table[name].quantity(one) for one in (after[name], wanted[name]))
             raise refuse_value(name, f"the controller set {made} instead of {asked}; the former values were restored")
 
 

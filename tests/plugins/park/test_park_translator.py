@@ -243,6 +243,15 @@ def test_setting_one_gain_keeps_the_others(bench: Make) -> None:
     assert peer.set(names.ZCTRL_PGAIN, 1000.0).code == ControlResponse.PARAM_ERROR
 
 
+def test_refused_frame_keeps_the_speed_of_the_tip(bench: Make) -> None:
+    peer = small(bench())
+    assert peer.set(names.SCAN_SPEED, 5e-9).ok
+    response = peer.set(names.SCAN_SIZE_X, 50e-6)  # 0.00005 lines per second: too slow for SmartScan
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert float(peer.get(names.SCAN_SIZE_X)) == pytest.approx(1e-6)
+    assert float(peer.get(names.SCAN_SPEED)) == pytest.approx(5e-9)
+
+
 def test_unreported_gains_are_not_supported(bench: Make) -> None:
     made = bench(reports_gains=False)
     peer = small(made)

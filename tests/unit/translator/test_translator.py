@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from afspm import wire
-from afspm.basics.errors import ConfigError, WireError
+from afspm.basics.errors import ConfigError, Refused, WireError
 from afspm.basics.exit_codes import ExitCode
 from afspm.client.cycle import Cycle, CycleOutcome
 from afspm.model import (
@@ -486,6 +486,21 @@ def test_change_in_the_rest_of_the_frame_is_refused_and_restored(bench: Any, mon
         response.reason == "scan-size-y: the controller set 2000 nm instead of 500 nm; the former values were restored"
     )
     assert (values["W"], values["H"]) == (1000.0, 500.0)
+
+
+def test_refused_frame_restores_the_speed_of_a_controller_with_lines_per_second(bench: Any, monkeypatch: Any) -> None:
+    plain, values = bench.microscope.set, bench.microscope.values
+    speed_before = values["Speed"]
+
+    def half_set(given: Any) -> None:
+        plain(given)
+        if given.get("W") == 2000.0:  # the width is set, its line rate is refused
+            values["Speed"] *= 2.0
+            raise Refused(PARAM_ERROR, "the line rate is too low")
+
+    monkeypatch.setattr(bench.microscope, "set", half_set)
+    assert bench.ask(PARAM, Parameter("scan-size-x", "2", "um")).code == PARAM_ERROR
+    assert (values["W"], values["Speed"]) == (1000.0, speed_before)
 
 
 def test_only_disturbing_requests_are_refused_during_a_scan(bench: Any) -> None:
