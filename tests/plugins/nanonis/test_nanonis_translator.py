@@ -213,6 +213,21 @@ def test_feedback_is_switched_on_after_its_other_settings(bench: Make, monkeypat
     assert switched_with == [(False, 0.25), (True, 0.75)]
 
 
+def test_wider_frame_is_not_scanned_faster(bench: Make) -> None:
+    made = bench()
+
+    def keep_time(emulator: Emulated) -> None:
+        emulator.software.scans.speed = (2e-6, 2e-6, 0.5, 0.5, 1, 1.0)
+
+    made.at_panel(keep_time)
+    peer = made.start()
+    ready(peer)
+    assert peer.set(names.SCAN_SIZE_X, 50e-9).ok
+    assert float(peer.get(names.SCAN_SPEED)) == pytest.approx(2e-6)
+    assert peer.set(names.SCAN_SIZE_X, 1e-6).ok
+    assert float(peer.get(names.SCAN_SPEED)) == pytest.approx(2e-6)
+
+
 def test_probe_moves_at_its_speed_and_keeps_its_position_during_a_scan(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = made.start()

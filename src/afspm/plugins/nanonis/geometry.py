@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Final
 
 from afspm.basics.formatting import lengths_text
 from afspm.model import Region, names
-from afspm.plugins.nanonis.parameter_groups import Ask, Group, MoveSpeed
+from afspm.plugins.nanonis.parameter_groups import Ask, Group, MoveSpeed, keep_speed
 from afspm.plugins.nanonis.protocol import BadReply
 from afspm.translator.parameters import Value, refuse_value
 from afspm.translator.setting_groups import FRAME, POSITION, frame, frame_values
@@ -50,6 +50,8 @@ class ScanFrame(Group):
             )
         if names.SCAN_RESOLUTION_X in values or names.SCAN_RESOLUTION_Y in values:
             self._ask("Scan.BufferSet", self._ask("Scan.BufferGet")[0], columns, rows)
+        # a frame set wider with the time per line kept would be scanned faster, beyond any limit of the speed
+        keep_speed(self._ask)
         width, height = region.size_m
         self._ask(
             "Scan.FrameSet",

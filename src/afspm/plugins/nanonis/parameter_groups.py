@@ -22,6 +22,8 @@ DRIFT_RATE_Y: Final = "x-drift-rate-y"
 
 _ON, _OFF = 1, 2
 """Values of a switch in `…Set`; `…Get` returns 1 and 0 instead."""
+_KEEP_SPEED: Final = 1
+"""Value of Scan.SpeedSet for the quantity that a change of the frame keeps; Scan.SpeedGet returns 0 instead."""
 
 
 class Group(SettingsGroup):
@@ -47,10 +49,17 @@ def numbers(ask: Ask, name: str, *arguments: object) -> tuple[Any, ...]:
     return found
 
 
+def keep_speed(ask: Ask) -> None:
+    """Let Nanonis keep both scan speeds when the frame changes, instead of the time per line."""
+    *speeds, keeps_time, ratio = ask("Scan.SpeedGet")
+    if keeps_time:
+        ask("Scan.SpeedSet", *speeds, _KEEP_SPEED, ratio)
+
+
 class ScanSpeed(Group):
     """The forward scan speed in m/s. The backward speed keeps its ratio to the forward speed.
 
-    After a setting, Nanonis keeps both speeds when the frame changes, instead of the time per line.
+    Nanonis keeps both speeds when the frame changes, instead of the time per line (`keep_speed`).
     """
 
     names = (names.SCAN_SPEED,)
@@ -68,9 +77,8 @@ class ScanSpeed(Group):
                 names.SCAN_SPEED,
                 f"the speeds forward and backward must be above 0, not {forward_m_s:g} and {backward_m_s:g} m/s",
             )
-        keep_speed = 1  # SpeedGet returns 0 for this choice
         times_s = width_m / forward_m_s, width_m / backward_m_s
-        self._ask("Scan.SpeedSet", forward_m_s, backward_m_s, *times_s, keep_speed, ratio)
+        self._ask("Scan.SpeedSet", forward_m_s, backward_m_s, *times_s, _KEEP_SPEED, ratio)
 
 
 class Gains(Group):
