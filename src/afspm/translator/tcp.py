@@ -144,12 +144,12 @@ class TcpConnection:
             traced.is_whole = True
             return found
 
-    def has_answer(self) -> bool:
-        """Return True if an answer has begun to arrive, or if the connection is lost."""
+    def has_answer(self, within_s: float = 0.0) -> bool:
+        """Return True if an answer begins to arrive within a time, or if the connection is lost."""
         try:
-            self._socket.settimeout(0.0)
+            self._socket.settimeout(within_s)
             self._socket.recv(1, socket.MSG_PEEK)
-        except BlockingIOError:
+        except (BlockingIOError, TimeoutError):
             return False
         except OSError:
             return True

@@ -17,7 +17,7 @@ from tests.plugins.vendor_bench import FLAT, TURNED, moved, ready, scanned, scan
 
 from afspm.basics.errors import InvalidValue
 from afspm.basics.exit_codes import ExitCode
-from afspm.model import Region, Scan, ScanLines, ScopeState, Spectrum, names
+from afspm.model import ControlResponse, Region, Scan, ScanLines, ScopeState, Spectrum, names
 from afspm.plugins.nanosurf.emulator import NanosurfEmulator
 from afspm.plugins.nanosurf.emulator.studio import SETPOINT, StudioProgram
 from afspm.simulation.faults import Faults
@@ -162,6 +162,18 @@ def test_the_tip_is_withdrawn_at_any_time_and_brought_back(bench: Make) -> None:
     assert peer.act(names.ENGAGE).ok
     assert "COARSE_MOTOR" in states(peer.until(FREE))
     assert made.emulator.rig.engaged
+
+
+def test_refused_withdrawal_is_no_success(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(now_s: float) -> None:
+        raise InvalidValue("the z scanner is locked")
+
+    made = bench()
+    peer = small(made)
+    monkeypatch.setattr(made.emulator.rig, "withdraw", refuse)
+    response = peer.act(names.RETRACT)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "the z scanner is locked" in response.reason
 
 
 def test_the_tip_is_withdrawn_where_a_second_connection_waits(bench: Make) -> None:

@@ -12,6 +12,7 @@ import pytest
 from tests.plugins.park.park_bench import Bench
 from tests.plugins.vendor_bench import FLAT, SOON, left_in_danger, moved, ready, scanned, scans, small, states
 
+from afspm.basics.errors import InvalidValue
 from afspm.model import ControlResponse, Region, ScopeState, Spectrum, names
 
 pytestmark = pytest.mark.slow
@@ -93,6 +94,19 @@ def test_tip_is_withdrawn_at_the_end_of_a_run(bench: Make, scanning: bool) -> No
     made = bench(speed=10.0)
     left_in_danger(made, scanning=scanning, retracts=True)
     assert not made.emulator.rig.engaged
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_refused_withdrawal_is_no_success(bench: Make, monkeypatch: pytest.MonkeyPatch, variant: Settings) -> None:
+    def refuse(now_s: float) -> None:
+        raise InvalidValue("the z scanner is locked")
+
+    made = bench(**variant)
+    peer = small(made)
+    monkeypatch.setattr(made.emulator.rig, "withdraw", refuse)
+    response = peer.act(names.RETRACT)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "the z scanner is locked" in response.reason
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from typing import ClassVar, Final
 
 from afspm.basics.clock import Clock
 from afspm.basics.errors import AfspmError, Refused
-from afspm.model import Region, ScopeState, ScopeStatus
+from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.plugins.nanosurf import commands
 from afspm.plugins.nanosurf.link import StudioError
 from afspm.plugins.nanosurf.session import Session
@@ -22,6 +22,8 @@ from afspm.translator.long_call import LongCall
 from afspm.translator.result_files import SCAN, FilePrecision, as_list
 
 FORCE: Final = "force"
+_ANSWERS_S: Final = 0.5
+"""Real time within which Studio reports that it refuses an approach or a withdrawal."""
 
 
 class NanosurfFiles(FolderFiles):
@@ -123,18 +125,33 @@ class StudioActivity(Activity):
         self.watch(self._session.begin(FORCE, commands.TAKE_CURVE))
 
     def approach(self) -> None:
-        self.watch(self._session.begin("approach", commands.APPROACH))
+        """Approach the sample. Raises Refused: ACTION_ERROR: Studio reports an error at once."""
+        self._move("approach", commands.APPROACH)
 
     def withdraw(self) -> None:
-        """Stop scan, curve and approach, and withdraw the tip. Raises StudioError, ControllerLost."""
+        """Stop scan, curve and approach, and withdraw the tip.
+
+        Raises:
+            Refused: ACTION_ERROR: Studio reports an error at once. StudioError, ControllerLost.
+        """
         self.stopped()
         self.close()
         try:
-            self.call = self._session.begin("withdrawal", commands.WITHDRAW, commands.STOP_ALL)
+            self._move("withdrawal", commands.WITHDRAW, commands.STOP_ALL)
         except ControllerLost as lost:
             # A Studio may serve one client only; the first connection then waits for the end of the withdrawal.
             self._log.warning("there is no further connection (%s): the tip is withdrawn by the first", lost)
             self._session.run(f"{commands.STOP_ALL} {commands.WORKFLOW}.{commands.WITHDRAW}() return 0")
+
+    def _move(self, what: str, command: str, first: str = "") -> None:
+        # a refused withdrawal must not count as done
+        call = self._session.begin(what, command, first, _ANSWERS_S)
+        try:
+            call.running()
+        except StudioError as error:
+            call.close()
+            raise Refused(ControlResponse.ACTION_ERROR, f"Studio refused the {what}: {error}") from error
+        self.watch(call)
 
     def _running_call(self) -> LongCall | None:
         call = self.call

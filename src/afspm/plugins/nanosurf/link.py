@@ -53,6 +53,10 @@ class Link:
         # Studio executes one script at a time on a connection, and replies at its end.
         self._connection.send(_shown(script), _LENGTH.pack(len(raw)) + raw)
 
+    def wait(self, within_s: float) -> None:
+        """Wait for the reply to `begin`, at most `within_s` of real time."""
+        self._connection.has_answer(within_s)
+
     def reply(self, what: str) -> tuple[bool, list[Any]]:
         """Return whether the reply has arrived, and its values (empty until then). Raises the errors of `run`."""
         return (True, self._values(what)) if self._connection.has_answer() else (False, [])

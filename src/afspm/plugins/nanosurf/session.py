@@ -119,8 +119,11 @@ class Session:
             raise ControllerLost(f"Studio replied {found} when asked if it scans")
         return Scanning(*found)
 
-    def begin(self, what: str, command: str, first: str = "") -> LongCall:
+    def begin(self, what: str, command: str, first: str = "", wait_s: float = 0.0) -> LongCall:
         """Start a long command on a separate connection, after the script `first`.
+
+        Args:
+            wait_s: longest wait for its reply, real time.
 
         Raises:
             ControllerLost
@@ -130,6 +133,7 @@ class Session:
             self._select(link)
             # A long command blocks its connection: the first connection stays free for polls and stops.
             link.begin(f"{first} return {WORKFLOW}.{command}()")
+            link.wait(wait_s)
         except BaseException:  # Ctrl-C, too: nothing else closes this connection
             link.close()
             raise

@@ -10,7 +10,7 @@ from typing import ClassVar, Final
 
 from afspm.basics.clock import Clock
 from afspm.basics.errors import AfspmError, Refused
-from afspm.model import Region, ScopeState, ScopeStatus
+from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.plugins.park.link import SmartScanError
 from afspm.plugins.park.result_files import ParkFiles
 from afspm.plugins.park.session import Session
@@ -96,7 +96,8 @@ class SmartScanActivity(Activity):
         self.curve_awaited, self._curve_at = kind, place_m
 
     def approach(self) -> None:
-        self.watch(self._session.begin("approach", APPROACH))
+        """Approach the sample. Raises Refused: ACTION_ERROR: SmartScan reports an error within 0.5 s."""
+        self._move("approach", APPROACH)
 
     def evaluate(self, expression: str) -> None:
         """Evaluate an expression. An expression that takes longer than 0.5 s keeps the microscope busy.
@@ -116,13 +117,17 @@ class SmartScanActivity(Activity):
             call.close()
 
     def withdraw(self, lift_um: float) -> None:
-        """Stop scan, curve and approach, and withdraw the tip: by the scanner, then by the stage if `lift_um` > 0."""
+        """Stop scan, curve and approach, and withdraw the tip: by the scanner, then by the stage if `lift_um` > 0.
+
+        Raises:
+            Refused: ACTION_ERROR: SmartScan reports an error within 0.5 s.
+        """
         self.stopped()
         self.close()
         # an error of a stop must not prevent the withdrawal
         ended = " ".join(f"try {{ spm.{one}(); }} catch (ignored) {{}}" for one in _ENDED_FIRST)
         away = f"spm.zscanner.retractAll(); if ({lift_um!r} > 0) {{ spm.zstage.move({lift_um!r}, 1); }}"
-        self.watch(self._session.begin("withdrawal", f"(function() {{ {ended} {away} return 0; }})()"))
+        self._move("withdrawal", f"(function() {{ {ended} {away} return 0; }})()")
 
     def watch(self, call: LongCall) -> None:
         self.curve_awaited = ""
@@ -136,6 +141,16 @@ class SmartScanActivity(Activity):
         super().stopped()
 
     # --- inside ---
+
+    def _move(self, what: str, script: str) -> None:
+        # a refused withdrawal must not count as done
+        call = self._session.begin(what, script, _ANSWERS_S)
+        try:
+            call.running()
+        except SmartScanError as error:
+            call.close()
+            raise Refused(ControlResponse.ACTION_ERROR, f"SmartScan refused the {what}: {error}") from error
+        self.watch(call)
 
     def _running_call(self) -> LongCall | None:
         # The move to a curve and the curve are two scripts: the curve starts when the move has ended.
