@@ -17,10 +17,12 @@ from afspm.basics.errors import AfspmError, ConfigError, InvalidValue
 from afspm.model import Region, ScopeState, names
 from afspm.plugins.asylum import Asylum, xop
 from afspm.plugins.asylum.emulator import wire
+from afspm.plugins.asylum.emulator.files import igor_wave
 from afspm.plugins.asylum.result_files import local
 from afspm.plugins.asylum.scan_files import center_and_angle
 from afspm.plugins.asylum.session import Doing
 from afspm.plugins.asylum.settings import NAMES, asylums, from_image, generic, on_image
+from afspm.storage.formats import read
 
 finite = st.floats(-1e300, 1e300)
 
@@ -268,3 +270,16 @@ def test_invalid_settings_are_refused(setting: dict[str, Any]) -> None:
 
 def test_without_spots_the_tip_can_not_be_moved() -> None:
     assert not {names.PROBE_POS_X, names.PROBE_POS_Y} & Asylum(spots="none").table.keys()
+
+
+# --- files ---
+
+
+def test_each_column_of_a_curve_has_its_own_unit(tmp_path: Path) -> None:
+    columns = ["Raw", "Defl", "Amp", "Phase", "Freq", "Bias", "Cur", "ZSnsr", "Odd"]
+    values = np.ones((16, len(columns)))
+    path = tmp_path / "Curve0000.ibw"
+    path.write_bytes(igor_wave("Curve0000", values, "m", [(1e-3, "s")], columns, b"ScanRate: 1\r", 0.0))
+    (curve,) = read(path).spectra
+    assert curve.names == (*columns, "Time")
+    assert curve.units == ("m", "m", "m", "deg", "Hz", "V", "A", "m", "", "s")

@@ -2,12 +2,13 @@
 
 Real files show: XOffset and YOffset are the centre of the scan; images are [x, y, channel] with both axes ascending for
 either scan direction; FastScanSize is the distance from the first to the last pixel; `Seconds` is the local time of
-saving, since 1904; the unit of a wave applies to its first channel only.
+saving, since 1904; the unit of a wave applies to its first channel or column only.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
 
@@ -29,6 +30,11 @@ _IGOR_EPOCH = datetime(1904, 1, 1)  # noqa: DTZ001  (local time of the controlle
 _UNITS = {
     "Height": "m", "ZSensor": "m", "RawZSensor": "m", "Amplitude": "m", "Deflection": "m", "Phase": "deg",
     "Frequency": "Hz", "Current": "A", "UserIn": "V", "BackPackIn": "V", "Lateral": "V", "Potential": "V",
+}  # fmt: skip
+# Units of a curve's columns, by the beginning of their names. The file has only the unit of the first column.
+_CURVE_UNITS = {
+    "Raw": "m", "DeflV": "V", "Defl": "m", "ZSnsr": "m", "Amp": "m", "Phas": "deg", "Freq": "Hz", "Cur": "A",
+    "Bias": "V", "Pot": "V", "Lat": "V", "User": "V",
 }  # fmt: skip
 
 
@@ -112,8 +118,11 @@ def start_ns(note: Note, rows: int, zone: tzinfo | None) -> int | None:
 
 def unit_of(channel: str) -> str:
     """Return the unit of an image channel by its name; empty: unknown."""
-    name = channel.removeprefix("Nap")
-    return next((unit for start, unit in _UNITS.items() if name.startswith(start)), "")
+    return _of_name(channel.removeprefix("Nap"), _UNITS)
+
+
+def _of_name(name: str, units: Mapping[str, str]) -> str:
+    return next((unit for start, unit in units.items() if name.startswith(start)), "")
 
 
 def _image(wave: igor.Wave, note: Note, path: Path, zone: tzinfo | None) -> FileContent:
@@ -138,11 +147,12 @@ def _image(wave: igor.Wave, note: Note, path: Path, zone: tzinfo | None) -> File
 
 
 def _curve(wave: igor.Wave, note: Note, path: Path, zone: tzinfo | None) -> FileContent:
-    # The columns are lengths (raw z, deflection, z sensor) at equal time steps; the time is appended as the last
-    # column.
+    # The columns (raw z, deflection, z sensor; when tapping also amplitude and phase) are sampled at equal time steps.
+    # The time is appended as the last column.
     points, count = wave.values.shape
     if len(wave.labels[1]) != count:
         raise FileError(f"{count} columns with {len(wave.labels[1])} names")
+    units = [_of_name(name, _CURVE_UNITS) or (wave.unit if k == 0 else "") for k, name in enumerate(wave.labels[1])]
     time_s = np.arange(points) * wave.steps[0]
     x, y = number(note, "XLVDT"), number(note, "YLVDT")
     end = end_ns(note, zone)
@@ -150,7 +160,7 @@ def _curve(wave: igor.Wave, note: Note, path: Path, zone: tzinfo | None) -> File
         None if x is None or y is None else (x, y),
         "force",
         (*wave.labels[1], "Time"),
-        (*[wave.unit] * count, "s"),
+        (*units, "s"),
         np.column_stack([_float64(wave.values), time_s]),
         end,
         str(path),
