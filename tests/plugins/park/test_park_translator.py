@@ -76,6 +76,20 @@ def test_refusal_has_smartscans_own_text(bench: Make, variant: Settings) -> None
     assert "busy with a calibration" in response.reason
 
 
+@pytest.mark.parametrize("replies", ["at-end", "at-once"])
+def test_restarted_translator_awaits_the_end_of_an_approach(bench: Make, replies: str) -> None:
+    made = bench(speed=10.0, replies=replies)
+    peer = small(made)
+    made.at_panel(lambda emulator: setattr(emulator.rig.setup, "approach_s", 20.0))
+    assert peer.act(names.ENGAGE).ok
+    made.kill()
+    peer = made.start()
+    assert "COARSE_MOTOR" in states(peer.until(FREE))
+    busy: list[bool] = []
+    made.at_panel(lambda emulator: busy.append(emulator.rig.busy(emulator.clock.now_s())))
+    assert busy == [False]
+
+
 def test_withdrawing_ends_a_scan_and_lifts_the_stage(bench: Make) -> None:
     made = bench(speed=10.0)
     peer = made.start(lift=250e-6)

@@ -115,7 +115,7 @@ class Park(Driver):
             raise ConfigError(problem, where="data_dir", hint='data_dir = "/where/it/is/mounted"')
         self._files = ParkFiles(self.memory, self.log, self.clock.monotonic_s)
         self._activity = SmartScanActivity(
-            session, self._files, self._folder, self._frame_in_force, self.clock, self.log
+            session, self._files, self.memory, self._folder, self._frame_in_force, self.clock, self.log
         )
 
     def close(self) -> None:

@@ -18,6 +18,7 @@ from afspm.plugins.park.settings import MOVE, way_to
 from afspm.translator.activity import Activity
 from afspm.translator.long_call import LongCall
 from afspm.translator.result_files import SCAN, XY, as_list
+from afspm.translator.state import Kept
 
 START, STOP, STOP_CURVE = "scan.triggerImageScan()", "scan.stop()", "spect.stop()"
 CURVES: Final = {"force": "fd", "IV": "iv"}
@@ -33,6 +34,7 @@ class SmartScanActivity(Activity):
     """The running measurement or move, started by a request or at SmartScan's panel.
 
     Args:
+        kept: persistent, JSON-able: name of the running script, which goes on after the connection is lost.
         folder: returns the local path of SmartScan's files.
         frame_in_force: returns the frame as it was set.
     """
@@ -45,6 +47,7 @@ class SmartScanActivity(Activity):
         self,
         session: Session,
         files: ParkFiles,
+        kept: Kept,
         folder: Callable[[], Path],
         frame_in_force: Callable[[], Region],
         clock: Clock,
@@ -54,6 +57,10 @@ class SmartScanActivity(Activity):
         self._session, self._files = session, files
         self._folder, self._frame_in_force = folder, frame_in_force
         self._curve_at: XY = (0.0, 0.0)
+        self._kept = kept
+        # taken, and stored again by the next poll: if that fails, a script is not resumed for ever
+        if what := kept.pop("call", ""):
+            self.call = session.resumed(what)
 
     def status(self) -> ScopeStatus:
         """Return the present state. Register measurements that began or ended, and take a curve that awaits the tip."""
@@ -132,6 +139,7 @@ class SmartScanActivity(Activity):
     def watch(self, call: LongCall) -> None:
         self.curve_awaited = ""
         super().watch(call)
+        self._kept["call"] = call.what
 
     def stopped(self) -> None:
         """Register a stop: the running measurement has no result. A move of the tip continues."""
@@ -159,4 +167,5 @@ class SmartScanActivity(Activity):
             kind, self.curve_awaited = self.curve_awaited, ""
             self.begin(kind)
             self.call = call = self._session.begin(kind, f'(spm.spect.start("{CURVES[kind]}", "here"), 0)')
+        self._kept["call"] = "" if call is None else call.what
         return call

@@ -26,6 +26,15 @@ TRUE, FALSE = frozenset({"true", "1"}), frozenset({"false", "0"})
 _GEOMETRY: Final = ("pixelHeight", "pixelWidth", "width", "height", "offsetX", "offsetY", "rotation")
 
 
+class _NoReply:
+    """The connection of a script whose reply went to an earlier connection."""
+
+    def reply(self, what: str) -> tuple[bool, object]:
+        return True, None
+
+    def close(self) -> None: ...
+
+
 class Session:
     """SmartScan over one connection, with a further connection for each long script. Not thread-safe.
 
@@ -132,6 +141,10 @@ class Session:
             raise
         # A value of None means that SmartScan has replied before the end of the script.
         return LongCall(what, link, lambda value: value is None and self.script_runs())
+
+    def resumed(self, what: str) -> LongCall:
+        """Return a script of an earlier connection: only `script_runs` shows its end."""
+        return LongCall(what, _NoReply(), lambda value: self.script_runs())
 
     def close(self) -> None:
         self._link.close()
