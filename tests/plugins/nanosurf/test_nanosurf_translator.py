@@ -164,6 +164,17 @@ def test_the_tip_is_withdrawn_at_any_time_and_brought_back(bench: Make) -> None:
     assert made.emulator.rig.engaged
 
 
+def test_approach_during_a_restart_is_not_taken_for_done(bench: Make) -> None:
+    made = bench(speed=10.0)
+    peer = small(made)
+    made.at_panel(lambda emulator: setattr(emulator.rig.setup, "approach_s", 20.0))
+    assert peer.act(names.ENGAGE).ok
+    made.kill()
+    peer = made.start()
+    assert "INTERRUPTED" in states(peer.until(FREE))
+    assert "lost during the approach" in made.log_text()
+
+
 def test_refused_withdrawal_is_no_success(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(now_s: float) -> None:
         raise InvalidValue("the z scanner is locked")

@@ -92,7 +92,7 @@ class Nanosurf(Driver):
         self._kept.kept_in(self.memory)
         self._files = NanosurfFiles(self.memory, self.log)
         self._activity = StudioActivity(
-            session, self._files, self._place, self._folder, self._frame_in_force, self.clock, self.log
+            session, self._files, self._place, self.memory, self._folder, self._frame_in_force, self.clock, self.log
         )
         self._save_files(session)
 

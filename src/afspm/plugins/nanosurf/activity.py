@@ -20,6 +20,7 @@ from afspm.translator.driver_base import ControllerLost
 from afspm.translator.folder_files import FolderFiles
 from afspm.translator.long_call import LongCall
 from afspm.translator.result_files import SCAN, FilePrecision, as_list
+from afspm.translator.state import Kept
 
 FORCE: Final = "force"
 _ANSWERS_S: Final = 0.5
@@ -37,6 +38,7 @@ class StudioActivity(Activity):
     """The running measurement or move, started by a request or at Studio's panel.
 
     Args:
+        kept: persistent, JSON-able: name of the running approach or withdrawal.
         folder: returns the local path of Studio's files.
         frame_in_force: returns the frame as it was set.
     """
@@ -50,6 +52,7 @@ class StudioActivity(Activity):
         session: Session,
         files: NanosurfFiles,
         place: TipPlace,
+        kept: Kept,
         folder: Callable[[], Path],
         frame_in_force: Callable[[], Region],
         clock: Clock,
@@ -58,6 +61,11 @@ class StudioActivity(Activity):
         super().__init__(files, clock, log)
         self._session, self._files, self._place = session, files, place
         self._folder, self._frame_in_force = folder, frame_in_force
+        self._kept = kept
+        if what := kept.pop("call", ""):
+            # Studio reports the end of a command only on the connection of this command
+            log.error("contact with Studio was lost during the %s: look if it has ended, and where the tip is", what)
+            self._failed = True
 
     def status(self) -> ScopeStatus:
         """Return the present state. Register measurements that began or ended, and take a curve that awaits the tip."""
@@ -136,6 +144,7 @@ class StudioActivity(Activity):
         """
         self.stopped()
         self.close()
+        self._kept["call"] = ""
         try:
             self._move("withdrawal", commands.WITHDRAW, commands.STOP_ALL)
         except ControllerLost as lost:
@@ -152,11 +161,13 @@ class StudioActivity(Activity):
             call.close()
             raise Refused(ControlResponse.ACTION_ERROR, f"Studio refused the {what}: {error}") from error
         self.watch(call)
+        self._kept["call"] = what
 
     def _running_call(self) -> LongCall | None:
         call = self.call
         if (running := self.watched_call()) is not None or call is None:
             return running
+        self._kept["call"] = ""
         message = call.value[0].get("message") if call.value and isinstance(call.value[0], dict) else None
         if message:
             self._log.info("the %s has ended: %s", call.what, message)
