@@ -76,6 +76,19 @@ class Connection:
             self._controller.reach(self._driver)
         self.is_reached = True
 
+    def reach_for_retract(self) -> None:
+        """Connect as `reach`, and go on if connecting failed halfway, for lack of a folder of data for example.
+
+        Raises:
+            an error in `LOST`.
+        """
+        try:
+            self.reach()
+        except LOST:
+            raise
+        except Exception as error:  # broad: a driver may raise anything, and the tip may be reachable all the same
+            self._log.warning("the tip is retracted although connecting failed: %s", error)
+
     def require(self) -> None:
         """Raise ControllerLost unless `stands`."""
         if not self.stands:

@@ -120,7 +120,7 @@ class RequestHandler:
             connection.guarded(partial(observer.observe, values=False))
         if request.subject == names.RETRACT:
             # a retract is always possible: a reachable controller suffices, even if its state can't be read
-            connection.reach()
+            connection.reach_for_retract()
         else:
             connection.require()
         try:

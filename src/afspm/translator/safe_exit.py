@@ -113,7 +113,7 @@ class SafeExit:
         return "" if response.ok else response.reason or str(response.code)
 
     def _retract(self) -> Response:
-        self._connection.reach()
+        self._connection.reach_for_retract()
         response = self._act(names.RETRACT)
         self._state.save()
         return response

@@ -211,6 +211,24 @@ def test_retract_is_retried_on_a_new_connection(bench: Any, monkeypatch: pytest.
     assert (microscope.connected, microscope.done) == (2, ["retract"])
 
 
+@pytest.mark.parametrize("at_stop", [False, True])
+def test_tip_is_retracted_although_connecting_fails_halfway(
+    bench: Any, monkeypatch: pytest.MonkeyPatch, at_stop: bool
+) -> None:
+    def without_folder() -> None:
+        raise ConfigError("the folder of data does not exist")
+
+    switched(bench, "false")
+    monkeypatch.setattr(bench.microscope, "connect", without_folder)
+    bench.microscope.confused = ConnectionError("unplugged")
+    bench.look()
+    if at_stop:
+        assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
+    else:
+        assert bench.ask(ACTION, names.RETRACT).code == OK
+    assert bench.microscope.done[0] == "retract"
+
+
 def unplugged(*_: Any) -> Any:
     raise ConnectionError("unplugged")
 

@@ -109,14 +109,15 @@ class Park(Driver):
             self.table = self.table.without(Gains.names)
         for group in (self._kept, self._place):
             group.kept_in(self.memory)
-        folder = self._folder()
-        if not folder.is_dir():
-            problem = f"SmartScan's folder of data {folder} does not exist on this computer"
-            raise ConfigError(problem, where="data_dir", hint='data_dir = "/where/it/is/mounted"')
         self._files = ParkFiles(self.memory, self.log, self.clock.monotonic_s)
         self._activity = SmartScanActivity(
             session, self._files, self.memory, self._folder, self._frame_in_force, self.clock, self.log
         )
+        # last: the tip can be withdrawn even without the folder
+        folder = self._folder()
+        if not folder.is_dir():
+            problem = f"SmartScan's folder of data {folder} does not exist on this computer"
+            raise ConfigError(problem, where="data_dir", hint='data_dir = "/where/it/is/mounted"')
 
     def close(self) -> None:
         if self._activity is not None:
