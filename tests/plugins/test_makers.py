@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
@@ -96,6 +97,23 @@ def test_stopped_scan_is_not_published(maker: Maker, bench: Make) -> None:
     assert states(received) == ["INTERRUPTED", "FREE"]
     assert not scans(received)
     assert peer.act(names.STOP_SCAN).ok, "nothing to stop is no error"
+
+
+@pytest.mark.parametrize("maker", [MAKERS[name] for name in ("nanosurf", "park")], ids=lambda one: one.name)
+def test_older_file_is_no_result_when_the_network_drive_returns(maker: Maker, bench: Make) -> None:
+    made = bench(speed=10.0)
+    peer = made.start()
+    ready(peer)
+    scanned(peer)  # unknown to the next translator
+    made.kill()
+    shutil.rmtree(made.folder / "state")
+    peer = made.start()
+    ready(peer, shape=(64, 32))
+    away = made.data.rename(made.folder / "away")
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    away.rename(made.data)
+    assert {scan.shape for scan in scans(peer.until(FREE))} == {(64, 32)}
 
 
 @each

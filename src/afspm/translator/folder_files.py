@@ -39,7 +39,11 @@ class FolderFiles(ResultFiles):
             taken: the place of the measurement: "frame" of a scan, "position" of a spectrum.
         """
         # only files newer than those of now can be its result
-        self._begins(what, {"folder": str(folder), "newest_ns": newest(self._files(folder))[0], **taken})
+        self._begins(what, {"folder": str(folder), "newest_ns": self.look(folder), **taken})
+
+    def look(self, folder: Path) -> int:
+        """Take note of the files in a folder; return the time of the newest, in ns."""
+        return self.newest_ns(folder, self._files(folder))
 
     def end(self, now_ns: int) -> None:
         if self._kept["running"] is not None:
@@ -82,7 +86,7 @@ class FolderFiles(ResultFiles):
 
     def _goes_on(self, running: Entry) -> None:
         # the controller repeats scans: only a newer file belongs to the next image
-        running["newest_ns"] = newest(self._files(Path(running["folder"])))[0]
+        running["newest_ns"] = self.look(Path(running["folder"]))
 
     def _take(self, measured: Entry) -> bool:
         # True also for an incomplete scan: there is nothing more to wait for
@@ -99,6 +103,7 @@ class FolderFiles(ResultFiles):
             self.broken_off = True
             return True
         self.check(paths[0], content[0], measured)
+        self.newest_ns(Path(measured["folder"]), paths)
         self._add(self.result_name(paths[0]), measured, {"files": [list(one) for one in files]}, content)
         return True
 

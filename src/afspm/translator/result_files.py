@@ -88,6 +88,23 @@ class ResultFiles(ABC):
             self._content = {result: self.read(entry)}
         return self._content[result]
 
+    def newest_ns(self, folder: Path | None, files: Iterable[Path], what: str = "") -> int:
+        """Return the modification time in ns of the newest file in a folder; only newer files are results.
+
+        A folder may be missing or empty while its network drive is away: the newest file seen before counts then.
+
+        Args:
+            files: the files in the folder now.
+            what: the kind of measurement, if each kind has its own files.
+        """
+        place = f"{folder} {'scans' if what == SCAN else 'spectra' if what else ''}".strip()
+        seen = self._kept.setdefault("newest", {})
+        before_ns = seen.pop(place, 0)
+        seen[place] = newest(files)[0] or before_ns
+        for oldest in list(seen)[:-_LISTED]:
+            del seen[oldest]
+        return int(seen[place])
+
     def _begins(self, what: str, facts: Mapping[str, object]) -> None:
         self._kept["running"], self._kept["ended"] = {"what": what, **facts}, None
 

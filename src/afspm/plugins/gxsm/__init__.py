@@ -166,6 +166,7 @@ class Gxsm(Driver):
             shows_s=self.patience_s(SHOWS_S),
             saving=saving,
         )
+        self._activity.look()
         self._tip = TipPlace(scan_frame, self.memory, self._sets_out)
         own = FrameSettings(scan_frame, self._tip, is_led=self._offered.hardware is Hardware.RPSPMC)
         feedback = FeedbackSwitch(ask, self._activity.gxsm.doing, self._feedback_actions)

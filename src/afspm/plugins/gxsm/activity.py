@@ -174,6 +174,11 @@ class GxsmActivity(Activity):
 
     # --- start and stop ---
 
+    def look(self) -> None:
+        """Take note of the files that are there before a measurement."""
+        folder = self._folder()
+        self._files.look(folder, self._saving.probe_dir or folder)
+
     def start_scan(self) -> None:
         self._autosave.on = None  # unknown: a person may have switched Auto Save at the panel
         self._autosave.switch(on=False)

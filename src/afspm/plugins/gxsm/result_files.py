@@ -125,7 +125,7 @@ class GxsmFiles(ResultFiles):
         """
         self._hurry(begun_ns / NS_PER_S)
         followed = self._kept["ended"]
-        newest = max((file.stat().st_mtime_ns for file in _files(folder, what)), default=0)
+        newest = self.newest_ns(folder, _files(folder, what), what)
         place = None if folder is None else str(folder)
         facts = {"folder": place, "newest_ns": newest, "begun_ns": begun_ns, "before": None}
         self._begins(what, {**facts, "own": own, "by_gxsm": by_gxsm, **taken})
@@ -134,6 +134,11 @@ class GxsmFiles(ResultFiles):
             there = _files(_folder(followed), followed["what"])
             names = [str(file) for file in there if modified_ns(file) > followed["newest_ns"]]
             self._kept["ended"] = {**followed, "names": sorted(names)}
+
+    def look(self, scans: Path | None, spectra: Path | None) -> None:
+        """Take note of the files that are there before a measurement, in the folders of scans and spectra."""
+        for what, folder in ((SCAN, scans), ("spectrum", spectra)):
+            self.newest_ns(folder, _files(folder, what), what)
 
     def end(
         self,
@@ -328,6 +333,7 @@ class GxsmFiles(ResultFiles):
                 scan, header = files[file].scans[0], files[file].header
                 self._kept["program"] = f"{header.get('Creator', '')} {header.get('Version', '')}".strip()
                 self._kept["channels"][ending] = [scan.channel, scan.unit]
+        self.newest_ns(_folder(ended), files, ended["what"])
         names = [str(file) for file in files]
         # the end time makes the name unique: SRanger overwrites files of spectra
         content = [_PRECISION.as_set(one, ended) for file in files.values() for one in file]

@@ -123,6 +123,7 @@ class Nanonis(Driver):
                 "the session folder %s does not exist on this computer: data is fetched over TCP (or set session_dir)",
                 folder,
             )
+        self._files.look(folder)
 
     def close(self) -> None:
         if self._session is not None:

@@ -60,8 +60,13 @@ class NanonisFiles(ResultFiles):
             taken: settings of the measurement: "frame" of a scan, "position" of a spectrum.
         """
         folder = self._session_dir or Path(session)
-        newest_ns, _ = newest(_files(folder, what))
+        newest_ns = self.newest_ns(folder, _files(folder, what), what)
         self._begins(what, {"seen": what != SCAN, "folder": str(folder), "newest_ns": newest_ns, **taken})
+
+    def look(self, folder: Path) -> None:
+        """Take note of the files that are there before a measurement."""
+        for what in (SCAN, "spectrum"):
+            self.newest_ns(folder, _files(folder, what), what)
 
     @property
     def was_seen(self) -> bool:
@@ -178,6 +183,7 @@ class NanonisFiles(ResultFiles):
             self._log.error("the scan before the present one is lost: its file %s is incomplete", followed["reported"])
 
     def _take(self, file: Path, ended: Entry, content: Content) -> None:
+        self.newest_ns(Path(ended["folder"]), [file] if file.parent != self._own_folder else [], ended["what"])
         self._add(str(file), ended, {}, content)
         self._kept["ended"] = None
 

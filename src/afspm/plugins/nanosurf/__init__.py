@@ -207,6 +207,7 @@ class Nanosurf(Driver):
         if not folder.is_dir():
             problem = f"Studio's gallery {folder} does not exist on this computer"
             raise ConfigError(problem, where="gallery_dir", hint='gallery_dir = "/where/it/is/mounted"')
+        self._files.look(folder)
 
     def _check_table(self, session: Session) -> None:
         rows = {row.vendor: row for row in self.table.values() if "." in row.vendor}

@@ -118,6 +118,7 @@ class Park(Driver):
         if not folder.is_dir():
             problem = f"SmartScan's folder of data {folder} does not exist on this computer"
             raise ConfigError(problem, where="data_dir", hint='data_dir = "/where/it/is/mounted"')
+        self._files.look(folder)
 
     def close(self) -> None:
         if self._activity is not None:
