@@ -254,6 +254,20 @@ def test_mismatches_are_reported(bench: Make, emulator: dict[str, int], settings
     made.until_logged(logged)
 
 
+def test_value_in_another_unit_is_neither_read_nor_set(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    studio = made.emulator.program
+    assert isinstance(studio, StudioProgram)
+    made.at_panel(lambda emulator: studio.set_setpoint_unit("m"))
+    made.until_logged("Studio has z_control.setpoint in m, not in V")
+    assert not peer.set(names.ZCTRL_SETPOINT, "0.5", "V").ok
+    assert studio.values[SETPOINT] == 0.7
+    made.at_panel(lambda emulator: studio.set_setpoint_unit("V"))
+    made.until_logged("the controller answers again")
+    assert peer.get(names.ZCTRL_SETPOINT) == "0.7"
+
+
 def test_refused_values_change_none(bench: Make) -> None:
     made = bench()
     peer = made.start(parameters={"scan-speed": {"range": [1e-9, 1.0]}})

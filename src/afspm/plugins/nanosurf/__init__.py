@@ -216,9 +216,11 @@ class Nanosurf(Driver):
             raise ConfigError(f"Studio has no {path}", where=rows[path].name, hint="a path below root.workflow")
         expected = {**UNITS, **{path: (row.unit,) for path, row in rows.items() if row.type == "float"}}
         # A value in another unit would be converted by a wrong factor: refuse at the start.
-        for path, unit in session.units(expected).items():
+        units = session.units(expected)
+        for path, unit in units.items():
             if unit not in expected[path]:
                 problem = f"Studio has {path} in {unit or 'no unit'}, not in {expected[path][0] or 'none'}"
                 name = rows[path].name if path in rows else ""
                 hint = f'[microscope.parameters.{name}] unit = "{unit}", with a range' if name else "report it"
                 raise ConfigError(problem, where=name or path, hint=hint)
+        session.keep_units(units)

@@ -64,6 +64,10 @@ return units
 
 PUT_ALL: Final = """
 local done = {}
+local function same(node, unit)
+  local now = node.unit_get()
+  if now ~= unit then error("its unit was changed from " .. unit .. " to " .. tostring(now), 0) end
+end
 local function put(node, field, value)
   local before = node[field .. "_get"]()
   node[field .. "_set"](value)
@@ -76,7 +80,7 @@ if not fine then
 end
 return 0
 """
-"""Sets values; if Studio refuses a value, restores the values set before and fails."""
+"""Sets values; if a value has another unit, or Studio refuses it, restores the values set before and fails."""
 
 BUFFER_LEVEL: Final = 2
 """The lowest session level with low-level buffers."""

@@ -55,6 +55,7 @@ class Session:
         self._open_link, self._release, self._name = open_link, release, name
         self._level = commands.level(release) if level is None else level
         self._old = commands.has_old_commands(release)
+        self._units: Mapping[str, str] = {}
         self._link = open_link()
         try:
             self._name = self._checked_name(name)
@@ -79,11 +80,17 @@ class Session:
         """Return values of panels by path.
 
         Raises:
-            ControllerLost: the script fails, or a value is missing or not finite: the reply can't be trusted.
+            ControllerLost: the script fails, or a value is missing, not finite or in another unit than at the start:
+                the reply can't be trusted.
         """
         # One request for all values: they belong to the same moment, and a poll stays short.
-        script = ", ".join(f"{WORKFLOW}.{path}.{_field(path)}_get()" for path in paths)
-        found = dict(zip(paths, self._returned(script), strict=False))
+        measured = [path for path in paths if path in self._units]
+        fields = [f"{path}.{_field(path)}_get()" for path in paths] + [f"{path}.unit_get()" for path in measured]
+        returned = self._returned(", ".join(f"{WORKFLOW}.{field}" for field in fields))
+        found = dict(zip(paths, returned, strict=False))
+        for path, unit in zip(measured, returned[len(paths) :], strict=False):
+            if unit != self._units[path]:
+                raise ControllerLost(f"the unit of {path} was changed at Studio from {self._units[path]} to {unit}")
         for path in paths:
             value = found.get(path)
             if not isinstance(value, bool | int | float | str) or (isinstance(value, float) and not isfinite(value)):
@@ -91,12 +98,15 @@ class Session:
         return found
 
     def put(self, values: Mapping[str, Value]) -> None:
-        """Set values of panels, all or none. Raises Refused: PARAM_ERROR: Studio rejects a value."""
-        puts = " ".join(
-            f"put({WORKFLOW}.{path}, {written(_field(path))}, {written(value)})" for path, value in values.items()
-        )
+        """Set values of panels, all or none.
+
+        Raises:
+            Refused: PARAM_ERROR: Studio rejects a value, or has it in another unit than at the start.
+        """
+        checks = [f"same({WORKFLOW}.{path}, {written(self._units[path])})" for path in values if path in self._units]
+        puts = [f"put({WORKFLOW}.{path}, {written(_field(path))}, {written(value)})" for path, value in values.items()]
         try:
-            self.run(commands.PUT_ALL % puts)
+            self.run(commands.PUT_ALL % " ".join(checks + puts))
         except StudioError as error:
             raise Refused(ControlResponse.PARAM_ERROR, f"Studio refused {', '.join(values)}: {error}") from error
 
@@ -105,6 +115,10 @@ class Session:
         paths = list(paths)
         found = self.run(commands.UNITS % ", ".join(map(written, paths)))[0]
         return {path: str(found.get(number, "")) for number, path in enumerate(paths, 1)}
+
+    def keep_units(self, units: Mapping[str, str]) -> None:
+        """Refuse values from now on whose unit, by path, is not this one: a person may change units at the panel."""
+        self._units = {path: unit for path, unit in units.items() if unit}
 
     def missing(self, paths: Iterable[str]) -> list[str]:
         """Return the paths that Studio lacks."""
