@@ -271,6 +271,19 @@ def test_setting_one_gain_keeps_the_others(bench: Make) -> None:
     assert peer.set(names.ZCTRL_PGAIN, 1000.0).code == ControlResponse.PARAM_ERROR
 
 
+def test_refused_move_leaves_the_position(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise InvalidValue("beyond the scanner")
+
+    made = bench()
+    peer = small(made)
+    monkeypatch.setattr(made.emulator.rig, "move_probe", refuse)
+    response = peer.set(names.PROBE_POS_X, 1e-6)
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "beyond the scanner" in response.reason
+    assert float(peer.get(names.PROBE_POS_X)) == 0.0
+
+
 def test_refused_frame_keeps_the_speed_of_the_tip(bench: Make) -> None:
     peer = small(bench())
     assert peer.set(names.SCAN_SPEED, 5e-9).ok

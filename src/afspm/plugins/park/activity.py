@@ -13,7 +13,7 @@ from afspm.basics.errors import AfspmError, Refused
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.plugins.park.link import SmartScanError
 from afspm.plugins.park.result_files import ParkFiles
-from afspm.plugins.park.session import Session
+from afspm.plugins.park.session import ANSWERS_S, Session
 from afspm.plugins.park.settings import MOVE, way_to
 from afspm.translator.activity import Activity
 from afspm.translator.long_call import LongCall
@@ -26,8 +26,6 @@ CURVES: Final = {"force": "fd", "IV": "iv"}
 APPROACH: Final = '(spm.approach.start("q+s"), 0)'
 _ENDED_FIRST: Final = ("scan.stop", "spect.stop", "approach.stop")
 _STATES: Final = {MOVE: ScopeState.MOVING, **dict.fromkeys(CURVES, ScopeState.SPEC)}
-_ANSWERS_S: Final = 0.5
-"""Real time after which an expression counts as a long command; an error is expected earlier."""
 
 
 class SmartScanActivity(Activity):
@@ -104,7 +102,7 @@ class SmartScanActivity(Activity):
 
     def approach(self) -> None:
         """Approach the sample. Raises Refused: ACTION_ERROR: SmartScan reports an error within 0.5 s."""
-        self._move("approach", APPROACH)
+        self.watch(self._session.start("approach", APPROACH, ControlResponse.ACTION_ERROR))
 
     def evaluate(self, expression: str) -> None:
         """Evaluate an expression. An expression that takes longer than 0.5 s keeps the microscope busy.
@@ -112,7 +110,7 @@ class SmartScanActivity(Activity):
         Raises:
             SmartScanError: the expression failed within 0.5 s. ControllerLost.
         """
-        call = self._session.begin("command", f"({expression}, 0)", _ANSWERS_S)
+        call = self._session.begin("command", f"({expression}, 0)", ANSWERS_S)
         try:
             goes_on = call.running()
         except BaseException:  # Ctrl-C, too: nothing else closes this connection
@@ -134,7 +132,9 @@ class SmartScanActivity(Activity):
         # an error of a stop must not prevent the withdrawal
         ended = " ".join(f"try {{ spm.{one}(); }} catch (ignored) {{}}" for one in _ENDED_FIRST)
         away = f"spm.zscanner.retractAll(); if ({lift_um!r} > 0) {{ spm.zstage.move({lift_um!r}, 1); }}"
-        self._move("withdrawal", f"(function() {{ {ended} {away} return 0; }})()")
+        script = f"(function() {{ {ended} {away} return 0; }})()"
+        # a refused withdrawal must not count as done
+        self.watch(self._session.start("withdrawal", script, ControlResponse.ACTION_ERROR))
 
     def watch(self, call: LongCall) -> None:
         self.curve_awaited = ""
@@ -149,16 +149,6 @@ class SmartScanActivity(Activity):
         super().stopped()
 
     # --- inside ---
-
-    def _move(self, what: str, script: str) -> None:
-        # a refused withdrawal must not count as done
-        call = self._session.begin(what, script, _ANSWERS_S)
-        try:
-            call.running()
-        except SmartScanError as error:
-            call.close()
-            raise Refused(ControlResponse.ACTION_ERROR, f"SmartScan refused the {what}: {error}") from error
-        self.watch(call)
 
     def _running_call(self) -> LongCall | None:
         # The move to a curve and the curve are two scripts: the curve starts when the move has ended.

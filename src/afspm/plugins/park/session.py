@@ -22,6 +22,8 @@ from afspm.translator.driver_base import ControllerLost
 from afspm.translator.long_call import LongCall
 from afspm.translator.parameters import Value
 
+ANSWERS_S: Final = 0.5
+"""Real time after which an expression counts as a long command; an error is expected earlier."""
 TRUE, FALSE = frozenset({"true", "1"}), frozenset({"false", "0"})
 _GEOMETRY: Final = ("pixelHeight", "pixelWidth", "width", "height", "offsetX", "offsetY", "rotation")
 
@@ -141,6 +143,16 @@ class Session:
             raise
         # A value of None means that SmartScan has replied before the end of the script.
         return LongCall(what, link, lambda value: value is None and self.script_runs())
+
+    def start(self, what: str, expression: str, refusal: int) -> LongCall:
+        """Start a long script as `begin`. Raises Refused with the code `refusal`: it fails within `ANSWERS_S`."""
+        call = self.begin(what, expression, ANSWERS_S)
+        try:
+            call.running()
+        except SmartScanError as error:
+            call.close()
+            raise Refused(refusal, f"SmartScan refused the {what}: {error}") from error
+        return call
 
     def resumed(self, what: str) -> LongCall:
         """Return a script of an earlier connection: only `script_runs` shows its end."""

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from afspm.basics.errors import InvalidValue
-from afspm.model import Region, names
+from afspm.model import ControlResponse, Region, names
 from afspm.plugins.park.session import Session
 from afspm.translator.long_call import LongCall
 from afspm.translator.parameters import Value
@@ -97,7 +97,9 @@ class TipPlace(KeptSettings):
 
     def write(self, values: Mapping[str, Value]) -> None:
         wanted = self.merged(values)
-        self._begun(self._session().begin(MOVE, way_to((float(wanted[POSITION[0]]), float(wanted[POSITION[1]])))))
+        way = way_to((float(wanted[POSITION[0]]), float(wanted[POSITION[1]])))
+        # after a refused move the tip is still at the position before
+        self._begun(self._session().start(MOVE, way, ControlResponse.PARAM_ERROR))
         super().write(values)
 
     def xy_m(self) -> XY:
