@@ -116,6 +116,26 @@ def test_older_file_is_no_result_when_the_network_drive_returns(maker: Maker, be
     assert {scan.shape for scan in scans(peer.until(FREE))} == {(64, 32)}
 
 
+@pytest.mark.parametrize("maker", [MAKERS[name] for name in ("nanosurf", "park")], ids=lambda one: one.name)
+def test_frame_is_refused_if_its_line_rate_is_raised(
+    maker: Maker, bench: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = bench()
+    peer = small(made)
+    assert peer.set(names.SCAN_SPEED, 2e-7).ok
+    setter = {"nanosurf": "put", "park": "_set"}[maker.name]
+    plain = getattr(made.emulator.program, setter)
+
+    def raised(path: str, value: Any) -> None:
+        plain(path, max(value, 0.1) if path.endswith("rate") else value)
+
+    monkeypatch.setattr(made.emulator.program, setter, raised)
+    response = peer.set(names.SCAN_SIZE_X, 50e-6)
+    assert "would scan this frame at 10 µm/s instead of 0.2 µm/s" in response.reason
+    assert float(peer.get(names.SCAN_SIZE_X)) == pytest.approx(1e-6)
+    assert float(peer.get(names.SCAN_SPEED)) == pytest.approx(2e-7)
+
+
 @each
 def test_scan_from_the_panel_is_published(maker: Maker, bench: Make) -> None:
     made = bench(speed=20.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
 from typing import Final
@@ -31,6 +32,10 @@ POSITION: Final = (names.PROBE_POS_X, names.PROBE_POS_Y)
 _FRAME_MESSAGE, _FEEDBACK_MESSAGE, _POSITION_MESSAGE = SCAN_PARAMETERS.name, FEEDBACK_STATE.name, PROBE_POSITION.name
 
 MOVES: Final = frozenset(FRAME + POSITION)
+
+
+_SAME_SPEED: Final = 0.01
+"""Largest difference from the speed that a frame is set with, relative; a line rate may be rounded."""
 
 
 class SettingsGroup(ABC):
@@ -84,6 +89,17 @@ class KeptSettings(SettingsGroup):
 
     def write(self, values: Mapping[str, Value]) -> None:
         self._kept.update(values)
+
+
+def check_speed(wanted_m_s: float, made_m_s: float) -> None:
+    """Refuse a frame that a controller would scan at another speed, for example for lack of so slow a line rate.
+
+    Raises:
+        Refused: PARAM_ERROR.
+    """
+    if not math.isclose(wanted_m_s, made_m_s, rel_tol=_SAME_SPEED):
+        made, wanted = (f"{speed_m_s * 1e6:.6g} µm/s" for speed_m_s in (made_m_s, wanted_m_s))
+        raise refuse_value(names.SCAN_SPEED, f"the controller would scan this frame at {made} instead of {wanted}")
 
 
 def watched(table: ParameterTable) -> list[str]:

@@ -15,7 +15,7 @@ from afspm.model import Region, names
 from afspm.plugins.nanosurf import commands
 from afspm.plugins.nanosurf.session import Session
 from afspm.translator.parameters import Value
-from afspm.translator.setting_groups import FRAME, POSITION, SettingsGroup, frame, frame_values
+from afspm.translator.setting_groups import FRAME, POSITION, SettingsGroup, check_speed, frame, frame_values
 
 DIRECTION: Final = "imaging.slow_axis_scan_direction"
 _UPWARD, _DOWNWARD = 1, 0
@@ -63,6 +63,7 @@ class FrameSettings(SettingsGroup):
         rate = speed_m_s / (SPEED_PATH * width)
         angle_deg = math.degrees(region.angle_rad)
         self._session().put(dict(zip(_FRAME, (x, y, width, height, angle_deg, columns, rows, rate), strict=True)))
+        check_speed(speed_m_s, float(self.read()[names.SCAN_SPEED]))
 
 
 class Slopes(SettingsGroup):

@@ -16,7 +16,15 @@ from afspm.plugins.park.session import Session
 from afspm.translator.long_call import LongCall
 from afspm.translator.parameters import Value
 from afspm.translator.result_files import XY
-from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, SettingsGroup, frame, frame_values
+from afspm.translator.setting_groups import (
+    FRAME,
+    POSITION,
+    KeptSettings,
+    SettingsGroup,
+    check_speed,
+    frame,
+    frame_values,
+)
 
 MICROMETRE: Final = 1e-6
 MOVE: Final = "move"
@@ -64,6 +72,7 @@ class FrameSettings(SettingsGroup):
         )
         # The line rate is not part of the geometry.
         self._session().put({_RATE: speed_m_s / (_SPEED_PATH * width)})
+        check_speed(speed_m_s, float(self.read()[names.SCAN_SPEED]))
 
 
 class Gains(SettingsGroup):
