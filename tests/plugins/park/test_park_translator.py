@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from tests.plugins.park.park_bench import Bench
 from tests.plugins.vendor_bench import FLAT, SOON, left_in_danger, moved, ready, scanned, scans, small, states
 
@@ -269,6 +270,16 @@ def test_setting_one_gain_keeps_the_others(bench: Make) -> None:
     feedback = made.emulator.rig.setup.feedback
     assert (feedback.proportional_gain, feedback.integral_gain) == pytest.approx((0.1, 750.0))
     assert peer.set(names.ZCTRL_PGAIN, 1000.0).code == ControlResponse.PARAM_ERROR
+
+
+def test_picture_of_another_program_does_not_cost_the_scan(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = made.start()
+    ready(peer, shape=(40, 32))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    Image.new("L", (8, 8)).save(made.data / "screenshot.tif")
+    assert scans(peer.until(FREE))
 
 
 def test_refused_move_leaves_the_position(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:

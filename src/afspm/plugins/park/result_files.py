@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from afspm.basics.plain_data import Plain
+from afspm.plugins.park.scan_files import is_foreign
 from afspm.translator.folder_files import FolderFiles
 from afspm.translator.result_files import Entry, FilePrecision, modified_ns
 
@@ -38,4 +39,6 @@ class ParkFiles(FolderFiles):
         now_s = self._monotonic_s()
         if files != self._seen[0]:
             self._seen = (files, now_s)
-        return files if now_s - self._seen[1] >= SETTLE_S else []
+        settled = now_s - self._seen[1] >= SETTLE_S
+        # pictures of other programs are left out: else a screenshot would cost the scan
+        return [one for one in files if not is_foreign(Path(one[0]))] if settled else []

@@ -74,6 +74,14 @@ def read_tiff(path: Path, zone: tzinfo | None) -> FileContent:
     )
 
 
+def is_foreign(path: Path) -> bool:
+    """Return True for a complete TIFF of another program, such as a screenshot."""
+    try:
+        return _tags(path).get(MAGIC_TAG) != MAGIC
+    except Exception:  # broad: Pillow raises errors of any type for a file that is still being written
+        return False
+
+
 def _tags(path: Path) -> Tags:
     from PIL import Image, TiffImagePlugin, UnidentifiedImageError
 
