@@ -254,6 +254,15 @@ def test_mismatches_are_reported(bench: Make, emulator: dict[str, int], settings
     made.until_logged(logged)
 
 
+def test_move_that_never_arrives_is_given_up(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = bench()
+    peer = small(made)
+    monkeypatch.setattr(made.emulator.rig, "probe_at", lambda now_s: (2e-9, 0.0))  # its sensor is off by 2 nm
+    assert peer.set(names.PROBE_POS_X, 0.0).ok
+    assert states(peer.until(FREE)) == ["MOVING", "FREE"]
+    made.until_logged("the tip did not reach the position")
+
+
 def test_value_in_another_unit_is_neither_read_nor_set(bench: Make) -> None:
     made = bench()
     peer = small(made)

@@ -77,7 +77,8 @@ class Nanosurf(Driver):
         self._session: Session | None = None
         self._activity: StudioActivity | None = None
         self._kept = KeptSettings(_AT_FIRST)
-        self._place = TipPlace(self._studio)
+        late = "the tip did not reach the position that it was sent to"
+        self._place = TipPlace(self._studio, lambda: self.clock.now_s(), lambda: self.log.error(late))
         self.groups = (self._kept, FrameSettings(self._studio), Slopes(self._studio), self._place)
 
     @classmethod

@@ -27,10 +27,14 @@ _FRAME: Final = (_X, _Y, _WIDTH, _HEIGHT, _ANGLE, _COLUMNS, _ROWS, _RATE)
 _SLOPES: Final = ("imaging.slope_x", "imaging.slope_y")
 _TARGET: Final = ("scanner.offset_x_target", "scanner.offset_y_target")
 _PLACE: Final = ("scanner.offset_x", "scanner.offset_y")
+_SPEED: Final = "scanner.move_speed_xy_on_surface"
+_LATEST_S: Final = 10.0
+"""Experiment time after the expected end of a move, until the move counts as failed."""
 UNITS: Final[dict[str, tuple[str, ...]]] = {
     **dict.fromkeys((_X, _Y, _WIDTH, _HEIGHT, *_TARGET, *_PLACE), ("m",)),
     **dict.fromkeys((_ANGLE, *_SLOPES), ("°", "deg")),
     _RATE: ("Hz", "1/s"),
+    _SPEED: ("m/s",),
 }
 """Accepted units of Studio's values: the conversions here are right for these units only."""
 SPEED_PATH: Final = 2.0
@@ -85,13 +89,19 @@ class Slopes(SettingsGroup):
 
 
 class TipPlace(SettingsGroup):
-    """The target position of the tip."""
+    """The target position of the tip.
+
+    Args:
+        now_s: returns experiment time.
+        on_late: called when a move is given up, because the tip has not reached the target in time.
+    """
 
     names = POSITION
 
-    def __init__(self, session: Callable[[], Session]) -> None:
-        self._session = session
+    def __init__(self, session: Callable[[], Session], now_s: Callable[[], float], on_late: Callable[[], None]) -> None:
+        self._session, self._now_s, self._on_late = session, now_s, on_late
         self._moving = False
+        self._latest_s = 0.0
 
     def read(self) -> dict[str, Value]:
         return dict(zip(POSITION, self.xy_m(), strict=True))
@@ -108,18 +118,26 @@ class TipPlace(SettingsGroup):
 
     def go(self) -> None:
         """Start moving the tip to the target. Raises Refused: ACTION_ERROR."""
+        x, y, to_x, to_y, speed_m_s = (
+            float(one) for one in self._session().values((*_PLACE, *_TARGET, _SPEED)).values()
+        )
         self._session().do(commands.MOVE)
+        lasts_s = math.dist((x, y), (to_x, to_y)) / speed_m_s if speed_m_s > 0.0 else 0.0
+        self._latest_s = self._now_s() + 2.0 * lasts_s + _LATEST_S
         self._moving = True
 
     def arrived(self) -> bool:
         """Return whether the last move by `go` has ended; True without a move.
 
         A move has ended once the tip is within 1 nm of the target, or within 0.1 % of the target's distance from the
-        origin.
+        origin. A move that takes much longer than expected is given up.
         """
         if self._moving:
             x, y, to_x, to_y = (float(value) for value in self._session().values((*_PLACE, *_TARGET)).values())
             self._moving = math.dist((x, y), (to_x, to_y)) > max(1e-9, 1e-3 * math.hypot(to_x, to_y))
+            if self._moving and self._now_s() >= self._latest_s:
+                self._moving = False
+                self._on_late()
         return not self._moving
 
 
