@@ -73,7 +73,10 @@ class MicroscopeStatus:
         changed = replace(self, state=state, states_seen=self.states_seen + 1)
         if state is ScopeState.UNDEFINED:
             return replace(changed, lost_since_s=now_s) if self.lost_since_s is None else changed
-        return replace(changed, lost_since_s=None)._with_risk(replace(self.risk, state=state))
+        # the answer to a withdrawal comes at its beginning: it may fail later
+        is_broken_off = state is ScopeState.INTERRUPTED and self.risk.state is ScopeState.COARSE_MOTOR
+        away = self.risk.tip_away and not is_broken_off
+        return replace(changed, lost_since_s=None)._with_risk(replace(self.risk, state=state, tip_away=away))
 
     def with_feedback(self, feedback: Feedback) -> MicroscopeStatus:
         """Return the status with a published feedback; unchanged if `feedback.on` is unknown."""
