@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +141,29 @@ def test_bad_changes_are_refused(night: Path, tmp_path: Path) -> None:
     shutil.copy(night / "journal.sqlite", tmp_path)
     with pytest.raises(FileError, match="no recorded requests"):
         afspm.what_if(tmp_path)
+
+
+def test_class_beside_the_experiment_file_is_found_as_in_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home, night = tmp_path / "home", tmp_path / "night"
+    home.mkdir()
+    night.mkdir()
+    module = home / "lab_beside.py"
+    module.write_text(
+        "from tests.plugins.what_if import what_if_lab as lab\n"
+        "class Beside(lab.Remarks):\n    def remark(self, scan):\n        return 'before'\n"
+    )
+    with monkeypatch.context() as while_recorded:
+        while_recorded.syspath_prepend(str(home))
+        lab.record(night, {"beside": import_module("lab_beside").Beside()}, until="15 min")
+    del sys.modules["lab_beside"]
+    (night / "run.json").write_text(json.dumps({"homes": [str(home)]}))
+    same = afspm.what_if(night)
+    assert not same.unread
+    assert same.first is None
+    module.write_text(module.read_text().replace("before", "after it"))
+    assert [one.now.text for one in afspm.what_if(night).differences if one.now][:1] == ["after it"]
 
 
 # --- mutants ---

@@ -13,6 +13,7 @@ from afspm.basics.launch import Launch
 from afspm.client import port_log
 from afspm.client.component import Component
 from afspm.experiment import Experiment
+from afspm.experiment.class_loader import importing_from
 from afspm.experiment.experiment import load_expanded
 from afspm.model import Role
 from afspm.plugins.what_if import component_replay, hash_seeds, scheduler_replay
@@ -181,7 +182,7 @@ def what_if(run: str | Path, changes: Changes = None, *, only: Collection[str] =
         ConfigError: a changed or chosen component can't be created, or a name is unknown.
         InvalidValue: a change is neither settings nor a class.
     """
-    with open_run(run) as record:
+    with open_run(run) as record, importing_from(_homes(record.folder, *_files(changes))):
         logs = _logs(record.folder)
         changed = _changed(record.folder, changes, logs)
         unknown = {*(changes if isinstance(changes, Mapping) else ()), *only} - logs.keys()
@@ -324,7 +325,15 @@ def changed_experiment(folder: Path, *files: Path) -> Experiment:
     Raises:
         ConfigError: the experiment has errors.
     """
-    homes = [*map(Path, run_json_or_empty(folder).get(HOMES, [])), *(file.resolve().parent for file in files)]
-    experiment = load_expanded(folder / EXPERIMENT_FILE, homes, *files)
+    experiment = load_expanded(folder / EXPERIMENT_FILE, _homes(folder, *files), *files)
     experiment.require_valid()
     return experiment
+
+
+def _homes(folder: Path, *files: Path) -> list[Path]:
+    # as in the run, the user's classes are found beside the experiment files
+    return [*map(Path, run_json_or_empty(folder).get(HOMES, [])), *(file.resolve().parent for file in files)]
+
+
+def _files(changes: Changes) -> list[Path]:
+    return [Path(changes)] if isinstance(changes, str | Path) else []
