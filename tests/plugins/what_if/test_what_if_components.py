@@ -166,6 +166,17 @@ def test_class_beside_the_experiment_file_is_found_as_in_the_run(
     assert [one.now.text for one in afspm.what_if(night).differences if one.now][:1] == ["after it"]
 
 
+def test_time_at_which_a_note_was_written_is_no_difference(night: Path) -> None:
+    class Slower(lab.Judge):
+        def remark(self, scan: Any) -> str:
+            self.clock.now_ns()
+            return "rough" if self.clock.now_ns() and super().remark(scan) == "rough" else "smooth"
+
+    assert afspm.what_if(night, {"judge": Slower}, only=["judge"]).first is None
+    result = afspm.what_if(night, {"judge": {"factor": 0.0}}, only=["judge"])
+    assert all(one.recorded and one.now and one.recorded.text != one.now.text for one in result.differences)
+
+
 # --- mutants ---
 
 

@@ -13,6 +13,7 @@ from afspm.plugins.what_if.alignment import Output, PacketName
 from afspm.scheduler.control.descriptions import request_text
 
 _PROBLEMS = (ControlRequest.ADD_EXP_PRBLM, ControlRequest.RMV_EXP_PRBLM)
+_CREATION_TIMES = {"time_ns", "written_ns"}
 _HARMLESS = (CLOCK_REQUEST, RELAY_REQUEST, ControlRequest.ACTION_SUPPORT)
 
 
@@ -54,8 +55,9 @@ class OutputReader:
         try:
             message = wire.message_of(envelope)
             thing: Any = wire.decode(message, payload)
-            if "time_ns" in getattr(thing, "__dataclass_fields__", ()):
-                thing = replace(thing, time_ns=0)
+            made_at = dict.fromkeys(_CREATION_TIMES & {*getattr(thing, "__dataclass_fields__", ())}, 0)
+            if made_at:
+                thing = replace(thing, **made_at)
                 payload = bytes(wire.encode(thing)[1])
         except AfspmError:  # a message of a package that is not installed here: its bytes are compared
             message, thing = envelope, payload
