@@ -131,6 +131,27 @@ def test_error_of_a_changed_component_is_a_difference(night: Path) -> None:
     assert any(one.now and "ZeroDivisionError" in one.now.text for one in result.differences)
 
 
+def test_missing_scan_is_no_difference_of_the_component(tmp_path: Path) -> None:
+    lab.record(tmp_path, {"judge": lab.Judge()}, until="15 min", series=lab.FineSeries())
+    for file in (tmp_path / "scans").iterdir():
+        file.unlink()
+    result = afspm.what_if(tmp_path)
+    assert result.first is None
+    assert result.unread.keys() == {"judge", "fine_series"}
+    with pytest.raises(FileError, match="no such file"):
+        afspm.what_if(tmp_path, {"judge": {"factor": 2.0}})
+
+
+def test_class_that_can_not_be_created_is_named(night: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(judge: lab.Judge, factor: float = 1.0) -> None:
+        raise OSError("no such port")
+
+    monkeypatch.setattr(lab.Judge, "__init__", fails)
+    result = afspm.what_if(night)
+    assert result.first is None
+    assert "can't be created: OSError: no such port" in result.unread["judge"]
+
+
 def test_bad_changes_are_refused(night: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no requests of stranger"):
         afspm.what_if(night, {"stranger": {"factor": 1.0}})

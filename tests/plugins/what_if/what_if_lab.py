@@ -25,8 +25,16 @@ CHANNEL = "Height"
 class Series(ScanSeries):
     """Four scans, one every ten minutes."""
 
+    side = 8
+
     def __init__(self) -> None:
-        super().__init__((1e-6, 1e-6), pixels=(8, 8), every=600.0, scans=4)
+        super().__init__((1e-6, 1e-6), pixels=(self.side, self.side), every=600.0, scans=4)
+
+
+class FineSeries(Series):
+    """Scans that are too large for the log of requests."""
+
+    side = 64
 
 
 class Remarks(Component):
@@ -119,9 +127,12 @@ def record(
     seed: int = 1,
     dies_in_call: float = 0.0,
     until: str = "1 h",
+    series: Series | None = None,
 ) -> Bench:
     """Simulate a night that keeps its requests, and write its record into `folder`."""
-    bench = Bench(Series(), others=others, folder=folder, seed=seed, dies_in_call=dies_in_call, keeps_requests=True)
+    bench = Bench(
+        series or Series(), others=others, folder=folder, seed=seed, dies_in_call=dies_in_call, keeps_requests=True
+    )
     faults(bench)
     bench.run(until=until)
     with closing(RecordStore(folder)) as store:

@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import AfspmError, ConfigError
 from afspm.basics.launch import Launch
 from afspm.model import ProblemNames
 from afspm.plugins.what_if.alignment import Difference, Output, aligned, first_difference
@@ -169,7 +170,7 @@ def _run(launch: Launch, port: ReplayPort, life: Life, make: Make, outputs: Outp
     log = logging.getLogger(f"afspm.what_if.{launch.name}")
     log.propagate, log.disabled = False, True
     register_all(launch.messages)
-    component = make(launch)
+    component = _made(launch, make)
     port.handled = lambda: getattr(component, "packet", None)
     context = ProcessContext(
         launch,
@@ -186,8 +187,19 @@ def _run(launch: Launch, port: ReplayPort, life: Life, make: Make, outputs: Outp
         ended = None
     except Exception as error:  # the component's code may raise anything; the record has the type only
         ended = type(error).__name__
+    if port.missing is not None:
+        raise port.missing
     if ended is not None and (life.end is not None or not port.is_over):
         port.outputs.append(outputs.end(ended, port.place(), port.clock.shown_ns))
+
+
+def _made(launch: Launch, make: Make) -> ExperimentProcess:
+    try:
+        return make(launch)
+    except AfspmError:
+        raise
+    except Exception as error:  # the component's code may raise anything, also because the replay forbids it something
+        raise ConfigError(f"can't be created: {type(error).__name__}: {error}", where=launch.name) from error
 
 
 class _Home:

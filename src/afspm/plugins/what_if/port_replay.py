@@ -190,6 +190,7 @@ class ReplayPort:
         outputs: all outputs of the component so far.
         differs: whether an output differs from the recorded life.
         unanswered: the command, or the endless polling, that ended the replay early; empty otherwise.
+        missing: the error that ended the replay early, because the record lacks a packet; None otherwise.
         handled: returns the packet that the component is handling.
     """
 
@@ -210,6 +211,7 @@ class ReplayPort:
         self.outputs: list[Output] = []
         self.differs = False
         self.unanswered = ""
+        self.missing: FileError | None = None
         self.handled: Callable[[], Packet | None] = lambda: None
         self._expect_readings()
 
@@ -347,7 +349,11 @@ class ReplayPort:
     def _packet(self, envelope: str, time_ns: int | None, payload: str | None) -> Packet:
         if payload is not None:
             return Packet(envelope, b64decode(payload), time_ns)
-        return self._packet_of(time_ns or 0, envelope)
+        try:
+            return self._packet_of(time_ns or 0, envelope)
+        except FileError as error:  # a handler of the component might take it for an error of its own
+            self.missing = error
+            raise LifeOver from error
 
     # --- the recorded lines ---
 
