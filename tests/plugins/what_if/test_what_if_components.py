@@ -22,7 +22,7 @@ import afspm
 from afspm import wire
 from afspm.basics.errors import ConfigError, FileError, InvalidValue
 from afspm.plugins.what_if import component_replay
-from afspm.plugins.what_if.commands import DIFFERS, app
+from afspm.plugins.what_if.commands import DIFFERS, INCOMPLETE, app
 from afspm.plugins.what_if.port_replay import read_lives
 from afspm.plugins.what_if.recorded_packets import recorded_packets
 from afspm.record.run import open_run
@@ -328,6 +328,31 @@ def test_command_exits_with_three_if_a_night_differs(night: Path) -> None:
     assert differs.exit_code == DIFFERS, differs.output
     assert "first difference: alarmist" in differs.output
     assert "flags tip-shape-changed" in differs.output
+
+
+def test_command_replays_the_other_nights_after_one_that_can_not_be_replayed(night: Path, tmp_path: Path) -> None:
+    older, latest, page = tmp_path / "older", tmp_path / "latest", tmp_path / "page.html"
+    older.mkdir()
+    shutil.copy(night / "journal.sqlite", older)  # without requests
+    latest.symlink_to(night)
+    (tmp_path / "runs.sqlite").touch()
+    nights = [*map(str, (older, latest, night, tmp_path / "runs.sqlite"))]
+    same = CliRunner().invoke(app, nights)
+    assert same.exit_code == INCOMPLETE, same.output
+    assert "older was not replayed: " in same.output
+    assert same.output.count("no difference") == 1
+    differs = CliRunner().invoke(app, [*nights, "--set", "alarmist.at=3", "--page", str(page)])
+    assert differs.exit_code == DIFFERS, differs.output
+    assert "older: not replayed" in page.read_text(encoding="utf-8")
+
+
+def test_command_exits_with_one_if_a_component_can_not_be_replayed(night: Path, tmp_path: Path) -> None:
+    shutil.copytree(night, tmp_path, dirs_exist_ok=True)
+    log = tmp_path / "requests" / "judge.jsonl"
+    log.write_text(log.read_text().replace("what_if_lab.Judge", "what_if_lab.Gone"))
+    result = CliRunner().invoke(app, [str(tmp_path)])
+    assert result.exit_code == INCOMPLETE, result.output
+    assert "judge was not replayed: " in result.output
 
 
 def test_command_prints_json_for_programs(night: Path) -> None:

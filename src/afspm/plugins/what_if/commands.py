@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from afspm.basics.clock import iso_utc
+from afspm.basics.errors import AfspmError
 from afspm.basics.formatting import counted, day_and_time
 from afspm.cli.arguments import AFTERWARDS, names_in, opt
 
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 DIFFERS = 3
 """Exit code: a night differs."""
+INCOMPLETE = 1
+"""Exit code: no night differs, but one, or a process of one, could not be replayed."""
 _MOST_SHOWN = 10
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
 
@@ -57,24 +60,26 @@ def what_if(
     """Replay recorded nights with a change, and show the differences.
 
     Each component gets its recorded packets and answers again, and its outputs are compared with the recorded outputs.
-    Needs runs with `requests = true` in [record]. Exit code 3: a night differs.
+    Needs runs with `requests = true` in [record]. Exit code 3: a night differs; 1: none differs, but not all could be
+    replayed.
     """
     folders, changes = _given(paths, change or [])
     if page is not None:
         _require_page(page, closed=closed)
-    differs = False
     if closed:
-        for folder in folders:
-            differs |= _rerun(folder, changes, runs)
+        differs = [_rerun(folder, changes, runs) for folder in folders]
+        code = DIFFERS if any(differs) else 0
     else:
-        differs = _replay(folders, changes, names_in(component), page, as_json=as_json)
-    if differs:
-        raise typer.Exit(DIFFERS)
+        code = _replay(folders, changes, names_in(component), page, as_json=as_json)
+    if code:
+        raise typer.Exit(code)
 
 
 def _given(paths: list[Path], change: list[str]) -> tuple[list[Path], Any]:
     files = [path for path in paths if path.suffix == ".toml"]
-    folders = [path for path in paths if path.suffix != ".toml"]
+    # `runs/*` has the newest run twice, as `latest` is a link, and files: the index of `afspm runs`
+    others = (path for path in paths if path.suffix != ".toml" and not path.is_file())
+    folders = [*{path.resolve(): path for path in others}.values()]
     if not folders:
         raise typer.BadParameter("name the folder of a run", param_hint="RUN")
     if len(files) > 1:
@@ -108,14 +113,24 @@ def _require_page(page: Path, *, closed: bool) -> None:
         raise typer.BadParameter(f"there is no folder {page.parent}", param_hint="--page")
 
 
-def _replay(folders: list[Path], changes: Any, only: tuple[str, ...], target: Path | None, *, as_json: bool) -> bool:
+def _replay(folders: list[Path], changes: Any, only: tuple[str, ...], target: Path | None, *, as_json: bool) -> int:
     from afspm.plugins.what_if.page import DifferencePage
     from afspm.plugins.what_if.what_if import what_if
 
-    page, differs = DifferencePage(changes), False
+    page, differs, is_whole = DifferencePage(changes), False, True
     for folder in folders:
-        result = what_if(folder, changes, only=only)
+        try:
+            result = what_if(folder, changes, only=only)
+        except AfspmError as error:
+            if len(folders) == 1:
+                raise
+            # the other nights are replayed all the same: they may take an hour
+            is_whole = False
+            page.add_unread(folder.name, str(error))
+            typer.echo(f"{folder.name} was not replayed: {error}", err=True)
+            continue
         differs |= result.differs
+        is_whole &= not result.unread
         if as_json:
             typer.echo(json.dumps(_facts(result), ensure_ascii=False))
         else:
@@ -125,7 +140,7 @@ def _replay(folders: list[Path], changes: Any, only: tuple[str, ...], target: Pa
     if target is not None:
         page.write(target)
         typer.echo(target, err=as_json)
-    return differs
+    return DIFFERS if differs else 0 if is_whole else INCOMPLETE
 
 
 def _rerun(folder: Path, changes: Any, runs: Path) -> bool:

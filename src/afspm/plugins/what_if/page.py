@@ -52,6 +52,15 @@ class DifferencePage:
         self._different += result.differs
         self._simulated |= result.simulated
 
+    def add_unread(self, name: str, why: str) -> None:
+        """Add a night that could not be replayed."""
+        number, verdict = len(self._nights) + 1, "not replayed"
+        self._names.append(name)
+        self._nights.append(
+            f'<article id="night-{number}"><h2>{escape(name)}: {verdict}</h2><p>{escape(why)}</p></article>'
+        )
+        self._overview.append([f'<a href="#night-{number}">{escape(name)}</a>', verdict, ""])
+
     def write(self, target: Path) -> None:
         """Write the page.
 
