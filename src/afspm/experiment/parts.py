@@ -62,6 +62,8 @@ class ExperimentParts:
     """Equivalent of each line of a file of another form (`forms`)."""
     instead: dict[str, Settings] = field(default_factory=dict)
     """Tables of components without equivalent, by name, unchanged."""
+    unused: list[str] = field(default_factory=list)
+    """Names of intermediaries without effect."""
 
     def free_name(self, wanted: str) -> str:
         """Return a name that is not in the file: `wanted`, with a number if that name is taken."""
@@ -170,9 +172,11 @@ def _report_unused(parts: ExperimentParts, used: set[str], document: Document) -
         elif "component" in table:
             continue  # switched off: component = false
         elif "class" in table or "command" in table:
+            parts.unused.append(name)
             hint = "does it lack `component = true`?" if wire_of(table) is None else ""
             document.warning(f"nothing refers to [{name}]", name, hint=hint)
         else:
+            parts.unused.append(name)
             document.warning(f"[{name}] is neither a section nor a component", name, hint=nearest(name, SECTIONS))
 
 

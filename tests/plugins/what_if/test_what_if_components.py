@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 import afspm
 from afspm import wire
 from afspm.basics.errors import ConfigError, FileError, InvalidValue
-from afspm.plugins.what_if import component_replay
+from afspm.plugins.what_if import component_replay, what_if
 from afspm.plugins.what_if.commands import DIFFERS, INCOMPLETE, app
 from afspm.plugins.what_if.port_replay import read_lives
 from afspm.plugins.what_if.recorded_packets import recorded_packets
@@ -150,6 +150,15 @@ def test_class_that_can_not_be_created_is_named(night: Path, monkeypatch: pytest
     result = afspm.what_if(night)
     assert result.first is None
     assert "can't be created: OSError: no such port" in result.unread["judge"]
+
+
+def test_line_of_a_limit_is_no_change_of_it() -> None:
+    def limits(place: str, high: float) -> dict[str, Any]:
+        return {"limits": {"parameters": {"bias": {"high": high, "source": place}}, "region_source": place}}
+
+    recorded = limits("night.toml:12", 1.0)
+    assert what_if.at_recorded_places(recorded, limits("new.toml:3", 1.0)) == recorded
+    assert what_if.at_recorded_places(recorded, limits("new.toml:3", 2.0)) == limits("night.toml:12", 2.0)
 
 
 def test_bad_changes_are_refused(night: Path, tmp_path: Path) -> None:

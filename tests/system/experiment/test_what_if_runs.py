@@ -10,6 +10,7 @@ import pytest
 from tests.system.experiment.experiment_lab import AfspmRun, Run
 
 import afspm
+from afspm.basics.errors import ConfigError
 from afspm.plugins.what_if.closed_loop import rerun
 
 KEEPS = "[record]\nrequests = true\n"
@@ -45,6 +46,13 @@ def test_recorded_run_with_kills_repeats_its_record(run: Run, tmp_path: Path, mo
     fewer = afspm.what_if(folder, changed)
     assert fewer.first is not None
     assert fewer.first.component == "series"
+    untried = tmp_path / "untried.toml"
+    for text in ("[microscope]\nseed = 12\n", "[serie]\nscans = 2\n"):  # nothing of it is in a replay
+        untried.write_text(text, encoding="utf-8")
+        with pytest.raises(ConfigError, match="nothing that this file changes can be tried"):
+            afspm.what_if(folder, untried)
+    untried.write_text("[series]\nscans = 2\n[serie]\nscans = 2\n", encoding="utf-8")
+    assert afspm.what_if(folder, untried).untried == {"serie": "is no process of the experiment"}
     outcomes = rerun(folder, changed, runs=tmp_path / "again", terminal=sys.stderr)
     assert outcomes.rows["whole scans"] == ("3", "2")
     assert afspm.open_run(outcomes.folder).simulated

@@ -186,6 +186,10 @@ def _print(result: WhatIf) -> None:
             typer.echo(f"{name} depends on more than its inputs: it {hazard}")
     for name, why in result.unread.items():
         typer.echo(f"{name} was not replayed: {why}", err=True)
+    if result.left_out:
+        typer.echo(f"left out: {', '.join(sorted(result.left_out))}", err=True)
+    for name, why in result.untried.items():
+        typer.echo(f"[{name}] {why}", err=True)
 
 
 def _facts(result: WhatIf) -> dict[str, Any]:
@@ -213,4 +217,6 @@ def _facts(result: WhatIf) -> dict[str, Any]:
         "differences": [difference(one) for one in result.differences],
         "hazards": result.hazards,
         "not_replayed": result.unread,
+        "left_out": result.left_out,
+        "not_tried": result.untried,
     }

@@ -163,6 +163,7 @@ def _notes(result: WhatIf) -> str:
         for hazard in hazards
     ]
     notes += [f"{name} was not replayed: {why}" for name, why in {**result.unread, **result.left_out}.items()]
+    notes += [f"[{name}] {why}" for name, why in result.untried.items()]
     return "".join(f"<p>{escape(note)}</p>" for note in notes)
 
 

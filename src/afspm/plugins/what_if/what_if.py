@@ -15,6 +15,7 @@ from afspm.client.component import Component
 from afspm.experiment import Experiment
 from afspm.experiment.class_loader import importing_from
 from afspm.experiment.experiment import load_expanded
+from afspm.experiment.parts import ExperimentPart
 from afspm.model import Role
 from afspm.plugins.what_if import component_replay, hash_seeds, scheduler_replay
 from afspm.plugins.what_if.alignment import Difference
@@ -29,6 +30,8 @@ from afspm.storage.line_log import REQUESTS_FOLDER, read_lines
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.run import HOMES
 from afspm.transport.process.loading import load
+
+_PLACES = ("source", "region_source")
 
 Changes = Mapping[str, Mapping[str, Any] | type[Component]] | str | Path | None
 
@@ -63,6 +66,7 @@ class WhatIf:
         controls: replays without the change, for each changed component that differs.
         unread: reasons why processes were not replayed, by name.
         left_out: reasons why processes were left out, by name.
+        untried: reasons why a change of the experiment file was not tried, by the name of its table.
         simulated: whether the microscope was simulated.
     """
 
@@ -73,6 +77,7 @@ class WhatIf:
     controls: dict[str, ComponentReplay] = field(default_factory=dict)
     unread: dict[str, str] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
+    untried: dict[str, str] = field(default_factory=dict)
     simulated: bool = False
 
     @property
@@ -184,7 +189,7 @@ def what_if(run: str | Path, changes: Changes = None, *, only: Collection[str] =
     """
     with open_run(run) as record, importing_from(_homes(record.folder, *_files(changes))):
         logs = _logs(record.folder)
-        changed = _changed(record.folder, changes, logs)
+        changed, untried = _changed(record.folder, changes, logs)
         unknown = {*(changes if isinstance(changes, Mapping) else ()), *only} - logs.keys()
         if unknown:
             raise ConfigError(
@@ -193,6 +198,7 @@ def what_if(run: str | Path, changes: Changes = None, *, only: Collection[str] =
                 hint=f"it has those of {', '.join(sorted(logs))}",
             )
         result = WhatIf(record.folder, left_out=_without_log(record, logs), simulated=record.simulated)
+        result.untried = untried
         packet_of = recorded_packets(record)
         for name, path in sorted(logs.items()):
             if only and name not in only:
@@ -265,9 +271,10 @@ def _is_component(part: object) -> bool:
     return isinstance(part, dict) and bool(part.get("component"))
 
 
-def _changed(folder: Path, changes: Changes, logs: Mapping[str, Path]) -> dict[str, Changed]:
+def _changed(folder: Path, changes: Changes, logs: Mapping[str, Path]) -> tuple[dict[str, Changed], dict[str, str]]:
+    # the changes by name, and for each change that is not tried its reason
     if changes is None:
-        return {}
+        return {}, {}
     if isinstance(changes, str | Path):
         return _changed_by_file(folder, Path(changes), logs)
     found: dict[str, Changed] = {}
@@ -280,7 +287,7 @@ def _changed(folder: Path, changes: Changes, logs: Mapping[str, Path]) -> dict[s
             raise InvalidValue(
                 f"a change can't be {change!r}", where=name, hint="give a dict of settings, or a class of a component"
             )
-    return found
+    return found, {}
 
 
 def _made_by(class_: type[Component]) -> component_replay.Make:
@@ -299,7 +306,7 @@ def _launch(path: Path) -> Launch:
     raise FileError("has no beginning of a life", where=str(path))
 
 
-def _changed_by_file(folder: Path, file: Path, logs: Mapping[str, Path]) -> dict[str, Changed]:
+def _changed_by_file(folder: Path, file: Path, logs: Mapping[str, Path]) -> tuple[dict[str, Changed], dict[str, str]]:
     if not file.is_file():
         raise FileError("there is no such file", where=str(file))
     experiment = changed_experiment(folder, file)
@@ -309,10 +316,54 @@ def _changed_by_file(folder: Path, file: Path, logs: Mapping[str, Path]) -> dict
         if start.role is Role.TRANSLATOR or launch.name not in logs:
             continue
         before = _launch(logs[launch.name])
+        if start.role is Role.SCHEDULER:
+            launch = replace(launch, settings=at_recorded_places(before.settings, launch.settings))
         if (launch.class_, json.dumps(launch.settings)) == (before.class_, json.dumps(before.settings)):
             continue
         found[launch.name] = (launch.settings, _loaded_as(launch.class_))
-    return found
+    untried = _untried(changed_experiment(folder), experiment, found, logs)
+    if untried and not found:  # without an error this would look as if the change made no difference
+        raise ConfigError(
+            "nothing that this file changes can be tried: "
+            + "; ".join(f"[{name}] {why}" for name, why in untried.items()),
+            where=str(file),
+            hint=f"the record has the requests of {', '.join(sorted(logs))}",
+        )
+    return found, untried
+
+
+def at_recorded_places(before: Any, now: Any) -> Any:
+    """Return changed settings of a scheduler in which each limit keeps its recorded file and line.
+
+    A refusal names them, and another file with the same limits refuses the same.
+    """
+    if not (isinstance(before, dict) and isinstance(now, dict)):
+        return now
+    return {
+        key: before[key] if key in _PLACES and key in before else at_recorded_places(before.get(key), value)
+        for key, value in now.items()
+    }
+
+
+def _untried(before: Experiment, now: Experiment, found: Collection[str], logs: Collection[str]) -> dict[str, str]:
+    recorded, changed = ({part.name: part for part in one.parts.components} for one in (before, now))
+    untried = dict.fromkeys(set(now.parts.unused) - {*before.parts.unused}, "is no process of the experiment")
+    for name in sorted({**recorded, **changed}):
+        if name in found or _content(recorded.get(name)) == _content(changed.get(name)):
+            continue
+        if name not in recorded:
+            untried[name] = "is new, so the record has no inputs of it"
+        elif name not in logs:
+            untried[name] = "is changed, but its requests are not in the record"
+        elif name not in changed:
+            untried[name] = "is left out of the changed experiment, but is replayed as it was"
+        else:
+            untried[name] = "is replayed as it was: only other settings or another class can be tried"
+    return untried
+
+
+def _content(part: ExperimentPart | None) -> object:
+    return part and (part.class_path, part.command, part.settings, part.own)
 
 
 def _loaded_as(class_path: str) -> component_replay.Make:
