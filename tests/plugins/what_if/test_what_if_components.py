@@ -323,7 +323,16 @@ def test_replay_writes_nothing_outside_its_folder(tmp_path: Path, monkeypatch: p
     assert written
     result = afspm.what_if(night)
     assert table.read_text() == written
-    assert any(f"writes a file outside its folder: {table}" in one for one in result.hazards["writer"])
+    assert f"it writes a file outside its folder: {table}" in result.unread["writer"]
+    assert not result.differs
+
+
+def test_component_with_inputs_from_people_is_left_out(tmp_path: Path) -> None:
+    lab.record(tmp_path, {"page": lab.Page()}, until="15 min")
+    result = afspm.what_if(tmp_path)
+    assert not result.differs
+    assert not result.unread
+    assert result.left_out["page"] == "what people do at its pages is not in the record"
 
 
 # --- the command ---

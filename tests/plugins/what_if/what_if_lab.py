@@ -119,6 +119,12 @@ class Writer(Remarks):
         return "written"
 
 
+class Page(WallClock):
+    """A component with inputs beyond its port, as a dashboard has."""
+
+    has_people = True
+
+
 def record(
     folder: Path,
     others: Mapping[str, Component],

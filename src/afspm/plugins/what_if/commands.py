@@ -186,8 +186,9 @@ def _print(result: WhatIf) -> None:
             typer.echo(f"{name} depends on more than its inputs: it {hazard}")
     for name, why in result.unread.items():
         typer.echo(f"{name} was not replayed: {why}", err=True)
-    if result.left_out:
-        typer.echo(f"left out: {', '.join(sorted(result.left_out))}", err=True)
+    for why in sorted({*result.left_out.values()}):
+        names = sorted(name for name, reason in result.left_out.items() if reason == why)
+        typer.echo(f"left out: {', '.join(names)}: {why}", err=True)
     for name, why in result.untried.items():
         typer.echo(f"[{name}] {why}", err=True)
 

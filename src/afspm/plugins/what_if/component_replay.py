@@ -43,6 +43,7 @@ class ComponentReplay:
         first: the first difference; None if all outputs are equal.
         acts: whether the component commands the microscope, or requests control.
         hazards: dependencies beyond the recorded inputs, as text.
+        forbidden: description of an action of the component that the replay prevented; empty if there was none.
         stopped: reason why the replay ended before the record; empty for a complete replay.
         real_s: real time of the replay.
         recorded_s: experiment time that the record covers.
@@ -52,6 +53,7 @@ class ComponentReplay:
     recorded: list[Output]
     now: list[Output]
     hazards: list[str] = field(default_factory=list)
+    forbidden: str = ""
     stopped: str = ""
     real_s: float = 0.0
     recorded_s: float = 0.0
@@ -140,7 +142,7 @@ def _replay(
                 stopped = f"the record has no answer to: {port.unanswered}"
                 break
     return ComponentReplay(
-        name, recorded, now, list(guard.seen), stopped, time.perf_counter() - began_s, _length_s(lives)
+        name, recorded, now, list(guard.seen), guard.forbidden, stopped, time.perf_counter() - began_s, _length_s(lives)
     )
 
 

@@ -45,6 +45,7 @@ class HazardGuard:
 
     Attributes:
         seen: descriptions of the hazards, in order of occurrence.
+        forbidden: description of the first action that was prevented; empty if there was none.
     """
 
     def __init__(self, folder: Path, known: tuple[Path, ...]) -> None:
@@ -59,6 +60,7 @@ class HazardGuard:
         )
         self._temporary = str(Path(tempfile.gettempdir()).resolve()) + os.sep
         self.seen: dict[str, None] = {}
+        self.forbidden = ""
 
     @contextmanager
     def active(self) -> Iterator[None]:
@@ -110,6 +112,7 @@ class HazardGuard:
 
     def _forbid(self, what: str) -> None:
         if self._note(what):
+            self.forbidden = self.forbidden or what
             raise ReplayForbids(f"in a replay a component can't do this: it {what}")
 
     def _note(self, what: str) -> bool:

@@ -29,8 +29,12 @@ from afspm.scheduler import step_log
 from afspm.storage.line_log import REQUESTS_FOLDER, read_lines
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.run import HOMES
-from afspm.transport.process.loading import load
+from afspm.transport.process.loading import find_class, load
 
+_UNRECORDED = {
+    "has_people": "what people do at its pages is not in the record",
+    "is_instrument": "the answers of its instrument are not in the record",
+}
 _PLACES = ("source", "region_source")
 
 Changes = Mapping[str, Mapping[str, Any] | type[Component]] | str | Path | None
@@ -230,8 +234,14 @@ def _replay(
     if not lives:
         result.unread[name] = "its log is empty"
         return
+    if why := _unrecorded(lives[0].facts["launch"]["class"]):
+        result.left_out[name] = why
+        return
     settings, make = changed or (None, None)
     made = component_replay.replay(lives, packet_of, result.run, make=make or load, settings=settings)
+    if made.first is not None and made.forbidden and changed is None:
+        result.unread[name] = f"a replay does not allow what it does: it {made.forbidden}"
+        return
     result.components[name] = made
     if made.first is None:
         return
@@ -244,6 +254,14 @@ def _replay(
     if control.first is not None and not control.hazards:
         control.hazards += hash_seeds.hazards(result.run, name)
         made.hazards += [one for one in control.hazards if one not in made.hazards]
+
+
+def _unrecorded(class_path: str) -> str:
+    try:
+        class_ = find_class(class_path, "")
+    except ConfigError:  # the replay has the error, unless the change gives another class
+        return ""
+    return next((why for mark, why in _UNRECORDED.items() if getattr(class_, mark, False)), "")
 
 
 def _logs(folder: Path) -> dict[str, Path]:
