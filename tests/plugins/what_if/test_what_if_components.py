@@ -327,6 +327,51 @@ def test_replay_writes_nothing_outside_its_folder(tmp_path: Path, monkeypatch: p
     assert not result.differs
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.parametrize("way", ["thread", "pool", "program", "move", "hdf5", "sqlite", "socket"])
+def test_replay_changes_nothing_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
+    outside = tmp_path / "outside"
+    monkeypatch.setenv(lab.OUTSIDE, str(outside))
+    night = _outsiders_night(tmp_path, way)
+    outside.unlink(missing_ok=True)
+    result = afspm.what_if(night)
+    assert not outside.exists()
+    found = [*result.hazards.get("outsider", []), result.unread.get("outsider", "")]
+    assert any(words in one for one in found for words in ("outside its folder", "the network", "a program"))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
+def test_replay_writes_to_no_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    controller, device = os.openpty()
+    monkeypatch.setenv(lab.OUTSIDE, str(tmp_path / "outside"))
+    monkeypatch.setenv(lab.DEVICE, os.ttyname(device))
+    night = _outsiders_night(tmp_path, "device")
+    assert b"PULSE" in os.read(controller, 1000)
+    assert "writes a file outside its folder: /dev/" in afspm.what_if(night).unread["outsider"]
+    os.set_blocking(controller, False)
+    with pytest.raises(BlockingIOError):
+        os.read(controller, 1)
+    os.close(controller)
+    os.close(device)
+
+
+def _outsiders_night(folder: Path, way: str) -> Path:
+    night = folder / "night"
+    night.mkdir()
+    lab.record(night, {"outsider": lab.Outsider(way)}, until="15 min")
+    log = night / "requests" / "outsider.jsonl"
+    log.write_text(log.read_text().replace('"settings":{}', f'"settings":{{"way":"{way}"}}', 1))
+    return night
+
+
+def test_temporary_files_and_tracebacks_are_no_hazard(tmp_path: Path) -> None:
+    lab.record(tmp_path, {"tidy": lab.Tidy()}, until="15 min")
+    result = afspm.what_if(tmp_path)
+    assert result.first is None
+    assert not result.hazards
+    assert not result.unread
+
+
 def test_component_with_inputs_from_people_is_left_out(tmp_path: Path) -> None:
     lab.record(tmp_path, {"page": lab.Page()}, until="15 min")
     result = afspm.what_if(tmp_path)

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import os
 import random
+import shutil
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import threading
 import time
+import traceback
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 
+import h5py
 import numpy as np
+import zmq
 
 from afspm import Component, Scan
 from afspm.components.planned_scans import ScanSeries
@@ -19,6 +29,8 @@ from afspm.testing import Bench
 
 OUTSIDE = "AFSPM_TEST_OUTSIDE"
 """Environment variable with the file that `OutsideFile` reads."""
+DEVICE = "AFSPM_TEST_DEVICE"
+"""Environment variable with the device that `Outsider` writes to."""
 CHANNEL = "Height"
 
 
@@ -117,6 +129,67 @@ class Writer(Remarks):
         with Path(os.environ[OUTSIDE]).open("a") as file:
             file.write("x")
         return "written"
+
+
+class Outsider(Remarks):
+    """Changes something outside the run, in a given way."""
+
+    def __init__(self, way: str = "") -> None:
+        self.way = way
+
+    def remark(self, scan: Scan) -> str:
+        getattr(self, self.way)(Path(os.environ[OUTSIDE]))
+        return "done"
+
+    def thread(self, outside: Path) -> None:
+        thread = threading.Thread(target=lambda: outside.write_text("by a thread"))
+        thread.start()
+        thread.join()
+
+    def pool(self, outside: Path) -> None:
+        with ThreadPoolExecutor(1) as pool:  # no line of the component is at work in the thread
+            pool.submit(shutil.copy, __file__, outside)
+
+    def program(self, outside: Path) -> None:
+        command = [sys.executable, "-c", f"open({str(outside)!r}, 'w').write('by a program')"]
+        thread = threading.Thread(target=subprocess.run, args=(command,))
+        thread.start()
+        thread.join()
+
+    def move(self, outside: Path) -> None:
+        descriptor, name = tempfile.mkstemp()
+        os.close(descriptor)
+        Path(name).replace(outside)
+
+    def hdf5(self, outside: Path) -> None:
+        h5py.File(outside, "w").close()
+
+    def sqlite(self, outside: Path) -> None:
+        outside.unlink(missing_ok=True)
+        sqlite3.connect(outside).execute("CREATE TABLE scans (time)").connection.close()
+
+    def device(self, outside: Path) -> None:
+        with Path(os.environ[DEVICE]).open("wb", buffering=0) as line:
+            line.write(b"PULSE")
+
+    def socket(self, outside: Path) -> None:
+        with zmq.Context() as context, context.socket(zmq.PUSH) as push:
+            push.bind(f"ipc://{outside}")
+
+
+class Tidy(Remarks):
+    """Uses temporary files, and shows an error with its line."""
+
+    def remark(self, scan: Scan) -> str:
+        with tempfile.TemporaryDirectory() as folder:
+            (Path(folder) / "one.txt").write_text("one")
+        other = Path(tempfile.mkdtemp())
+        (other / "two.txt").write_text("two")
+        shutil.rmtree(other)
+        try:
+            raise KeyError
+        except KeyError:
+            return traceback.format_exc()[:100]
 
 
 class Page(WallClock):
