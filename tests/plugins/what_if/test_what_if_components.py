@@ -152,6 +152,22 @@ def test_class_that_can_not_be_created_is_named(night: Path, monkeypatch: pytest
     assert "can't be created: OSError: no such port" in result.unread["judge"]
 
 
+def test_log_that_ends_before_the_run_is_noted(night: Path, tmp_path: Path) -> None:
+    """As after a disk that was full from then on."""
+    shutil.copytree(night, tmp_path, dirs_exist_ok=True)
+    for log in (tmp_path / "requests").iterdir():
+        text = log.read_bytes()
+        log.write_bytes(text[: len(text) * 2 // 3])
+    result = afspm.what_if(tmp_path)
+    assert result.first is None
+    notes = {row.name: row.note for row in result.table()}
+    for name in ("judge", "alarmist", "scheduler"):
+        assert "its record ends at " in notes[name], name
+    (tmp_path / "requests" / "scheduler.steps.jsonl").write_bytes(b"")
+    assert afspm.what_if(tmp_path).unread == {"scheduler": "its log is empty"}
+    assert not any(row.note for row in afspm.what_if(night).table())
+
+
 def test_line_of_a_limit_is_no_change_of_it() -> None:
     def limits(place: str, high: float) -> dict[str, Any]:
         return {"limits": {"parameters": {"bias": {"high": high, "source": place}}, "region_source": place}}

@@ -14,14 +14,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from afspm.basics.clock import ExperimentClock
+from afspm.basics.clock import NS_PER_S, ExperimentClock
 from afspm.basics.errors import AfspmError, ConfigError
 from afspm.basics.launch import Launch
 from afspm.model import ProblemNames
 from afspm.plugins.what_if.alignment import Difference, Output, aligned, first_difference
 from afspm.plugins.what_if.hazards import HazardGuard
 from afspm.plugins.what_if.outputs import OutputReader
-from afspm.plugins.what_if.port_replay import Life, LifeOver, PacketOf, ReplayPort, recorded_outputs
+from afspm.plugins.what_if.port_replay import Life, LifeOver, PacketOf, Poll, ReplayPort, recorded_outputs
 from afspm.record.run_json import EXPERIMENT_FILE, RUN_FILE
 from afspm.transport.process.context import ExperimentProcess, ProcessActivity, ProcessContext
 from afspm.transport.process.loading import load
@@ -47,6 +47,7 @@ class ComponentReplay:
         stopped: reason why the replay ended before the record; empty for a complete replay.
         real_s: real time of the replay.
         recorded_s: experiment time that the record covers.
+        until_ns: time of the end of the log, if the last life has no recorded end; None otherwise.
     """
 
     name: str
@@ -57,6 +58,7 @@ class ComponentReplay:
     stopped: str = ""
     real_s: float = 0.0
     recorded_s: float = 0.0
+    until_ns: int | None = None
     same: int = 0
     differences: list[Difference] = field(default_factory=list)
     first: Difference | None = None
@@ -141,9 +143,12 @@ def _replay(
             if port.unanswered:
                 stopped = f"the record has no answer to: {port.unanswered}"
                 break
+    until_ns = _until_ns(lives[-1])
     return ComponentReplay(
-        name, recorded, now, list(guard.seen), guard.forbidden, stopped, time.perf_counter() - began_s, _length_s(lives)
-    )
+        name, recorded, now, list(guard.seen), guard.forbidden, stopped, time.perf_counter() - began_s,
+        max(0.0, (until_ns - lives[0].facts["now_ns"]) / NS_PER_S),
+        until_ns if lives[-1].end is None else None,
+    )  # fmt: skip
 
 
 def _parted(recorded: Sequence[Output], now: Sequence[Output]) -> bool:
@@ -151,10 +156,8 @@ def _parted(recorded: Sequence[Output], now: Sequence[Output]) -> bool:
     return first_difference("", recorded[: len(now)], now) is not None
 
 
-def _length_s(lives: Sequence[Life]) -> float:
-    last = lives[-1].lines[-1:] or lives[-1:]
-    end_ns = getattr(last[0], "now_ns", lives[-1].facts["now_ns"])
-    return float(max(0.0, (end_ns - lives[0].facts["now_ns"]) / 1e9))
+def _until_ns(life: Life) -> int:
+    return next((line.now_ns for line in reversed(life.lines) if isinstance(line, Poll)), int(life.facts["now_ns"]))
 
 
 def _launch(life: Life, folder: Path, settings: Mapping[str, Any] | None) -> Launch:

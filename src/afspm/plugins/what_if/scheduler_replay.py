@@ -44,6 +44,7 @@ class SchedulerReplay:
         first_step: the first step, counted from 1, with a different state or effect; None if all effects are equal.
         stopped: reason why the replay ended before the record; empty for a complete replay.
         note: limitation of the result, as text.
+        until_ns: time of the last step; None if there is none.
     """
 
     steps: int
@@ -55,6 +56,7 @@ class SchedulerReplay:
     real_s: float = 0.0
     recorded_s: float = 0.0
     note: str = ""
+    until_ns: int | None = None
 
 
 def read_steps(path: Path, core_of: CoreOf) -> Iterator[tuple[MakeCore, Restored] | Step]:
@@ -135,10 +137,11 @@ def replay(recorded: Iterable[tuple[MakeCore, Restored] | Step]) -> SchedulerRep
         if stopped:
             break
     real_s, recorded_s = time.perf_counter() - began_s, (times[-1] - times[0]) / 1e9 if times else 0.0
+    until_ns = times[-1] if times else None
     if first is None:
-        return SchedulerReplay(steps, len(before), [], None, None, stopped, real_s, recorded_s, note)
+        return SchedulerReplay(steps, len(before), [], None, None, stopped, real_s, recorded_s, note, until_ns)
     same, differences = aligned("scheduler", before, now)
-    return SchedulerReplay(steps, same, differences, first, parted, stopped, real_s, recorded_s, note)
+    return SchedulerReplay(steps, same, differences, first, parted, stopped, real_s, recorded_s, note, until_ns)
 
 
 def _stepped(core: SchedulerCore, one: Step) -> list[list[Any]]:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from datetime import UTC
 from pathlib import Path
 from typing import Any
 
+from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import ConfigError, FileError, InvalidValue
+from afspm.basics.formatting import day_and_time
 from afspm.basics.launch import Launch
 from afspm.client import port_log
 from afspm.client.component import Component
@@ -31,6 +34,8 @@ from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.run import HOMES
 from afspm.transport.process.loading import find_class, load
 
+_EMPTY = "its log is empty"
+_SHORT_BY_S, _SHORT_BY_REAL_S = 60.0, 2.0
 _UNRECORDED = {
     "has_people": "what people do at its pages is not in the record",
     "is_instrument": "the answers of its instrument are not in the record",
@@ -72,6 +77,7 @@ class WhatIf:
         left_out: reasons why processes were left out, by name.
         untried: reasons why a change of the experiment file was not tried, by the name of its table.
         simulated: whether the microscope was simulated.
+        short: times at which logs end well before the run, by name: after a full disk, or a kill without a restart.
     """
 
     run: Path
@@ -83,6 +89,7 @@ class WhatIf:
     left_out: dict[str, str] = field(default_factory=dict)
     untried: dict[str, str] = field(default_factory=dict)
     simulated: bool = False
+    short: dict[str, int] = field(default_factory=dict)
 
     @property
     def first(self) -> Difference | None:
@@ -145,6 +152,8 @@ class WhatIf:
         notes = [one.stopped] if one is not None and one.stopped else []
         if one is None and name == self.scheduler_name and self.scheduler is not None:
             notes = [text for text in (self.scheduler.stopped, self.scheduler.note) if text]
+        if (until_ns := self.short.get(name)) is not None:
+            notes.append(f"its record ends at {day_and_time(until_ns, UTC)}, before the run")
         if control is not None and control.first is not None:
             notes.append("the unchanged component differs, too")
         elif control is not None:
@@ -210,15 +219,32 @@ def what_if(run: str | Path, changes: Changes = None, *, only: Collection[str] =
                 continue
             try:
                 if path.name.endswith(step_log.SUFFIX):
-                    result.scheduler_name = name
-                    result.scheduler = scheduler_replay.replay_file(path, changed.get(name, (None, None))[0])
+                    _replay_scheduler(result, name, path, changed.get(name))
                 else:
                     _replay(result, name, read_lives(path), packet_of, changed.get(name))
             except (FileError, ConfigError) as error:
                 if name in changed or only:
                     raise
                 result.unread[name] = str(error)
+        result.short = _short(result, record)
         return result
+
+
+def _replay_scheduler(result: WhatIf, name: str, path: Path, changed: Changed | None) -> None:
+    made = scheduler_replay.replay_file(path, None if changed is None else changed[0])
+    if not made.steps:
+        result.unread[name] = _EMPTY
+        return
+    result.scheduler_name, result.scheduler = name, made
+
+
+def _short(result: WhatIf, record: Run) -> dict[str, int]:
+    ends = {name: one.until_ns for name, one in result.components.items()}
+    if result.scheduler is not None:
+        ends[result.scheduler_name] = result.scheduler.until_ns
+    speed = float(run_json_or_empty(record.folder).get("clock", {}).get("speed", 1.0))
+    latest_ns = record.newest_ns - round(max(_SHORT_BY_S, _SHORT_BY_REAL_S * speed) * NS_PER_S)
+    return {name: until_ns for name, until_ns in ends.items() if until_ns is not None and until_ns < latest_ns}
 
 
 Changed = tuple[Mapping[str, Any] | None, component_replay.Make | None]
@@ -232,7 +258,7 @@ def _replay(
     changed: Changed | None,
 ) -> None:
     if not lives:
-        result.unread[name] = "its log is empty"
+        result.unread[name] = _EMPTY
         return
     if why := _unrecorded(lives[0].facts["launch"]["class"]):
         result.left_out[name] = why
