@@ -223,6 +223,19 @@ def test_time_at_which_a_note_was_written_is_no_difference(night: Path) -> None:
     assert all(one.recorded and one.now and one.recorded.text != one.now.text for one in result.differences)
 
 
+def test_decision_between_two_packets_has_its_own_time(tmp_path: Path) -> None:
+    lab.record(tmp_path, {"patient": lab.Patient()}, until="25 min")
+    assert not any(row.note for row in afspm.what_if(tmp_path, only=["patient"]).table())
+    result = afspm.what_if(tmp_path, {"patient": {"ticks": 10_000}})
+    began_ns = open_run(tmp_path).oldest_ns
+    assert result.first is not None
+    assert result.first.at_ns - began_ns == pytest.approx(110 * 10e9, abs=11e9)  # its newest packet came at 10 min
+    assert result.counterfactual_from_ns == result.first.at_ns
+    earlier = afspm.what_if(tmp_path, {"patient": {"ticks": 105}})
+    notes = {row.name: row.note for row in earlier.table()}
+    assert notes == {**dict.fromkeys(notes, ""), "patient": "the same outputs, up to 50 s earlier or later"}
+
+
 # --- mutants ---
 
 

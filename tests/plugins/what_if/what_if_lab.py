@@ -92,6 +92,21 @@ class Alarmist(Component):
             self.scope.clear("tip-shape-changed")
 
 
+class Patient(Component):
+    """Flags the tip after some ticks, between two packets."""
+
+    period_s = 10.0
+    listens = ("ControlState",)
+
+    def __init__(self, ticks: int = 110) -> None:
+        self.ticks = ticks
+
+    def on_tick(self) -> None:
+        self.memory["ticks"] = self.memory.get("ticks", 0) + 1
+        if self.memory["ticks"] == self.ticks:
+            self.scope.flag("tip-shape-changed")
+
+
 class WallClock(Remarks):
     def remark(self, scan: Scan) -> str:
         return f"at {time.time_ns()}"

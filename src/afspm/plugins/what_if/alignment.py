@@ -29,7 +29,7 @@ class Output:
         value: content, which is compared.
         text: description, for people.
         packet: the packet being handled, or else the newest packet; None if no packet has arrived.
-        time_ns: experiment time.
+        time_ns: experiment time: of the packet being handled, or else of the wake-up before the output.
         life: number of the process's life (from a start to its end), from 1.
         reaches: whether the output changes the microscope, or its control.
     """
@@ -70,8 +70,8 @@ class Difference:
 
     @property
     def at_ns(self) -> int:
-        """The earlier time of the two sides: the time of the packet, or of an output without a packet."""
-        return min(one.packet.time_ns if one.packet else one.time_ns for one in self._sides)
+        """The earlier time of the two sides."""
+        return min(one.time_ns for one in self._sides)
 
     @property
     def packet(self) -> PacketName | None:

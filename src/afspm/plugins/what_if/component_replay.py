@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import logging
 import shutil
@@ -47,6 +48,7 @@ class ComponentReplay:
         stopped: reason why the replay ended before the record; empty for a complete replay.
         real_s: real time of the replay.
         recorded_s: experiment time that the record covers.
+        shifted_s: largest difference of time between equal outputs before the first difference.
         until_ns: time of the end of the log, if the last life has no recorded end; None otherwise.
     """
 
@@ -62,9 +64,14 @@ class ComponentReplay:
     same: int = 0
     differences: list[Difference] = field(default_factory=list)
     first: Difference | None = None
+    shifted_s: float = 0.0
 
     def __post_init__(self) -> None:
         self.first = first_difference(self.name, self.recorded, self.now)
+        equal = itertools.takewhile(
+            lambda pair: pair[0].is_as == pair[1].is_as, zip(self.recorded, self.now, strict=False)
+        )
+        self.shifted_s = max((abs(one.time_ns - other.time_ns) / NS_PER_S for one, other in equal), default=0.0)
         if self.first is None:
             self.same = len(self.recorded)
         else:
@@ -195,7 +202,7 @@ def _run(launch: Launch, port: ReplayPort, life: Life, make: Make, outputs: Outp
     if port.missing is not None:
         raise port.missing
     if ended is not None and (life.end is not None or not port.is_over):
-        port.outputs.append(outputs.end(ended, port.place(), port.clock.shown_ns))
+        port.outputs.append(outputs.end(ended, *port.place()))
 
 
 def _made(launch: Launch, make: Make) -> ExperimentProcess:

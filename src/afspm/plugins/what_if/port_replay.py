@@ -208,6 +208,7 @@ class ReplayPort:
         self._answers = _answers(life)
         self._ids: dict[str, str] = {}
         self._polls = 0
+        self._woken_ns: int = facts["now_ns"]
         self.outputs: list[Output] = []
         self.differs = False
         self.unanswered = ""
@@ -239,7 +240,7 @@ class ReplayPort:
     def send(self, frames: Sequence[bytes]) -> None:
         self._end_if_killed()
         there = tuple(map(bytes, frames))
-        output = self._reader.request(there, self.place(), self._clock.shown_ns)
+        output = self._reader.request(there, *self.place())
         request_id = wire.id_of(frames)
         if output is not None and (not request_id or request_id not in self._sent):
             self.outputs.append(output)
@@ -252,7 +253,7 @@ class ReplayPort:
 
     def publish(self, envelope: str, payload: bytes) -> None:
         self._end_if_killed()
-        self.outputs.append(self._reader.message(envelope, bytes(payload), self.place(), self._clock.shown_ns))
+        self.outputs.append(self._reader.message(envelope, bytes(payload), *self.place()))
         self._follows((envelope.encode(), bytes(payload)), is_request=False)
 
     def _follows(self, frames: tuple[bytes, ...], *, is_request: bool) -> bool:
@@ -294,10 +295,14 @@ class ReplayPort:
         reason = f"the value of {name} is not in the record"
         return Response(int(ControlResponse.FAILURE), b"", reason, request_id)
 
-    def place(self) -> PacketName | None:
-        """Return the packet that the component is handling, or else the newest received packet; None before any."""
+    def place(self) -> tuple[PacketName | None, int]:
+        """Return the packet that the component is handling, and its time.
+
+        Between packets: the newest received packet (None before any), and the time of the last wake-up.
+        """
         packet = self.handled()
-        return self._newest if packet is None else PacketName(packet.time_ns or 0, packet.envelope)
+        handled = None if packet is None else PacketName(packet.time_ns or 0, packet.envelope)
+        return _place(handled, self._newest, self._woken_ns)
 
     # --- inputs of the component ---
 
@@ -318,12 +323,14 @@ class ReplayPort:
                 break
             self._polls = 0
             self._clock.move(line.monotonic_s, line.now_ns)
+            self._woken_ns = line.now_ns
             self._advance()
             if line.events or line.timeout_s == timeout_s:
                 return self._incoming(line.events)
             self._skip_sent()
         self._end_if_over()
         self._clock.pass_by(timeout_s or 0.0)
+        self._woken_ns = self._clock.shown_ns
         return []
 
     def _skip_sent(self) -> None:
@@ -378,6 +385,12 @@ class ReplayPort:
             self._end_if_over()
 
 
+def _place(handled: PacketName | None, newest: PacketName | None, now_ns: int) -> tuple[PacketName | None, int]:
+    if handled is not None:
+        return handled, handled.time_ns or now_ns
+    return newest, now_ns
+
+
 def recorded_outputs(life: Life, outputs: OutputReader) -> Iterator[Output]:
     """Yield all outputs of a recorded life, and its end if recorded; repetitions of a request are left out."""
     sent: set[str] = set()
@@ -390,12 +403,12 @@ def recorded_outputs(life: Life, outputs: OutputReader) -> Iterator[Output]:
                 if kind == "packet":
                     newest = PacketName(rest[1] or 0, rest[0])
             continue
-        place = line.handled or newest
+        place, at_ns = _place(line.handled, newest, now_ns)
         if not line.is_request:
-            yield outputs.message(line.frames[0].decode(), line.frames[1], place, now_ns)
+            yield outputs.message(line.frames[0].decode(), line.frames[1], place, at_ns)
             continue
         request_id = wire.id_of(line.frames)
-        output = outputs.request(line.frames, place, now_ns)
+        output = outputs.request(line.frames, place, at_ns)
         if output is not None and (not request_id or request_id not in sent):
             yield output
         sent.add(request_id)

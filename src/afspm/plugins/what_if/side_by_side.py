@@ -64,7 +64,10 @@ def message_name(one: Difference) -> str:
 def where(one: Difference) -> str:
     """Return the time (UTC) and the packet of a difference, as text."""
     at = day_and_time(one.at_ns, UTC)
-    return f"{at}, at the packet {one.packet.envelope}" if one.packet else f"{at}, before the first packet"
+    if one.packet is None:
+        return f"{at}, before the first packet"
+    when = "at" if one.at_ns == one.packet.time_ns else "after"
+    return f"{at}, {when} the packet {one.packet.envelope}"
 
 
 def _fields(output: Output | None) -> dict[str, str]:

@@ -11,7 +11,7 @@ from typing import Any
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import ConfigError, FileError, InvalidValue
-from afspm.basics.formatting import day_and_time
+from afspm.basics.formatting import day_and_time, duration_text
 from afspm.basics.launch import Launch
 from afspm.client import port_log
 from afspm.client.component import Component
@@ -34,6 +34,7 @@ from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.run import HOMES
 from afspm.transport.process.loading import find_class, load
 
+_SHIFTED_S = 1.0
 _EMPTY = "its log is empty"
 _SHORT_BY_S, _SHORT_BY_REAL_S = 60.0, 2.0
 _UNRECORDED = {
@@ -152,6 +153,8 @@ class WhatIf:
         notes = [one.stopped] if one is not None and one.stopped else []
         if one is None and name == self.scheduler_name and self.scheduler is not None:
             notes = [text for text in (self.scheduler.stopped, self.scheduler.note) if text]
+        if one is not None and one.shifted_s > _SHIFTED_S:
+            notes.append(f"the same outputs, up to {duration_text(one.shifted_s)} earlier or later")
         if (until_ns := self.short.get(name)) is not None:
             notes.append(f"its record ends at {day_and_time(until_ns, UTC)}, before the run")
         if control is not None and control.first is not None:
