@@ -122,6 +122,19 @@ def test_component_that_asks_for_another_scan_ends_where_the_record_has_no_answe
     assert result.first.reaches
 
 
+def test_class_that_listens_to_more_than_its_record_is_noted(night: Path, tmp_path: Path) -> None:
+    class Curious(lab.Judge):
+        listens = ("Scan2d", "ScopeStateMsg")
+
+    shutil.copytree(night, tmp_path, dirs_exist_ok=True)
+    log = tmp_path / "requests" / "judge.jsonl"
+    log.write_text(log.read_text().replace('"envelopes":null', '"envelopes":["Scan2d"]'))
+    (row,) = afspm.what_if(tmp_path, {"judge": Curious}, only=["judge"]).table()
+    assert row.note == "it listens to ScopeStateMsg, too, which its record lacks"
+    (row,) = afspm.what_if(night, {"judge": Curious}, only=["judge"]).table()
+    assert not row.note
+
+
 def test_error_of_a_changed_component_is_a_difference(night: Path) -> None:
     class Broken(lab.Judge):
         def remark(self, scan: Any) -> str:

@@ -49,6 +49,7 @@ class ComponentReplay:
         real_s: real time of the replay.
         recorded_s: experiment time that the record covers.
         shifted_s: largest difference of time between equal outputs before the first difference.
+        unheard: prefixes of envelopes that the class listens to, but that were not subscribed to in the record.
         until_ns: time of the end of the log, if the last life has no recorded end; None otherwise.
     """
 
@@ -61,6 +62,7 @@ class ComponentReplay:
     real_s: float = 0.0
     recorded_s: float = 0.0
     until_ns: int | None = None
+    unheard: tuple[str, ...] = ()
     same: int = 0
     differences: list[Difference] = field(default_factory=list)
     first: Difference | None = None
@@ -145,7 +147,7 @@ def _replay(
             home.begin(life, is_own=_parted(recorded, now))
             with guard.active(), guard.watching() if watch else nullcontext():
                 port = ReplayPort(life, outputs, packet_of)
-                _run(launch, port, life, make, outputs)
+                component = _run(launch, port, life, make, outputs)
             now += port.outputs
             if port.unanswered:
                 stopped = f"the record has no answer to: {port.unanswered}"
@@ -155,12 +157,20 @@ def _replay(
         name, recorded, now, list(guard.seen), guard.forbidden, stopped, time.perf_counter() - began_s,
         max(0.0, (until_ns - lives[0].facts["now_ns"]) / NS_PER_S),
         until_ns if lives[-1].end is None else None,
+        _unheard(launch, component),
     )  # fmt: skip
 
 
 def _parted(recorded: Sequence[Output], now: Sequence[Output]) -> bool:
     # `recorded` already contains the outputs of the next life: only as many outputs as in `now` are compared
     return first_difference("", recorded[: len(now)], now) is not None
+
+
+def _unheard(launch: Launch, component: object) -> tuple[str, ...]:
+    if launch.envelopes is None:
+        return ()
+    listens = getattr(component, "listens", None) or ("",)
+    return tuple(prefix for prefix in listens if not prefix.startswith(tuple(launch.envelopes)))
 
 
 def _until_ns(life: Life) -> int:
@@ -178,7 +188,7 @@ def _launch(life: Life, folder: Path, settings: Mapping[str, Any] | None) -> Lau
     )
 
 
-def _run(launch: Launch, port: ReplayPort, life: Life, make: Make, outputs: OutputReader) -> None:
+def _run(launch: Launch, port: ReplayPort, life: Life, make: Make, outputs: OutputReader) -> ExperimentProcess:
     log = logging.getLogger(f"afspm.what_if.{launch.name}")
     log.propagate, log.disabled = False, True
     register_all(launch.messages)
@@ -203,6 +213,7 @@ def _run(launch: Launch, port: ReplayPort, life: Life, make: Make, outputs: Outp
         raise port.missing
     if ended is not None and (life.end is not None or not port.is_over):
         port.outputs.append(outputs.end(ended, *port.place()))
+    return component
 
 
 def _made(launch: Launch, make: Make) -> ExperimentProcess:

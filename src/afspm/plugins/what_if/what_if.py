@@ -79,6 +79,7 @@ class WhatIf:
         untried: reasons why a change of the experiment file was not tried, by the name of its table.
         simulated: whether the microscope was simulated.
         short: times at which logs end well before the run, by name: after a full disk, or a kill without a restart.
+        subscribed: names of components whose subscriptions are in the experiment file, instead of the class.
     """
 
     run: Path
@@ -91,6 +92,7 @@ class WhatIf:
     untried: dict[str, str] = field(default_factory=dict)
     simulated: bool = False
     short: dict[str, int] = field(default_factory=dict)
+    subscribed: Collection[str] = ()
 
     @property
     def first(self) -> Difference | None:
@@ -155,6 +157,9 @@ class WhatIf:
             notes = [text for text in (self.scheduler.stopped, self.scheduler.note) if text]
         if one is not None and one.shifted_s > _SHIFTED_S:
             notes.append(f"the same outputs, up to {duration_text(one.shifted_s)} earlier or later")
+        if one is not None and one.unheard and name not in self.subscribed:
+            topics = " and ".join(prefix or "all messages" for prefix in one.unheard)
+            notes.append(f"it listens to {topics}, too, which its record lacks")
         if (until_ns := self.short.get(name)) is not None:
             notes.append(f"its record ends at {day_and_time(until_ns, UTC)}, before the run")
         if control is not None and control.first is not None:
@@ -215,6 +220,7 @@ def what_if(run: str | Path, changes: Changes = None, *, only: Collection[str] =
             )
         result = WhatIf(record.folder, left_out=_without_log(record, logs), simulated=record.simulated)
         result.untried = untried
+        result.subscribed = _subscribed(record)
         packet_of = recorded_packets(record)
         for name, path in sorted(logs.items()):
             if only and name not in only:
@@ -312,6 +318,13 @@ def _without_log(record: Run, logs: Mapping[str, Path]) -> dict[str, str]:
     if not (record.folder / EXPERIMENT_FILE).is_file():
         return {}
     return {name: why for name, part in record.experiment.items() if _is_component(part) and name not in logs}
+
+
+def _subscribed(record: Run) -> list[str]:
+    if not (record.folder / EXPERIMENT_FILE).is_file():
+        return []
+    keys = {"envelopes", "subscriber"}
+    return [name for name, part in record.experiment.items() if _is_component(part) and keys & part.keys()]
 
 
 def _is_component(part: object) -> bool:
