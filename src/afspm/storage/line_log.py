@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from afspm.basics.errors import FileError
 from afspm.basics.plain_data import PlainList
+from afspm.storage.disk import DEADLINE_S, DiskBacklogFull, DiskThread, DiskTimeout
 
 REQUESTS_FOLDER = "requests"
 """Folder of a run with the logs that `[record] requests = true` keeps."""
@@ -18,39 +20,69 @@ REQUESTS_FOLDER = "requests"
 class LineLog:
     """A writer that appends lines to a file.
 
-    A write error must not end the experiment: it is logged once, and the log ends there until a restart.
+    A line is awaited for a moment only (`afspm.storage.disk`): on a hanging disk lines are written once it answers. A
+    write error must not end the experiment: it is logged once, and the log ends there until a restart.
     """
 
     def __init__(self, path: Path, logger: logging.Logger) -> None:
         self._path = path
         self._logger = logger
+        self._disk = DiskThread()
         self._file: int | None = None
-        self._open()
-
-    def _open(self) -> None:
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-            os.write(self._file, b"\n")  # a kill or a full disk may have left half a line
-        except OSError as error:
-            self._give_up(error)
+        self._failure: OSError | None = None
+        self._is_closed = self._is_late = False
+        self._do(self._open)
 
     def add(self, line: PlainList) -> None:
         """Append a line of JSON's types."""
-        if self._file is None:
-            return
-        try:
-            text = memoryview(json.dumps(line, separators=(",", ":")).encode() + b"\n")
-            while text:
-                text = text[os.write(self._file, text) :]
-        except OSError as error:
-            self._give_up(error)
+        if not self._is_closed:
+            text = json.dumps(line, separators=(",", ":")).encode() + b"\n"
+            self._do(lambda: self._write(text), len(text))
 
     def close(self) -> None:
         """Close the file. Safe to repeat."""
-        if self._file is not None:
+        if self._is_closed:
+            return
+        self._is_closed = True
+        if self._disk.close(DEADLINE_S) and self._file is not None:
             os.close(self._file)
             self._file = None
+
+    def _do(self, work: Callable[[], None], size: int = 0) -> None:
+        try:
+            self._disk.run(work, size)
+        except DiskBacklogFull as error:
+            self._give_up(error)
+        except DiskTimeout as error:
+            if not self._is_late:
+                self._logger.warning("requests are recorded late: %s", error)
+            self._is_late = True
+        except OSError as error:
+            self._give_up(error)
+        else:
+            self._is_late = False
+
+    def _open(self) -> None:
+        with self._failing():
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+            os.write(self._file, b"\n")  # a kill or a full disk may have left half a line
+
+    def _write(self, line: bytes) -> None:
+        if self._failure is not None or self._file is None:  # of a late line: the log has no gaps
+            raise self._failure or OSError("the file is not open")
+        with self._failing():
+            text = memoryview(line)
+            while text:
+                text = text[os.write(self._file, text) :]
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self._failure = error
+            raise
 
     def _give_up(self, error: OSError) -> None:
         self._logger.error("requests are no longer recorded, what-if can replay up to here only: %s", error)
