@@ -46,6 +46,9 @@ def test_recorded_run_with_kills_repeats_its_record(run: Run, tmp_path: Path, mo
     fewer = afspm.what_if(folder, changed)
     assert fewer.first is not None
     assert fewer.first.component == "series"
+    assert afspm.what_if(folder, {"series": {"size": ["2 um", "2 um"]}}, only=["series"]).differs
+    with pytest.raises(ConfigError, match="series"):
+        afspm.what_if(folder, {"series": {"size": ["2 um", "2 V"]}})
     untried = tmp_path / "untried.toml"
     for text in ("[microscope]\nseed = 12\n", "[serie]\nscans = 2\n"):  # nothing of it is in a replay
         untried.write_text(text, encoding="utf-8")

@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from afspm.basics.clock import NS_PER_S
@@ -19,6 +20,7 @@ from afspm.experiment import Experiment
 from afspm.experiment.class_loader import importing_from
 from afspm.experiment.experiment import load_expanded
 from afspm.experiment.parts import ExperimentPart
+from afspm.experiment.toml_writer import dumps
 from afspm.model import Role
 from afspm.plugins.what_if import component_replay, hash_seeds, scheduler_replay
 from afspm.plugins.what_if.alignment import Difference
@@ -314,7 +316,9 @@ def _logs(folder: Path) -> dict[str, Path]:
 
 
 def _without_log(record: Run, logs: Mapping[str, Path]) -> dict[str, str]:
-    why = "its requests are not in the record; only the scheduler and subclasses of Component keep them"
+    why = (
+        "its requests are not in this folder; only the scheduler and subclasses of Component keep them, where they run"
+    )
     if not (record.folder / EXPERIMENT_FILE).is_file():
         return {}
     return {name: why for name, part in record.experiment.items() if _is_component(part) and name not in logs}
@@ -342,12 +346,28 @@ def _changed(folder: Path, changes: Changes, logs: Mapping[str, Path]) -> tuple[
         if isinstance(change, type):
             found[name] = (None, _made_by(change))
         elif isinstance(change, Mapping):
-            found[name] = ({**_settings(logs[name]), **change}, None) if name in logs else (change, None)
+            settings = {**_settings(logs[name]), **_in_si(folder, name, change)} if name in logs else change
+            found[name] = (settings, None)
         else:
             raise InvalidValue(
                 f"a change can't be {change!r}", where=name, hint="give a dict of settings, or a class of a component"
             )
     return found, {}
+
+
+def _in_si(folder: Path, name: str, change: Mapping[str, Any]) -> Mapping[str, Any]:
+    # texts may have units, as in an experiment file
+    if not ('"' in json.dumps([*change.values()], default=repr) and (folder / EXPERIMENT_FILE).is_file()):
+        return change
+    with TemporaryDirectory(prefix="afspm-what-if-") as made:
+        overlay = Path(made) / "changed.toml"
+        try:
+            overlay.write_text(dumps({name: dict(change)}), encoding="utf-8")
+        except (TypeError, ValueError):  # an object, for a class of the caller
+            return change
+        starts = changed_experiment(folder, overlay).launches(take_address=FreePorts().address)
+    settings = next((one.launch.settings for one in starts if one.launch.name == name), {})
+    return {key: settings.get(key, value) for key, value in change.items()}
 
 
 def _made_by(class_: type[Component]) -> component_replay.Make:
