@@ -22,6 +22,7 @@ import afspm
 from afspm import wire
 from afspm.basics.errors import ConfigError, FileError, InvalidValue
 from afspm.plugins.what_if import component_replay, what_if
+from afspm.plugins.what_if.closed_loop import Outcomes
 from afspm.plugins.what_if.commands import DIFFERS, INCOMPLETE, app
 from afspm.plugins.what_if.port_replay import read_lives
 from afspm.plugins.what_if.recorded_packets import recorded_packets
@@ -467,6 +468,14 @@ def test_command_prints_json_for_programs(night: Path) -> None:
     assert facts["first"]["component"] == "judge"
     assert facts["first"]["packet"]["envelope"].startswith("Scan2d")
     assert [row["name"] for row in facts["table"]] == ["judge"]
+
+
+@pytest.mark.parametrize(
+    ("scans", "lasted_alike", "differs"), [("10", True, False), ("10", False, True), ("9", True, True)]
+)
+def test_duration_of_equal_nights_is_no_difference(scans: str, lasted_alike: bool, differs: bool) -> None:
+    rows = {"lasted": ("1 h 18 min", "1 h 23 min"), "whole scans": ("10", scans)}
+    assert Outcomes(Path("again"), rows, lasted_alike).differs == differs
 
 
 @pytest.mark.parametrize(
