@@ -250,6 +250,14 @@ def test_decision_between_two_packets_has_its_own_time(tmp_path: Path) -> None:
     assert notes == {**dict.fromkeys(notes, ""), "patient": "the same outputs, up to 50 s earlier or later"}
 
 
+def test_loop_that_waits_for_a_time_ends_the_replay(tmp_path: Path) -> None:
+    lab.record(tmp_path, {"settling": lab.Settling()}, until="15 min")
+    assert afspm.what_if(tmp_path).first is None
+    result = afspm.what_if(tmp_path, {"settling": {"settle_s": 2.0}}, only=["settling"])
+    assert result.differs
+    assert "it reads the clock without end" in result.table()[0].note
+
+
 # --- mutants ---
 
 

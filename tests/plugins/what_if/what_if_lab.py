@@ -107,6 +107,19 @@ class Patient(Component):
             self.scope.flag("tip-shape-changed")
 
 
+class Settling(Remarks):
+    """Waits after each scan for a time, instead of for an event."""
+
+    def __init__(self, settle_s: float = 0.0) -> None:
+        self.settle_s = settle_s
+
+    def remark(self, scan: Scan) -> str:
+        until_s = self.clock.monotonic_s() + self.settle_s
+        while self.clock.monotonic_s() < until_s:
+            pass
+        return "settled"
+
+
 class WallClock(Remarks):
     def remark(self, scan: Scan) -> str:
         return f"at {time.time_ns()}"

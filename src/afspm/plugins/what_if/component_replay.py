@@ -149,8 +149,8 @@ def _replay(
                 port = ReplayPort(life, outputs, packet_of)
                 component = _run(launch, port, life, make, outputs)
             now += port.outputs
-            if port.unanswered:
-                stopped = f"the record has no answer to: {port.unanswered}"
+            if port.unanswered or port.clock.stuck:
+                stopped = port.clock.stuck or f"the record has no answer to: {port.unanswered}"
                 break
     until_ns = _until_ns(lives[-1])
     return ComponentReplay(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from base64 import b64decode
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
@@ -37,6 +38,7 @@ _ANSWERABLE = {
 }  # fmt: skip
 _DONE = "answered"
 _MOST_POLLS = 100_000  # without any progress
+_MOST_READINGS = 1_000  # a loop may sleep between two
 
 
 class LifeOver(BaseException):
@@ -123,12 +125,22 @@ def _name(handled: Sequence[Any] | None) -> PacketName | None:
 
 
 class ReplayClock:
-    """Clock that shows the recorded readings in order; without a reading, the time of the last recorded event."""
+    """Clock that shows the recorded readings in order; without a reading, the time of the last recorded event.
+
+    As in the record, only readings by the component's own thread count. No time passes between events, so a loop that
+    waits for a time, instead of an event, ends the replay.
+
+    Attributes:
+        stuck: reason why the clock ended the replay; empty otherwise.
+    """
 
     def __init__(self, monotonic_s: float, now_ns: int, speed: float) -> None:
         self._speed = speed or 1.0
         self._shown: dict[str, Any] = {"m": monotonic_s, "n": now_ns, "s": now_ns / 1e9}
         self._coming: dict[str, deque[Any]] = defaultdict(deque)
+        self._thread = threading.get_ident()
+        self._unrecorded = 0  # readings since the last event
+        self.stuck = ""
 
     def monotonic_s(self) -> float:
         return float(self._read("m"))
@@ -140,7 +152,7 @@ class ReplayClock:
         return float(self._read("s"))
 
     def real_s(self, experiment_s: float) -> float:
-        coming = self._coming["r"]
+        coming = self._coming["r"] if threading.get_ident() == self._thread else None
         return float(coming.popleft()) if coming else experiment_s / self._speed
 
     def late(self) -> AbstractContextManager[None]:
@@ -164,6 +176,7 @@ class ReplayClock:
 
     def move(self, monotonic_s: float, now_ns: int) -> None:
         """Advance to the time of an event; the clock never goes back."""
+        self._unrecorded = 0
         self._shown["m"] = max(self._shown["m"], monotonic_s)
         if now_ns > self._shown["n"]:
             self._shown["n"], self._shown["s"] = now_ns, now_ns / 1e9
@@ -173,8 +186,15 @@ class ReplayClock:
         self.move(self._shown["m"] + seconds, self._shown["n"] + round(seconds * self._speed * 1e9))
 
     def _read(self, kind: str) -> Any:
+        if threading.get_ident() != self._thread:
+            return self._shown[kind]
         if coming := self._coming[kind]:
             self._shown[kind] = coming.popleft()
+        else:
+            self._unrecorded += 1
+            if self._unrecorded > _MOST_READINGS:
+                self.stuck = "it reads the clock without end, and no time passes"
+                raise LifeOver
         return self._shown[kind]
 
 
