@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -67,6 +68,16 @@ def test_killed_anywhere_the_unchanged_night_repeats_its_record(tmp_path: Path, 
     result = afspm.what_if(tmp_path)
     assert result.first is None
     assert len(read_lives(tmp_path / "requests" / "series.jsonl")) > 1
+
+
+def test_ids_of_requests_are_no_difference(night: Path, tmp_path: Path) -> None:
+    """Another version may number its requests in another way."""
+    shutil.copytree(night, tmp_path, dirs_exist_ok=True)
+    for log in (tmp_path / "requests").glob("*.jsonl"):
+        log.write_text(re.sub(r'"session":"\w+"', '"session":"another"', log.read_text()))
+    result = afspm.what_if(tmp_path)
+    assert result.first is None
+    assert not any(row.note for row in result.table())
 
 
 def kills_of_judge(bench: Bench) -> None:

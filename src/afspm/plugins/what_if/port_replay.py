@@ -278,11 +278,13 @@ class ReplayPort:
 
     def _follows(self, frames: tuple[bytes, ...], *, is_request: bool) -> bool:
         line = self._line()
-        if not self.differs and isinstance(line, Sent) and (line.frames, line.is_request) == (frames, is_request):
-            self._advance()
-            return True
-        self.differs = True
-        return False
+        if self.differs or not isinstance(line, Sent) or (line.frames[:2], line.is_request) != (frames[:2], is_request):
+            self.differs = True
+            return False
+        if is_request and (recorded_id := wire.id_of(line.frames)) != (request_id := wire.id_of(frames)):
+            self._ids[recorded_id] = request_id  # another version numbers its requests in another way
+        self._advance()
+        return True
 
     def _answer(self, frames: Sequence[bytes], content: bytes, request_id: str) -> None:
         recorded = self._answers.get(content, [])
