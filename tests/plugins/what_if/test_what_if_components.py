@@ -147,6 +147,24 @@ def test_class_that_listens_to_more_than_its_record_is_noted(night: Path, tmp_pa
     assert not row.note
 
 
+def test_changed_memory_is_kept_over_a_kill_though_no_output_has_shown_it(tmp_path: Path) -> None:
+    class Twice(lab.Counting):
+        def counted(self, before: int) -> int:
+            return before + 2 if before == 0 else super().counted(before)
+
+    def kill(bench: Bench) -> None:
+        bench.at("15 min", bench.kill, "counting")
+
+    lab.record(tmp_path, {"counting": lab.Counting()}, kill)
+    assert not afspm.what_if(tmp_path, only=["counting"]).differs
+    first = afspm.what_if(tmp_path, {"counting": Twice}, only=["counting"]).first
+    assert first is not None
+    assert first.recorded is not None
+    assert first.now is not None
+    assert (first.recorded.text, first.now.text) == ("3 scans", "4 scans")
+    assert first.recorded.life == 2
+
+
 def test_error_of_a_changed_component_is_a_difference(night: Path) -> None:
     class Broken(lab.Judge):
         def remark(self, scan: Any) -> str:

@@ -73,6 +73,24 @@ class Judge(Remarks):
         return "rough" if seen and roughness > self.factor * sum(seen) / len(seen) else "smooth"
 
 
+class Counting(Component):
+    """Counts the scans, and writes a note only at the first scan after a kill."""
+
+    def __init__(self) -> None:
+        self.says_nothing = False
+
+    def on_scan(self, scan: Scan) -> None:
+        if scan.channel == CHANNEL:
+            before = self.memory.get("scans", 0)
+            self.memory["scans"] = self.counted(before)
+            if before and not self.says_nothing:
+                self.scope.note(f"{self.memory['scans']} scans")
+            self.says_nothing = True
+
+    def counted(self, before: int) -> int:
+        return before + 1
+
+
 class Alarmist(Component):
     """Flags the tip at the second scan, and clears it at the next tick."""
 

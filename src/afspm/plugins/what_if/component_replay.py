@@ -138,15 +138,18 @@ def _replay(
     recorded, now, stopped = list[Output](), list[Output](), ""
     began_s = time.perf_counter()
     with TemporaryDirectory(prefix="afspm-what-if-") as folder:
-        guard = HazardGuard(Path(folder), (run_dir,))
         home = _Home(Path(folder), run_dir, name)
+        memories = _Memories()
+        guard = HazardGuard(Path(folder), (run_dir,), home.memory, memories.saved)
         for number, life in enumerate(lives, 1):
             launch = _launch(life, home.folder, settings)
             outputs = OutputReader(ProblemNames(launch.problems), number)
+            is_own = first_difference(name, recorded, now) is not None
             recorded += recorded_outputs(life, outputs)
-            home.begin(life, is_own=_parted(recorded, now))
+            home.begin(life, is_own=is_own, remembers=number > 1 and not memories.may_be(life.facts["memory"]))
             with guard.active(), guard.watching() if watch else nullcontext():
                 port = ReplayPort(life, outputs, packet_of)
+                memories.begin(home.memory, port)
                 component = _run(launch, port, life, make, outputs)
             now += port.outputs
             if port.unanswered or port.clock.stuck:
@@ -159,11 +162,6 @@ def _replay(
         until_ns if lives[-1].end is None else None,
         _unheard(launch, component),
     )  # fmt: skip
-
-
-def _parted(recorded: Sequence[Output], now: Sequence[Output]) -> bool:
-    # `recorded` already contains the outputs of the next life: only as many outputs as in `now` are compared
-    return first_difference("", recorded[: len(now)], now) is not None
 
 
 def _unheard(launch: Launch, component: object) -> tuple[str, ...]:
@@ -225,6 +223,30 @@ def _made(launch: Launch, make: Make) -> ExperimentProcess:
         raise ConfigError(f"can't be created: {type(error).__name__}: {error}", where=launch.name) from error
 
 
+class _Memories:
+    """The memories that a life may leave, if it is killed after its last recorded line."""
+
+    def __init__(self) -> None:
+        self._texts: list[str] = []
+        self._port: ReplayPort | None = None
+
+    def begin(self, file: Path, port: ReplayPort) -> None:
+        self._texts = [file.read_text(encoding="utf-8") if file.is_file() else ""]
+        self._port = port
+
+    def saved(self, text: str) -> None:
+        if self._port is not None and not self._port.is_over:
+            self._texts.clear()  # a recorded line follows, so the process lived longer than this save
+        self._texts.append(text)
+
+    def may_be(self, memory: str | None) -> bool:
+        """Return whether a recorded memory is one of them. Another shows a decision that no output has shown yet."""
+        try:
+            return json.loads(memory or "{}") in [json.loads(text or "{}") for text in self._texts]
+        except ValueError:  # the recorded file was damaged
+            return True
+
+
 class _Home:
     """Folders of a replayed component, with its saved files as far as they were recorded."""
 
@@ -233,17 +255,25 @@ class _Home:
         self._state = self.folder / "state"
         self._state.mkdir(parents=True)
         self._name = name
+        self.memory = self._state / f"{name}.json"
         self._results = run_dir / "state" / f"{name}.results"
         for file in (EXPERIMENT_FILE, RUN_FILE):
             if (run_dir / file).is_file():
                 shutil.copy(run_dir / file, self.folder)
 
-    def begin(self, life: Life, *, is_own: bool) -> None:
-        """Restore the files saved at the start of a life, unless the replay continues with its own files (`is_own`)."""
+    def begin(self, life: Life, *, is_own: bool, remembers: bool) -> None:
+        """Restore the files saved at the start of a life.
+
+        Args:
+            is_own: keep all files of the replay instead.
+            remembers: keep only the memory of the replay.
+        """
         if is_own:
             return
-        for kept, file in (("memory", f"{self._name}.json"), ("measurements", f"{self._name}.scope.json")):
-            text, path = life.facts[kept], self._state / file
+        for kept, path in (("memory", self.memory), ("measurements", self._state / f"{self._name}.scope.json")):
+            text = life.facts[kept]
+            if kept == "memory" and remembers:
+                continue
             if text is None:
                 path.unlink(missing_ok=True)
             else:

@@ -59,14 +59,17 @@ class HazardGuard:
     Args:
         folder: folder of the replay, in which the component may do everything.
         known: folders of the record; other files of the user can be read, but count as a hazard.
+        memory: file of the process's memory.
+        on_saved: called with each new text of that file, just before it replaces the former text.
 
     Attributes:
         seen: descriptions of the hazards, in order of occurrence.
         forbidden: description of the first action that was prevented; empty if there was none.
     """
 
-    def __init__(self, folder: Path, known: tuple[Path, ...]) -> None:
+    def __init__(self, folder: Path, known: tuple[Path, ...], memory: Path, on_saved: Callable[[str], None]) -> None:
         self._own = str(folder.resolve()) + os.sep
+        self._memory, self._on_saved = os.path.realpath(memory), on_saved
         paths = {*map(str, known), *sysconfig.get_paths().values(), sys.prefix, sys.base_prefix, str(_AFSPM)}
         self._readable = (
             self._own,
@@ -121,6 +124,8 @@ class HazardGuard:
         elif event == "ctypes.dlopen":
             self._note(f"loads a library that a replay does not guard: {args[0]}")
         elif event in _CHANGES:
+            if event == "os.rename" and _path_of(args[1]) == self._memory:
+                self._on_saved(Path(args[0]).read_text(encoding="utf-8"))
             for at, folder_at in _CHANGES[event]:
                 folder = args[folder_at] if folder_at is not None and folder_at < len(args) else None
                 path = _path_of(args[at], folder)
