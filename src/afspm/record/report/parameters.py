@@ -32,7 +32,7 @@ _LATE_S = 1.0
 
 
 @dataclass(frozen=True)
-class ParameterChange:
+class ChangedParameter:
     """A change of one parameter.
 
     Attributes:
@@ -47,7 +47,7 @@ class ParameterChange:
     after: str
 
 
-def read(run: Run) -> list[ParameterChange]:
+def read(run: Run) -> list[ChangedParameter]:
     """Return the changes of all parameters except scan region, pixels and probe position, in the order of time.
 
     The feedback is published at each change, also at the controller. Other parameters are known from requests only:
@@ -62,9 +62,9 @@ def read(run: Run) -> list[ParameterChange]:
     return sorted(changes, key=lambda change: change.time_ns)
 
 
-def html(changes: Iterable[ParameterChange], clock: PageTimes) -> str:
+def html(changes: Iterable[ChangedParameter], clock: PageTimes) -> str:
     """Return a table with a row for each parameter and author; a click opens its list. Empty without changes."""
-    groups: dict[tuple[str, str], list[ParameterChange]] = {}
+    groups: dict[tuple[str, str], list[ChangedParameter]] = {}
     for one in changes:
         groups.setdefault((one.parameter, one.who), []).append(one)
     rows = [
@@ -87,7 +87,7 @@ def html(changes: Iterable[ParameterChange], clock: PageTimes) -> str:
     return f'{table(heads, rows)}<p class="note">{" ".join(notes)}</p>'
 
 
-def _listed(made: Sequence[ParameterChange], clock: PageTimes) -> str:
+def _listed(made: Sequence[ChangedParameter], clock: PageTimes) -> str:
     rows = [[clock.both(one.time_ns), _known(one.before), escape(one.after)] for one in made[:MOST_LISTED]]
     left_out = len(made) - len(rows)
     more = f'<p class="note">{counted(left_out, "more change")} in the record.</p>' if left_out else ""
@@ -99,7 +99,7 @@ def _known(before: str) -> str:
     return escape(before) or "not known"
 
 
-def _requested(journal: Iterable[JournalEntry], left_out: frozenset[str]) -> Iterable[ParameterChange]:
+def _requested(journal: Iterable[JournalEntry], left_out: frozenset[str]) -> Iterable[ChangedParameter]:
     last: dict[str, str] = {}
     for entry in journal:
         is_set = entry.request == ControlRequest.PARAM and entry.response in _MAY_SET and entry.value
@@ -111,7 +111,7 @@ def _requested(journal: Iterable[JournalEntry], left_out: frozenset[str]) -> Ite
             continue
         after = last[name] = _value(entry.value, entry.unit or names.BASE_PARAMETERS.get(name) or "")
         if after != before:
-            yield ParameterChange(entry.time_ns, entry.who, name, before, after)
+            yield ChangedParameter(entry.time_ns, entry.who, name, before, after)
 
 
 def _value(value: str, unit: str) -> str:
@@ -136,7 +136,7 @@ def _may_set_feedback(entry: JournalEntry) -> bool:
 
 def _of_feedback(
     states: Iterable[tuple[int, Feedback]], requests: Sequence[JournalEntry], late_ns: int
-) -> Iterable[ParameterChange]:
+) -> Iterable[ChangedParameter]:
     requests = sorted(requests, key=_sent_ns)
     before = Feedback()
     # published in SI without a unit, which an accepted request may have
@@ -146,7 +146,9 @@ def _of_feedback(
         for name, old, new in zip(_FEEDBACK, astuple(before), astuple(now), strict=True):
             if old is not None and new is not None and old != new:
                 who = _author(time_ns, requests, late_ns)
-                yield ParameterChange(time_ns, who, name, *(_field(value, units.get(name, "")) for value in (old, new)))
+                yield ChangedParameter(
+                    time_ns, who, name, *(_field(value, units.get(name, "")) for value in (old, new))
+                )
         before = now
 
 

@@ -86,7 +86,7 @@ class RunStory:
     ledger: TreatmentLedger
     comparisons: Sequence[WorkComparison] = ()
     agents: Sequence[agents.AgentWork] = ()
-    changes: Sequence[parameters.ParameterChange] = ()
+    changes: Sequence[parameters.ChangedParameter] = ()
     bands: AllowedBands = field(default_factory=dict)
     unfinished: Mapping[str, str] = field(default_factory=dict)
 
