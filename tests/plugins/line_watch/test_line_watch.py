@@ -69,6 +69,18 @@ def test_changed_tip_is_flagged_while_the_scan_is_running() -> None:
     assert last.confidence > 0.98
 
 
+def test_missing_lines_are_reported_after_three_scans(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab("line_watch")
+    for number, picture in enumerate(night()[:4]):
+        at_s = 100.0 + number * PERIOD_S
+        lab.at(at_s, partial(lab.publish, ScopeStatus(ScopeState.SCANNING)))
+        publish_scan(lab, picture, number, at_s + 30.0)
+        lab.at(at_s + 31.0, partial(lab.publish, ScopeStatus(ScopeState.FREE)))
+    lab.at(900.0, lab.kill)
+    run(LineWatch(), lab)
+    assert [text for text in caplog.messages if "no lines came of the last 3 scans" in text] == caplog.messages[-1:]
+
+
 def test_look_publishes_the_row_and_flags_nothing() -> None:
     lab = Lab("line_watch")
     whole_night(lab)

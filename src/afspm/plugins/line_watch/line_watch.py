@@ -14,11 +14,12 @@ from afspm.client.component import Component
 from afspm.client.events import PublishedEvent
 from afspm.components import tip_verdict
 from afspm.components.channel_pairs import ChannelPairing, HeightPair, MissingChannels
-from afspm.model import ControlState, Feedback, Scan, ScanLines, ScopeState
+from afspm.model import ControlState, Feedback, Scan, ScanLines, ScopeState, ScopeStatus
 from afspm.plugins.line_watch.line_judge import Alarm, AlarmLevel, Kind, LineJudge, ScanJudge, confidence
 from afspm.plugins.line_watch.registration import Array
 
 KEPT_TIMES = 16  # number of scans learnt from whose times are saved: a restarted process may receive them again
+_SCANS_WITHOUT_LINES = 3  # a short scan may end before its first lines are published
 
 
 @dataclass
@@ -106,6 +107,8 @@ class LineWatch(Component):
         self._condition = ""
         self._refused: set[str] = set()
         self._not_judged: set[str] = set()  # reasons that were logged
+        self._has_begun = False
+        self._scans_without_lines = 0
 
     def on_start(self) -> None:
         self.expected = MissingChannels(self.channels, self.log)
@@ -176,10 +179,24 @@ class LineWatch(Component):
             if scan.time_ns in self.memory.get("learnt_ns", ()):
                 self._learn(_Finished(pair, self._kind(pair.trace)), again=True)
             return
+        self._report_missing_lines(has_lines=running is not None)
         self._learn_finished()
         is_whole = running is None or not (running.is_disturbed or (running.judge is not None and running.judge.alarm))
         downwards = running is not None and running.downwards
         self._finished = _Finished(pair, self._kind(scan), downwards, is_whole, is_whole and self._problems == ())
+
+    def on_state(self, status: ScopeStatus) -> None:
+        self._has_begun |= status.state is ScopeState.SCANNING
+
+    def _report_missing_lines(self, *, has_lines: bool) -> None:
+        if has_lines:
+            self._scans_without_lines = 0
+        elif self._has_begun:
+            self._scans_without_lines += 1
+            if self._scans_without_lines == _SCANS_WITHOUT_LINES:
+                what = "no lines came of the last %d scans: nothing is watched. Does the microscope publish lines?"
+                self.log.warning(what, _SCANS_WITHOUT_LINES)
+        self._has_begun = False
 
     def _forget(self) -> None:
         self.judge.forget_places()
