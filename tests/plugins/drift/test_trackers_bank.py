@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ Drift = Callable[[float], Array]
 
 NM = 1e-9
 STEADY = steady((0.05 * NM, -0.03 * NM))
+Y = (np.arange(128) + 0.5) / 64 - 1.0  # of the rows, from -1 to 1
 
 
 def night(seed: int, walk_m: float = NM) -> Drift:
@@ -101,6 +103,48 @@ def test_the_bank_counts_the_wandering_of_the_sample_during_a_scan(walk_m: float
             error = error_m(world, update.after) + wandered_m
             chi2.append(error @ np.linalg.solve(update.after.covariance_m2, error) / 2)
     assert 0.1 < np.mean(chi2) < 2.0
+
+
+class WorldByFeatures(WorldByRows):
+    """Scans in opposite directions are sheared, so they are compared by other rows than scans in one direction."""
+
+    uneven = 0.0
+
+    def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
+        self.uneven = 1.0 if reference.upwards != scan.upwards else 0.0
+        found = super().register(reference, scan, prior)
+        slope = 6.0 / scan.region.size_m[1] * (self._by_row(scan, Y) - self._by_row(reference, Y))
+        return replace(found, linear=np.outer(slope, (0.0, 1.0)))
+
+    def shown_m(self, scan: DriftScan) -> Array:
+        # neither set of weights mistakes a constant velocity for a shift
+        return self._by_row(scan, 1.0 + self.uneven * (3 * Y**2 - 1) / 2)
+
+    def _by_row(self, scan: DriftScan, weights: Array) -> Array:
+        times_s = scan.mid_s + (Y if scan.upwards else -Y) * scan.duration_s / 2
+        return np.asarray(np.mean([w * self.drift_m(float(t)) for t, w in zip(times_s, weights, strict=True)], axis=0))
+
+
+def walking(seed: int, walk_m: float) -> Drift:
+    """A constant velocity, and a random walk of this step in an hour that also distorts scans."""
+    times_s = np.arange(0.0, 2000.0, 4.0)
+    steps = np.random.default_rng(seed).standard_normal((len(times_s), 2))
+    walk = np.cumsum(steps, axis=0) * walk_m * np.sqrt(4.0 / 3600.0)
+    return lambda t: STEADY(t) + np.array([np.interp(t, times_s, walk[:, axis]) for axis in range(2)])
+
+
+def test_distorted_scans_do_not_feign_a_velocity() -> None:
+    """Up, down and up again: the displacements do not add up, which a second's delay must not explain."""
+    for seed in range(12):
+        world = WorldByFeatures(walking(seed, 10 * NM), noise_m=0.03 * NM, seed=seed)
+        following, interval_s = BankTracker(world), FRAME_S + 16.0
+        for k in range(3):
+            time_s = FRAME_S + k * interval_s
+            tip = following.forecast.at(time_s).mapping.inverse.apply((0.0, 0.0))
+            following.add(scan_at(time_s, tip, size_m=SIZE_M / 2, pixels=128, upwards=k != 1, key=str(k)))
+        found = following.forecast.at(time_s)
+        assert np.linalg.norm(found.rate_m_s - STEADY(1.0)) < 0.03 * NM
+        assert np.linalg.norm(error_m(world, following.forecast.at(time_s + interval_s))) < 10.0 * NM
 
 
 def test_errors_do_not_accumulate() -> None:

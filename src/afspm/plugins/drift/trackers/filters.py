@@ -124,6 +124,10 @@ class Filters:
         weight = np.exp(self.log_weight - self.log_weight.max())
         return np.asarray(weight / weight.sum())
 
+    def wandered_m2(self, duration_s: float) -> float:
+        """Return `Models.wandered_m2`, averaged over the filters."""
+        return float(self.weight @ self.models.wandered_m2(duration_s))
+
     def moved(self, time_s: float, followed_m: Array) -> Filters:
         """Return the filters at a later time, in tip coordinates that have moved by `followed_m` (2,) meanwhile."""
         step_s = time_s - self.time_s
