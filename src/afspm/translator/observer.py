@@ -128,8 +128,10 @@ class Observer:
     def _is_of_earlier_scan(self, status: ScopeStatus, results: bool) -> bool:
         # A controller that repeats scans at the panel may never be free: a result that has waited for long during a
         # scan is of the scan before. Without this it would wait for the last scan's end, and be lost if that is a stop.
-        published, now_s = self._state.sequence.published.state, self._clock.now_s()
-        if not (results and status.state is published is ScopeState.SCANNING):
+        # A requested scan is not repeated: then the controller shows the end late.
+        sequence, now_s = self._state.sequence, self._clock.now_s()
+        is_scanning = status.state is sequence.published.state is ScopeState.SCANNING
+        if not (results and is_scanning) or sequence.is_requested:
             self._result_since_s = None
             return False
         if self._result_since_s is None:

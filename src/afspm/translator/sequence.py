@@ -47,6 +47,9 @@ class StatusSequence:
     Args:
         published: the last published status (perhaps by an earlier process of this translator).
         result_timeout_s: longest time from the end to the results, and longest duration of a stop.
+
+    Attributes:
+        is_requested: whether a request to this process began the running measurement.
     """
 
     def __init__(self, published: ScopeStatus, result_timeout_s: float) -> None:
@@ -54,10 +57,13 @@ class StatusSequence:
         self._timeout_s = result_timeout_s
         self._waiting_since_s: float | None = None
         self._broken_off = ScopeState.UNDEFINED
+        self.is_requested = False
 
     def begin(self, state: ScopeState) -> list[SequenceStep]:
         """Return the steps that publish a state after an accepted request, even before the controller shows it."""
-        return self._publish(ScopeStatus(state))
+        steps = self._publish(ScopeStatus(state))
+        self.is_requested = True
+        return steps
 
     def interrupt(self) -> list[SequenceStep]:
         """Return the steps that publish an interruption: a request has stopped the running measurement."""
@@ -137,5 +143,5 @@ class StatusSequence:
             return []
         if status == _INTERRUPTED:
             self._broken_off = self.published.state
-        self.published = status
+        self.published, self.is_requested = status, False
         return [PublishStatus(status)]

@@ -50,5 +50,5 @@ def test_ledger_and_report_of_a_run_have_its_treatments(microscope: str, tmp_pat
     assert ledger.by == {"treats": 3}
     assert 25.0 < ledger.feedback_off_s < 300.0
     table = report[report.index("<h2>Treatments of the tip</h2>") :].partition("</section>")[0]
-    for shown in ("2, together 0.4 V s", "1, together 5 nm deep", "treats 3", "<td>1</td>"):
+    for shown in ("2, voltage × time together 0.4 V s", "1, depth together 5 nm", "treats 3", "<td>1</td>"):
         assert shown in table

@@ -44,6 +44,7 @@ def test_channels_of_a_scan_arrive_a_poll_apart_and_a_move_lasts_one(rig: Bridge
     theirs = Subscriber(plain(zmq.SUB), rig.publish)
     rig.peers.append(theirs)
     rig.until(lambda: theirs.cache)
+    sent_s = time.monotonic()
     for channel in ("Height", "Phase"):
         rig.publish_packet(*wire.encode(Scan(SCAN.region, channel, "m", SCAN.values, 1)))
     rig.publish_packet(*wire.encode(ScopeStatus(ScopeState.MOVING)))
@@ -57,8 +58,9 @@ def test_channels_of_a_scan_arrive_a_poll_apart_and_a_move_lasts_one(rig: Bridge
     ):
         rig.until(is_there)
         arrived_s[name] = time.monotonic()
-    for before, after in (("Height", "Phase"), ("moving", "free")):
-        assert arrived_s[after] - arrived_s[before] > PAUSE_S * 0.8
+    # on a busy computer an arrival is noticed late, but never early
+    assert arrived_s["Phase"] - sent_s > PAUSE_S * 0.8
+    assert arrived_s["free"] - sent_s > 2 * PAUSE_S * 0.8
 
 
 def test_a_late_peer_receives_the_last_packet_of_each_envelope(rig: BridgedRig, plain: Any) -> None:
