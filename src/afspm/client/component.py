@@ -47,7 +47,7 @@ class Component:
                     scans = self.scope.scan(region, shape=(256, 256), key=f"tile-{i}")
 
     Everything runs on one thread, one handler at a time. An exception in a handler ends the process; the supervisor
-    restarts the process, and the scheduler sends the cached packets again, also those handled before.
+    restarts the process, and the scheduler sends the cached packets again, also packets handled before.
 
     The attributes below exist from `on_start` on, not yet in `__init__`.
 

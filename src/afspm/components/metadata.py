@@ -49,9 +49,10 @@ class Metadata(Component):
     holder of control when a scan began while this component was not running.
 
     The last columns are the bias and the setpoint of the feedback when the measurement began. The bias is not
-    published: its column has the last requested value, and is empty before the first request, for a measurement begun
-    at the controller, and from MANUAL mode until the next request. The setpoint is published without a unit:
-    `setpoint_units` is empty until a request sets the parameter `zctrl-setpoint` with a unit.
+    published: its column has the last requested value. It is empty before the first request and for a measurement
+    begun at the controller. MANUAL mode, a lost controller or a restart of the scheduler empties it until the next
+    request. The setpoint is published without a unit: `setpoint_units` is empty until a request sets the parameter
+    `zctrl-setpoint` with a unit.
 
     The file has one header, and each row exactly once, even if processes are killed.
 

@@ -107,7 +107,7 @@ class PlannedScans(Component):
 
     def _set_parameters(self) -> None:
         if not self.parameters:
-            return  # control would be released, perhaps during a scan from before a restart: no flag would stop that
+            return  # control would be released, perhaps in a scan from before a restart: no flag would stop that scan
         with self.clock.late(), self.scope.control():
             for name, quantity in self.parameters.items():
                 self.scope.set(name, quantity)
@@ -212,11 +212,11 @@ class PlannedScans(Component):
     ) -> PlanRest:
         messages = (event.message for event in seen if not isinstance(event.message, ScopeStatus))
         found = [one for one in map(tip_verdict.read_line_verdict, messages) if one is not None and one.stops]
-        # of this scan only: a verdict on an earlier scan, or on another component's, would leave out rows of this one
+        # of this scan only: a verdict on an earlier scan, or on another component's scan, would leave out rows here
         stopping = [one for one in found if one.shape == part.shape and _is_of(one, lasted_ns)]
         if not stopping:
             return rest
-        # a restarted watch, or a second one, may have seen the change later
+        # a restarted or second watch may have seen the change later: the verdict that leaves the most rows counts
         rests = [rest.since(one.since_row, downwards=one.downwards) for one in stopping]
         rest = max(rests, key=lambda one: one.last - one.first)
         self.log.info("%s: rows %d to %d are left", part.key, rest.first, rest.last)

@@ -131,7 +131,7 @@ def _write_surroundings(sample: h5py.Group, readings: Sequence[PlainMapping]) ->
         _write_texts(sensor, {"reason": one.get("reason")})
     for word, quantity in _OF_SAMPLE.items():
         found = [one for one in readings if re.split(r"\W|_", str(one["name"]))[-1] == word]
-        # of two sensors neither is the sample's for certain: a file must not have the one, and the next file the other
+        # of two sensors neither is certainly the sample's: the field could show another sensor in the next file
         if len(found) == 1 and found[0].get("value") is not None:
             values(sample, quantity, float(found[0]["value"]), str(found[0]["unit"]))
 

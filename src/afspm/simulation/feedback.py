@@ -86,7 +86,7 @@ class FeedbackSettings:
         mode: "amplitude" (tapping; the setpoint is an amplitude in V), "current" (tunnelling; in A) or
             "frequency-shift" (non-contact; in Hz, below zero).
         integral_gain: in 1/s: an error decays in about 1 / gain.
-        setpoint: None: 0.7 V, 100 pA or half of the largest frequency shift, by the mode.
+        setpoint: in the unit of the mode. Default: 0.7 V, 100 pA or half of the largest frequency shift.
         free_amplitude_v: amplitude far from the sample.
         sensitivity_m_per_v: sensitivity of the detector.
         lag_s, delay_s: lag of the actuator, delay of the loop; integral gains above about 1 / delay_s oscillate.

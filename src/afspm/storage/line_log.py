@@ -20,8 +20,8 @@ REQUESTS_FOLDER = "requests"
 class LineLog:
     """A writer that appends lines to a file.
 
-    A line is awaited for a moment only (`afspm.storage.disk`): on a hanging disk lines are written once it answers. A
-    write error must not end the experiment: it is logged once, and the log ends there until a restart.
+    A write waits for the disk for at most `DEADLINE_S` (`afspm.storage.disk`): a hanging disk gets the lines once it
+    answers. A write error must not end the experiment: it is logged once, and the log ends there until a restart.
     """
 
     def __init__(self, path: Path, logger: logging.Logger) -> None:

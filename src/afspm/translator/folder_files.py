@@ -42,7 +42,7 @@ class FolderFiles(ResultFiles):
         self._begins(what, {"folder": str(folder), "newest_ns": self.look(folder), **taken})
 
     def look(self, folder: Path) -> int:
-        """Take note of the files in a folder; return the time of the newest, in ns."""
+        """Register the files in a folder as no results; return the time of the newest file, in ns."""
         return self.newest_ns(folder, self._files(folder))
 
     def end(self, now_ns: int) -> None:

@@ -127,8 +127,8 @@ class Observer:
 
     def _is_of_earlier_scan(self, status: ScopeStatus, results: bool) -> bool:
         # A controller that repeats scans at the panel may never be free: a result that has waited for long during a
-        # scan is of the scan before. Without this it would wait for the last scan's end, and be lost if that is a stop.
-        # A requested scan is not repeated: then the controller shows the end late.
+        # scan is of the scan before. Otherwise the result would wait for the end of the last scan, and be lost if that
+        # scan is stopped. A requested scan is not repeated: then the controller shows the end late.
         sequence, now_s = self._state.sequence, self._clock.now_s()
         is_scanning = status.state is sequence.published.state is ScopeState.SCANNING
         if not (results and is_scanning) or sequence.is_requested:

@@ -89,7 +89,7 @@ class ResultFiles(ABC):
         return self._content[result]
 
     def newest_ns(self, folder: Path | None, files: Iterable[Path], what: str = "") -> int:
-        """Return the modification time in ns of the newest file in a folder; only newer files are results.
+        """Return, and store, the modification time in ns of the newest file in a folder; only newer files are results.
 
         A folder may be missing or empty while its network drive is away: the newest file seen before counts then.
 

@@ -49,7 +49,7 @@ class StatusSequence:
         result_timeout_s: longest time from the end to the results, and longest duration of a stop.
 
     Attributes:
-        is_requested: whether a request to this process began the running measurement.
+        is_requested: whether a request to this process began the published state, such as a scan.
     """
 
     def __init__(self, published: ScopeStatus, result_timeout_s: float) -> None:

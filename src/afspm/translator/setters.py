@@ -69,7 +69,7 @@ def apply(driver: DriverBase, values: Mapping[str, Value], about_to_act: Callabl
     # the whole frame: when a part of it is set, a controller may change the rest
     framed = FRAME if not values.keys().isdisjoint(FRAME) else ()
     whole = {*values, *(name for name in framed if name in table)}
-    # a controller with lines per second, and half a frame set, has another speed: it is restored with the frame
+    # at a controller with a line rate a frame half set changes the speed, too: the speed is restored with the frame
     speed = {names.SCAN_SPEED} & table.keys() if framed else set()
     before = driver.in_force(whole | speed)
     wanted = {**before, **values}

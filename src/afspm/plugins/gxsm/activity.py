@@ -175,7 +175,7 @@ class GxsmActivity(Activity):
     # --- start and stop ---
 
     def look(self) -> None:
-        """Take note of the files that are there before a measurement."""
+        """Register the files that are there before a measurement: they are not its results."""
         folder = self._folder()
         self._files.look(folder, self._saving.probe_dir or folder)
 

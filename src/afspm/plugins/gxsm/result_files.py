@@ -136,7 +136,7 @@ class GxsmFiles(ResultFiles):
             self._kept["ended"] = {**followed, "names": sorted(names)}
 
     def look(self, scans: Path | None, spectra: Path | None) -> None:
-        """Take note of the files that are there before a measurement, in the folders of scans and spectra."""
+        """Register the files that are there before a measurement, in the folders of scans and spectra."""
         for what, folder in ((SCAN, scans), ("spectrum", spectra)):
             self.newest_ns(folder, _files(folder, what), what)
 

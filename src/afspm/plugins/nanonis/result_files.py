@@ -64,7 +64,7 @@ class NanonisFiles(ResultFiles):
         self._begins(what, {"seen": what != SCAN, "folder": str(folder), "newest_ns": newest_ns, **taken})
 
     def look(self, folder: Path) -> None:
-        """Take note of the files that are there before a measurement."""
+        """Register the files that are there before a measurement: they are not its results."""
         for what in (SCAN, "spectrum"):
             self.newest_ns(folder, _files(folder, what), what)
 

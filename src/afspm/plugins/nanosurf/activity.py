@@ -133,14 +133,14 @@ class StudioActivity(Activity):
         self.watch(self._session.begin(FORCE, commands.TAKE_CURVE))
 
     def approach(self) -> None:
-        """Approach the sample. Raises Refused: ACTION_ERROR: Studio reports an error at once."""
+        """Approach the sample. Raises Refused: ACTION_ERROR: Studio reports an error within 0.5 s."""
         self._move("approach", commands.APPROACH)
 
     def withdraw(self) -> None:
         """Stop scan, curve and approach, and withdraw the tip.
 
         Raises:
-            Refused: ACTION_ERROR: Studio reports an error at once. StudioError, ControllerLost.
+            Refused: ACTION_ERROR: Studio reports an error within 0.5 s. StudioError, ControllerLost.
         """
         self.stopped()
         self.close()

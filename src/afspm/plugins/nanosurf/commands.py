@@ -80,7 +80,7 @@ if not fine then
 end
 return 0
 """
-"""Sets values; if a value has another unit, or Studio refuses it, restores the values set before and fails."""
+"""Sets values; if a unit was changed, or Studio refuses a value, restores the values set before and fails."""
 
 BUFFER_LEVEL: Final = 2
 """The lowest session level with low-level buffers."""

@@ -117,7 +117,10 @@ class Session:
         return {path: str(found.get(number, "")) for number, path in enumerate(paths, 1)}
 
     def keep_units(self, units: Mapping[str, str]) -> None:
-        """Refuse values from now on whose unit, by path, is not this one: a person may change units at the panel."""
+        """Store the expected units by path: `values` and `put` fail from now on if Studio has another unit.
+
+        A person may change units at the panel. Values without a unit are not checked.
+        """
         self._units = {path: unit for path, unit in units.items() if unit}
 
     def missing(self, paths: Iterable[str]) -> list[str]:
@@ -137,7 +140,7 @@ class Session:
         """Start a long command on a separate connection, after the script `first`.
 
         Args:
-            wait_s: longest wait for its reply, real time.
+            wait_s: longest wait for the reply to the command, real time.
 
         Raises:
             ControllerLost

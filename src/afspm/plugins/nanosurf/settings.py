@@ -29,7 +29,7 @@ _TARGET: Final = ("scanner.offset_x_target", "scanner.offset_y_target")
 _PLACE: Final = ("scanner.offset_x", "scanner.offset_y")
 _SPEED: Final = "scanner.move_speed_xy_on_surface"
 _LATEST_S: Final = 10.0
-"""Experiment time after the expected end of a move, until the move counts as failed."""
+"""Experiment time beyond twice the expected duration of a move, until the move counts as failed."""
 UNITS: Final[dict[str, tuple[str, ...]]] = {
     **dict.fromkeys((_X, _Y, _WIDTH, _HEIGHT, *_TARGET, *_PLACE), ("m",)),
     **dict.fromkeys((_ANGLE, *_SLOPES), ("°", "deg")),

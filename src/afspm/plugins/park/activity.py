@@ -56,7 +56,7 @@ class SmartScanActivity(Activity):
         self._folder, self._frame_in_force = folder, frame_in_force
         self._curve_at: XY = (0.0, 0.0)
         self._kept = kept
-        # taken, and stored again by the next poll: if that fails, a script is not resumed for ever
+        # removed here, and stored again by the next poll: after a failed poll the script is not resumed for ever
         if what := kept.pop("call", ""):
             self.call = session.resumed(what)
 

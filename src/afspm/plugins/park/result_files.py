@@ -32,7 +32,7 @@ class ParkFiles(FolderFiles):
         self._seen: tuple[list[tuple[str, int]], float] = ([], 0.0)
 
     def files_of(self, measured: Entry) -> list[tuple[str, int]]:
-        """Return all new files once no file has appeared or changed for `SETTLE_S`; an empty list until then."""
+        """Return all new files of SmartScan once no file has appeared or changed for `SETTLE_S`; until then none."""
         listed = [(str(path), modified_ns(path)) for path in self._files(Path(measured["folder"]))]
         # By time and not by name: SmartScan's names can be chosen freely.
         files = sorted(one for one in listed if one[1] > measured["newest_ns"])
@@ -40,5 +40,5 @@ class ParkFiles(FolderFiles):
         if files != self._seen[0]:
             self._seen = (files, now_s)
         settled = now_s - self._seen[1] >= SETTLE_S
-        # pictures of other programs are left out: else a screenshot would cost the scan
+        # pictures of other programs are left out: a screenshot would otherwise count as a part of the scan
         return [one for one in files if not is_foreign(Path(one[0]))] if settled else []

@@ -155,7 +155,7 @@ class Session:
         return call
 
     def resumed(self, what: str) -> LongCall:
-        """Return a script of an earlier connection: only `script_runs` shows its end."""
+        """Return the call of a script that an earlier connection started: only `script_runs` shows its end."""
         return LongCall(what, _NoReply(), lambda value: self.script_runs())
 
     def close(self) -> None:

@@ -19,7 +19,7 @@ AGAIN_S = 2.0
 CONNECT_S = 1.0
 GOES_ON_WITHIN_S = 60.0
 """Real time after which a restarted process does not continue steps of a target: a person may have seen them halt."""
-_KEPT_AGAIN_S = 20.0
+_KEPT_AGAIN_S = 20.0  # real time: unchanged steps must not look older than GOES_ON_WITHIN_S after a kill
 _STEPS = "steps"
 
 

@@ -114,12 +114,13 @@ class RampInSteps:
     """A target that is moved to `final` step by step.
 
     Attributes:
-        sent: the last step, as confirmed by the server; before: the previous step.
+        sent: the last step, as confirmed by the server or as read back; before: the previous step.
         ideal: the last step before its rounding by the server.
         sent_s: time of the last step.
         in_flight: whether the last step is still unconfirmed.
-        target_s: time of the request for the target, which must still equal the last step.
-        is_interrupted: whether the connection was lost: the target read afterwards decides how to continue.
+        target_s: time of the request for the target, which must still be within two steps of the last step.
+        is_interrupted: whether the connection or the process was lost: the target read afterwards decides how to
+            continue.
     """
 
     final: float
@@ -254,7 +255,7 @@ class SecopClient:
         }
 
     def go_on_with(self, unfinished: PlainMapping) -> None:
-        """Continue the steps of an earlier process, unless the target read first is another one."""
+        """Continue the steps of an earlier process, unless the first target read shows that another client set it."""
         for name, kept in unfinished.items():
             if (channel := self.channels.get(name)) is None:
                 continue
@@ -432,7 +433,7 @@ class SecopClient:
         return [lines.change(channel.target, number)]
 
     def _start_of_steps(self, channel: Channel, rate_per_s: float) -> float:
-        # At the target, if it is in force: a set point that jumps to the value is too fast. Else at the value: the
+        # At the target, if it is in force: a setpoint that jumps to the value is too fast. Else at the value: the
         # target of a heater that was switched off, or of a magnet that was moved at its panel, may be anywhere.
         assert channel.newest is not None
         target, near = channel.newest_target, 2.0 * rate_per_s * STEP_S

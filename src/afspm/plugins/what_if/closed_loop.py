@@ -37,7 +37,7 @@ class Outcomes:
     Attributes:
         folder: folder of the new run.
         rows: texts for the recorded and the new run, by heading.
-        lasted_alike: whether the durations differ by no more than those of two equal nights.
+        lasted_alike: whether the durations differ by no more than the durations of two equal nights.
     """
 
     folder: Path

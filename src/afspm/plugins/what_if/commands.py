@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 DIFFERS = 3
 """Exit code: a night differs."""
 INCOMPLETE = 1
-"""Exit code: no night differs, but one, or a process of one, could not be replayed."""
+"""Exit code: no night differs, but a night, or a process of a night, could not be replayed."""
 _MOST_SHOWN = 10
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
 

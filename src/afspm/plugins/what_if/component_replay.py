@@ -240,7 +240,7 @@ class _Memories:
         self._texts.append(text)
 
     def may_be(self, memory: str | None) -> bool:
-        """Return whether a recorded memory is one of them. Another shows a decision that no output has shown yet."""
+        """Return whether a recorded memory is among them; if not, it shows a decision that no output has shown yet."""
         try:
             return json.loads(memory or "{}") in [json.loads(text or "{}") for text in self._texts]
         except ValueError:  # the recorded file was damaged
@@ -265,8 +265,8 @@ class _Home:
         """Restore the files saved at the start of a life.
 
         Args:
-            is_own: keep all files of the replay instead.
-            remembers: keep only the memory of the replay.
+            is_own: keep all files of the replay; restore none.
+            remembers: keep the memory of the replay; restore the other files.
         """
         if is_own:
             return

@@ -2,7 +2,7 @@
 
 The guard uses Python's audit events, which precede the opening of a file or the start of a program, in the component's
 thread and in all threads that it starts. HDF5 and ZeroMQ raise no audit events, so `h5py.File` and `zmq.Socket` are
-wrapped. Other libraries in C, such as a vendor's driver, are not guarded; one that is loaded by ctypes is named.
+wrapped. Other libraries in C, such as a vendor's driver, are not guarded; a library loaded by ctypes is reported.
 
 The watch uses Python's profiler, which sees every call of a clock or of an unseeded random function of Python. The
 functions of numpy are invisible to the profiler, so the state of numpy's global generator is compared before and after.

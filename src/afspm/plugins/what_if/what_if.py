@@ -415,7 +415,7 @@ def _changed_by_file(folder: Path, file: Path, logs: Mapping[str, Path]) -> tupl
 def at_recorded_places(before: Any, now: Any) -> Any:
     """Return changed settings of a scheduler in which each limit keeps its recorded file and line.
 
-    A refusal names them, and another file with the same limits refuses the same.
+    A refusal names file and line, which would differ for the same limits in another file.
     """
     if not (isinstance(before, dict) and isinstance(now, dict)):
         return now

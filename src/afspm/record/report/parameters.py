@@ -23,7 +23,7 @@ _PLACE = frozenset(
         names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y, names.PROBE_POS_X, names.PROBE_POS_Y,
     }
 )  # fmt: skip
-"""Parameters that stand with the scans and spectra."""
+"""Parameters that the report shows with the scans and spectra."""
 _FEEDBACK = (names.FEEDBACK_ON, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN, names.ZCTRL_SETPOINT)
 """The fields of a `Feedback` in their order, as parameters."""
 _MAY_SET = frozenset({ControlResponse.SUCCESS, ControlResponse.NO_RESPONSE})

@@ -66,7 +66,7 @@ def _estimated(shown: Sequence[TopographyPicture]) -> str:
 def sample_map(
     shown: Sequence[TopographyPicture], spectra_m: Sequence[XY], treated: Sequence[TreatmentPlace], frame: Frame
 ) -> str:
-    """Return an HTML map of the newest scans, with the newest on top, and of all spectra; empty without both.
+    """Return an HTML map of the newest scans, the newest on top, and of all spectra; empty if there are neither.
 
     Treatments of the tip are marked, or listed below the map if they are too far away.
     """

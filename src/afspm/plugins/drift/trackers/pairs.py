@@ -156,8 +156,8 @@ class PairMeasurement:
         """Return the measurement from a registration.
 
         The error of an efficient estimator consists of one location error per scan; the inflation is an error of the
-        pair. So is a share of the wandering during both scans. Otherwise, if the displacements between three scans
-        do not add up, a velocity would explain it through a delay of a second.
+        pair. So is a share of the wandering during both scans. Without this share, a large velocity times a short
+        delay between rows would explain displacements between three scans that do not add up.
         """
         link = newest.link(number, reference, found.center_m, found.displacement_m)
         pair_noise = (inflation - 1.0) * found.covariance_m2 + link.noise_m2
