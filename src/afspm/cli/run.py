@@ -81,8 +81,8 @@ def run(
 
     Everything is checked before anything starts. Processes that crash or freeze are restarted. Ctrl-C ends the
     experiment cleanly, a second Ctrl-C at once. Ends with 0 when the experiment has ended by itself, even if a
-    component was given up; with 1 when the experiment file is wrong or something essential was given up, with 3 when
-    all plans were done and nothing ended the experiment, with 4 when the last component with a plan was given up, with
+    component was given up; with 1 when the experiment file is wrong or something essential was given up; with 3 when
+    all plans were done and nothing ended the experiment; with 4 when the last component with a plan was given up; with
     130 when the run was stopped.
     """
     import logging

@@ -101,6 +101,8 @@ class NanonisFiles(ResultFiles):
     def end_followed(self, now_ns: int, now_s: float, path: str) -> None:
         """Register the end of a scan, and that the next scan of a continuous series is running already.
 
+        The scan's data is not fetched if the file is incomplete: Nanonis' memory already holds the next scan.
+
         Args:
             path: file path reported by Nanonis. A file from before the scan is left out: the report came late.
         """

@@ -440,10 +440,10 @@ class SecopClient:
         if target is None or not channel.is_controlled:
             return channel.newest
         distance = abs(target - channel.newest)
-        # behind steps of afspm the value may lag, or stay beside the target; it comes no nearer after it has left
+        # behind steps of afspm the value may lag, or stay beside the target; a value that leaves it exceeds `nearest`
         is_behind = channel.is_led and distance <= channel.nearest + near
-        # a value that has left its target is disturbed while the module is busy; a value that has never been there may
-        # be on its way to the target of another client, to which the way must not lead
+        # a value that has left its target is disturbed while the module is busy; a value that was never near it may be
+        # on its way to the target of another client, which may be far away
         is_disturbed = channel.is_busy and (channel.is_led or channel.nearest <= near)
         return target if distance <= near or is_behind or is_disturbed else channel.newest
 
