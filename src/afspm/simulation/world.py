@@ -44,7 +44,7 @@ _FITTING: dict[str, dict[str, dict[str, object]]] = {
     "lattice": {
         "tip": {"radius_m": 0.12e-9, "half_angle_deg": 35.0},
         "noise": {"white_m": 3e-12, "one_over_f_m": 3e-12, "line_offset_m": 3e-12, "scar_m": 0.05e-9},
-        "feedback": {"mode": "current", "setpoint": 100e-12},
+        "feedback": {"mode": "current"},
     },
     "steps": {"tip": {"second_below_radii": 0.015, "debris_radii": 1.0, "length_jump_radii": 0.1}},
     "stamper": {

@@ -185,6 +185,7 @@ SIMULATED = '[scheduler]\ncomponent = true\nclass = "Scheduler"\n[microscope]\nc
         ("", "1 nA", "nA can't be converted to V"),
         ('feedback = { mode = "current" }\n', "1 nA", ""),
         ('surface = "lattice"\n', "1 nA", ""),  # by default it tunnels
+        ('surface = "lattice"\nfeedback = { mode = "amplitude" }\n', "0.9 V", ""),
     ],
 )
 def test_a_setpoint_is_limited_in_the_unit_of_the_operating_mode(
