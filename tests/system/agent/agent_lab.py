@@ -82,6 +82,13 @@ class AgentClient:
             assert time.monotonic() < end_s, found
             await asyncio.sleep(0.1)
 
+    async def has_problems(self, wanted: list[str]) -> None:
+        """Wait until the server has received these flags: the answer to a stop may come first."""
+        end_s = time.monotonic() + DEADLINE_S
+        while (found := (await self.call("status"))["problems"]) != wanted:
+            assert time.monotonic() < end_s, found
+            await asyncio.sleep(0.1)
+
 
 class AgentRun(AfspmProcess):
     """`afspm run` of an experiment with an agent server."""

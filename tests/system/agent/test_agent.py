@@ -82,8 +82,7 @@ def test_stop_ends_a_scan_and_only_a_person_goes_on(started: Started, mode: str)
         await agent.call("measure", step={**SCAN, "pixels": [512, 512]})
         assert (await agent.call("stop", reason="the tip looks double"))["stopped"] is True
         await agent.refused("measure", step={**SCAN, "do": "jump"})
-        state = await agent.call("status")
-        assert state["problems"] == ["stopped-by-agent"]
+        await agent.has_problems(["stopped-by-agent"])
         again = await agent.ended((await agent.call("measure", step=SCAN))["run"])
         assert again["state"] == "failed"
 
