@@ -28,7 +28,6 @@ FRAME = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.SCAN_SIZE_X, names.
 
 
 Missed = Literal["extend", "catch-up", "skip", "rest"]
-_SCANNING = ScopeState.SCANNING
 _MISSED: dict[Missed, str] = {
     "extend": "to be taken at the end",
     "rest": "to be taken at the end",
@@ -350,7 +349,8 @@ def _newest_scan_ns(seen: Sequence[PublishedEvent]) -> tuple[int, int] | None:
     states = [(one.message.state, one.time_ns) for one in seen if isinstance(one.message, ScopeStatus) and one.time_ns]
     known = [(state, at_ns) for state, at_ns in states if state is not ScopeState.UNDEFINED]
     before = (ScopeState.UNDEFINED, *(state for state, _ in known))
-    starts = [at_ns for was, (state, at_ns) in zip(before, known, strict=False) if was is not state is _SCANNING]
+    begins = ScopeState.SCANNING
+    starts = [at_ns for was, (state, at_ns) in zip(before, known, strict=False) if was is not state is begins]
     return (starts[-1], known[-1][1]) if starts else None
 
 

@@ -204,7 +204,7 @@ class LineWatch(Component):
         finished = self._finished
         shows_tip = finished is not None and finished.is_trusted and finished.pair.trace.time_ns == self._seen_ns
         if self._seen_ns is not None:
-            self.memory["forgotten_ns"] = self._seen_ns - shows_tip
+            self.memory["forgotten_ns"] = self._seen_ns - 1 if shows_tip else self._seen_ns
 
     @property
     def _is_flagged(self) -> bool:
