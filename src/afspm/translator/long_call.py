@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
+
+from afspm.basics.errors import AfspmError, Refused
+
+ANSWERS_S: Final = 0.5
+"""Real time within which a controller reports that it refuses a command; one that runs longer is a long command."""
 
 
 class LongLink(Protocol):
@@ -46,6 +51,23 @@ class LongCall:
         if not self._came:
             self._came, self.value = self._link.reply(self.what)
         return not self._came or self._is_unfinished(self.value)
+
+    def require_accepted(self, failure: type[AfspmError], program: str, code: int) -> None:
+        """Refuse the command if the controller has reported an error of the type `failure` already.
+
+        Args:
+            program: the controller, in words.
+
+        Raises:
+            Refused: with `code`. ControllerLost.
+        """
+        try:
+            self.running()
+        except BaseException as error:  # Ctrl-C, too: nothing else closes this connection
+            self.close()
+            if isinstance(error, failure):
+                raise Refused(code, f"{program} refused the {self.what}: {error}") from error
+            raise
 
     def close(self) -> None:
         """Stop waiting for the reply."""

@@ -18,13 +18,11 @@ from afspm.plugins.nanosurf.settings import TipPlace
 from afspm.translator.activity import Activity
 from afspm.translator.driver_base import ControllerLost
 from afspm.translator.folder_files import FolderFiles
-from afspm.translator.long_call import LongCall
+from afspm.translator.long_call import ANSWERS_S, LongCall
 from afspm.translator.result_files import SCAN, FilePrecision, as_list
 from afspm.translator.state import Kept
 
 FORCE: Final = "force"
-_ANSWERS_S: Final = 0.5
-"""Real time within which Studio reports that it refuses an approach or a withdrawal."""
 
 
 class NanosurfFiles(FolderFiles):
@@ -154,12 +152,8 @@ class StudioActivity(Activity):
 
     def _move(self, what: str, command: str, first: str = "") -> None:
         # a refused withdrawal must not count as done
-        call = self._session.begin(what, command, first, _ANSWERS_S)
-        try:
-            call.running()
-        except StudioError as error:
-            call.close()
-            raise Refused(ControlResponse.ACTION_ERROR, f"Studio refused the {what}: {error}") from error
+        call = self._session.begin(what, command, first, ANSWERS_S)
+        call.require_accepted(StudioError, "Studio", ControlResponse.ACTION_ERROR)
         self.watch(call)
         self._kept["call"] = what
 

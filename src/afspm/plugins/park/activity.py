@@ -13,10 +13,10 @@ from afspm.basics.errors import AfspmError, Refused
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.plugins.park.link import SmartScanError
 from afspm.plugins.park.result_files import ParkFiles
-from afspm.plugins.park.session import ANSWERS_S, Session
+from afspm.plugins.park.session import Session
 from afspm.plugins.park.settings import MOVE, way_to
 from afspm.translator.activity import Activity
-from afspm.translator.long_call import LongCall
+from afspm.translator.long_call import ANSWERS_S, LongCall
 from afspm.translator.result_files import SCAN, XY, as_list
 from afspm.translator.state import Kept
 

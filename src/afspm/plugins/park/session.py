@@ -19,11 +19,9 @@ from afspm.plugins.park.link import (
     numbers,
 )
 from afspm.translator.driver_base import ControllerLost
-from afspm.translator.long_call import LongCall
+from afspm.translator.long_call import ANSWERS_S, LongCall
 from afspm.translator.parameters import Value
 
-ANSWERS_S: Final = 0.5
-"""Real time after which an expression counts as a long command; an error is expected earlier."""
 TRUE, FALSE = frozenset({"true", "1"}), frozenset({"false", "0"})
 _GEOMETRY: Final = ("pixelHeight", "pixelWidth", "width", "height", "offsetX", "offsetY", "rotation")
 
@@ -147,11 +145,7 @@ class Session:
     def start(self, what: str, expression: str, refusal: int) -> LongCall:
         """Start a long script as `begin`. Raises Refused with the code `refusal`: it fails within `ANSWERS_S`."""
         call = self.begin(what, expression, ANSWERS_S)
-        try:
-            call.running()
-        except SmartScanError as error:
-            call.close()
-            raise Refused(refusal, f"SmartScan refused the {what}: {error}") from error
+        call.require_accepted(SmartScanError, "SmartScan", refusal)
         return call
 
     def resumed(self, what: str) -> LongCall:
