@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from afspm.model import ControlRequest, ControlResponse, ProbePosition, Request
+from afspm.model import ControlRequest, ControlResponse, ProbePosition, Request, Response
 from afspm.model.geometry import XY
 from afspm.scheduler.control import control_change
 from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlInput
@@ -66,8 +66,13 @@ def offset_m(draft: StateDraft) -> XY | None:
     return (float(xy_m[0]), float(xy_m[1]))
 
 
-def refused(draft: StateDraft, job: ForwardedRequest) -> str:
-    """Return why a command lacks an approval or breaks the limits of its role; empty if it may be sent."""
+def refusal(draft: StateDraft, job: ForwardedRequest) -> Response | None:
+    """Return the refusal of a command without an approval or outside the limits of its role; None if it may be sent."""
+    why = _refused(draft, job)
+    return Response(int(ControlResponse.PARAM_ERROR), b"", why, job.request.id) if why else None
+
+
+def _refused(draft: StateDraft, job: ForwardedRequest) -> str:
     until_s = draft.lease.asked_until_s()
     # a frozen scheduler finds the request and the end of the lease at the same time
     if draft.env.settings.rules.is_agent(job.client) and until_s is not None and draft.now_s > until_s:

@@ -133,7 +133,7 @@ def _next_order(draft: StateDraft, instrument: str, may_send: MaySend) -> Instru
     while (first := draft.instruments.first(instrument)) is not None:
         if first.order is not None:
             return first.order
-        refusal = may_send(draft, first.job) or _limit_refusal(draft, first.job) or _approval_refusal(draft, first.job)
+        refusal = may_send(draft, first.job) or _limit_refusal(draft, first.job) or approvals.refusal(draft, first.job)
         if refusal is None:
             return _hand_out(draft, instrument, first)
         draft.log("WARNING", f"refused {first.job.client}: {refusal.reason}")
@@ -153,11 +153,6 @@ def _limit_refusal(draft: StateDraft, job: ForwardedRequest) -> Response | None:
         why = f"{request.subject.name} can't be set while its value is not known: {reading.reason}"
         return Response(int(ControlResponse.PARAM_ERROR), b"", why, request.id)
     return draft.limits.check(job.client, request, draft.now_ns, is_repeated=job.is_repeated)
-
-
-def _approval_refusal(draft: StateDraft, job: ForwardedRequest) -> Response | None:
-    why = approvals.refused(draft, job)
-    return Response(int(ControlResponse.PARAM_ERROR), b"", why, job.request.id) if why else None
 
 
 def _hand_out(draft: StateDraft, instrument: str, waiting: OpenOrder) -> InstrumentOrder:

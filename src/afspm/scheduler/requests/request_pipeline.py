@@ -311,8 +311,8 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
     mapped = _mapped(draft, job)
     if isinstance(mapped, Response) or not _is_within_limits(draft, job, mapped):
         return
-    if why := approvals.refused(draft, job):
-        _refuse(draft, job, Response(int(ControlResponse.PARAM_ERROR), b"", why, job.request.id))
+    if (refusal := approvals.refusal(draft, job)) is not None:
+        _refuse(draft, job, refusal)
         return
     if job.request.kind == _ACTION:
         if turn.move is None and _starts_move(draft, job, turn):
