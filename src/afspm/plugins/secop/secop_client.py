@@ -484,8 +484,7 @@ class SecopClient:
         if channel.ramp_switch:
             progress.waits_for = f"changed {channel.ramp_switch}"
             return [lines.switch_on(channel.ramp_switch)]
-        progress.waits_for = f"changed {channel.target}"
-        return [lines.change(channel.target, progress.wanted)]
+        return self._set_target(progress)
 
     def _ramp_switched(self, progress: OrderInProgress, confirmed: object) -> list[str]:
         channel = progress.channel
@@ -493,8 +492,11 @@ class SecopClient:
             why = f"{channel.ramp_switch} should be true, the server set {confirmed}"
             self._finish(progress.order, ControlResponse.PARAM_ERROR, why)
             return []
-        progress.waits_for = f"changed {channel.target}"
-        return [lines.change(channel.target, progress.wanted)]
+        return self._set_target(progress)
+
+    def _set_target(self, progress: OrderInProgress) -> list[str]:
+        progress.waits_for = f"changed {progress.channel.target}"
+        return [lines.change(progress.channel.target, progress.wanted)]
 
     def _take_refusal(self, line: SecopLine, now_s: float) -> list[str]:
         progress = self._progress
