@@ -233,12 +233,18 @@ def si_unit(unit: str) -> str:
     return _base_and_factor(unit)[0]
 
 
+def si_unit_or_none(unit: str) -> str | None:
+    """Return the SI unit of the same kind; None for an unknown unit."""
+    try:
+        return si_unit(unit)
+    except UnitError:
+        return None
+
+
 def same_kind(unit_a: str, unit_b: str) -> bool:
     """Return whether one unit can be converted to the other; False for unknown units."""
-    try:
-        return _base_and_factor(unit_a)[0] == _base_and_factor(unit_b)[0]
-    except UnitError:
-        return False
+    found = si_unit_or_none(unit_a)
+    return found is not None and found == si_unit_or_none(unit_b)
 
 
 @lru_cache(maxsize=1000)

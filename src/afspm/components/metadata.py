@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 from afspm.basics.clock import iso_utc
 from afspm.basics.errors import UnitError
-from afspm.basics.units import convert, si_unit
+from afspm.basics.units import convert, si_unit_or_none
 from afspm.client.component import Component
 from afspm.components.line_file import LineFile, csv_line
 from afspm.model import (
@@ -136,7 +136,7 @@ class Metadata(Component):
         elif is_set and entry.subject == names.TIP_BIAS_VOLTAGE:
             self._keep_bias(entry.time_ns, _in_volts(entry))
         elif is_set and entry.subject == names.ZCTRL_SETPOINT:
-            self.memory["setpoint_units"] = _si_unit(entry.unit) or self.memory.get("setpoint_units", "")
+            self.memory["setpoint_units"] = si_unit_or_none(entry.unit) or self.memory.get("setpoint_units", "")
         else:
             return
         self.memory["journal_ns"] = entry.time_ns
@@ -221,13 +221,6 @@ def _in_volts(entry: JournalEntry) -> float | None:
         return convert(float(entry.value), entry.unit or "V", "V")
     except (ValueError, UnitError):
         return None
-
-
-def _si_unit(unit: str) -> str:
-    try:
-        return si_unit(unit)
-    except UnitError:
-        return ""
 
 
 def _number(value: float) -> str:

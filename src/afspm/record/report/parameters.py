@@ -10,7 +10,7 @@ from html import escape
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import UnitError
 from afspm.basics.formatting import PREFIXABLE, counted, quantity, unit_text
-from afspm.basics.units import convert, si_unit
+from afspm.basics.units import convert, si_unit, si_unit_or_none
 from afspm.model import ControlRequest, ControlResponse, Feedback, JournalEntry, names
 from afspm.record.report.markup import PageTimes, table
 from afspm.record.run import Run
@@ -141,7 +141,7 @@ def _of_feedback(
     before = Feedback()
     # published in SI without a unit, which an accepted request may have
     accepted = (entry for entry in requests if entry.unit and entry.response == ControlResponse.SUCCESS)
-    units = {entry.subject: _si_unit(entry.unit) for entry in accepted}
+    units = {entry.subject: si_unit_or_none(entry.unit) or "" for entry in accepted}
     for time_ns, now in states:
         for name, old, new in zip(_FEEDBACK, astuple(before), astuple(now), strict=True):
             if old is not None and new is not None and old != new:
@@ -150,13 +150,6 @@ def _of_feedback(
                     time_ns, who, name, *(_field(value, units.get(name, "")) for value in (old, new))
                 )
         before = now
-
-
-def _si_unit(unit: str) -> str:
-    try:
-        return si_unit(unit)
-    except UnitError:
-        return ""
 
 
 def _author(time_ns: int, requests: Sequence[JournalEntry], late_ns: int) -> str:
