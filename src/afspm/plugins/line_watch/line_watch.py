@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
@@ -11,7 +12,7 @@ from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import UnitError
 from afspm.basics.units import convert
 from afspm.client.component import Component
-from afspm.client.events import PublishedEvent
+from afspm.client.events import Events, PublishedEvent
 from afspm.components import tip_verdict
 from afspm.components.channel_pairs import ChannelPairing, HeightPair, MissingChannels
 from afspm.model import ControlState, Feedback, Scan, ScanLines, ScopeState, ScopeStatus
@@ -61,6 +62,42 @@ class _Finished:
     is_trusted: bool = True
 
 
+class _LaterStates:
+    """The states of the microscope that were published after the packet being handled."""
+
+    def __init__(self, events: Events) -> None:
+        self._events = events
+        self._kept: list[PublishedEvent] = []
+
+    def since(self, packet_ns: int) -> list[PublishedEvent]:
+        """Return the states after a time; forget the states before it."""
+        self._kept += self._events.waiting()
+        self._kept = [one for one in self._kept if (one.time_ns or 0) > packet_ns]
+        return self._kept
+
+
+class _MissingLines:
+    """A reporter of successive scans without any lines."""
+
+    def __init__(self, log: logging.Logger) -> None:
+        self._log = log
+        self._has_begun = False  # not true of the cached scans at a start
+        self._count = 0
+
+    def on_state(self, status: ScopeStatus) -> None:
+        self._has_begun |= status.state is ScopeState.SCANNING
+
+    def on_scan(self, *, has_lines: bool) -> None:
+        if has_lines:
+            self._count = 0
+        elif self._has_begun:
+            self._count += 1
+            if self._count == _SCANS_WITHOUT_LINES:
+                what = "no lines came of the last %d scans: nothing is watched. Does the microscope publish lines?"
+                self._log.warning(what, self._count)
+        self._has_begun = False
+
+
 class LineWatch(Component):
     """A watch on running scans, which publishes the row at which their lines show that the tip has changed.
 
@@ -107,13 +144,11 @@ class LineWatch(Component):
         self._condition = ""
         self._refused: set[str] = set()
         self._not_judged: set[str] = set()  # reasons that were logged
-        self._has_begun = False
-        self._scans_without_lines = 0
 
     def on_start(self) -> None:
         self.expected = MissingChannels(self.channels, self.log)
-        self._states = self.scope.events("ScopeStateMsg")
-        self._later_states: list[PublishedEvent] = []
+        self._missing_lines = _MissingLines(self.log)
+        self._later_states = _LaterStates(self.scope.events("ScopeStateMsg"))
         if "judge" in self.memory:
             self.judge.restore(self.memory["judge"])
 
@@ -179,24 +214,14 @@ class LineWatch(Component):
             if scan.time_ns in self.memory.get("learnt_ns", ()):
                 self._learn(_Finished(pair, self._kind(pair.trace)), again=True)
             return
-        self._report_missing_lines(has_lines=running is not None)
+        self._missing_lines.on_scan(has_lines=running is not None)
         self._learn_finished()
         is_whole = running is None or not (running.is_disturbed or (running.judge is not None and running.judge.alarm))
         downwards = running is not None and running.downwards
         self._finished = _Finished(pair, self._kind(scan), downwards, is_whole, is_whole and self._problems == ())
 
     def on_state(self, status: ScopeStatus) -> None:
-        self._has_begun |= status.state is ScopeState.SCANNING
-
-    def _report_missing_lines(self, *, has_lines: bool) -> None:
-        if has_lines:
-            self._scans_without_lines = 0
-        elif self._has_begun:
-            self._scans_without_lines += 1
-            if self._scans_without_lines == _SCANS_WITHOUT_LINES:
-                what = "no lines came of the last %d scans: nothing is watched. Does the microscope publish lines?"
-                self.log.warning(what, _SCANS_WITHOUT_LINES)
-        self._has_begun = False
+        self._missing_lines.on_state(status)
 
     def _forget(self) -> None:
         self.judge.forget_places()
@@ -212,7 +237,7 @@ class LineWatch(Component):
 
     def _begin(self, lines: ScanLines) -> None:
         self._learn_finished()
-        self._states_since_packet()
+        self._later_states.since(self._packet_ns)
         self._lines = _Lines(lines.began_ns, None)
         if self._problems == ():  # the scans of a repair are not the experiment's
             kind = Kind.of(lines.region, lines.shape, self._condition)
@@ -271,14 +296,13 @@ class LineWatch(Component):
         # tip. A flag would then stop a scan whose lines are not judged yet.
         if self.scope.state is not ScopeState.SCANNING or self.scope.control_state.problems:
             return True
-        return any(event.message.state is not ScopeState.SCANNING for event in self._states_since_packet())
-
-    def _states_since_packet(self) -> list[PublishedEvent]:
         # states arrive while the packets before them still wait to be handled
-        now_ns = (self.packet.time_ns if self.packet is not None else None) or 0
-        self._later_states += self._states.waiting()
-        self._later_states = [one for one in self._later_states if (one.time_ns or 0) > now_ns]
-        return self._later_states
+        later = self._later_states.since(self._packet_ns)
+        return any(event.message.state is not ScopeState.SCANNING for event in later)
+
+    @property
+    def _packet_ns(self) -> int:
+        return (self.packet.time_ns if self.packet is not None else None) or 0
 
     def _learn_finished(self) -> None:
         finished, self._finished = self._finished, None
