@@ -126,11 +126,15 @@ class LimitsReader:
         self._check_sizes(limits)
         return limits
 
+    @property
+    def _known_parameters(self) -> list[str]:
+        return [*self.parameters, *(one for parameters in self.instruments.values() for one in parameters)]
+
     def _parameter(self, name: str, table: object) -> Limit | None:
-        of_instruments = [one for parameters in self.instruments.values() for one in parameters]
-        if name not in (*self.parameters, *of_instruments) and (self.certain or not name.startswith("x-")):
+        known = self._known_parameters
+        if name not in known and (self.certain or not name.startswith("x-")):
             is_action = name in self._known_actions
-            near = nearest(name, [*self.parameters, *of_instruments, *_OWN])
+            near = nearest(name, [*known, *_OWN])
             hint = f"it is an action: [limits.actions.{name}]" if is_action else near
             self.document.error(f"[limits] there is no parameter {name!r}", "limits", name, hint=hint)
             return None
@@ -210,10 +214,9 @@ class LimitsReader:
 
     def _range(self, name: str, pair: tuple[Quantity, Quantity], path: tuple[str, ...]) -> Limit | None:
         place = (*path, "parameters", name)
-        of_instruments = [one for parameters in self.instruments.values() for one in parameters]
-        if name not in (*self.parameters, *of_instruments):
+        if name not in (known := self._known_parameters):
             what = f"[{'.'.join(path)}] there is no parameter {name!r}"
-            self.document.error(what, *place, hint=nearest(name, [*self.parameters, *of_instruments]))
+            self.document.error(what, *place, hint=nearest(name, known))
             return None
         given = dict(zip(("min", "max"), pair, strict=True))
         # of an instrument as written, as in `_unit`
