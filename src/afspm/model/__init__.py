@@ -43,6 +43,7 @@ from afspm.model.instruments import (
     InstrumentReadings,
     OrderOutcome,
     instrument_of,
+    is_of_instrument,
 )
 from afspm.model.packet import LoggedPacket, Packet, PacketHeader
 from afspm.model.problems import HIGHEST_PROBLEM, STOPPED_BY_AGENT, Problem, ProblemNames
@@ -147,6 +148,7 @@ __all__ = [
     "Spectrum",
     "component_of",
     "instrument_of",
+    "is_of_instrument",
     "is_process_name",
     "registration_summary",
     "request_name",

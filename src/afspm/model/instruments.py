@@ -19,6 +19,11 @@ def instrument_of(parameter: str) -> str:
     return owner if separator else ""
 
 
+def is_of_instrument(parameter: str) -> bool:
+    """Return whether a parameter belongs to another instrument by its name, in any experiment."""
+    return bool(instrument_of(parameter)) and not parameter.startswith("x-")  # the name of a driver's may have a dot
+
+
 @dataclass(frozen=True, slots=True)
 class InstrumentReading:
     """One value of an instrument.

@@ -10,7 +10,7 @@ from typing import Final, Literal, get_args
 
 from afspm.basics.errors import InvalidValue, UnitError
 from afspm.basics.units import convert, parse_quantity, require_unit, si_unit
-from afspm.model.instruments import instrument_of
+from afspm.model.instruments import is_of_instrument
 from afspm.model.names import BASE_PARAMETERS
 from afspm.model.requests import Parameter
 
@@ -47,7 +47,7 @@ class SweepAxis:
             InvalidValue, UnitError: there are no values, a value twice, values that this parameter can't have, or a
                 parameter of another instrument.
         """
-        if instrument_of(name) and not name.startswith("x-"):
+        if is_of_instrument(name):
             raise InvalidValue(
                 f"{name} is a parameter of another instrument, and a sweep does not wait for it",
                 hint=f'set it with scope.set("{name}", ..., wait=True), and take a scan or a sweep at each value',

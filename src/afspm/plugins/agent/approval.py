@@ -10,7 +10,7 @@ from afspm.basics.errors import InvalidValue
 from afspm.basics.formatting import duration_text, quantity
 from afspm.basics.plain_data import Plain
 from afspm.basics.units import parse_quantity, si
-from afspm.model import Frame, Grant, GrantedCount, GrantedRange, Proposal, instrument_of, names
+from afspm.model import Frame, Grant, GrantedCount, GrantedRange, Proposal, is_of_instrument, names
 from afspm.plugins.agent.plan import Plan, ScanStep, plan_of
 from afspm.plugins.agent.untrusted import escaped
 
@@ -74,7 +74,7 @@ def of_table(table: Mapping[str, object], facts: Plain) -> Grant:
         )
     ranges = []
     for name, pair in _table(table, "parameters").items():
-        if instrument_of(name) and not name.startswith("x-"):
+        if is_of_instrument(name):
             what = f"{name} is a parameter of another instrument, which a grant can't include"
             raise InvalidValue(what, where="grant, parameters", hint="approve a plan that sets it")
         low, high = (si(one, names.BASE_PARAMETERS.get(name) or "") for one in _pair(pair, name))
