@@ -225,7 +225,8 @@ class CheckpointFile:
     Each generation is an appended line, which takes ten microseconds: a twentieth of a replacement of the file. The
     file is replaced only at `longest` bytes. The last line survives a kill of any process, and a moment later a power
     cut (see `disk`). A power cut during a replacement may leave the file empty. Then the previous generation is read; a
-    thread syncs it, so it is at most about `period_s` older.
+    thread syncs it, so it is at most about `period_s` older. An empty file without a previous generation is the first
+    one, cut off in its first moment: it counts as no file.
     """
 
     def __init__(self, path: Path, period_s: float = PERIOD_S, longest: int = LONGEST) -> None:
@@ -318,14 +319,14 @@ def load_checkpoint(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, s
         read: converts a generation; raises ValueError, KeyError or TypeError for a damaged generation.
 
     Returns:
-        The converted generation, None if there is no file; and the damage of the last generation if an earlier
-        generation was read, else "".
+        The converted generation, None if there is no file, or only the empty one of a first save that a power cut took
+        back; and the damage of the last generation if an earlier generation was read, else "".
 
     Raises:
         FileError: no generation can be read, or neither the folder nor its parent exists.
     """
     try:
-        generations = path.read_bytes().splitlines() or [b""]
+        content = path.read_bytes()
     except FileNotFoundError as error:
         if not any(folder.is_dir() for folder in (path.parent, path.parent.parent)):
             # the drive is not mounted: its file may exist, and must not be replaced by an empty one
@@ -334,6 +335,10 @@ def load_checkpoint(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, s
     except OSError as error:
         generations, damage = [], f"{error!r}"
     else:
+        # file systems leave unsynced content empty, or as zero bytes
+        if not content.strip(b"\0") and not previous_generation(path).exists():
+            return None, ""
+        generations = content.splitlines() or [b""]
         try:
             return read(generations.pop()), ""
         except _DAMAGED as error:

@@ -174,6 +174,20 @@ def test_two_unreadable_generations_are_refused(tmp_path: Path) -> None:
         load_checkpoint(path, number)
 
 
+@pytest.mark.parametrize("left", [b"", b"\0" * 20])
+def test_first_generation_lost_in_a_power_cut_counts_as_no_file(tmp_path: Path, left: bytes) -> None:
+    path = tmp_path / "x"
+    path.write_bytes(left)
+    assert load_checkpoint(path, number) == (None, "")
+
+
+def test_unreadable_text_without_an_earlier_generation_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    path.write_bytes(b"half a num")
+    with pytest.raises(FileError, match="delete it"):
+        load_checkpoint(path, number)
+
+
 def test_removed_checkpoint_starts_empty(tmp_path: Path) -> None:
     path = tmp_path / "x"
     saved(path, b"1")
