@@ -121,8 +121,7 @@ class SchedulerShell:
             if source in (sockets.router, sockets.router.monitor):
                 self._receive_requests()
             elif source is sockets.link:
-                heard = sockets.link.receive()
-                if heard is not None:
+                for heard in sockets.link.receive():
                     self._step_with(events.TranslatorReply(heard.number, _response(heard)))
             elif source is sockets.subscriber:
                 self._receive_packets()

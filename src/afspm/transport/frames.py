@@ -39,12 +39,16 @@ def send_frames(socket: Socket, frames: Sequence[bytes]) -> bool:
     Raises:
         zmq.ZMQError: the addressed peer is gone, on sockets that report it.
     """
-    try:
-        for frame in frames[:-1]:
-            socket.send(frame, _NOW | _MORE)
-        socket.send(frames[-1], _NOW)
-    except zmq.Again:
-        return False
+    last = len(frames) - 1
+    for index, frame in enumerate(frames):
+        try:
+            socket.send(frame, _NOW if index == last else _NOW | _MORE)
+        except zmq.Again:
+            # The connection was lost between two frames, and libzmq drops everything up to the next last frame. It gets
+            # the rest of this message to drop, or it would drop the next message and report success.
+            if 0 < index < last:
+                send_frames(socket, frames[index + 1 :])
+            return False
     return True
 
 

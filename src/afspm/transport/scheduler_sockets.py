@@ -20,6 +20,8 @@ from afspm.transport.router import Router
 from afspm.transport.subscriber import Subscriber
 
 _LONGEST_NUMBER = 18
+_MOST_ANSWERS = 12
+"""Limit of answers in one turn, below the 100 frames that libzmq receives between two looks at its connections."""
 
 
 class LinkUp(NamedTuple):
@@ -54,7 +56,10 @@ class TranslatorLink:
         self._address = address
         self.socket = network.socket(zmq.DEALER)
         # without it, requests would queue for a translator that is gone, and move the tip when it returns. The price:
-        # an answer may be lost with the connection; the request is then repeated with its id.
+        # an answer may be lost with the connection; the request is then repeated with its id. And `receive` must always
+        # read until nothing is left: with this option libzmq 4.3.5 drops the rest of an answer, and aborts the process
+        # (`Assertion failed: !_more`), if it finds the connection lost between two frames. It looks when nothing is
+        # left, and at each 100th frame after that.
         self.socket.setsockopt(zmq.IMMEDIATE, 1)
         self.monitor = Monitor(network, self.socket, CONNECTED | DISCONNECTED)
         network.connect(self.socket, address)
@@ -63,10 +68,19 @@ class TranslatorLink:
         """Send a request; return False without a connected translator."""
         return send_frames(self.socket, [b"%d" % number, *self._before, *frames])
 
-    def receive(self) -> LinkReply | None:
-        """Return the next answer; None if there is none, or it is malformed."""
-        frames = [frame.bytes for frame in receive_frames(self.socket)]
-        if not frames or frames == [b""]:  # an empty message is the translator's probe
+    def receive(self) -> list[LinkReply]:
+        """Return all answers that have arrived; a malformed one is dropped."""
+        found: list[LinkReply] = []
+        for _ in range(_MOST_ANSWERS):
+            if not (frames := receive_frames(self.socket)):
+                break
+            reply = self._interpret([frame.bytes for frame in frames])
+            if reply is not None:
+                found.append(reply)
+        return found
+
+    def _interpret(self, frames: list[bytes]) -> LinkReply | None:
+        if frames == [b""]:  # the translator's probe
             return None
         before, content = _parted(frames)
         number = before[0] if before else b""
