@@ -34,6 +34,8 @@ COMMIT_S = 1.0
 LAST_WORDS_S = 30.0
 STOPPING_S = 1.0
 
+_MOST_NAMED = 3
+
 DISK_ERRORS = (OSError, sqlite3.OperationalError)
 
 
@@ -226,7 +228,18 @@ class RecordWriter:
         self._progress.took([], store.waiting())
         self._commit(store)
         if ended:
+            self._warn_unlisted(store)
             store.settle()
+
+    def _warn_unlisted(self, store: RecordStore) -> None:
+        if unlisted := store.unlisted_files():
+            self._logger.warning(
+                "%d measured files are in no table of the record, since a power cut took their packets, or a damaged "
+                "journal was put aside; they can be read: %s%s",
+                len(unlisted),
+                ", ".join(unlisted[:_MOST_NAMED]),
+                " …" if len(unlisted) > _MOST_NAMED else "",
+            )
 
     def _commit(self, store: RecordStore) -> None:
         # the log may be overwritten up to here

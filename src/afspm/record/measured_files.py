@@ -63,6 +63,14 @@ class MeasuredFiles:
         """Remove all files that do not have their final names yet."""
         self._batch.discard()
 
+    def unlisted(self) -> list[str]:
+        """Return the files in no table: a power cut took their packets, or a damaged journal was put aside."""
+        listed, found = set[str](), set[str]()
+        for kind in (SCANS, SPECTRA):
+            listed |= {name for (name,) in self._journal.execute(f"SELECT file FROM {kind}")}
+            found |= {f"{kind}/{path.name}" for path in (self._folder / kind).glob(f"*{SUFFIX}")}
+        return sorted(found - listed)
+
     def close(self) -> None:
         self._batch.close()
 

@@ -124,6 +124,10 @@ class RecordStore:
         with self._all_or_nothing():
             self._write(self._gathering.finish(self._newest_ns))
 
+    def unlisted_files(self) -> list[str]:
+        """Return the files of measurements that no table of the journal names, as paths in the run's folder."""
+        return self._files.unlisted()
+
     def has(self, packet: Packet) -> bool:
         """Return whether a packet is recorded, or waits for other packets of its scan."""
         row = self._journal.execute(

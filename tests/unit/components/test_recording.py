@@ -25,7 +25,7 @@ from afspm.basics.exit_codes import ExitCode
 from afspm.basics.launch import Launch
 from afspm.components import recorder, recording
 from afspm.components.recording import RecordWriter
-from afspm.model import ControlMode, ControlState, LoggedPacket, Packet, Region, ScanLines
+from afspm.model import ControlMode, ControlState, LoggedPacket, Packet, Region, Scan, ScanLines
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.storage.packet_log import LogReader, PacketLog, committed, expect_recorder
@@ -135,6 +135,22 @@ def test_restarted_recorder_reads_lines_of_an_unfinished_scan_again(bench: Bench
     assert row.interrupted
     assert np.isfinite(afspm.open_run(bench.folder).scan(row).first.values).sum() == 8
     assert bench.is_committed
+
+
+def test_file_whose_packets_a_power_cut_took_is_kept_and_logged(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    image = Scan(Region((0.0, 0.0), (1e-6, 1e-6)), "Height", "m", np.zeros((4, 4)))
+    bench.publish(Packet("Scan2d", wire.encode(image)[1], 100), control(200))
+    first = bench.writer()
+    _until(lambda: bench.times() == [100, 200])
+    first.finish(ended=False)
+    (file,) = bench.folder.glob("scans/*.h5")
+    taken = file.with_stem(f"2{file.stem}")
+    taken = file.with_stem("20261102T220000_000000Z-00002")
+    taken.write_bytes(file.read_bytes())
+    bench.writer().finish(ended=True)
+    assert taken.exists()
+    (warning,) = [record.getMessage() for record in caplog.records if "in no table" in record.getMessage()]
+    assert f"scans/{taken.name}" in warning
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="what a descriptor is open on is found in /proc")
