@@ -275,19 +275,12 @@ class CheckpointFile:
             SYNCER.soon(self._file.fileno())
             SYNCER.folder_soon(self.path.parent)
             return
-        written = 0
         try:
-            written = self._file.write(line)
-            if written < len(line):
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            _append_whole(self._file, line, self._size)
         except OSError:
-            with contextlib.suppress(OSError):
-                if written:
-                    self._file.truncate(self._size)  # remove the part: the generation before is the last again
             self._let_go()  # after a drive returns, files that were open on it stay dead
             raise
-        self._size += written
-        SYNCER.soon(self._file.fileno())
+        self._size += len(line)
 
     def _let_go(self) -> None:
         if self._file is not None:
@@ -305,6 +298,42 @@ class CheckpointFile:
             with contextlib.suppress(FileError):  # `save` reports a full disk
                 write_atomic(previous_generation(self.path), [newest])
             self._closing.wait(self._period_s)
+
+
+def append_generation(path: Path, line: bytes) -> None:
+    """Add a generation to a file without waiting for the disk: a power cut may cut it off, and leaves those before.
+
+    The file is replaced, and synced, if there is none, at `LONGEST` bytes, and behind a line that was cut off.
+
+    Raises:
+        FileError: the line can't be written.
+    """
+    try:
+        with io.FileIO(path, "r+") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - 1))
+            if file.read(1) == b"\n" and size + len(line) <= LONGEST:
+                _append_whole(file, line, size)
+                return
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise FileError(f"can't be written: {error}", where=str(path)) from error
+    write_atomic(path, [line])
+
+
+def _append_whole(file: io.FileIO, line: bytes, size: int) -> None:
+    written = 0
+    try:
+        written = file.write(line)
+        if written < len(line):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    except OSError:
+        with contextlib.suppress(OSError):
+            if written:
+                file.truncate(size)  # remove the part: the generation before is the last again
+        raise
+    SYNCER.soon(file.fileno())
 
 
 def _is_there(file: io.FileIO) -> bool:
@@ -335,8 +364,7 @@ def load_checkpoint(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, s
     except OSError as error:
         generations, damage = [], f"{error!r}"
     else:
-        # file systems leave unsynced content empty, or as zero bytes
-        if not content.strip(b"\0") and not previous_generation(path).exists():
+        if not content and not previous_generation(path).exists():
             return None, ""
         generations = content.splitlines() or [b""]
         try:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
-import os
 from collections.abc import Iterator, MutableMapping
 from pathlib import Path
 from typing import Any
 
 from afspm.basics.errors import InvalidValue
 from afspm.basics.plain_data import Plain
-from afspm.storage.atomic import CheckpointFile, OutageLog, load_checkpoint, previous_generation, write_atomic
+from afspm.storage.atomic import CheckpointFile, OutageLog, append_generation, load_checkpoint, write_atomic
 from afspm.storage.disk import DEADLINE_S, DiskThread
 
 SYNCED_WITHIN_S = 5.0  # longest wait; a disk that hangs counts as full
@@ -79,7 +77,8 @@ class Memory(MutableMapping[str, Any]):
             if (generations := self._generations) is not None:
                 self._disk.run(lambda: generations.save(text.encode()))
             elif (path := self._path) is not None:
-                self._disk.run(lambda: _replace(path, text, synced=synced))
+                line = text.encode() + b"\n"
+                self._disk.run(lambda: write_atomic(path, [line]) if synced else append_generation(path, line))
             self._saved = text
             return True
         return False
@@ -111,16 +110,6 @@ class Memory(MutableMapping[str, Any]):
 
     def __repr__(self) -> str:
         return f"<Memory {self._values!r}>"
-
-
-def _replace(path: Path, text: str, *, synced: bool) -> None:
-    if not synced:  # a power cut may damage the new file; the one before is on the disk by now
-        aside = path.with_name(f".{path.name}.before")
-        with contextlib.suppress(OSError):  # the first one, or a file system without links
-            aside.unlink(missing_ok=True)
-            os.link(path, aside)
-            aside.replace(previous_generation(path))
-    write_atomic(path, [text.encode(), b"\n"], synced=synced, soon=not synced)
 
 
 def _number(value: Any) -> Any:

@@ -103,10 +103,10 @@ class Shadow:
         _replace(aside, self._names / path.replace("/", "%"))
 
     def forget(self, path: Any) -> None:
-        """Forget the file of this name: its inode number may be reused."""
+        """Forget the file of this name, unless it has another name: its inode number may be reused."""
         with contextlib.suppress(OSError):
             found = os.lstat(path)
-            if str(path).startswith(self._folder) and stat.S_ISREG(found.st_mode):
+            if str(path).startswith(self._folder) and stat.S_ISREG(found.st_mode) and found.st_nlink == 1:
                 _unlink(self._files / str(found.st_ino))
 
     def restore(self) -> None:

@@ -147,13 +147,30 @@ def test_later_packets_do_not_overtake_those_on_disk() -> None:
     assert [first.time_ns, *(packet.time_ns for packet in iter(backlog.take, None))] == [0, 1, 2, 3]
 
 
-def test_a_power_cut_after_an_unsynced_save_leaves_the_generation_before(tmp_path: Path) -> None:
-    memory = Memory(tmp_path / "x.json")
-    for done in (1, 2):
+@pytest.mark.parametrize("cut", range(1, 13))
+def test_power_cut_after_unsynced_saves_leaves_a_generation_before(tmp_path: Path, cut: int) -> None:
+    path = tmp_path / "x.json"
+    memory = Memory(path)
+    for done in (1, 2, 3):
         memory["done"] = done
         assert memory.save(synced=False)
-    assert Memory(tmp_path / "x.json")["done"] == 2
-    (tmp_path / "x.json").write_bytes(b"")  # what may be left of a file that was not synced
-    again = Memory(tmp_path / "x.json")
-    assert again["done"] == 1
-    assert again.damage
+    assert Memory(path)["done"] == 3
+    path.write_bytes(path.read_bytes()[:-cut])
+    again = Memory(path)
+    assert again["done"] == (3 if cut == 1 else 2)
+    assert bool(again.damage) == (cut not in (1, 12))
+    again["done"] = 4
+    assert again.save(synced=False)
+    assert Memory(path)["done"] == 4
+
+
+def test_unsynced_saves_keep_the_memory_file_short(tmp_path: Path) -> None:
+    path = tmp_path / "x.json"
+    memory = Memory(path)
+    for done in range(30):
+        memory["done"] = f"{done} {100_000 * 'x'}"
+        assert memory.save(synced=False)
+    assert path.stat().st_size < 1.1 * 2**20
+    assert memory.save()
+    assert len(path.read_bytes().splitlines()) == 1
+    assert Memory(path)["done"].startswith("29 ")

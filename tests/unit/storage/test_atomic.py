@@ -174,10 +174,9 @@ def test_two_unreadable_generations_are_refused(tmp_path: Path) -> None:
         load_checkpoint(path, number)
 
 
-@pytest.mark.parametrize("left", [b"", b"\0" * 20])
-def test_first_generation_lost_in_a_power_cut_counts_as_no_file(tmp_path: Path, left: bytes) -> None:
+def test_first_generation_lost_in_a_power_cut_counts_as_no_file(tmp_path: Path) -> None:
     path = tmp_path / "x"
-    path.write_bytes(left)
+    path.write_bytes(b"")
     assert load_checkpoint(path, number) == (None, "")
 
 
