@@ -160,8 +160,7 @@ class LimitsReader:
         if known is not None or not any(key in given for key in _QUANTITIES):
             return known
         if instrument_of(name) in self.instruments:
-            # as written: an instrument converts it, and refuses values without a unit
-            return _unit_given(given, lambda written: written) or ""
+            return self._unit_of_instrument(given, path)
         unit = _unit_given(given, si_unit)
         if unit is None:
             if name in names.BASE_PARAMETERS:
@@ -172,6 +171,14 @@ class LimitsReader:
         hint = f"values without a unit are taken to be in {unit}: see that the translator means the same"
         self.document.warning(what, *path, hint=hint)
         return unit
+
+    def _unit_of_instrument(self, given: Table, path: tuple[str, ...]) -> str:
+        # as written: an instrument converts it, and refuses values without a unit
+        unit = _unit_given(given, str)
+        if unit is None:
+            what = f"[{'.'.join(path)}] has no unit: if the instrument's parameter has one, each request is refused"
+            self.document.warning(what, *path, hint='give the unit, as in "20 K"')
+        return unit or ""
 
     def _action(self, name: str, table: object) -> Limit | None:
         path = ("limits", "actions", name)
@@ -219,9 +226,10 @@ class LimitsReader:
             self.document.error(what, *place, hint=nearest(name, known))
             return None
         given = dict(zip(("min", "max"), pair, strict=True))
-        # of an instrument as written, as in `_unit`
-        as_unit = si_unit if name in self.parameters else str
-        unit = self.parameters.get(name) or _unit_given(given, as_unit) or ""
+        if name in self.parameters:
+            unit = self.parameters[name] or _unit_given(given, si_unit) or ""
+        else:
+            unit = self._unit_of_instrument(given, place)
         low, high = (self._in(value, key, unit, place) for key, value in given.items())
         if low is not None and high is not None and low > high:
             self.document.error(f"{name_of(place)}: the first value is above the second", *place)

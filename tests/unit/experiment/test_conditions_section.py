@@ -48,6 +48,19 @@ def test_limit_of_an_instrument_is_in_the_unit_as_written(write: Write) -> None:
 
 
 @pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ('[limits."cryo.field"]\nmax = 2\n', "[limits.cryo.field]"),
+        ('[limits.roles.grid]\nparameters = { "cryo.field" = [0, 2] }\n', "[limits.roles.grid.parameters.cryo.field]"),
+    ],
+)
+def test_limit_of_an_instrument_without_a_unit_is_a_warning(write: Write, text: str, place: str) -> None:
+    grid = "[grid]\ncomponent = true\nclass = 'Series'\n"
+    found = [one for one in write(CRYO + grid + text).check() if "has no unit" in one.what]
+    assert [one.what.partition(" has")[0] for one in found] == [place]
+
+
+@pytest.mark.parametrize(
     ("text", "what"),
     [
         ('[conditions.cold]\n"cryo.temprature" = { from = "4 K" }\n', "no instrument has the parameter"),
