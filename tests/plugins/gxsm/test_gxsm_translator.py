@@ -678,7 +678,7 @@ def test_scan_with_a_shorter_start_delay_counts_as_new(bench: Make) -> None:
 
 def test_redpitaya_measurement_at_the_panel_does_not_republish_the_previous_scan(bench: Make) -> None:
     # RPSPMC does not distinguish spectra from scans, and GXSM saves its memory again after a spectrum.
-    made = bench(speed=5.0, card="RPSPMC")
+    made = bench(speed=2.5, card="RPSPMC")
     peer = made.start()
     ready(peer)
     assert len(scanned(peer)) == 4
