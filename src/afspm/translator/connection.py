@@ -9,6 +9,7 @@ from afspm.basics.clock import Clock
 from afspm.basics.errors import AfspmError, ConfigError
 from afspm.translator.driver_base import LOST, ControllerLost, DriverBase
 from afspm.translator.emulated_controller import EmulatedController
+from afspm.transport.process.failure import place_of
 
 RETRY_S = 1.0  # real; decision 0016
 _STARTUP_S = 2.0
@@ -87,7 +88,7 @@ class Connection:
         except LOST:
             raise
         except Exception as error:  # broad: a driver may raise anything, and the tip may be reachable all the same
-            self._log.warning("the tip is retracted although connecting failed: %s", error)
+            self._log.warning("connecting failed, and retracting the tip is tried all the same: %s", error)
 
     def require(self) -> None:
         """Raise ControllerLost unless `stands`."""
@@ -124,10 +125,16 @@ class Connection:
         starts = isinstance(error, LOST) and not self.ever_stood and now_s - self._began_s < _STARTUP_S
         self._retry_at_s = now_s + (_STARTUP_RETRY_S if starts else RETRY_S)
         stood, self.stands, self.is_reached = self.stands, False, False
-        self.why_lost = str(error) if isinstance(error, AfspmError | OSError) else f"{type(error).__name__}: {error}"
+        self.why_lost = _reason(error)
         if not starts and (stood or self.why_lost != self._logged):
             self._logged = self.why_lost
             self._log.error("lost contact with the controller: %s; retrying", self._logged)
         if stood or not self._loss_published:
             self._loss_published = True
             self._on_lost()
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, AfspmError | OSError):
+        return str(error)
+    return f"{type(error).__name__}: {error} ({place_of(error)})"  # a fault of the driver, found by its line
