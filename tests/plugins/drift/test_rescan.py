@@ -41,6 +41,13 @@ def test_a_rotated_scan_is_off_at_its_corners() -> None:
     assert "14.1 nm off" in too_far_off(ASKED, turned, 0.0, 0.99 * corner_m)
 
 
+def test_the_reason_for_a_rescan_names_the_value_that_exceeds_the_tolerance() -> None:
+    scanned = ASKED.moved_to((8.0 * NM, 0.0))
+    assert too_far_off(ASKED, scanned, 1.5 * NM, 10.0 * NM) == (
+        "it may be 11 nm off (8 nm, and twice the standard deviation of 1.5 nm), 10 nm is tolerated"
+    )
+
+
 def test_regions_in_tip_coordinates_are_refused() -> None:
     tip = Region((0.0, 0.0), (2e-6, 2e-6))
     with pytest.raises(InvalidValue, match="tip coordinates"):

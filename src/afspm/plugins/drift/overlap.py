@@ -164,10 +164,11 @@ def too_far_off(asked: Region, scanned: Region, sd_m: float, tolerance_m: float)
     if not tolerance_m > 0.0:
         raise InvalidValue(f"the tolerance must be above zero, and is {tolerance_m * 1e9:g} nm")
     off_m = float(np.linalg.norm(asked.corners_m() - scanned.corners_m(), axis=1).max())
-    if off_m + 2.0 * sd_m <= tolerance_m:
+    worst_m = off_m + 2.0 * sd_m
+    if worst_m <= tolerance_m:
         return ""
-    tolerated = f"{tolerance_m * 1e9:.3g} nm is tolerated"
-    return f"it is {off_m * 1e9:.3g} nm off (standard deviation {sd_m * 1e9:.2g} nm), {tolerated}"
+    parts = f"{off_m * 1e9:.3g} nm, and twice the standard deviation of {sd_m * 1e9:.2g} nm"
+    return f"it may be {worst_m * 1e9:.3g} nm off ({parts}), {tolerance_m * 1e9:.3g} nm is tolerated"
 
 
 def _in_sample(*regions: Region) -> None:
