@@ -97,7 +97,7 @@ class ScanAssembler:
         before = self._open.lines[-1][1] if self._open.lines else None
         over: list[Assembled] = []
         if self._open.channels or (before is not None and (before.region, before.shape) != (lines.region, lines.shape)):
-            over = self.finish(packet.time_ns or 0)
+            over = self.finish()
         self._open.lines.append((packet, lines))
         return over
 
@@ -114,7 +114,7 @@ class ScanAssembler:
             interrupted.interrupted_ns = time_ns
             return [interrupted]
         if status.state is ScopeState.SCANNING and before is not ScopeState.SCANNING:
-            return self.finish(time_ns)
+            return self.finish()
         # lines without channels stay open: some translators become free before they publish the scan
         return self.flush() if status.state is ScopeState.FREE else []
 
@@ -125,13 +125,14 @@ class ScanAssembler:
         taken, self._open = self._open, AssembledScan()
         return [taken]
 
-    def finish(self, time_ns: int) -> list[Assembled]:
-        """End the open scan; a scan without channels counts as interrupted."""
+    def finish(self) -> list[Assembled]:
+        """End the open scan; a scan without channels counts as interrupted, at the time of its last lines."""
         if not self._open.channels and not self._open.lines:
             return []
         taken, self._open = self._open, AssembledScan()
         if not taken.channels:
-            taken.interrupted_ns = time_ns
+            # not the time of what comes next: by then the same scan may have been requested again
+            taken.interrupted_ns = taken.lines[-1][0].time_ns or 0
         return [taken]
 
 

@@ -93,8 +93,6 @@ class RecordStore:
     def _begin(self, about: RecordSettings) -> None:
         self._files = MeasuredFiles(self._folder, self._journal, about.facts, about.problems)
         self._gathering = ScanAssembler(provenance.last_state(self._journal))
-        newest = self._journal.execute("SELECT max(time_ns) FROM packets WHERE source = ?", (SCHEDULER,)).fetchone()[0]
-        self._newest_ns = -1 if newest is None else int(newest)
         for name, value in about.facts.items():
             self.note(name, value)
 
@@ -122,7 +120,7 @@ class RecordStore:
     def finish(self) -> None:
         """End the open scan; a scan with lines only is recorded as interrupted. Raises as `take`."""
         with self._all_or_nothing():
-            self._write(self._gathering.finish(self._newest_ns))
+            self._write(self._gathering.finish())
 
     def unlisted_files(self) -> list[str]:
         """Return the files of measurements that no table of the journal names, as paths in the run's folder."""
@@ -162,7 +160,7 @@ class RecordStore:
 
     @contextmanager
     def _all_or_nothing(self) -> Iterator[None]:
-        gathering, newest_ns = self._gathering.copy(), self._newest_ns
+        gathering = self._gathering.copy()
         self._journal.execute("BEGIN IMMEDIATE")
         try:
             yield
@@ -171,7 +169,7 @@ class RecordStore:
             self._journal.execute("COMMIT")
         except BaseException:  # only to roll back: every error is raised again, also KeyboardInterrupt
             self._files.discard()
-            self._gathering, self._newest_ns = gathering, newest_ns
+            self._gathering = gathering
             with suppress(sqlite3.Error):  # after an error of a full disk, SQLite may have rolled back already
                 self._journal.execute("ROLLBACK")
             raise
@@ -190,8 +188,6 @@ class RecordStore:
                 self._write(self._gathering.spectrum(packet, replace(thing, frame=self._about.frame)))
             case _:
                 self._add(packet, message, source, thing)
-        if source == SCHEDULER:
-            self._newest_ns = max(self._newest_ns, packet.time_ns or 0)
 
     def _add(self, packet: Packet, message: str, source: str, thing: object) -> None:
         payload = without_values(message, packet.payload) if message else bytes(packet.payload)

@@ -51,6 +51,19 @@ def test_scan_is_found_by_its_key(night: Night, store: RecordStore, tmp_path: Pa
         run.scan("tile-9")
 
 
+def test_key_leads_to_the_whole_scan_after_a_run_was_cut_off_in_it(
+    night: Night, store: RecordStore, tmp_path: Path
+) -> None:
+    store.take([start(night, "tile-1"), night.state(ScopeState.SCANNING), night.lines()])
+    ended_ns = night.now_ns
+    resumed = night.state(ScopeState.FREE)  # not INTERRUPTED: nobody saw the end of the scan
+    store.take([resumed, start(night, "tile-1"), *night.whole_scan(1)])
+    run = afspm.open_run(tmp_path)
+    assert [(row.key, row.interrupted) for row in run.scans] == [("tile-1", True), ("tile-1", False)]
+    assert run.scan("tile-1").first.filename == "scan-0001.nc"
+    assert (run.scans[0].time_ns, run.scans[0].began_ns) == (ended_ns, ended_ns - 1_000_000)
+
+
 def test_record_without_keys_is_named_in_the_error(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take(night.whole_scan(1))
     with pytest.raises(KeyError, match="nothing was measured under a key"):
