@@ -102,7 +102,8 @@ class ControlHold:
         reported = ""
         while not self.held:
             may_ask = link.or_reconnected(self._when_changed(solving))
-            obstacle = self._ask(solving, until_s)
+            with link.clock.late():  # not in the wait below: another component may use that time
+                obstacle = self._ask(solving, until_s)
             if obstacle is None:
                 break
             if obstacle != reported:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC
 from typing import Any
@@ -177,9 +177,7 @@ class MeasurementRunner:
             self._control.release_inherited()
             results = task.watch.cycle.results
         else:
-            with ExitStack() as control:
-                with self._link.clock.late():
-                    control.enter_context(self._control.hold(until_s=task.until_s))
+            with self._control.hold(until_s=task.until_s):
                 results = self._measure(task).results
         return list({task.target.name_of(thing): thing for thing in results}.values())
 

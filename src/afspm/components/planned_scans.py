@@ -107,7 +107,7 @@ class PlannedScans(Component):
     def _set_parameters(self) -> None:
         if not self.parameters:
             return  # control would be released, perhaps in a scan from before a restart: no flag would stop that scan
-        with self.clock.late(), self.scope.control():
+        with self.scope.control(), self.clock.late():
             for name, quantity in self.parameters.items():
                 self.scope.set(name, quantity)
 

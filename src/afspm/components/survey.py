@@ -186,7 +186,7 @@ class Survey(Component):
 
     def _set(self, parameters: Mapping[str, str | float]) -> None:
         if parameters:
-            with self.clock.late(), self.scope.control():
+            with self.scope.control(), self.clock.late():
                 for name, quantity in parameters.items():
                     self.scope.set(name, quantity)
 
