@@ -264,6 +264,9 @@ class TipJudge:
         seen = metrics(seen_slopes, correlation, place.expected if place else None)
         if seen.contrast < LEAST_CONTRAST:
             return Verdict(Opinion.UNCLEAR, f"nothing to see but noise (contrast {seen.contrast:.2f})", seen)
+        if seen.ghost > 1.0:  # trace and retrace agree more at another place than at their own
+            why = "trace and retrace do not agree: the feedback does not follow the surface at this speed"
+            return Verdict(Opinion.UNCLEAR, why, seen)
         if not self._is_known(kind):
             return self._learn(kind, place, seen, correlation, region)
         verdict = self._compare(kind, place, seen)

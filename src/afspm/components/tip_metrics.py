@@ -40,7 +40,8 @@ class TipMetrics:
 
     Attributes:
         detail: short-wave against long-wave power of the slopes.
-        ghost: largest autocorrelation of the slopes beside the centre, 0 to 1, beyond what was expected there.
+        ghost: largest autocorrelation of the slopes beside the centre, 0 to 1, beyond what was expected there; above 1
+            if trace and retrace are displaced against each other, and the metrics mean nothing.
         unrest_m: disagreement of trace and retrace over stretches, exceeded in a tenth of the lines; 0 without retrace.
         contrast: power of the sample's slopes relative to noise; below `LEAST_CONTRAST` the other metrics mean nothing.
     """

@@ -75,6 +75,14 @@ def test_fault_found_at_a_known_place_is_not_cleared_elsewhere(seed: int, condit
     assert judged(judge, bad[-1]).opinion is not Opinion.GOOD
 
 
+def test_trace_and_retrace_of_different_places_are_unclear() -> None:
+    judge, good, _ = learnt(1, "double")
+    trace, retrace = (scan.values for scan in good[0])
+    verdict = judge.judge(trace, np.roll(retrace, 24, axis=1), good[0][0].region)
+    assert verdict.opinion is Opinion.UNCLEAR
+    assert "trace and retrace do not agree" in verdict.why
+
+
 def test_reference_survives_a_restart() -> None:
     judge, good, bad = learnt(2, "double")
     again = TipJudge(LEARN)
