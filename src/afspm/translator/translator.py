@@ -164,6 +164,8 @@ class Translator:
         if response.code == ControlResponse.NO_RESPONSE:  # the controller is still starting, which is no refusal
             self._log.log(level, "%s", response.reason)
         elif response.code != ControlResponse.SUCCESS:
+            if response.code == ControlResponse.NOT_FREE:  # clients wait, and ask again
+                level = logging.DEBUG
             self._log.log(level, "refused, %s: %s", ControlResponse(response.code).name, response.reason)
         self._port.reply(wire.encode_response(response))
 
