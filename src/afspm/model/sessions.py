@@ -159,6 +159,11 @@ class SessionTable:
         session = self.names.get(name)
         return session.connection if session is not None else None
 
+    def token(self, name: str) -> str | None:
+        """Return the token of the newest session of a name; None if unknown."""
+        session = self.names.get(name)
+        return None if session is None else session.token
+
     def lost_since_s(self, name: str) -> float | None:
         """Return the real time at which a known name lost its connection; None if connected or unknown."""
         session = self.names.get(name)

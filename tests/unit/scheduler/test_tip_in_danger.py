@@ -15,7 +15,7 @@ from afspm.model import (
     ResponseDetail,
     ScopeState,
 )
-from afspm.scheduler.events import Kill, Log, Stopped, Tick, TranslatorDown, TranslatorUp
+from afspm.scheduler.events import Disconnected, Kill, Log, Stopped, Tick, TranslatorDown, TranslatorUp
 from afspm.scheduler.safety.watchdog import WatchdogSettings
 from afspm.scheduler.settings import ControlSettings, SchedulerSettings, Waits
 
@@ -510,3 +510,46 @@ def test_second_kill_does_not_forget_the_retract_of_the_first_life() -> None:
     again = Lab(state=restarted_over_a_retract().core.snapshot())
     again.step(TranslatorUp())
     assert again.says("corrector", ACTION, "start-scan") is ControlResponse.NOT_FREE
+
+
+def restarted_with_feedback_off() -> Lab:
+    lab = Lab(SchedulerSettings())
+    lab.translator()
+    lab.scope_is(ScopeState.FREE)
+    lab.ask("experiment", ControlRequest.REQUEST_CTRL, 0, "experiment/a/1")
+    lab.publish("ZCtrlParameters", OFF)
+    lab.step(Disconnected(lab.connections.pop("experiment")))
+    lab.ask("experiment", ControlRequest.REQUEST_CTRL, 0, "experiment/b/1")
+    assert lab.holder == "experiment"
+    return lab
+
+
+@pytest.mark.parametrize("request_id", ["experiment/b/2", "experiment/key/tile/1"])
+def test_restarted_holder_does_not_measure_with_the_feedback_off_of_its_earlier_life(request_id: str) -> None:
+    lab = restarted_with_feedback_off()
+    (reply,) = replies(lab.ask("experiment", ACTION, "start-scan", request_id))
+    assert reply.response.code == ControlResponse.NOT_IN_CONTROL
+    assert "its process died" in reply.response.reason
+    assert sent(lab) == ["x-retract"]
+    lab.answer(lab.forwarded[-1])
+    lab.step(Tick())
+    assert int(Problem.DEVICE_MALFUNCTION) in lab.core.control.problems
+
+
+def test_restarted_scheduler_knows_that_the_holder_had_died_with_the_feedback_off() -> None:
+    again = resumed(restarted_with_feedback_off(), SchedulerSettings())
+    again.ask("experiment", ControlRequest.REQUEST_CTRL, 0, "experiment/c/1")
+    (reply,) = replies(again.ask("experiment", ACTION, "start-scan", "experiment/c/2"))
+    assert reply.response.code == ControlResponse.NOT_IN_CONTROL
+    assert sent(again) == ["x-retract"]
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_restarted_holder_that_sets_the_feedback_itself_goes_on(on: bool) -> None:
+    lab = restarted_with_feedback_off()
+    lab.ask("experiment", ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=on), "experiment/b/2")
+    lab.answer(lab.forwarded[-1])
+    lab.publish("ZCtrlParameters", Feedback(on=on))
+    lab.ask("experiment", ACTION, "start-spec", "experiment/b/3")
+    assert sent(lab) == [Feedback(on=on), "start-spec"]
+    assert lab.holder == "experiment"

@@ -70,14 +70,18 @@ def decide(draft: StateDraft, ask: ControlInput, event: RequestIn | None = None)
     if before.holder is None and after.holder is not None:
         draft.lease = replace(draft.lease, token=token)
     if after != before:
-        granted_to = draft.lease.token
-        is_other_life = None not in (token, granted_to) and token != granted_to
-        _carry_out(draft, _Change(before, after, ask, row, is_other_life and ask.who == before.holder))
+        had_died = ask.who == before.holder and is_other_life(draft, token)
+        _carry_out(draft, _Change(before, after, ask, row, had_died))
     if after.ended and not before.ended:
         begin_end(draft)
     if event is not None and row.response is not None:
         answer_unless_ending(draft, event, row.response, reason(row, before, ask, rules))
     return False
+
+
+def is_other_life(draft: StateDraft, token: str | None) -> bool:
+    """Return whether a session token belongs to another process than the holder that was granted control."""
+    return None not in (token, draft.lease.token) and token != draft.lease.token
 
 
 def begin_end(draft: StateDraft) -> None:

@@ -304,6 +304,11 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
     if (refusal := _not_allowed_now(draft, job)) is not None:
         _answer_unsent(draft, job, refusal)
         return
+    if _knows_no_danger(draft, job):
+        draft.pending = replace(draft.pending, turn=None)
+        # the death of its earlier life is decided now: the tip is retracted, and this command is called back
+        control_change.decide(draft, ControlInput(ArbitrationEvent.DEAD, job.client))
+        return
     turn = draft.pending.turn or Turn(job.number)
     if turn.awaited is None and _starts_reads(draft, job, turn):
         return
@@ -377,6 +382,17 @@ def _not_allowed_now(draft: StateDraft, job: ForwardedRequest) -> Response | Non
     if (why := _refusal_for_tip(draft)) is not None:
         return Response(int(ControlResponse.NOT_FREE), b"", why, job.request.id)
     return None
+
+
+def _knows_no_danger(draft: StateDraft, job: ForwardedRequest) -> bool:
+    # the holder was restarted, and commands with the feedback off as its earlier life left it (decision 0001); one that
+    # sets the feedback or retracts knows of it
+    if job.client != draft.control.holder or not draft.microscope.endangered_by_feedback:
+        return False
+    retracts = job.request.kind == _ACTION and job.request.subject == draft.watchdog.settings.retract
+    feedback = feedback_of(job.request)
+    is_aware = retracts or (feedback is not None and feedback.on is not None)
+    return not is_aware and control_change.is_other_life(draft, draft.peers.sessions.token(job.client))
 
 
 def _refusal_for_tip(draft: StateDraft) -> str | None:
@@ -587,6 +603,9 @@ def _apply_success(draft: StateDraft, job: ForwardedRequest, response: Response)
         _action_started(draft, job, is_certain=True)
     elif (feedback := feedback_of(request)) is not None:
         draft.microscope = draft.microscope.with_feedback(feedback)
+        if feedback.on is not None and job.client and job.client == draft.control.holder:
+            # from now on the restarted holder answers for the feedback itself
+            draft.lease = replace(draft.lease, token=draft.peers.sessions.token(job.client) or draft.lease.token)
     if job.command:
         _restart_lease(draft, job.client)
         approvals.done(draft, job)
