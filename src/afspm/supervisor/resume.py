@@ -29,6 +29,7 @@ from afspm.supervisor.ports import require_free
 from afspm.supervisor.run import FILES, HOMES, HOW, ONLY, RUN, WITHOUT, FinishedRun, RunOptions
 from afspm.supervisor.run_identity import RunIdentity, new_identity
 from afspm.supervisor.supervision.run_end import EndReason
+from afspm.supervisor.supervisor import TOLERANCE_S
 
 _OVER = {reason.name.lower() for reason in EndReason if reason.is_final}
 _LOOPBACK = re.compile(r"tcp://(127\.0\.0\.1|localhost|\*|0\.0\.0\.0):(\d+)")
@@ -123,12 +124,21 @@ def _resumed_identity(experiment: Experiment, options: RunOptions, found: Resuma
     facts = found.facts
     simulated = bool(facts.get("simulated")) or experiment.simulated(options.only, options.without)
     if not simulated:
-        clock = experiment.clock()
+        clock = _real_clock_after(found.folder, experiment.clock())
     elif options.only or options.without:
         clock = ExperimentClock.from_dict(facts["clock"])
     else:
         clock = _clock_after(facts, found.folder)
     return RunIdentity(clock, str(facts.get(RUN) or new_identity()), simulated)
+
+
+def _real_clock_after(folder: Path, clock: ExperimentClock) -> ExperimentClock:
+    # Where the wall clock was set back (a battery is empty, or it was wrong before), components would wait until it
+    # has caught up, and packets would get times that are not theirs.
+    seen_ns = last_seen_ns(folder)
+    if seen_ns <= clock.now_ns() + round(TOLERANCE_S * NS_PER_S):
+        return clock
+    return ExperimentClock.starting_now((seen_ns + STEP_NS) / NS_PER_S)
 
 
 def _clock_after(facts: Plain, folder: Path) -> ExperimentClock:

@@ -14,7 +14,7 @@ from typing import TextIO
 from afspm.basics.addresses import connectable
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError
-from afspm.basics.formatting import counted
+from afspm.basics.formatting import counted, duration_text
 from afspm.basics.launch import Launch, Sockets
 from afspm.client.connect import GUEST, guest_facts
 from afspm.experiment import Experiment, ProcessStart, Role
@@ -32,7 +32,7 @@ from afspm.supervisor.reporter import reporter_of
 from afspm.supervisor.run_identity import RunIdentity
 from afspm.supervisor.supervision.child import ChildPolicy, RestartPolicy
 from afspm.supervisor.supervision.liveness import LivenessPolicy
-from afspm.supervisor.supervisor import RunOutcome, Supervisor
+from afspm.supervisor.supervisor import TOLERANCE_S, RunOutcome, Supervisor
 from afspm.transport.heartbeat import HeartbeatListener
 
 TAKES_WHO_COMES = ""
@@ -132,6 +132,8 @@ def go(
         if {start.launch.name for start in starts} & set(experiment.recorders):
             expect_recorder(log_folder(folder / STATE_DIR))
         log.write(LOGGED_AS, logging.INFO, f"{name}: {counted(len(starts), 'process', 'processes')}, into {folder}")
+        if not common.simulated and (warning := _ahead_of_wall(clock)):
+            log.write(LOGGED_AS, logging.WARNING, warning)
         handed = key_handout.hand_over(experiment, starts)
         reporter = reporter_of(experiment, starts, clock, common.run, handed.supervisor)
         tasks = [from_start(start) for start in handed.starts]
@@ -157,6 +159,15 @@ def go(
         ended = EndedRun(name, folder, outcome, common.simulated)
         post_run.follow(experiment, ended, starts, clock, log, with_report=options.report)
     return FinishedRun(folder, outcome)
+
+
+def _ahead_of_wall(clock: ExperimentClock) -> str:
+    # of a resumed run, see `resume`, or of a scheduler on another computer; empty if the run has the wall clock
+    ahead_s = clock.now_s() - ExperimentClock.real().now_s()
+    if clock.origin_s == clock.start_s or ahead_s < TOLERANCE_S:
+        return ""
+    behind = f"the computer's clock is {duration_text(ahead_s)} behind the run's clock"
+    return f"{behind}, which is never set back; the record keeps the run's own time"
 
 
 def addresses_of(starts: Sequence[ProcessStart]) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import threading
 from dataclasses import replace
@@ -149,3 +150,31 @@ def test_simulated_time_goes_on_where_other_computers_have_parts_of_the_run(
         assert clock.now_s() == pytest.approx(before.now_s(), abs=60.0)
     else:  # nothing has happened meanwhile
         assert clock.now_s() < 6000.0
+
+
+REAL = """
+[microscope]
+component = true
+class = "Nanonis"
+
+[scheduler]
+component = true
+class = "Scheduler"
+"""
+
+
+@pytest.mark.parametrize(("ahead_s", "goes_on"), [(-60.0, False), (1.0, False), (3600.0, True)])
+def test_real_run_goes_on_after_its_last_time_if_the_wall_clock_was_set_back(
+    ahead_s: float, goes_on: bool, tmp_path: Path
+) -> None:
+    file, state = tmp_path / "experiment.toml", tmp_path / "state"
+    file.write_text(REAL, encoding="utf-8")
+    state.mkdir()
+    now_s = ExperimentClock.real().now_s()
+    seen_ns = round((now_s + ahead_s) * 1e9)
+    (state / "microscope.json").write_text(json.dumps({"translator": {"seen_ns": seen_ns}}), encoding="utf-8")
+    experiment = load_expanded(file, [tmp_path])
+    found = ResumableRun(tmp_path, "night", experiment, {RUN: "run", "simulated": False}, (tmp_path,))
+    clock = _resumed_identity(experiment, RunOptions(), found).clock
+    assert clock.now_s() == pytest.approx(now_s + ahead_s if goes_on else now_s, abs=5.0)
+    assert ("behind the run's clock" in running._ahead_of_wall(clock)) is goes_on
