@@ -141,14 +141,17 @@ class CommandRetry:
         request_id: str = "",
         until_s: float | None = None,
         is_seen: Callable[[], bool] = lambda: False,
+        is_lost: Callable[[], bool] = lambda: False,
     ) -> Response:
         """Send a request, and repeat it while the microscope is silent: with the same id, so that it is executed once.
 
         Args:
             is_seen: returns whether the effect of the request has been observed, which counts as an answer.
+            is_lost: returns whether the request had no effect; called if the translator still does not know the outcome
+                after `PATIENCE_S`.
 
         Returns:
-            The answer; NO_RESPONSE only if control was lost before any answer.
+            The answer; NO_RESPONSE only if control was lost before any answer, or if the request `is_lost`.
 
         Raises:
             NoResponse: the microscope stays silent.
@@ -172,6 +175,11 @@ class CommandRetry:
             if is_seen():
                 return Response(ControlResponse.SUCCESS, id=request_id)
             if link.clock.monotonic_s() >= give_up_s:
+                # the translator has answered, and does not know the outcome: it never will
+                is_final = response.detail is ResponseDetail.NONE and bool(response.reason)
+                is_in_time = until_s is None or link.clock.monotonic_s() < until_s
+                if is_final and is_in_time and is_lost():
+                    return response
                 raise NoResponse(
                     f"the microscope does not answer {kind.name}: {response.reason or 'no reason given'}",
                     where=link.name,

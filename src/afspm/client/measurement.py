@@ -25,7 +25,7 @@ from afspm.client.experiment_link import ExperimentLink
 from afspm.client.keyed_results import KeyedResults, MeasurementResult, check_key
 from afspm.client.measurement_setup import MeasurementSetup
 from afspm.client.targets import Target, target_from
-from afspm.model import ControlRequest, ControlResponse, Packet, Response, Scan
+from afspm.model import ControlRequest, ControlResponse, Packet, Response, Scan, ScopeState
 from afspm.model.sessions import KEYED
 from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
 
@@ -223,9 +223,14 @@ class MeasurementRunner:
                 request_id=task.request_id,
                 until_s=until_s,
                 is_seen=lambda: cycle.begun,
+                is_lost=lambda: link.view.state is ScopeState.FREE,
             )
         if response.ok or cycle.begun:
             self._follow(task, watch)
+            return
+        if response.code == ControlResponse.NO_RESPONSE and self._control.held:
+            # a translator that died in the command never knows the outcome under this id: the next attempt has another
+            cycle.outcome = CycleOutcome.VANISHED
             return
         if _may_have_begun(response, is_new=is_new):
             cycle.control_was_lost()

@@ -309,3 +309,29 @@ def test_a_result_that_a_power_cut_has_damaged_is_measured_again(
     assert len(survey(scope_of(lab, tmp_path, 1))) == 3
     assert lab.begun_scans == 4
     assert "tile-1 is damaged and measured again" in caplog.text
+
+
+@pytest.mark.parametrize("lives", [1, 2])
+def test_scan_whose_start_was_lost_is_requested_with_another_id(lives: int, tmp_path: Path) -> None:
+    """A translator that dies in a command, or loses its controller in it, never knows the outcome under this id."""
+    lab, lost = Lab(), list[str]()
+
+    def dies(request: Request) -> Response | str:
+        if request.subject != "start-scan" or request.id not in (lost or [request.id]):
+            return "go on"
+        lost.append(request.id)
+        return Response(ControlResponse.NO_RESPONSE, reason="the translator was restarted during this request")
+
+    lab.intercept = dies
+    for life in range(lives):
+        port = LabPort(lab)
+        if life < lives - 1:
+            kill_in(lab, 30.0, port)
+        try:
+            scans = scope_of(lab, tmp_path, life, port).scan(REGION, shape=(8, 8), key="tile")
+        except Kill9:
+            lab.restart_component()
+    assert len(set(lost)) == 1
+    assert lab.finished == [REGION]
+    assert len(scans.interruptions) == 1
+    assert lab.control.holder is None
