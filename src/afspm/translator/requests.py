@@ -152,8 +152,10 @@ class RequestHandler:
             self._acting = None
             if request.subject == names.RETRACT and response.ok:
                 self._state.feedback.retracted()
-            if response.code == ControlResponse.PARAM_ERROR:
-                self._outcomes.forget(request)  # nothing was changed
+            # nothing was changed, or a setting may be written again: a lost controller is back soon
+            is_lost = response.code == ControlResponse.NO_RESPONSE and request.kind != ControlRequest.ACTION
+            if response.code == ControlResponse.PARAM_ERROR or is_lost:
+                self._outcomes.forget(request)
             else:
                 self._outcomes.finish(request, response)
             self._state.save()

@@ -31,6 +31,7 @@ from afspm.model import (
     names,
 )
 from afspm.storage.memory import Memory
+from afspm.translator.driver_base import ControllerLost
 from afspm.transport.port import ParentGone, RequestReceived, SubscriberJoined
 from afspm.transport.process.parent import TIP_WITHIN_S
 from afspm.wire.generated import feedback_pb2, scan_pb2
@@ -888,6 +889,16 @@ def test_a_request_that_was_refused_may_be_asked_again(bench: Any) -> None:
     bench.microscope.state = ScopeState.FREE
     assert bench.ask(ACTION, names.START_SCAN, "me/1/1").code == OK
     assert bench.microscope.done == ["scan"]
+
+
+def test_setting_lost_with_its_controller_is_carried_out_when_it_is_repeated(bench: Any) -> None:
+    bench.microscope.fails = ControllerLost("reset by peer")
+    lost = bench.ask(PARAM, Parameter("scan-speed", "2", "um/s"), "me/1/1")
+    assert (lost.code, lost.detail) == (ControlResponse.NO_RESPONSE, ResponseDetail.OUTCOME_UNKNOWN)
+    bench.microscope.fails = None
+    bench.look(after_s=1.0)
+    assert bench.ask(PARAM, Parameter("scan-speed", "2", "um/s"), "me/1/1").code == OK
+    assert bench.ask(PARAM, Parameter("scan-speed"), "me/1/2").payload
 
 
 def test_restarted_translator_does_not_repeat_requests(bench: Any) -> None:
