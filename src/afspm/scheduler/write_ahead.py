@@ -37,7 +37,8 @@ class StateFile:
         """Return the state saved last; None if there is no file.
 
         If a power cut has damaged the last state, the last readable state before is used, with its mode and problems,
-        but without a holder: the holder may have changed since, and requests control again.
+        but without a holder: the holder may have changed since, and requests control again. Only a holder that has
+        switched the feedback off is kept, so that the scheduler retracts the tip after its death.
 
         Raises:
             FileError: no saved state can be read, or the folder is missing. Starting without a flagged problem could
@@ -48,10 +49,11 @@ class StateFile:
         state, damage = load_checkpoint(self.path, _read)
         if state is None or not damage:
             return state
-        self._log.critical(
-            "the newest saved state is damaged, the one before it is used, with no component in control: %s", damage
-        )
-        return state.without_holder()
+        risk = state.tip_risk
+        is_kept = state.control.holder is not None and risk.feedback_on is False and not risk.tip_away
+        holder = f"{state.control.holder} in control, as the feedback is off" if is_kept else "no component in control"
+        self._log.critical("the newest saved state is damaged, the one before it is used, with %s: %s", holder, damage)
+        return state if is_kept else state.without_holder()
 
     def save(self, state: SavedState) -> None:
         """Write the state, so that it outlives a kill.

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+from pathlib import Path
+
 import pytest
 from tests.unit.scheduler.logic_lab import Lab, in_control, killed, kinds, replies, resumed
 
@@ -18,6 +21,7 @@ from afspm.model import (
 from afspm.scheduler.events import Disconnected, Kill, Log, Stopped, Tick, TranslatorDown, TranslatorUp
 from afspm.scheduler.safety.watchdog import WatchdogSettings
 from afspm.scheduler.settings import ControlSettings, SchedulerSettings, Waits
+from afspm.scheduler.write_ahead import StateFile
 
 ACTION, PARAM = ControlRequest.ACTION, ControlRequest.PARAM
 OFF = Feedback(on=False)
@@ -553,3 +557,19 @@ def test_restarted_holder_that_sets_the_feedback_itself_goes_on(on: bool) -> Non
     lab.ask("experiment", ACTION, "start-spec", "experiment/b/3")
     assert sent(lab) == [Feedback(on=on), "start-spec"]
     assert lab.holder == "experiment"
+
+
+def test_damaged_state_does_not_lose_the_holder_that_left_the_tip_in_danger(tmp_path: Path) -> None:
+    lab = feedback_off()
+    lab.publish("ZCtrlParameters", OFF)
+    path, log = tmp_path / "scheduler.json", logging.getLogger("scheduler")
+    file = StateFile(path, log)
+    file.save(lab.core.snapshot())
+    file.close()
+    path.write_bytes(path.read_bytes() + b'{"kind": "sch')  # the power failed
+    again = Lab(SchedulerSettings(), state=StateFile(path, log).load())
+    again.translator()
+    assert again.says("other", ControlRequest.REQUEST_CTRL, 0) is ControlResponse.ALREADY_UNDER_CONTROL
+    again.later(real_s=SchedulerSettings().waits.restart_grace_s)
+    again.step(Tick())
+    assert sent(again) == ["x-retract"]
