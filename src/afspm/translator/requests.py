@@ -118,11 +118,11 @@ class RequestHandler:
         # the last look may be old: the microscope must be free now
         if connection.stands and not _is_read_only(request):
             connection.guarded(partial(observer.observe, values=False))
-        if request.subject == names.RETRACT:
+        if request.subject != names.RETRACT:
+            connection.require()
+        elif request.kind == ControlRequest.ACTION:  # the question whether there is such an action needs no controller
             # a retract is always possible: a reachable controller suffices, even if its state can't be read
             connection.reach_for_retract()
-        else:
-            connection.require()
         try:
             done = self.commands.do(request)
         finally:

@@ -230,6 +230,22 @@ def test_tip_is_retracted_although_connecting_fails_halfway(
     assert bench.microscope.done[0] == "retract"
 
 
+def test_question_for_the_retract_logs_no_retraction(
+    bench: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(bench.microscope, "connect", unplugged)
+    bench.microscope.confused = OSError("no space left")
+    bench.look()
+    monkeypatch.setattr(bench.microscope, "connect", full_disk)
+    assert bench.ask(ControlRequest.ACTION_SUPPORT, names.RETRACT).code == OK
+    assert "retracted" not in caplog.text
+    assert bench.microscope.done == []
+
+
+def full_disk(*_: Any) -> Any:
+    raise RuntimeError("no space left")
+
+
 def unplugged(*_: Any) -> Any:
     raise ConnectionError("unplugged")
 
