@@ -15,7 +15,7 @@ from afspm.basics.errors import InvalidValue
 from afspm.model import LoggedPacket
 from afspm.model.snapshot import restored, snapshot
 from afspm.scheduler.saved_state import KIND, VERSION, SavedState
-from afspm.storage.atomic import CheckpointFile, OutageLog, load_checkpoint
+from afspm.storage.atomic import CheckpointFile, OutageLog, load_checkpoint, previous_generation
 from afspm.storage.disk import DEADLINE_S, SYNCER, DiskBacklogFull, DiskThread
 from afspm.storage.packet_log import PacketLog
 
@@ -47,6 +47,8 @@ class StateFile:
         if self.path is None:
             return None
         state, damage = load_checkpoint(self.path, _read)
+        if state is None and previous_generation(self.path).exists():
+            self._log.critical("the saved state is missing: control is free, and no problem is flagged (%s)", self.path)
         if state is None or not damage:
             return state
         risk = state.tip_risk

@@ -59,6 +59,16 @@ def test_written_packets_are_in_the_log_at_once(bench: Bench) -> None:
     assert bench.state.load() == STATE
 
 
+def test_missing_state_is_logged_unless_it_is_the_first(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    assert bench.state.load() is None
+    assert not caplog.records
+    bench.state.save(STATE)
+    bench.state.close()
+    (bench.packets.parent / "scheduler.json").unlink()
+    assert bench.state.load() is None
+    assert "no problem is flagged" in caplog.text
+
+
 class FullDisk:
     """A log that takes no packets while it `is_full`."""
 
