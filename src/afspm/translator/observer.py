@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 
 from afspm import wire
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import AfspmError
+from afspm.basics.formatting import duration_text
 from afspm.model import ScopeState, ScopeStatus, names
 from afspm.storage.disk import is_full
 from afspm.translator import setting_groups
@@ -53,6 +55,7 @@ class Observer:
         self._all_at_s = 0.0
         self._result_since_s: float | None = None
         self._replayed = False
+        self._overdue = OverdueScan(log)
 
     def begin(self) -> None:
         """Publish the last results again (once, after a restart), then all settings and the state.
@@ -77,6 +80,7 @@ class Observer:
         elif (status := self._status()) != published:
             # the end of a measurement changes no setting; any other change of state may
             self.observe(values=published.state not in MEASURING, status=status)
+        self._overdue.look(self._clock.monotonic_s(), self._expected_s)
         for name, payload in self._new_lines():
             self._port.publish(name, payload, self._state.stamp()[0], keep=False)
 
@@ -217,6 +221,7 @@ class Observer:
 
     def _adapt_polling(self, state: ScopeState) -> None:
         before, self._polled_for, now_s = self._polled_for, state, self._clock.monotonic_s()
+        self._overdue.state_changed(now_s, is_scanning=state is ScopeState.SCANNING)
         if state is ScopeState.SCANNING:
             self._live.begin(self._clock.now_ns())
         else:
@@ -232,6 +237,11 @@ class Observer:
         else:
             self._polling.moved(now_s)
 
+    def _expected_s(self) -> float | None:
+        # a person may have made the scan slower since its start; a retrace may be slower than the settings show
+        known = [one for one in (self._polling.expected_s, self._expected_scan()[0]) if one is not None]
+        return max(known, default=None)
+
     def _expected_scan(self) -> tuple[float | None, tuple[Value, ...]]:
         # a lower bound: the time lost at the edges of a scan is not known
         extent = tuple(self.values.get(name, 0.0) for name in setting_groups.EXTENT)
@@ -241,6 +251,39 @@ class Observer:
                 width_m, rows = float(extent[0]), float(extent[1])
                 return self._clock.real_s(2.0 * width_m * rows / speed_m_s), (*extent, speed_m_s)
         return None, extent
+
+
+OVERDUE_RATIO = 3.0
+"""Ratio of a scan's duration to its expected duration above which the scan is overdue."""
+OVERDUE_S = 600.0
+"""Real time added to it: a controller may be slow to begin, and a person may pause a scan."""
+
+
+class OverdueScan:
+    """A watch over a scan that does not end, as of a controller that hangs: everything waits for it."""
+
+    def __init__(self, log: logging.Logger) -> None:
+        self._log = log
+        self._began_s = self._again_s = math.inf
+
+    def state_changed(self, now_s: float, *, is_scanning: bool) -> None:
+        """Process a published change of state, at a real monotonic time."""
+        self._began_s, self._again_s = (now_s, now_s + OVERDUE_S) if is_scanning else (math.inf, math.inf)
+
+    def look(self, now_s: float, expected_s: Callable[[], float | None]) -> None:
+        """Log an overdue scan once.
+
+        Args:
+            expected_s: returns the expected duration in real time; None if unknown.
+        """
+        if now_s < self._again_s:
+            return
+        lasts_s, self._again_s = expected_s(), now_s + OVERDUE_S
+        passed_s = now_s - self._began_s
+        if lasts_s is not None and passed_s > OVERDUE_RATIO * lasts_s + OVERDUE_S:
+            self._again_s = math.inf
+            took, due = duration_text(passed_s), duration_text(lasts_s)
+            self._log.critical("the scan has lasted for %s, %s was expected: does the controller hang?", took, due)
 
 
 def _live_lines_s(microscope: DriverBase) -> float | None:

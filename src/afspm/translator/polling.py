@@ -65,6 +65,12 @@ class AdaptivePolling:
         else:
             self._expected = ExpectedEnd(now_s, now_s + lasts_s, max(_LEAST_DOUBT_S, doubt * lasts_s))
 
+    @property
+    def expected_s(self) -> float | None:
+        """The expected duration of the measurement, learnt from earlier ones if there were any; None if unknown."""
+        expected = self._expected
+        return None if expected is None or expected.end_s is None else expected.end_s - expected.began_s
+
     def moved(self, now_s: float) -> None:
         """Record the start of a short activity."""
         self._measuring = None

@@ -32,6 +32,7 @@ from afspm.model import (
 )
 from afspm.storage.memory import Memory
 from afspm.translator.driver_base import ControllerLost
+from afspm.translator.observer import OVERDUE_RATIO, OVERDUE_S
 from afspm.transport.port import ParentGone, RequestReceived, SubscriberJoined
 from afspm.transport.process.parent import TIP_WITHIN_S
 from afspm.wire.generated import feedback_pb2, scan_pb2
@@ -915,6 +916,24 @@ def test_setting_lost_with_its_controller_is_carried_out_when_it_is_repeated(ben
     bench.look(after_s=1.0)
     assert bench.ask(PARAM, Parameter("scan-speed", "2", "um/s"), "me/1/1").code == OK
     assert bench.ask(PARAM, Parameter("scan-speed"), "me/1/2").payload
+
+
+def test_scan_that_does_not_end_is_logged_once(bench: Any, scan: Any, caplog: pytest.LogCaptureFixture) -> None:
+    bench.microscope.values["Speed"] = 0.01
+    bench.look(after_s=1.0)
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+    lasts_s, _ = bench.translator.observer._expected_scan()
+    assert lasts_s is not None
+    bench.look(after_s=OVERDUE_RATIO * lasts_s + OVERDUE_S - 1.0)
+    bench.microscope.state = ScopeState.FREE
+    bench.microscope.files["a"] = [scan()]
+    bench.look()
+    assert not [one for one in caplog.records if one.levelno == logging.CRITICAL]
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+    for _ in range(4):
+        bench.look(after_s=OVERDUE_RATIO * lasts_s + OVERDUE_S)
+    (logged,) = [one for one in caplog.records if one.levelno == logging.CRITICAL]
+    assert "does the controller hang?" in logged.message
 
 
 def test_restarted_translator_does_not_repeat_requests(bench: Any) -> None:
