@@ -74,14 +74,14 @@ def treatment_ledger(
         keep_away_m: distance from scanned regions within which a treatment counts as near.
     """
     ledger, values, retracted = TreatmentLedger(), dict[str, float](), list[tuple[int, bool]]()
-    for entry in journal:
+    for entry in _once(list(journal)):
         if entry.response not in _COUNTS:
             continue
         if entry.request == ControlRequest.PARAM and entry.subject:
             _keep_value(values, entry)
         elif entry.request == ControlRequest.ACTION and entry.subject in (names.RETRACT, names.ENGAGE):
             retracted.append((entry.time_ns, entry.subject == names.RETRACT))
-        elif entry.request == ControlRequest.ACTION and entry.subject in (names.PULSE, names.CRASH):
+        elif _is_treatment(entry):
             done_ns = entry.sent_ns if entry.sent_ns is not None else entry.time_ns
             place = next((xy_m for time_ns, xy_m in reversed(positions) if time_ns <= done_ns), None)
             if place is not None:
@@ -92,6 +92,31 @@ def treatment_ledger(
                 ledger = replace(ledger, in_keep_away=ledger.in_keep_away + near, places=places)
             ledger = _with_treatment(ledger, entry, values)
     return replace(ledger, feedback_off_s=_off_s(feedback, retracted, end_ns))
+
+
+def _once(journal: Sequence[JournalEntry]) -> list[JournalEntry]:
+    # the entries without unsent treatments, and one entry, with the last response, of each treatment that was sent: a
+    # long treatment has an entry for each repetition of its request, and another for a late answer
+    treatments = {i for i, one in enumerate(journal) if _is_treatment(one)}
+    last = {_sending(journal[i]): i for i in sorted(treatments)}
+    first = {_sending(journal[i]): i for i in sorted(treatments, reverse=True)}
+    found = []
+    for i, entry in enumerate(journal):
+        if i not in treatments:
+            found.append(entry)
+        elif entry.sent_ns is None:
+            found += [entry] if entry.response != ControlResponse.NO_RESPONSE else []
+        elif first[_sending(entry)] == i:
+            found.append(replace(entry, response=journal[last[_sending(entry)]].response))
+    return found
+
+
+def _is_treatment(entry: JournalEntry) -> bool:
+    return entry.request == ControlRequest.ACTION and entry.subject in (names.PULSE, names.CRASH)
+
+
+def _sending(entry: JournalEntry) -> tuple[str, str, int | None]:
+    return entry.who, entry.subject, entry.sent_ns
 
 
 def _keep_value(values: dict[str, float], entry: JournalEntry) -> None:

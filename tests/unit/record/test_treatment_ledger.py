@@ -20,8 +20,10 @@ def sets(at_s: int, name: str, value: str, unit: str, response: int = 0) -> Jour
     )
 
 
-def acts(at_s: int, name: str, response: int = 0, who: str = "corrector") -> JournalEntry:
-    return JournalEntry(at_s * S, "request", who, name, response, request=int(ControlRequest.ACTION), subject=name)
+def acts(at_s: int, name: str, response: int = 0, who: str = "corrector", sent_s: int | None = None) -> JournalEntry:
+    sent_ns = None if sent_s is None else sent_s * S
+    action = int(ControlRequest.ACTION)
+    return JournalEntry(at_s * S, "request", who, name, response, request=action, subject=name, sent_ns=sent_ns)
 
 
 PULSE_SET = [sets(1, names.PULSE_VOLTAGE, "-4000", "mV"), sets(2, names.PULSE_DURATION, "50", "ms")]
@@ -52,10 +54,29 @@ def test_refused_requests_count_nothing_and_unanswered_actions_count() -> None:
         *CRASH_SET,
         sets(2, names.CRASH_DEPTH, "50", "nm", refused),
         acts(3, names.CRASH, int(ControlResponse.NOT_IN_CONTROL)),
-        acts(4, names.CRASH, int(ControlResponse.NO_RESPONSE)),
+        acts(4, names.CRASH, int(ControlResponse.NO_RESPONSE), sent_s=3),
     )
     assert ledger.crashes == 1
     assert ledger.crash_depth_m == pytest.approx(5e-9)
+
+
+def test_treatment_with_several_answers_counts_once_by_its_last_answer() -> None:
+    none = int(ControlResponse.NO_RESPONSE)
+    slow = (
+        acts(9, names.CRASH, none, sent_s=4),
+        acts(15, names.CRASH, none, sent_s=4),
+        acts(16, names.CRASH, sent_s=4),
+    )
+    again = acts(18, names.CRASH, sent_s=17)
+    assert ledger_of(*CRASH_SET, *slow).crash_depth_m == pytest.approx(5e-9)
+    assert ledger_of(*CRASH_SET, *slow, again).crash_depth_m == pytest.approx(10e-9)
+    refused = acts(16, names.CRASH, int(ControlResponse.ACTION_ERROR), sent_s=4)
+    assert ledger_of(*CRASH_SET, slow[0], refused).crashes == 0
+
+
+def test_unsent_treatment_counts_nothing() -> None:
+    unsent = [acts(at_s, names.PULSE, int(ControlResponse.NO_RESPONSE)) for at_s in (3, 4, 5)]
+    assert ledger_of(*PULSE_SET, *unsent, acts(6, names.PULSE, sent_s=6)).pulses == 1
 
 
 def test_treatment_of_unknown_size_is_counted_as_such() -> None:

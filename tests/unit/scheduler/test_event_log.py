@@ -97,6 +97,18 @@ def test_repeated_start_keeps_its_first_time_of_forwarding_over_a_kill(lab: Lab)
     ]
 
 
+def test_repeated_treatment_keeps_its_first_time_of_forwarding_over_a_kill(lab: Lab) -> None:
+    lab.take_control("corrector")
+    lab.ask("corrector", R.ACTION, "x-pulse", "corrector/a/1")
+    sent_ns = lab.now_ns
+    after = killed_after(lab, Forward)
+    after.later(1.0, 1.0)
+    after.ask("corrector", R.ACTION, "x-pulse", "corrector/a/1")
+    after.answer(after.forwarded[-1])
+    pulses = [entry for entry in after.entries() if entry.subject == "x-pulse"]
+    assert [(entry.response, entry.sent_ns) for entry in pulses] == [(C.NO_RESPONSE, sent_ns), (C.SUCCESS, sent_ns)]
+
+
 def test_start_whose_entry_outlived_the_kill_is_not_logged_again(lab: Lab) -> None:
     lab.take_control("survey")
     lab.ask("survey", R.ACTION, "start-scan", "survey/key/tile-1/1")

@@ -70,7 +70,7 @@ def test_request_without_a_change_is_only_answered(lab: Lab) -> None:
 def test_the_holder_s_command_goes_to_the_translator_and_its_answer_back(lab: Lab) -> None:
     lab.take_control("experiment")
     effects = lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
-    assert kinds(effects) == ["Forward"]
+    assert kinds(effects) == ["SaveState", "Forward"]  # a kill must not lose the pulse
     answer = replies(lab.answer(lab.forwarded[-1], payload=b"7"))[0]
     assert (answer.name, answer.response.code, answer.response.payload) == ("experiment", OK, b"7")
 
@@ -331,7 +331,7 @@ def test_unsent_request_may_be_repeated(lab: Lab) -> None:
     answer = replies(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1"))[0].response
     assert (answer.code, answer.detail) == (NO_RESPONSE, ResponseDetail.NOT_SENT)
     lab.translator()
-    assert kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")) == ["Forward"]
+    assert kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")) == ["SaveState", "Forward"]
 
 
 def test_request_that_the_translator_could_not_begin_is_sent_again(lab: Lab) -> None:

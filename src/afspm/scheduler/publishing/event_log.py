@@ -43,7 +43,8 @@ LATE = "late: the client had got no answer in time"
 SCHEDULER = "scheduler"
 """The author of requests of the scheduler itself."""
 _UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})  # sent all the time by supervisors and starting processes
-_STARTS = frozenset({names.START_SCAN, names.START_SPEC})
+# with the treatments of a tip: a kill must not lose a pulse, and its repetitions must not look like other pulses
+_STARTS = frozenset({names.START_SCAN, names.START_SPEC, names.PULSE, names.CRASH})
 _STARTS_KEPT = 16
 """Number of starts kept over a restart: many more than can be forwarded while one entry waits to be published."""
 _CUT_OFF = "the scheduler was restarted before the answer was written down"
@@ -104,7 +105,9 @@ def _subject_of(request: Request) -> tuple[str, str, str]:
 
 @dataclass(frozen=True)
 class SentStart:
-    """The request that starts a measurement, saved before forwarding; its log entry holds the measurement's key.
+    """The request that starts a measurement or a treatment of the tip, saved before forwarding.
+
+    The log entry of a measurement holds its key.
 
     Attributes:
         sent_ns: experiment time of its first forwarding.
@@ -127,6 +130,7 @@ class SentStart:
             request=int(ControlRequest.ACTION),
             sent_ns=self.sent_ns,
             key=key_of(self.who, self.request_id),
+            subject=self.action,
         )
 
 
@@ -137,7 +141,8 @@ class EventLog:
     Attributes:
         due_s: the due time of their publication, in real monotonic time; None without entries.
         left_out: the number of requests that were only counted, with `most` entries gathered.
-        starts: the last starts of measurements, each saved before forwarding, since a kill loses the gathered entries.
+        starts: the last starts of measurements and treatments, each saved before forwarding, since a kill loses the
+            gathered entries.
     """
 
     most: int = MOST
@@ -169,7 +174,7 @@ class EventLog:
         return next(known, now_ns)
 
     def sending(self, who: str, request: Request, sent_ns: int) -> EventLog:
-        """Remember a forwarded request that starts a measurement; ignore all other requests."""
+        """Remember a forwarded request that starts a measurement or a treatment; ignore all other requests."""
         if request.kind != ControlRequest.ACTION or request.subject not in _STARTS:
             return self
         start = SentStart(who, str(request.subject), request.id, sent_ns)
