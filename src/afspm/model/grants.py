@@ -61,7 +61,7 @@ class Grant:
             mode changed since then, or after an hour.
         offset_m: the origin of component coordinates in microscope coordinates at that check; empty: the scheduler maps
             no coordinates.
-        drift_m: largest change of the offset; beyond it the approval is refused, too.
+        drift_m: largest change of the offset; beyond it the approval of a plan is refused, too.
 
     Raises:
         InvalidValue: a number out of range.

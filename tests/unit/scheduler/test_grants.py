@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -45,7 +46,7 @@ from afspm.model import (
 from afspm.scheduler.control.arbitration import RoleTable
 from afspm.scheduler.events import Forward, Tick
 from afspm.scheduler.instruments.conditions import InstrumentSettings
-from afspm.scheduler.safety.grants import limits_digest
+from afspm.scheduler.safety.grants import GrantChecker, limits_digest
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit, RoleLimits
 from afspm.scheduler.settings import ControlSettings, RunFacts, SchedulerSettings
 
@@ -213,6 +214,17 @@ def test_only_an_agent_is_approved(agent: AgentLab) -> None:
 )
 def test_stale_approval_is_refused(agent: AgentLab, changes: dict[str, Any]) -> None:
     assert agent.give(agent.grant(**changes)) is REFUSED
+
+
+def test_drift_makes_a_plan_stale_and_no_grant(agent: AgentLab) -> None:
+    checker = GrantChecker(agent.settings.rules, agent.settings.limits, "night")
+    now_ns, place = agent.lab.now_ns, {"offset_m": (0.0, 0.0), "drift_m": 1e-9}
+    plan = agent.plan((PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.1", "V")), **place)
+    assert checker.given(ADA, plan, now_ns, (0.9e-9, 0.0))[1] == ""
+    assert "drifted by 1.1 nm" in checker.given(ADA, plan, now_ns, (1.1e-9, 0.0))[1]
+    grant = agent.grant(offset_m=(0.0, 0.0))
+    assert checker.given(ADA, grant, now_ns, (20e-9, 0.0))[1] == ""
+    assert "not known" in checker.given(ADA, grant, now_ns, (math.nan, 0.0))[1]
 
 
 @pytest.mark.parametrize("disturb", ["problem", "manual"])

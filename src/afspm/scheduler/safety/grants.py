@@ -266,6 +266,8 @@ class GrantChecker:
             return "the coordinates of components have changed since the preflight"
         if grant.origin_m is None or offset_m is None:
             return ""
+        if not grant.plan:  # its region drifts with the sample
+            return "" if all(map(math.isfinite, offset_m)) else "the place of the sample is not known"
         moved_m = math.dist(grant.origin_m, offset_m)
         is_near = moved_m <= grant.drift_m  # False also for NaN: the place is not known
         return "" if is_near else f"the sample has drifted by {moved_m * 1e9:.3g} nm"
