@@ -355,6 +355,15 @@ def test_request_outside_of_the_grant_is_refused(agent: AgentLab, kind: int, sub
     assert agent.do(kind, subject) != ""
 
 
+def test_value_with_a_unit_is_outside_a_range_whose_unit_is_unknown(agent: AgentLab) -> None:
+    volts, amperes = GrantedRange(names.PULSE_VOLTAGE, -2.0, 2.0), GrantedRange(names.ZCTRL_SETPOINT, 0.0, 1e-10)
+    agent.begin(agent.grant(ranges=(volts, amperes)))
+    assert "kV" in agent.do(PARAM, Parameter(names.PULSE_VOLTAGE, "2", "kV"))
+    assert "kA" in agent.do(PARAM, Parameter(names.ZCTRL_SETPOINT, "5e-11", "kA"))
+    assert agent.do(PARAM, Parameter(names.PULSE_VOLTAGE, "2")) == ""
+    assert agent.do(PARAM, Parameter(names.ZCTRL_SETPOINT, "5e-11")) == ""
+
+
 def test_grant_counts_its_scans(agent: AgentLab) -> None:
     agent.begin(agent.grant())
     for _ in range(2):

@@ -36,7 +36,6 @@ from afspm.model import (
     Request,
     ScanParameters,
     component_of,
-    instrument_of,
     names,
 )
 from afspm.model.geometry import XY
@@ -482,13 +481,13 @@ def _less(held: Mapping[str, HeldGrant], agent: str) -> dict[str, HeldGrant]:
 
 
 def _limits_of(grant: Grant) -> ExperimentLimits:
-    # a range has no unit of its own: a value of an instrument with a unit is outside
+    # a range is in SI, and the scheduler knows the units of base parameters alone: another value with a unit is outside
     return ExperimentLimits(
         parameters={
             one.parameter: Limit(
                 one.low,
                 one.high,
-                unit=BASE_PARAMETERS.get(one.parameter, "" if instrument_of(one.parameter) else None),
+                unit=BASE_PARAMETERS.get(one.parameter) or "",
                 source="the grant",
             )
             for one in grant.ranges
