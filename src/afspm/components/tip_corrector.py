@@ -363,7 +363,10 @@ class TipCorrector(Component):
                     raise _Blind(f"no test scan can be taken: {error.what}") from error
                 continue
             verdict = self._own_verdict(scans)
-            score = self._own_score(verdict) if self.clears else self._score_of_others(scans, answers)
+            if self.clears:
+                score = self._own_score(verdict, decides=place == looks[-1])
+            else:
+                score = self._score_of_others(scans, answers)
             if not self.scope.is_flagged(self.problem):
                 return True
             if score == tip_verdict.BAD:
@@ -379,12 +382,13 @@ class TipCorrector(Component):
                 return verdict
         return None
 
-    def _own_score(self, verdict: Verdict | None) -> float:
+    def _own_score(self, verdict: Verdict | None, *, decides: bool) -> float:
+        # a scan at `test_center`, where the judge knows no place, can't show a double tip: it doesn't decide
         if verdict is None:
             self.log.warning("the test scan can't be judged: it lacks the channels")
             return tip_verdict.UNCLEAR
         self.log.info("test scan: %s (%s)", verdict.opinion.value, verdict.why)
-        if verdict.opinion is Opinion.GOOD:
+        if verdict.opinion is Opinion.GOOD and decides:
             self._restore(self._of_experiment()[0])
             self.scope.clear(self.problem)
             self._wait_flag(self.problem, flagged=False)

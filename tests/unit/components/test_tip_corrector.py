@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.unit.client.client_lab import REGION, SCAN_S, Kill9, Lab, LabPort, context_of, run
-from tests.unit.components.tip_scans_lab import HOME, channels
+from tests.unit.components.tip_scans_lab import ELSEWHERE, HOME, channels
 
 from afspm import wire
 from afspm.basics.errors import ConfigError
@@ -275,6 +275,28 @@ def test_its_own_judge_learns_nothing_from_the_test_scans_of_a_bad_tip() -> None
     assert len(lab.finished) >= 3
     assert repairing.judge is not None
     assert repairing.judge.kinds == ()
+
+
+def test_its_own_judge_clears_no_flag_by_a_test_scan_at_test_center() -> None:
+    pairs = channels(1, "double", 5)
+
+    class OfDoubleTip(Repairs):
+        def publish_scan(self, region: Region, shape: tuple[int, int] = (8, 8)) -> None:
+            is_elsewhere = region.center_m == pytest.approx(ELSEWHERE.center_m)
+            for scan in pairs[9] if is_elsewhere else pairs[5 + len(self.finished) % 4]:
+                self.publish(Scan(region, scan.channel, scan.unit, scan.values, self.clock.now_ns()))
+
+    lab = OfDoubleTip([])
+    lab.parameters = ScanParameters(HOME, (96, 96))
+    lab.publish(lab.parameters)
+    for number, pair in enumerate(pairs[:3]):
+        for scan in pair:
+            lab.at(10.0 * (number + 1), partial(lab.publish, scan))
+    lab.at(100.0, lambda: lab.flag(TIP))
+    lab.at(9000.0, lab.kill)
+    run(corrector(judge="self", reference_scans=3, crash_depths=(), test_center=ELSEWHERE.center_m), lab)
+    assert lab.finished == [ELSEWHERE, HOME] * 2
+    assert lab.problems == (TIP, MALFUNCTION)
 
 
 def test_no_treatment_is_near_a_scanned_region() -> None:
