@@ -75,7 +75,7 @@ class Report:
             raise InvalidValue("answer and usage are objects, cites and asks are lists")
         try:
             times = tuple(int(one) for one in cites)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:  # OverflowError: infinity, which Python's JSON reads
             raise InvalidValue(f"cites are times in ns: {error}") from error
         return cls(str(plain["status"]), answer, times, tuple(map(str, asks)), usage)
 
@@ -90,7 +90,7 @@ class Report:
             for key in keys:
                 found = found[key]
             return float(found) if not isinstance(found, bool) else math.nan
-        except (KeyError, IndexError, TypeError, ValueError):
+        except (KeyError, IndexError, TypeError, ValueError, OverflowError):
             return math.nan
 
     def value(self, name: str) -> tuple[float, float]:
