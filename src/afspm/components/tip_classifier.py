@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import UnitError
 from afspm.client.component import Component
 from afspm.components import tip_verdict
@@ -11,6 +12,7 @@ from afspm.components.channel_pairs import ChannelPairing, HeightPair, MissingCh
 from afspm.components.tip_judge import Opinion, TipJudge, TipTolerance, Verdict, VerdictCounter
 from afspm.model import ControlState, Scan
 
+ARRIVES_WITHIN_S = 600.0  # experiment time from the end of a scan to its arrival
 _SCORES = {Opinion.GOOD: tip_verdict.GOOD, Opinion.BAD: tip_verdict.BAD, Opinion.UNCLEAR: tip_verdict.UNCLEAR}
 
 
@@ -59,6 +61,7 @@ class TipClassifier(Component):
         self.counter = VerdictCounter(flag_after, clear_after)
         self.problem = problem
         self._problems: tuple[int, ...] | None = None  # not known yet
+        self._flagged_ns = -1  # time of a flag by another component or a person
 
     def on_start(self) -> None:
         self.expected = MissingChannels(self.pairing.channels, self.log)
@@ -69,7 +72,9 @@ class TipClassifier(Component):
     def on_control(self, control_state: ControlState) -> None:
         was, self._problems = self._is_flagged, control_state.problems
         if self._is_flagged and not was and self.counter.bad < self.counter.flag_after:
-            self.counter.good = 0  # flagged by another component or a person: only later scans can clear it
+            # flagged by another component or a person: only later scans can clear it
+            self.counter.good = 0
+            self._flagged_ns = (self.packet and self.packet.time_ns) or self.clock.now_ns()
         elif was and not self._is_flagged:
             self.counter.bad = 0  # repaired, or cleared by a person: only later scans can flag it
             self.judge.trust()
@@ -93,9 +98,14 @@ class TipClassifier(Component):
         except UnitError as error:
             self.log.warning("%s is not a height: %s", pair.trace.channel, error)
             return
-        self.counter.count(verdict.opinion)
+        is_older = verdict.opinion is Opinion.GOOD and self._ended_before_flag(pair.trace)
+        self.counter.count(Opinion.UNCLEAR if is_older else verdict.opinion)
         self._announce(pair.trace, verdict)
         self._remember(pair.trace)
+
+    def _ended_before_flag(self, scan: Scan) -> bool:
+        # with drift correction a scan arrives a while after its end; older times are of another clock
+        return scan.time_ns is not None and 0 <= self._flagged_ns - scan.time_ns < ARRIVES_WITHIN_S * NS_PER_S
 
     def _announce(self, scan: Scan, verdict: Verdict) -> None:
         # A solver needs the verdict to know where the fault is, and must find no flag after a good one:

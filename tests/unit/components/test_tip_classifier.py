@@ -124,6 +124,20 @@ def test_treated_tip_is_flagged_by_later_bad_scans_only() -> None:
     assert asked(lab, ControlRequest.ADD_EXP_PRBLM) == 1
 
 
+@pytest.mark.parametrize(("ended_s", "left"), [(440.0, (TIP,)), (460.0, ())])
+def test_flag_of_a_person_is_cleared_by_no_scan_that_ended_before(ended_s: float, left: tuple[int, ...]) -> None:
+    lab = Lab("tip_classifier")
+    pairs = channels(1, "double", 5)
+    start_ns = lab.clock.now_ns()
+    for number, pair in enumerate(pairs[:4]):
+        time_ns = start_ns + round((ended_s if number == 3 else 100.0 * number) * 1e9)
+        publish_at(lab, 100.0 * number + 170.0, tuple(replace(one, time_ns=time_ns) for one in pair))
+    lab.at(450.0, lambda: lab.flag(TIP))
+    lab.at(700.0, lab.kill)
+    run(classifier(), lab)
+    assert lab.control.published().problems == left
+
+
 def test_a_kind_of_scan_that_is_new_while_a_problem_is_flagged_is_unclear_and_not_learnt_from() -> None:
     lab = Lab("tip_classifier")
     pairs = channels(1, "double", 5)
