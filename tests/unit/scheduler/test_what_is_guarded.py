@@ -54,6 +54,27 @@ def test_place_moved_out_of_the_region_at_the_panel_is_refused_when_used(action:
     assert sent(lab.answer_reads(scan_top_left_x="1e-6", probe_pos_x="1e-6", **HERE)) == [action]
 
 
+VOLTAGE = SchedulerSettings(
+    limits=ExperimentLimits({"x-pulse-voltage": Limit(-4.0, 4.0, unit="V", source="experiment.toml:7")})
+)
+
+
+def test_pulse_with_a_voltage_in_force_beyond_its_limit_is_refused() -> None:
+    lab = in_control(VOLTAGE)
+    lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
+    (reply,) = replies(lab.answer_reads(x_pulse_voltage="5"))
+    assert reply.response.code == ControlResponse.ACTION_ERROR
+    assert "x-pulse: x-pulse-voltage = 5 V is above the highest allowed, 4 V" in reply.response.reason
+    lab.ask("experiment", ACTION, "x-pulse", "experiment/a/2")
+    assert sent(lab.answer_reads(x_pulse_voltage="-4.001")) == ["x-pulse"]
+
+
+def test_pulse_of_a_microscope_without_the_limited_parameter_is_sent() -> None:
+    lab = in_control(VOLTAGE)
+    lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
+    assert sent(lab.answer_reads()) == ["x-pulse"]
+
+
 @pytest.mark.parametrize("lacking", [ControlResponse.PARAM_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED])
 def test_published_place_counts_if_the_microscope_has_no_such_parameter(lacking: ControlResponse) -> None:
     lab = in_control(REGION)

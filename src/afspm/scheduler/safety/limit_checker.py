@@ -52,6 +52,12 @@ _REACH = 1e-9  # relative: a value on the border, to the precision of the arithm
 _TOLD_REACH = 1e-3  # the same for a place read from a controller, which rounds to its steps and to single precision
 _PLACES = ((frozenset(REGION_CHANGES), frozenset({names.START_SCAN})), (frozenset(PROBE_CHANGES), names.AT_PROBE))
 """The parameters of each place, with the actions that happen there."""
+_TREATMENTS = {
+    names.PULSE: (names.PULSE_VOLTAGE, names.PULSE_DURATION),
+    names.CRASH: (names.CRASH_DEPTH, names.CRASH_SPEED),
+}
+"""The parameters that a treatment of the tip uses as they are in force."""
+_OF_TREATMENTS = frozenset(name for given in _TREATMENTS.values() for name in given)
 
 
 class _Breach(Exception):
@@ -101,9 +107,13 @@ class LimitChecker:
         return None
 
     def check_place(self, request: Request) -> Response | None:
-        """Return the refusal of an action at the present place, which a person may have changed; None: it may start."""
+        """Return the refusal of an action at the present place, or of a treatment as it is set; None: it may start.
+
+        A person may have changed both.
+        """
         try:
             self._check_place(str(request.subject))
+            self._check_treatment(str(request.subject))
         except _Breach as breach:
             reason = f"{request.subject}: {breach.reason}"
             return Response(int(ControlResponse.ACTION_ERROR), b"", reason, request.id)
@@ -120,6 +130,10 @@ class LimitChecker:
         """
         given = self.names_set_by(request)
         needed = [name for name in given if name in self.limits.bounded]
+        if request.kind == ControlRequest.ACTION:
+            limited = self.limits.parameters
+            of_action = _TREATMENTS.get(str(request.subject), ())
+            needed += [name for name in of_action if name in limited and limited[name].is_of_a_number]
         if self.limits.region is not None or is_mapped:
             action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
             for place, actions in _PLACES:
@@ -144,7 +158,7 @@ class LimitChecker:
         for name, value in numbers_read.items():
             if value is None:
                 usage = usage.forget(name)
-            elif name in self.limits.bounded:
+            elif name in self.limits.bounded or name in _OF_TREATMENTS:
                 usage = usage.learn(name, value, now_ns, was_read=True)
         return replace(self, state=LimitState(usage, self.state.position.was_read(numbers_read)))
 
@@ -321,15 +335,22 @@ class LimitChecker:
                 f"{name} was used {ago_s:.3g} s ago, its shortest interval is {limit.interval_s:g} s ({limit.source})",
             )
 
+    def _check_range(self, name: str, value: float, limit: Limit, reach: float = _REACH) -> None:
+        def text(amount: float) -> str:
+            return quantity(amount, limit.unit or BASE_PARAMETERS.get(name) or "", 6)
+
+        setting = f"{name} = {text(value)}"
+        if limit.low is not None and value < limit.low - abs(limit.low) * reach:
+            raise _param_error(f"{setting} is below the lowest allowed, {text(limit.low)} ({limit.source})")
+        if limit.high is not None and value > limit.high + abs(limit.high) * reach:
+            raise _param_error(f"{setting} is above the highest allowed, {text(limit.high)} ({limit.source})")
+
     def _check_value(self, name: str, value: float, limit: Limit, now_ns: int) -> None:
         def text(amount: float, digits: int = 6) -> str:
             return quantity(amount, limit.unit or BASE_PARAMETERS.get(name) or "", digits)
 
         setting = f"{name} = {text(value)}"
-        if limit.low is not None and value < limit.low - abs(limit.low) * _REACH:
-            raise _param_error(f"{setting} is below the lowest allowed, {text(limit.low)} ({limit.source})")
-        if limit.high is not None and value > limit.high + abs(limit.high) * _REACH:
-            raise _param_error(f"{setting} is above the highest allowed, {text(limit.high)} ({limit.source})")
+        self._check_range(name, value, limit)
         if not limit.bounds_changes:
             return
         known = self.state.usage.known.get(name)
@@ -408,6 +429,12 @@ class LimitChecker:
             if self.state.position.probe_m is None:
                 raise _param_error("the microscope has not reported its probe position")
             self._check_point(self.state.position.probe_m, _TOLD_REACH)
+
+    def _check_treatment(self, action: str) -> None:
+        for name in _TREATMENTS.get(action, ()):
+            limit, known = self.limits.parameters.get(name), self.state.usage.known.get(name)
+            if limit is not None and known is not None:
+                self._check_range(name, known.value, limit, _TOLD_REACH)
 
     def _check_move(self, change: PositionChange) -> None:
         if self.limits.region is None:
