@@ -16,11 +16,14 @@ from afspm.model import (
     MeasurementSettings,
     Parameter,
     RelayedMessage,
+    Request,
     Response,
     ResponseDetail,
     ScopeState,
     request_name,
 )
+from afspm.model.microscope_status import feedback_of
+from afspm.wire.messages import FEEDBACK
 
 PATIENCE_S = 60.0  # real time for the restart of a translator
 RETRY_S = 1.0  # before a repetition, unless a state is published earlier
@@ -158,6 +161,9 @@ class CommandRetry:
         """
         link = self._link
         request_id = request_id or link.next_id()
+        before = self._control.switched
+        if (feedback := feedback_of(Request(kind, subject))) is not None and feedback.on is not None:
+            self._control.switched = link.view.count(FEEDBACK.name), feedback.on
         give_up_s = link.earlier(PATIENCE_S, until_s)
         is_repeated = has_warned = False
         self._wait_for_state(give_up_s)
@@ -171,6 +177,8 @@ class CommandRetry:
             if response.ok:
                 self._logged_reason = ""
             if response.code != ControlResponse.NO_RESPONSE or self._control.was_lost:
+                if not response.ok and response.code != ControlResponse.NO_RESPONSE:
+                    self._control.switched = before  # it was refused
                 return response
             if is_seen():
                 return Response(ControlResponse.SUCCESS, id=request_id)

@@ -7,10 +7,21 @@ from contextlib import contextmanager, nullcontext
 
 from afspm.basics.errors import ControlLost, ExperimentEnded, NoResponse, Refused
 from afspm.client.experiment_link import ExperimentLink
-from afspm.model import WAIT_FOR_CONTROL, ControlMode, ControlRequest, ControlResponse, Packet, Problem, ProblemNames
+from afspm.model import (
+    LEASE_REQUEST,
+    WAIT_FOR_CONTROL,
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Packet,
+    Problem,
+    ProblemNames,
+)
 from afspm.transport.process.parent import StopRequested
+from afspm.wire.messages import FEEDBACK
 
 ASK_AGAIN_S = 10.0  # in case a published control state was lost
+_AT_ONCE_S = 1e-3  # lease of a block that failed with the tip in danger
 
 
 class ControlHold:
@@ -25,6 +36,7 @@ class ControlHold:
         why_lost: reason of the last loss, for people.
         gives_back_inherited: whether to release control that the component held before its restart.
         is_unbroken: whether a loss of control in the present block is an error: all requests belong to one grant.
+        switched: the last switching of the feedback: number of its messages published before, and whether it is on.
     """
 
     def __init__(self, link: ExperimentLink, problems: ProblemNames) -> None:
@@ -32,11 +44,13 @@ class ControlHold:
         self._problems = problems
         self._wanted: list[int] = []
         self._was_named = False
+        self._was_off = False  # the feedback, at the beginning of the outermost block
         self.held = False
         self.tenures = 0
         self.why_lost = ""
         self.gives_back_inherited = False
         self.is_unbroken = False
+        self.switched: tuple[int, bool] | None = None
         link.listen(self._on_packet)
 
     @property
@@ -49,6 +63,9 @@ class ControlHold:
         self, *, solving: int = Problem.NONE, until_s: float | None = None, unbroken: bool = False
     ) -> Iterator[None]:
         """Hold control in the block; an inner block shares the control of the outer one.
+
+        If an error ends the outermost block, and the block has switched the feedback off, control is not released but
+        lost: the scheduler retracts the tip, since no other component knows of the danger.
 
         Raises:
             ControlLost: control was not given by `until_s`; the problem to solve is not flagged; an outer block solves
@@ -66,6 +83,8 @@ class ControlHold:
         try:
             with self._link.interrupts.heeded():
                 self.regain(until_s)
+            if len(self._wanted) == 1:
+                self._was_off = self._is_off
             self.is_unbroken = was_unbroken or unbroken
             yield
         except (ExperimentEnded, StopRequested):
@@ -73,8 +92,9 @@ class ControlHold:
             if not self._wanted:
                 self.leave()
             raise
-        except BaseException:  # also Ctrl-C: control must be released on every way out of the block
-            self._end_block(quietly=True)
+        except BaseException as error:  # also Ctrl-C: control must be released on every way out of the block
+            # after Ctrl-C a person attends to the tip
+            self._end_block(quietly=True, in_danger=isinstance(error, Exception) and self._is_off and not self._was_off)
             raise
         else:
             self._end_block(quietly=False)
@@ -193,7 +213,24 @@ class ControlHold:
         elif self._was_named:
             self.lost(self.obstacle(self._solving) or "it was revoked")
 
-    def _end_block(self, *, quietly: bool) -> None:
+    def _is_revoked(self, until_s: float | None) -> bool:
+        # by a lease that ends at once: after a release the scheduler leaves the tip alone
+        link = self._link
+        link.log.error("an error ended a block that had switched the feedback off: the tip is left to the scheduler")
+        if not link.request(LEASE_REQUEST, _AT_ONCE_S, until_s=until_s).ok:
+            return False
+        view = link.view
+        link.wait(lambda: view.control is not None and view.control.holder != link.name, until_s)
+        return True
+
+    @property
+    def _is_off(self) -> bool:
+        view = self._link.view
+        if self.switched is not None and self.switched[0] == view.count(FEEDBACK.name):
+            return not self.switched[1]
+        return view.feedback is not None and view.feedback.on is False
+
+    def _end_block(self, *, quietly: bool, in_danger: bool = False) -> None:
         # `quietly`: another exception is on its way, and must not be replaced
         self._wanted.pop()
         if self._wanted or not self.held:
@@ -204,7 +241,8 @@ class ControlHold:
             # a refusal (control was lost already) is fine; after a failure, wait only a short time
             with link.interrupts.heeded(), link.interrupts.deferred() if quietly else nullcontext():
                 until_s = link.until(link.request_timeout_s if quietly else None)
-                link.request(ControlRequest.RELEASE_CTRL, until_s=until_s)
+                if not (in_danger and self._is_revoked(until_s)):
+                    link.request(ControlRequest.RELEASE_CTRL, until_s=until_s)
         except (NoResponse, ExperimentEnded, StopRequested):
             if not quietly:
                 raise

@@ -33,6 +33,11 @@ class Reckless(Component):
         os._exit(9)
 
 
+class Faulty(Reckless):
+    def leave_it_so(self):
+        self.scope.set("tip-bias-voltage", "1 kV")
+
+
 class Blind(Reckless):
     def leave_it_so(self):
         self.log.info("the feedback is off")
@@ -57,7 +62,7 @@ grace = "1 s"
 
 [reckless]
 component = true
-class = "danger.Reckless"
+class = "danger.{kind}"
 """
 DOCTOR = """
 [doctor]
@@ -81,11 +86,12 @@ def engaged(run: AfspmRun) -> bool:
     return bool(Memory(run.folder / "state" / "microscope.json")["microscope"]["values"]["x-engaged"])
 
 
+@pytest.mark.parametrize("kind", ["Reckless", "Faulty"])
 def test_tip_left_in_danger_is_retracted_and_blocks_measurements_until_cleared(
-    run: Callable[..., AfspmRun], tmp_path: Path
+    run: Callable[..., AfspmRun], tmp_path: Path, kind: str
 ) -> None:
     (tmp_path / "danger.py").write_text(MODULE, encoding="utf-8")
-    one = run(more=PARTS + DOCTOR, scans=6, speed=60.0)
+    one = run(more=PARTS.format(kind=kind) + DOCTOR, scans=6, speed=60.0)
     assert one.end() == 0, one.output
     steps = [  # all of them lines of the scheduler: lines of two processes may be printed in another order
         "x-retract is sent to the microscope, since ",
