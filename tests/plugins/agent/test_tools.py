@@ -6,15 +6,18 @@ import asyncio
 import base64
 import io
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from mcp import Client, MCPError
 from PIL import Image
-from tests.simulation.agent_rig import AGENT, UM, AgentRig
+from tests.simulation import agent_rig
+from tests.simulation.agent_rig import ADA, AGENT, UM, AgentRig
 
-from afspm.model import Region, Scan, ScopeState, ScopeStatus
+from afspm.model import GRANT_REQUEST, Frame, Region, Request, Scan, ScopeState, ScopeStatus, names
+from afspm.plugins.agent.approval import of_plan
 from afspm.plugins.agent.tools import AgentTools
 from afspm.plugins.agent.untrusted import escaped, untrusted
 
@@ -121,6 +124,31 @@ def test_picture_has_at_most_the_pixels_asked_for() -> None:
     assert max(picture.size) <= 128
     numbers = facts(called(rig, "scan_numbers", {"scan": "newest"}))["numbers"][0]
     assert (len(numbers["blocks"]), len(numbers["blocks"][0])) == (16, 16)
+
+
+def test_tip_is_retracted_after_a_plan_that_failed_with_the_feedback_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = agent_rig.settings()
+    without_role = replace(found, limits=replace(found.limits, roles={}))
+    monkeypatch.setattr(agent_rig, "settings", lambda: without_role)
+    rig = AgentRig()
+    rig.values[names.FEEDBACK_ON] = "true"
+    monkeypatch.setattr(rig.watchman, "may_arrive", lambda request: None)
+    wanted = ((names.FEEDBACK_ON, "off"), (names.TIP_BIAS_VOLTAGE, "9 V"), (names.FEEDBACK_ON, "on"))
+    steps = [{"do": "set", "parameter": name, "value": value} for name, value in wanted]
+
+    async def whole() -> None:
+        given: dict[str, object] = {"plan": {"title": "t", "steps": steps}}
+        id_ = facts(await rig.tools.call("claude", "propose", given))["proposal"]
+        await rig.tools.call("claude", "preflight", {"proposal": id_})
+        approval, _ = of_plan(rig.place.proposal(id_)[0], Frame.TIP)
+        assert rig.request(ADA, Request(GRANT_REQUEST, approval, b"", f"{ADA}/a/1")).ok
+        await rig.tools.call("claude", "run", {"proposal": id_})
+        while rig.place.runs["1"].state == "running" or rig.core.control.holder is not None:
+            rig.later(0.1)
+            await asyncio.sleep(0.01)
+
+    asyncio.run(asyncio.wait_for(whole(), 30.0))
+    assert rig.effects[-1].endswith(" x-retract")
 
 
 def test_empty_texts_make_no_field() -> None:

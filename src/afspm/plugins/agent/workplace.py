@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -19,12 +19,15 @@ from afspm.model import (
     RELAY_REQUEST,
     STOPPED_BY_AGENT,
     Approvals,
+    ControlRequest,
     ControlResponse,
     Frame,
     Proposal,
     RelayedMessage,
+    Request,
     Response,
 )
+from afspm.model.microscope_status import feedback_of
 from afspm.model.problems import STOPPER
 from afspm.plugins.agent.plan import MoveStep, Plan, ScanStep, SetStep, SpectrumStep, Step, plan_of
 from afspm.plugins.web.archive import Archive
@@ -40,6 +43,8 @@ from afspm.transport.process.parent import StopRequested
 LEASE_S = 30.0
 """Real seconds after which an agent whose process is gone loses control."""
 RENEW_S = 10.0
+AT_ONCE_S = 1e-3
+"""Lease of an agent whose plan has failed with the feedback off."""
 STOP_ANSWERED_S = 5.0
 STOP_AGAIN_S = 0.5
 MOST_RUNS = 200
@@ -245,7 +250,11 @@ class Workplace:
         finally:
             self._save(run)
         try:
-            await self.do(person, lambda commands: commands.release_control())
+            if run.state == "failed" and _is_off_after(plan.steps[: run.step]):
+                # after a release the scheduler would leave the tip alone; after a lease it retracts the tip
+                await self.do(person, lambda commands: commands.renew(AT_ONCE_S))
+            else:
+                await self.do(person, lambda commands: commands.release_control())
         except RefusedRequest as error:  # control then ends with its lease
             _log.info("%s could not release control: %s", run.who, error.model.reason)
 
@@ -292,6 +301,16 @@ class Workplace:
             del self._saved[oldest.id]
         self._memory["runs"] = list(self._saved.values())
         self._memory.save(synced=False)
+
+
+def _is_off_after(steps: Sequence[Step]) -> bool:
+    # the last step has failed: it may have switched the feedback off, but not on
+    is_off = False
+    for step in steps:
+        feedback = feedback_of(Request(ControlRequest.PARAM, step.wanted)) if isinstance(step, SetStep) else None
+        if feedback is not None and not (feedback.on and step is steps[-1]):
+            is_off = not feedback.on
+    return is_off
 
 
 def with_preflight(proposal: Proposal, preflight: Plain) -> Proposal:
