@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -42,10 +42,18 @@ class Events(Iterator[PublishedEvent]):
 
     Args:
         prefixes: prefixes of the wanted envelopes; empty: all.
+        before_wait: called before each wait for a message.
     """
 
-    def __init__(self, link: ExperimentLink, prefixes: tuple[str, ...], timeout_s: float | None) -> None:
+    def __init__(
+        self,
+        link: ExperimentLink,
+        prefixes: tuple[str, ...],
+        timeout_s: float | None,
+        before_wait: Callable[[], None] = lambda: None,
+    ) -> None:
         self._link = link
+        self._before_wait = before_wait
         self._timeout_s = timeout_s
         backlog = self._backlog = PacketBacklog()
 
@@ -59,6 +67,8 @@ class Events(Iterator[PublishedEvent]):
     def __next__(self) -> PublishedEvent:
         while True:
             try:
+                if not len(self._backlog):
+                    self._before_wait()
                 if not self._link.wait(lambda: len(self._backlog) > 0, self._link.until(self._timeout_s)):
                     raise StopIteration
             except ExperimentEnded:

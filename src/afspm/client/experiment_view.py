@@ -85,11 +85,12 @@ class ExperimentView:
             envelopes: prefixes of the wanted envelopes; none: all.
             timeout_s: end the iteration after this real time without a message; None: only with the experiment.
         """
-        return Events(self._link, envelopes, timeout_s)
+        return Events(self._link, envelopes, timeout_s, self._before_wait)
 
     def wait_until(self, condition: Callable[[], bool], *, timeout_s: float | None = None) -> bool:
         """Wait until `condition()`, tested after each event; return False after `timeout_s` of real time."""
         with self._call():
+            self._before_wait()
             return self._link.wait(condition, self._link.until(timeout_s))
 
     def sleep(self, experiment_s: float) -> None:
@@ -104,12 +105,16 @@ class ExperimentView:
         clock = self._link.clock
         end_s = clock.now_s() + experiment_s
         with self._call():
+            self._before_wait()
             while (left_s := end_s - clock.now_s()) > 0.0:
                 self._link.wait(lambda: False, self._link.until(clock.real_s(left_s)))
 
     def is_flagged(self, problem: int | str) -> bool:
         """Return whether a problem, by name or number, is flagged."""
         return self.problems.number(problem) in self.control_state.problems
+
+    def _before_wait(self) -> None:
+        """Prepare for a wait that is no part of a request or measurement."""
 
     @contextmanager
     def _call(self) -> Iterator[None]:

@@ -521,6 +521,11 @@ class Scope(ExperimentView):
         self._control.gives_back_inherited = True
         self._control.release_inherited()
 
+    def _before_wait(self) -> None:
+        # a script that waits outside of a block does not continue the block of its earlier life: others would wait for
+        # ever, and the scheduler would not retract a tip left in danger
+        self.give_back_inherited()
+
     def _ask_scheduler(self, kind: int, subject: object) -> None:
         with self._call():
             response = self._link.request(kind, subject)

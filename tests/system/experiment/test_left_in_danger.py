@@ -38,6 +38,13 @@ class Faulty(Reckless):
         self.scope.set("tip-bias-voltage", "1 kV")
 
 
+class Waiting(Reckless):
+    def run(self):
+        super().run()
+        for event in self.scope.events("Scan2d"):
+            self.log.info("a scan")
+
+
 class Blind(Reckless):
     def leave_it_so(self):
         self.log.info("the feedback is off")
@@ -86,7 +93,7 @@ def engaged(run: AfspmRun) -> bool:
     return bool(Memory(run.folder / "state" / "microscope.json")["microscope"]["values"]["x-engaged"])
 
 
-@pytest.mark.parametrize("kind", ["Reckless", "Faulty"])
+@pytest.mark.parametrize("kind", ["Reckless", "Faulty", "Waiting"])
 def test_tip_left_in_danger_is_retracted_and_blocks_measurements_until_cleared(
     run: Callable[..., AfspmRun], tmp_path: Path, kind: str
 ) -> None:
