@@ -64,8 +64,8 @@ class ControlHold:
     ) -> Iterator[None]:
         """Hold control in the block; an inner block shares the control of the outer one.
 
-        If an error ends the outermost block, and the block has switched the feedback off, control is not released but
-        lost: the scheduler retracts the tip, since no other component knows of the danger.
+        If an error, or the stop of this process, ends the outermost block, and the block has switched the feedback off,
+        control is not released but lost: the scheduler retracts the tip, since no other component knows of the danger.
 
         Raises:
             ControlLost: control was not given by `until_s`; the problem to solve is not flagged; an outer block solves
@@ -89,7 +89,9 @@ class ControlHold:
             yield
         except (ExperimentEnded, StopRequested):
             self._wanted.pop()
-            if not self._wanted:
+            if not self._wanted and self._is_off and not self._was_off:
+                self.held = False  # not given back: once this process has ended, the scheduler retracts the tip
+            elif not self._wanted:
                 self.leave()
             raise
         except BaseException as error:  # also Ctrl-C: control must be released on every way out of the block

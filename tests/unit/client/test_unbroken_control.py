@@ -9,6 +9,7 @@ from afspm import model
 from afspm.basics.errors import ControlLost, NoResponse
 from afspm.client.scope import Scope
 from afspm.model import ControlMode, ControlResponse, Problem, Response
+from afspm.transport.process.parent import StopRequested
 
 TIP = Problem.TIP_SHAPE_CHANGED
 
@@ -73,3 +74,18 @@ def test_action_of_unknown_outcome_is_distinguished_from_one_not_done(lab: Lab, 
     lab.intercept = silent
     with pytest.raises(NoResponse, match="before the action was answered"), scope.control(unbroken=True):
         scope.action("start-spec")
+
+
+def sleep_with_feedback_off(scope: Scope) -> None:
+    with scope.control():
+        scope.set_feedback(on=False)
+        scope.sleep(60.0)
+
+
+@pytest.mark.parametrize("was_on", [True, False])
+def test_stopped_process_keeps_control_if_it_leaves_the_feedback_off(lab: Lab, scope: Scope, *, was_on: bool) -> None:
+    scope.set_feedback(on=was_on)
+    lab.at(5.0, lab.parent_goes)
+    with pytest.raises(StopRequested):
+        sleep_with_feedback_off(scope)
+    assert lab.control.holder == ("experiment" if was_on else None)
