@@ -380,7 +380,7 @@ def test_actions_that_are_not_saved_are_found_in_sample_coordinates(monkeypatch:
     """Where the sample moves, a repeated action is sent to another place: to a translator it is a new one."""
 
     def nights() -> None:
-        for seed in range(12, 15):
+        for seed in range(15, 18):
             DriftNight(_bad_night(seed)).run()
 
     nights()
