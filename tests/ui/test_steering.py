@@ -266,6 +266,22 @@ def test_a_scan_is_stopped_after_taking_over(night: Night, page: Any) -> None:
     said(page, "scan-speed is now 4 µm/s")
 
 
+def test_a_scan_requested_twice_does_not_delay_its_stop(night: Night, page: Any) -> None:
+    take_over(page, night)
+    fill(page, "scan-speed", "10 nm/s")
+    press(page, "Set")
+    said(page, "scan-speed is now 10 nm/s")
+    press(page, "Scan as set")
+    night.until(lambda: night.state is ScopeState.SCANNING)
+    press(page, "Scan as set")
+    press(page, "Stop the scan")
+    said(page, "The scan is stopped")
+    night.until(lambda: night.state is ScopeState.FREE)
+    fill(page, "scan-speed", "4 um/s")
+    press(page, "Set")
+    said(page, "scan-speed is now 4 µm/s")
+
+
 def test_stopping_in_automated_announces_the_takeover(night: Night, page: Any) -> None:
     press(page, "Stop the scan")
     page.wait_for_selector(".question:has-text('sets the mode to MANUAL')")

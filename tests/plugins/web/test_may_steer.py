@@ -25,7 +25,7 @@ def steering(access: Access, monkeypatch: pytest.MonkeyPatch) -> Steering:
     clock = ExperimentClock.real()
     watch = Watch(clock)
     persons = Persons(Launch("dashboard"), clock, watch)
-    monkeypatch.setattr(persons, "_connect", lambda person: (None, person))
+    monkeypatch.setattr(persons, "_connect", lambda person, hurried: (None, person))
     return Steering(persons, watch, access)
 
 

@@ -26,7 +26,7 @@ from afspm.model import (
     names,
 )
 from afspm.model.geometry import XY
-from afspm.plugins.web.watch import Watch
+from afspm.plugins.web.watch import Watch, is_free
 from afspm.record.overview import Overview
 
 ANSWER_S = 20.0  # real time for an answer
@@ -35,11 +35,16 @@ SETTLED_S = 2.0  # a changed setting is published within this time
 
 
 class PersonCommands:
-    """The requests of one person, for use in one thread. Each returns the response, even a refusal."""
+    """The requests of one person, for use in one thread. Each returns the response, even a refusal.
 
-    def __init__(self, link: ExperimentLink, watch: Watch) -> None:
+    Args:
+        hurried: whether an urgent action of this person waits for the end of the present one.
+    """
+
+    def __init__(self, link: ExperimentLink, watch: Watch, hurried: Callable[[], bool] = lambda: False) -> None:
         self._link = link
         self._watch = watch
+        self._hurried = hurried
 
     # --- the experiment ---
 
@@ -117,18 +122,21 @@ class PersonCommands:
     def act_when_free(self, action: str, next_id: Callable[[], str] = str) -> Response:
         """Request an action, and repeat the request while the microscope is busy, for `FREE_S` at most.
 
+        The wait ends early for an urgent action of the same person, such as to stop the scan.
+
         Args:
             next_id: returns the id of the next attempt; requests with the same id are executed once.
         """
         until_s = self._link.clock.monotonic_s() + FREE_S
         while True:
-            self._watch.wait_free(until_s - self._link.clock.monotonic_s())
+            self._watch.wait_for(lambda o: is_free(o) or self._hurried(), until_s - self._link.clock.monotonic_s())
             with self._watch.reading():
                 seen = self._watch.changes
             response = self._ask(ControlRequest.ACTION, action, next_id())
-            if response.code != ControlResponse.NOT_FREE or self._link.clock.monotonic_s() >= until_s:
+            is_over = self._hurried() or self._link.clock.monotonic_s() >= until_s
+            if response.code != ControlResponse.NOT_FREE or is_over:
                 return response
-            self._watch.wait_for(lambda _, n=seen: self._watch.changes != n, 1.0)  # type: ignore[misc]
+            self._watch.wait_for(lambda _, n=seen: self._watch.changes != n or self._hurried(), 1.0)  # type: ignore[misc]
 
     def stop(self) -> Response:
         """Stop the running scan or spectrum."""

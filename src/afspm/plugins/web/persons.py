@@ -26,9 +26,14 @@ T = TypeVar("T")
 
 @dataclass
 class _Person:
-    """A person's connection to the scheduler, used by one thread."""
+    """A person's connection to the scheduler, used by one thread.
+
+    Attributes:
+        urgent: number of submitted urgent actions that have not started yet.
+    """
 
     thread: ThreadPoolExecutor
+    urgent: int = 0
     commands: PersonCommands | None = None
     port: ZmqPort | None = None
 
@@ -54,8 +59,12 @@ class Persons:
         self._lock = threading.Lock()
         self._persons: OrderedDict[str, _Person] = OrderedDict()
 
-    def submit(self, person: str, action: Callable[[PersonCommands], T]) -> Future[T]:
-        """Start an action in the person's thread and name, and return its future."""
+    def submit(self, person: str, action: Callable[[PersonCommands], T], *, urgent: bool = False) -> Future[T]:
+        """Start an action in the person's thread and name, and return its future.
+
+        Args:
+            urgent: earlier actions of this person stop waiting for a free microscope, and are refused.
+        """
         with self._lock:
             one = self._persons.get(person)
             if one is None:
@@ -64,7 +73,11 @@ class Persons:
                     self._persons.popitem(last=False)[1].close()
                 one = self._persons[person] = _Person(ThreadPoolExecutor(1, thread_name_prefix="person"))
             self._persons.move_to_end(person)
-            return one.thread.submit(self._carry_out, person, one, action)
+            one.urgent += urgent
+            future = one.thread.submit(self._carry_out, person, one, action, urgent)
+        if urgent:
+            self._watch.wake()
+        return future
 
     def name_of(self, person: str) -> str:
         """Return the scheduler's name for a person."""
@@ -77,14 +90,16 @@ class Persons:
         for one in persons:
             one.close()
 
-    def _carry_out(self, person: str, one: _Person, action: Callable[[PersonCommands], T]) -> T:
+    def _carry_out(self, person: str, one: _Person, action: Callable[[PersonCommands], T], urgent: bool) -> T:
+        with self._lock:
+            one.urgent -= urgent
         if one.commands is None:
-            one.port, one.commands = self._connect(person)
+            one.port, one.commands = self._connect(person, lambda: one.urgent > 0)
         return action(one.commands)
 
-    def _connect(self, person: str) -> tuple[ZmqPort, PersonCommands]:
+    def _connect(self, person: str, hurried: Callable[[], bool]) -> tuple[ZmqPort, PersonCommands]:
         launch, name = self._launch, self.name_of(person)
         network = Network.from_launch(launch.name, launch.keys)
         port = ZmqPort(network, name, self._clock, control=launch.sockets.control)
         link = ExperimentLink.of_launch(launch, port, new_session(launch.run), name=name)
-        return port, PersonCommands(link, self._watch)
+        return port, PersonCommands(link, self._watch, hurried)

@@ -151,13 +151,23 @@ class Watch:
 
     def wait_free(self, within_s: float) -> bool:
         """Wait until the microscope is free; return False after a timeout."""
-        return self.wait_for(lambda o: o.status is not None and o.status.state is ScopeState.FREE, within_s)
+        return self.wait_for(is_free, within_s)
+
+    def wake(self) -> None:
+        """Let all waiting threads test their conditions again."""
+        with self._changed:
+            self._changed.notify_all()
 
     def _announce(self) -> None:
         self.changes += 1
         self._changed.notify_all()
         for callback in self._callbacks:
             callback()
+
+
+def is_free(overview: Overview) -> bool:
+    """Return whether the microscope is free."""
+    return overview.status is not None and overview.status.state is ScopeState.FREE
 
 
 class Bell:

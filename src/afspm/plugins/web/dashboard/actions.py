@@ -238,10 +238,14 @@ class Steering:
         self._watch = watch
         self._log = logging.getLogger("afspm.plugins.web.dashboard")
 
-    def do(self, visitor: Visitor, action: Action) -> Future[ActionResult]:
-        """Start an action in the name of a signed-in visitor; a visitor without a session gets a refusal."""
+    def do(self, visitor: Visitor, action: Action, *, urgent: bool = False) -> Future[ActionResult]:
+        """Start an action in the name of a signed-in visitor; a visitor without a session gets a refusal.
+
+        Args:
+            urgent: earlier actions of this person stop waiting for a free microscope.
+        """
         person = self._access.person_of(visitor)
-        return self._submit(person, action) if person else not_signed_in()
+        return self._submit(person, action, urgent=urgent) if person else not_signed_in()
 
     def read(self, action: Action) -> Future[ActionResult]:
         """Start an action that only reads, under the page's own name."""
@@ -251,8 +255,8 @@ class Steering:
         """End all connections; pending actions end without an answer."""
         self._persons.close()
 
-    def _submit(self, person: str, action: Action) -> Future[ActionResult]:
-        return self._persons.submit(person, lambda commands: self._carry_out(person, commands, action))
+    def _submit(self, person: str, action: Action, *, urgent: bool = False) -> Future[ActionResult]:
+        return self._persons.submit(person, lambda commands: self._carry_out(person, commands, action), urgent=urgent)
 
     def _carry_out(self, person: str, commands: PersonCommands, action: Action) -> ActionResult:
         try:

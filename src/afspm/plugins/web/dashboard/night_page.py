@@ -187,7 +187,7 @@ class NightSteering(Steering):
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="notes")
         self._log = logging.getLogger("afspm.plugins.web.dashboard")
 
-    def do(self, visitor: Visitor, action: Action) -> Future[ActionResult]:
+    def do(self, visitor: Visitor, action: Action, *, urgent: bool = False) -> Future[ActionResult]:
         person = self._access.person_of(visitor)
         return self._thread.submit(self._note, f"{self._name}{PERSON}{person}", action) if person else not_signed_in()
 

@@ -44,7 +44,7 @@ class ModeButtons:
             self._automated.set_visibility(may and is_manual)
 
     def _set(self, mode: ControlMode) -> None:
-        self._session.do(lambda a: a.set_mode(mode))
+        self._session.do(lambda a: a.set_mode(mode), urgent=True)
 
 
 class ProblemBar:
@@ -130,18 +130,18 @@ class SteeringPanel:
         if await asked("End the experiment?", "All components stop. All measurements are kept.", "End it") and (
             await asked("Really?", "The experiment can't be continued from here.", "Yes, end the experiment")
         ):
-            self._session.do(lambda a: a.end())
+            self._session.do(lambda a: a.end(), urgent=True)
 
     async def _ask_stop(self) -> None:
         if self._session.content.is_manual:
-            self._session.do(lambda a: a.stop_scan())
+            self._session.do(lambda a: a.stop_scan(), urgent=True)
         elif await asked(
             "Stop the scan?",
             "A component is in control. This sets the mode to MANUAL, then stops the scan; components go on when you "
             "hand back.",
             "Set MANUAL and stop",
         ):
-            self._session.do(lambda a: a.stop_scan(by_manual=True))
+            self._session.do(lambda a: a.stop_scan(by_manual=True), urgent=True)
 
     async def _ask_scan(self, event: events.GenericEventArguments) -> None:
         dialog = ScanDialog.of_place(event.args)

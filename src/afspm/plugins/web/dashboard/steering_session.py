@@ -46,11 +46,15 @@ class SteeringSession:
         """Create the element that shows the last result."""
         self._results = ui.html("", sanitize=False).classes("outcomes").props('role="status" aria-live="polite"')
 
-    def do(self, action: Action) -> None:
-        """Carry out an action in the background and show its result."""
+    def do(self, action: Action, *, urgent: bool = False) -> None:
+        """Carry out an action in the background and show its result.
+
+        Args:
+            urgent: earlier actions of this person stop waiting for a free microscope.
+        """
 
         async def doing() -> None:
-            result = await self.carry_out(action)
+            result = await self.carry_out(action, urgent=urgent)
             # the viewer may have closed the page meanwhile; a background task has no page of its own
             if not self._client.is_deleted:
                 with self._client:
@@ -58,9 +62,9 @@ class SteeringSession:
 
         background_tasks.create(doing())
 
-    async def carry_out(self, action: Action) -> ActionResult:
+    async def carry_out(self, action: Action, *, urgent: bool = False) -> ActionResult:
         """Carry out an action, and return its result."""
-        return await asyncio.wrap_future(self._steering.do(self._visitor, action))
+        return await asyncio.wrap_future(self._steering.do(self._visitor, action, urgent=urgent))
 
     def say(self, result: ActionResult) -> None:
         """Show a result."""

@@ -44,6 +44,7 @@ PUBLISHED_WITHIN_S = 1.0
 Wait = Annotated[float, Query(ge=0.0, le=LONGEST_WAIT_S, description="longest wait, s")]
 Name = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
 _SECURITY = (Depends(HTTPBasic(auto_error=False)), Depends(HTTPBearer(auto_error=False)))
+_URGENT = frozenset({names.STOP_SCAN, names.STOP_SPEC, names.RETRACT})
 _CONTROL, _LEASE, _SCAN, _SPECTRUM = ControlAsked(), LeaseModel(), ScanAsked(), SpectrumAsked()  # without a body
 
 
@@ -147,7 +148,7 @@ class CommandRoutes:
         """Start an action of the microscope, in control; return once it is accepted. `stop-scan` stops a scan."""
         if name in (names.START_SCAN, names.START_SPEC):
             raise RefusedRequest(RefusalCode.NOT_SUPPORTED, f"request {name} by POST /v1/scans or /v1/spectra")
-        await self._services.command(asked, lambda commands: commands.act(name))
+        await self._services.command(asked, lambda commands: commands.act(name), urgent=name in _URGENT)
         return DoneModel()
 
     # --- the experiment ---
@@ -169,7 +170,7 @@ class CommandRoutes:
     async def set_mode(self, asked: Request, wanted: ModeModel) -> ModeModel:
         """Set MANUAL, in which no component is in control, or AUTOMATED."""
         mode = ControlMode[wanted.mode]
-        await self._services.command(asked, lambda commands: commands.set_mode(mode))
+        await self._services.command(asked, lambda commands: commands.set_mode(mode), urgent=True)
         await self._published(lambda control: control.mode is mode)
         return wanted
 
@@ -182,7 +183,7 @@ class CommandRoutes:
     async def end_experiment(self, asked: Request) -> DoneModel:
         """End the experiment for everyone."""
         try:
-            await self._services.command(asked, lambda commands: commands.end())
+            await self._services.command(asked, lambda commands: commands.end(), urgent=True)
         except RefusedRequest as error:
             if error.model.code is not RefusalCode.EXPERIMENT_ENDED:  # the end may be published before the answer
                 raise

@@ -1,0 +1,81 @@
+"""An urgent action of a person does not wait behind an action that waits for a free microscope."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import pytest
+
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.launch import Launch
+from afspm.client.experiment_link import ExperimentLink
+from afspm.model import ControlResponse, Response, ScopeState, ScopeStatus, names
+from afspm.plugins.web.person_commands import PersonCommands
+from afspm.plugins.web.persons import Persons
+from afspm.plugins.web.watch import Watch
+
+SOON_S = 5.0
+
+
+class BusyMicroscope:
+    """A connection to a scheduler whose microscope is never free."""
+
+    def __init__(self) -> None:
+        self.clock = ExperimentClock.real()
+        self.asked: list[object] = []
+
+    def pump(self, timeout_s: float) -> None:
+        pass
+
+    def until(self, timeout_s: float) -> float:
+        return self.clock.monotonic_s() + timeout_s
+
+    def request(self, kind: int, subject: object = None, **_: object) -> Response:
+        self.asked.append(subject)
+        if subject != names.START_SCAN:
+            return Response(int(ControlResponse.SUCCESS))
+        return Response(int(ControlResponse.NOT_FREE))
+
+
+@pytest.fixture
+def link() -> BusyMicroscope:
+    return BusyMicroscope()
+
+
+@pytest.fixture
+def persons(link: BusyMicroscope, monkeypatch: pytest.MonkeyPatch) -> Persons:
+    watch = Watch(link.clock)
+    watch.take("ScopeStateMsg", ScopeStatus(ScopeState.SCANNING), 1)
+    made = Persons(Launch("dashboard"), link.clock, watch)
+
+    def connect(person: str, hurried: Callable[[], bool]) -> tuple[Any, PersonCommands]:
+        return None, PersonCommands(cast("ExperimentLink", link), watch, hurried)
+
+    monkeypatch.setattr(made, "_connect", connect)
+    return made
+
+
+def test_stop_ends_the_waits_of_earlier_scans(persons: Persons, link: BusyMicroscope) -> None:
+    waiting = [persons.submit("Ada", lambda one: one.act_when_free(names.START_SCAN)) for _ in range(2)]
+    stopped = persons.submit("Ada", lambda one: one.act(names.STOP_SCAN), urgent=True)
+    assert stopped.result(SOON_S).ok
+    assert [one.result(SOON_S).code for one in waiting] == [ControlResponse.NOT_FREE] * 2
+    assert link.asked[-1] == names.STOP_SCAN
+
+
+def test_urgent_action_of_another_person_ends_no_wait(persons: Persons, link: BusyMicroscope) -> None:
+    waiting = persons.submit("Ada", lambda one: one.act_when_free(names.START_SCAN))
+    assert persons.submit("Max", lambda one: one.act(names.STOP_SCAN), urgent=True).result(SOON_S).ok
+    with pytest.raises(TimeoutError):
+        waiting.result(0.2)
+    assert persons.submit("Ada", lambda one: one.act(names.STOP_SCAN), urgent=True).result(SOON_S).ok
+    assert waiting.result(SOON_S).code == ControlResponse.NOT_FREE
+
+
+def test_scan_after_an_urgent_action_waits_again(persons: Persons, link: BusyMicroscope) -> None:
+    assert persons.submit("Ada", lambda one: one.act(names.STOP_SCAN), urgent=True).result(SOON_S).ok
+    waiting = persons.submit("Ada", lambda one: one.act_when_free(names.START_SCAN))
+    with pytest.raises(TimeoutError):
+        waiting.result(0.2)
+    persons.submit("Ada", lambda one: one.act(names.STOP_SCAN), urgent=True).result(SOON_S)
