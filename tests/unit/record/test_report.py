@@ -8,6 +8,7 @@ import re
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import datetime
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from afspm.model import ControlMode, ControlState, ProcessCondition, Registratio
 from afspm.model.problems import CONDITIONS
 from afspm.record.bad_scans import BAD, VERDICT_MESSAGE
 from afspm.record.report import REPORT_FILE, page, pictures, sample, story, write
+from afspm.record.report.markup import PageTimes
 from afspm.record.run import open_run
 from afspm.record.run_json import EXPERIMENT_FILE, UNFINISHED
 from afspm.record.store import RecordSettings, RecordStore
@@ -473,6 +475,26 @@ def test_local_time_stands_beside_utc_where_it_is_another(run: Path, monkeypatch
     assert "2023-11-14 22:13 to 23:13 UTC (2023-11-15 03:43 to 04:43 XYZ)" in text
     assert "22:38:20<small>04:08:20 XYZ</small>" in text  # a problem was flagged
     assert ">local</b>" in text
+
+
+def test_local_times_have_the_zone_in_force_at_the_end_of_summer_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not hasattr(time, "tzset"):
+        pytest.skip("this system has one zone")
+    evening, morning = (
+        round(datetime.fromisoformat(f"2026-10-{text}:00+00:00").timestamp()) * S for text in ("24T20:00", "25T07:00")
+    )
+    monkeypatch.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
+    time.tzset()
+    try:
+        clock = PageTimes(evening, morning)
+        twice = [clock.both(evening + round(hours * 3600) * S) for hours in (4.5, 5.5)]
+        period, zone = clock.period(), clock.zone
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    assert twice == ["00:30:00<small>02:30:00 CEST</small>", "01:30:00<small>02:30:00 CET</small>"]
+    assert "(2026-10-24 22:00 CEST to 2026-10-25 08:00 CET)" in period
+    assert zone == "CEST, then CET"
 
 
 def test_map_shows_pictures_at_their_position_the_newest_on_top(tmp_path: Path) -> None:

@@ -18,13 +18,17 @@ class PageTimes:
 
     Args:
         start_ns, end_ns: start and end of the run.
+
+    Attributes:
+        zone: the name of the local zone; both names if the clock was changed during the run.
     """
 
     def __init__(self, start_ns: int, end_ns: int) -> None:
         self._start_ns, self._end_ns = start_ns, end_ns
         self._days = end_ns - start_ns > _DAY_NS
         self.is_local = any(_offset_s(time_ns) for time_ns in (start_ns, end_ns))
-        self.zone = utc_time(start_ns).astimezone().strftime("%Z") or "local"
+        self._zones = tuple(_zone(time_ns) for time_ns in (start_ns, end_ns))
+        self.zone = ", then ".join(dict.fromkeys(self._zones))
 
     def utc(self, time_ns: int) -> str:
         """Return a time in UTC, with the day if the run spans several days."""
@@ -33,18 +37,23 @@ class PageTimes:
 
     def both(self, time_ns: int) -> str:
         """Return a time as HTML, with the local time small below."""
-        local = f"<small>{time_of_day(time_ns)} {escape(self.zone)}</small>" if self.is_local else ""
+        local = f"<small>{time_of_day(time_ns)} {escape(_zone(time_ns))}</small>" if self.is_local else ""
         return f"{self.utc(time_ns)}{local}"
 
     def whole(self, time_ns: int) -> str:
         """Return day and time in UTC, with the local time in brackets."""
-        local = f" ({time_of_day(time_ns)} {self.zone})" if self.is_local else ""
+        local = f" ({time_of_day(time_ns)} {_zone(time_ns)})" if self.is_local else ""
         return f"{day_and_time(time_ns, UTC)}{local}"
 
     def period(self) -> str:
         """Return the period of the run."""
-        local = f" ({period_text(self._start_ns, self._end_ns)} {self.zone})" if self.is_local else ""
-        return f"{period_text(self._start_ns, self._end_ns, UTC)}{local}"
+        utc, local = (period_text(self._start_ns, self._end_ns, zone) for zone in (UTC, None))
+        if not self.is_local:
+            return utc
+        before, after = self._zones
+        if before != after:
+            local = local.replace(" to ", f" {before} to ")
+        return f"{utc} ({local} {after})"
 
 
 def document(title: str, body: str, css: str = "") -> str:
@@ -110,6 +119,11 @@ def figure(
 def _lines(rows: Sequence[Sequence[str]]) -> Iterator[str]:
     for row in rows:
         yield f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>"
+
+
+def _zone(time_ns: int) -> str:
+    # summer time may begin or end during the run
+    return utc_time(time_ns).astimezone().strftime("%Z") or "local"
 
 
 def _offset_s(time_ns: int) -> float:
