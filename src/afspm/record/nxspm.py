@@ -81,6 +81,9 @@ def write_bias_sweep(entry: h5py.Group, instrument: h5py.Group, spectrum: Spectr
     sweep = group(spectroscopy, "bias_sweep", "NXspm_scan_control")
     sweep["scan_type"] = "linear"
     bias = spectrum.values[:, 0]
+    far = np.abs(bias - bias[0])
+    if far[-1] < 0.5 * far.max():  # there and back: the way there, since the ends of the whole sweep are equal
+        bias = bias[: int(far.argmax()) + 1]
     first, last, count = float(bias[0]), float(bias[-1]), len(bias)
     region = group(sweep, "scan_region", "NXspm_scan_region")
     values(region, "scan_start_bias", first, "V")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from afspm.model import Region, Scan, Spectrum
 from afspm.record.nexus_writer import FileProvenance, encode_scan, encode_spectrum
@@ -71,6 +72,17 @@ def test_spectrum_over_the_bias_of_a_tunnelling_microscope_follows_nxsts() -> No
     assert said(region, "scan_range_bias") == [3.0]
     assert said(sweep, "linear_sweep/scan_points_bias", "linear_sweep/step_size_bias") == [31, pytest.approx(0.1)]
     assert said(sweep, "spatial_location/x", "spatial_location/y") == [1e-6, 2e-6]
+
+
+@pytest.mark.parametrize("back", [BIAS[::-1], BIAS[-2::-1]], ids=["turning point twice", "turning point once"])
+def test_bias_sweep_there_and_back_has_the_range_of_the_way_there(back: NDArray[np.float64]) -> None:
+    bias = np.concatenate((BIAS, back))
+    entry = opened(encode_spectrum(replace(SPECTRUM, values=np.column_stack((bias, bias**3))), KNOWN))
+    sweep = entry["experiment_instrument/bias_spectroscopy_environment/bias_spectroscopy/bias_sweep"]
+    region = sweep["scan_region"]
+    assert said(region, "scan_start_bias", "scan_end_bias", "scan_range_bias") == [-1.0, 2.0, 3.0]
+    assert said(sweep, "linear_sweep/scan_points_bias", "linear_sweep/step_size_bias") == [31, pytest.approx(0.1)]
+    assert entry["data/bias"].shape == bias.shape
 
 
 @pytest.mark.parametrize(
