@@ -186,6 +186,7 @@ class Overview:
         self.progress_reports: dict[str, Progress] = {}
         self.proposals: dict[str, Proposal] = {}
         self.approvals = Approvals()
+        self._approved_ns: dict[str, int] = {}
         self.of_conditions: set[int] = set()
         self.log: deque[LogLine] = deque(maxlen=MOST_LINES)
         self.notes: deque[Note] = deque(maxlen=most_entries)
@@ -216,6 +217,13 @@ class Overview:
     @property
     def running(self) -> RunningScan | None:
         return self._measured.running
+
+    @property
+    def waiting(self) -> list[Proposal]:
+        """The proposals with a preflight that were not approved since; a plan that was carried out waits no more."""
+        return [
+            one for one in self.proposals.values() if one.preflight and one.time_ns > self._approved_ns.get(one.id, -1)
+        ]
 
     @property
     def registration(self) -> str:
@@ -350,6 +358,7 @@ class Overview:
 
     def _on_approvals(self, approvals: Approvals, time_ns: int) -> None:
         self.approvals = approvals
+        self._approved_ns |= {one.plan: time_ns for one in approvals.approvals if one.plan}
 
     def _on_control(self, control: ControlState, time_ns: int) -> None:
         self.control = control

@@ -227,6 +227,7 @@ APPROVALS: Final = MessageDeclaration(
     kind=MessageKind.EVENT,
     source=Role.SCHEDULER,
     event="approvals",
+    in_past=True,
 )
 PROPOSAL: Final = MessageDeclaration(
     type=grants_pb2.Proposal,

@@ -12,13 +12,14 @@ import pytest
 
 from afspm import wire
 from afspm.basics.errors import InvalidValue
-from afspm.model import Approval, GrantedCount, GrantedRange, Proposal
+from afspm.model import Approval, Approvals, GrantedCount, GrantedRange, Proposal
 from afspm.plugins.agent.approval import of_table, simulated
 from afspm.plugins.agent.plan import read_plan
 from afspm.plugins.web.archive import agents_in
 from afspm.plugins.web.dashboard.approvals import in_force, reviewed, title, waiting
 from afspm.plugins.web.dashboard.grant_dialog import GrantFields
 from afspm.plugins.web.dashboard.steering_panel import drawn_box
+from afspm.record.overview import Overview
 from afspm.record.run_json import EXPERIMENT_FILE
 
 PLAN = read_plan({
@@ -96,6 +97,20 @@ FIELDS = GrantFields(
     ranges=[("tip-bias-voltage", "-0.5 V", "0.5 V"), ("", "", "")],
     counts={"start-scan": "20", "start-spec": "0", "x-pulse": "0"},
 )
+
+
+def test_plan_waits_again_only_after_a_new_preflight() -> None:
+    overview = Overview()
+    overview.take("Proposal", proposal(""), 5)
+    assert overview.waiting == []
+    overview.take("Proposal", proposal(), 10)
+    assert overview.waiting == [proposal()]
+    overview.take("Approvals", Approvals((Approval("agent:claude", PLAN.id, "dashboard:Ada", 99, 3),)), 20)
+    assert overview.waiting == []
+    overview.take("Approvals", Approvals(), 30)
+    assert overview.waiting == [], "it was carried out, and would be carried out a second time"
+    overview.take("Proposal", replace(proposal(), time_ns=40), 41)
+    assert overview.waiting == [replace(proposal(), time_ns=40)]
 
 
 def test_fields_of_the_dialog_are_the_table_of_the_command_line() -> None:

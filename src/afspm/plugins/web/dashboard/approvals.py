@@ -25,7 +25,7 @@ STEPS_SHOWN = 3
 
 
 class ApprovalBar:
-    """A line for each present approval, and for the newest unapproved proposals with a preflight, newest last."""
+    """A line for each present approval, and for the newest proposals that wait for one, newest last."""
 
     def __init__(self, session: SteeringSession) -> None:
         self._session = session
@@ -35,9 +35,7 @@ class ApprovalBar:
 
     def show(self) -> None:
         with self._session.watch.reading() as overview:
-            approvals = overview.approvals.approvals
-            approved = {one.plan for one in approvals}
-            ready = [one for one in overview.proposals.values() if one.preflight and one.id not in approved]
+            approvals, ready = overview.approvals.approvals, overview.waiting
         shown = (tuple(ready[-MOST_SHOWN:]), approvals, self._session.may_steer)
         if shown == self._shown:
             return
