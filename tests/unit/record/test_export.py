@@ -200,6 +200,22 @@ def test_damaged_spectrum_is_missing_in_the_grid(night: Night, store: RecordStor
         assert file["entry/forward/current"][1, 2, 20] == pytest.approx(6.0)
 
 
+def test_spectrum_beside_a_grid_is_named_as_the_reason_why_there_is_no_file_of_the_grid(
+    night: Night, store: RecordStore, tmp_path: Path
+) -> None:
+    bias = np.linspace(-1.0, 1.0, 5)
+    places = [(x * 1e-7, y * 1e-7) for y in range(3) for x in range(4)]
+    for place in [*places, (5.3e-6, 2.2e-6)]:
+        values = np.column_stack((bias, bias))
+        spectrum = Spectrum(place, "IV", ("Bias", "Current"), ("V", "A"), values, night.now_ns, "")
+        store.take([night.packet(spectrum, "Spec1d_IV")])
+    told: list[str] = []
+    written = list(export(afspm.open_run(tmp_path), "gwy", tmp_path / "out", tell=told.append))
+    assert len(written) == len(places) + 1
+    (said,) = told
+    assert said.startswith("13 spectra of kind IV are in no file of a grid: ")
+
+
 def test_map_of_a_grid_is_a_scan(night: Night, store: RecordStore, tmp_path: Path) -> None:
     spectra = spectra_of_a_grid(night, store, tmp_path).spectra
     current = spectra.map("Current", at=1.0)

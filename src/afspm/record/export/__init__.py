@@ -25,6 +25,8 @@ from afspm.record.tables import ScanRow, SpectrumRow
 __all__ = ["chosen", "export"]
 
 
+_LEAST_POSITIONS = 4
+"""The positions of the smallest grid."""
 Writer = Callable[[Run, ScanRow | SpectrumRow], Iterator[tuple[str, bytes]]]
 
 
@@ -61,7 +63,7 @@ def export(
         for name, content in module.tables(run, wanted, spectra) if hasattr(module, "tables") else ():
             yield _written(folder / name, content)
         yield from _write_each(module.write, run, [*wanted, *spectra], folder, tell)
-        for name, stack in grids(run, spectra) if hasattr(module, "grid_file") else ():
+        for name, stack in grids(run, spectra, tell) if hasattr(module, "grid_file") else ():
             yield _written(folder / f"{name}.{to}", module.grid_file(stack, run.metadata))
     except OSError as error:
         raise FileError(f"can't be written: {error}", where=str(folder)) from error
@@ -120,10 +122,15 @@ def chosen(rows: list[ScanRow], numbers: str) -> list[ScanRow]:
     return [by_number[number] for number in dict.fromkeys(wanted)]
 
 
-def grids(run: Run, rows: Sequence[SpectrumRow]) -> Iterator[tuple[str, SpectrumStack]]:
+def grids(
+    run: Run, rows: Sequence[SpectrumRow], tell: Callable[[str], None] | None = None
+) -> Iterator[tuple[str, SpectrumStack]]:
     """Yield each grid of at least two by two spectra of one kind, with the name of its file.
 
     Different sweeps are interpolated to common values. A spectrum with a damaged file counts as unmeasured.
+
+    Args:
+        tell: called with a message for spectra at several positions that form no grid, as with one spectrum beside it.
     """
     spectra: dict[tuple[str, tuple[str, ...]], list[Spectrum]] = {}
     for row in rows:
@@ -131,8 +138,12 @@ def grids(run: Run, rows: Sequence[SpectrumRow]) -> Iterator[tuple[str, Spectrum
             spectrum = run.spectrum(row)
             spectra.setdefault((spectrum.kind, spectrum.names), []).append(spectrum)
     for number, ((kind, _), alike) in enumerate(spectra.items(), 1):
-        with suppress(InvalidValue):  # these spectra form no grid
+        try:
             stack = stacked(alike, interpolate=True)
-            if min(len(stack.points.x_m), len(stack.points.y_m)) > 1:
-                name = re.sub(r"[^\w-]+", "-", kind).strip("-") or "spectra"
-                yield f"grid-{number:02}-{name}", stack
+        except InvalidValue as error:
+            if tell is not None and len({one.position_m for one in alike}) >= _LEAST_POSITIONS:
+                tell(f"{len(alike)} spectra of kind {kind or '(none)'} are in no file of a grid: {error.what}")
+            continue
+        if min(len(stack.points.x_m), len(stack.points.y_m)) > 1:
+            name = re.sub(r"[^\w-]+", "-", kind).strip("-") or "spectra"
+            yield f"grid-{number:02}-{name}", stack
