@@ -51,6 +51,28 @@ def test_old_data_are_marked(night: Night, opened: Opened) -> None:
     page.wait_for_selector("#trouble", state="hidden", timeout=40_000)
 
 
+def test_microscope_without_an_answer_does_not_stop_the_page(night: Night, opened: Opened) -> None:
+    page = opened(night.url, person="Ada")
+    # the supervisor, too: it would replace the microscope
+    frozen = (night.process.pid, pid_of(night, "microscope"))
+    for pid in frozen:
+        os.kill(pid, signal.SIGSTOP)
+    try:
+        page.click("button:has-text('Take over')")  # and the page reads the parameters
+        page.wait_for_selector("[data-part=mode]:text-is('MANUAL')")
+        updated_ms = []
+        for _ in range(10):
+            page.wait_for_timeout(1000)
+            updated_ms.append(page.evaluate("Date.now() - window.afspm.updated"))
+    finally:
+        for pid in reversed(frozen):
+            os.kill(pid, signal.SIGCONT)
+    assert max(updated_ms) < 4000
+    page.click("button:has-text('Hand back')")
+    page.wait_for_selector("[data-part=mode]:text-is('AUTOMATED')")
+    page.wait_for_selector("#trouble", state="hidden", timeout=40_000)
+
+
 def test_a_page_that_joined_a_run_shows_a_lost_scheduler(opened: Opened, tmp_path: Path) -> None:
     file = tmp_path / "experiment.toml"
     file.write_text(EXPERIMENT.partition("[dashboard]")[0].format(speed=60.0, lines=2.0), encoding="utf-8")

@@ -127,7 +127,7 @@ def test_the_microscope_refuses_a_missing_ability(night: Night, page: Any) -> No
     press(page, "Set")
     page.wait_for_selector(".outcomes .refused")
     assert "Refused" in page.inner_text(".outcomes")
-    assert night.entry(ADA, "scan-size-x", after=after).refused
+    assert night.entry(ADA, "scan-size-x = 0", after=after).refused
 
 
 def test_adjustable_parameters_are_set_while_a_component_measures(night: Night, page: Any, keep: Any) -> None:

@@ -127,7 +127,7 @@ class Page:
         self._mode.show()
         self._problems.show()
         self._approvals.show()
-        await self._sections.show(content)
+        self._sections.show(content)
         state = self._state(content)
         try:
             theme = await ui.run_javascript(f"return window.afspm?.update({json.dumps(state)})", timeout=ANSWER_S)
@@ -206,7 +206,7 @@ class Sections:
             with section("Last refusals", "refused"):
                 self._refusals = ui.html("", sanitize=False).classes("scrolled").props('tabindex="0"')
 
-    async def show(self, content: Content) -> None:
+    def show(self, content: Content) -> None:
         """Update all sections."""
         self._content = content
         self._draw()
@@ -218,7 +218,7 @@ class Sections:
         self._notes.show(content.notes)
         self._spectra_section.set_visibility(self._spectra.show())
         if self._steering is not None:
-            await self._steering.show(content)
+            self._steering.show(content)
 
     def _draw(self) -> None:
         slow = self._content.slow

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from nicegui import ui
+from nicegui import background_tasks, ui
 
 from afspm.model import names
 from afspm.plugins.web.dashboard.actions import ActionResult
@@ -28,7 +28,7 @@ class ParameterForm:
                 button("Read again", self._read)
         self._box.set_visibility(False)
 
-    async def show(self) -> None:
+    def show(self) -> None:
         """Show the parameters that may be set at present."""
         content = self._session.content
         offered = () if content.ended else PARAMETERS if content.is_manual else content.adjustable
@@ -39,7 +39,8 @@ class ParameterForm:
         self._rows.clear()
         self._fields, self._in_force = {}, {}
         if offered:
-            await self._read()
+            # not awaited: while the microscope is slow to answer, the page must go on, with its button to stop
+            background_tasks.create(self._read())
 
     async def _read(self) -> None:
         offered = self._offered

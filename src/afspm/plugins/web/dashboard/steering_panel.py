@@ -118,13 +118,13 @@ class SteeringPanel:
         ui.on("spectrum_here", self._ask_spectrum)
         ui.on("grant_here", self._ask_grant)
 
-    async def show(self, content: Content) -> None:
+    def show(self, content: Content) -> None:
         """Show the buttons and parameters that are usable at present."""
         for one in self._by_hand:
             one.set_visibility(content.is_manual)
         self._hint.set_text(_MANUAL if content.is_manual else _ADJUST if content.adjustable else _TAKE_OVER)
         self._agents.set_visibility(bool(content.agents) and self._session.may_steer)
-        await self._parameters.show()
+        self._parameters.show()
 
     async def _ask_end(self) -> None:
         if await asked("End the experiment?", "All components stop. All measurements are kept.", "End it") and (

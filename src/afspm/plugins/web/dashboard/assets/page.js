@@ -99,4 +99,7 @@ window.afspm = {
   get image() {
     return image;
   },
+  get updated() {
+    return updated;
+  },
 };
