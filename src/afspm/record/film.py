@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -138,7 +139,7 @@ class Film:
         width, height = picture.size
         after_s = (self.times_ns[index] - self.times_ns[0]) / NS_PER_S
         clock = f"+{duration_text(after_s)}" if index else "start"
-        when = day_and_time(self.times_ns[index], seconds=False)
+        when = day_and_time(self.times_ns[index], UTC, seconds=False)
         _write(draw, (_MARGIN_PX, _MARGIN_PX), f"{clock}   {when}", "la")
         _write(draw, (width - _MARGIN_PX, _MARGIN_PX), f"scan {self.numbers[index]}", "ra")
         bar_m = round_length_m(self.window.size_m[0] / 3.0)

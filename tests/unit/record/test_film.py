@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -185,3 +186,18 @@ def test_export_writes_a_film_of_each_place(tmp_path: Path) -> None:
     assert _gif(path)[0] == SCANS
     (part,) = export(run, "gif", tmp_path / "part", "2-4")
     assert _gif(part)[0] == 3
+
+
+def test_clock_of_a_film_is_in_utc_as_all_exports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not hasattr(time, "tzset"):
+        pytest.skip("this system has one zone")
+    film = recorded(tmp_path, Frame.TIP, with_drift=False).film()
+    here = [np.asarray(image) for image in film.images()]
+    monkeypatch.setenv("TZ", "XYZ-5:30")
+    time.tzset()
+    try:
+        elsewhere = [np.asarray(image) for image in film.images()]
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    assert all(np.array_equal(one, other) for one, other in zip(here, elsewhere, strict=True))
