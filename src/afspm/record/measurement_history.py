@@ -36,7 +36,7 @@ class ScanSummary:
         holder: the component in control; None if the microscope was free, or the holder is unknown.
         interrupted: the scan is incomplete.
         setpoint: the feedback setpoint at the start, in the unit of the operating mode; None if not published.
-        number: the number of the scan in the run, from 1, the same for all its channels.
+        number: the number of the scan in the run, as in its record: from 1, the same for all its channels.
     """
 
     time_ns: int
@@ -117,11 +117,13 @@ class MeasurementHistory:
 
     Attributes:
         running: the running scan, or None.
+        count: the number of scans so far, with scans interrupted before their first line, as in the record.
         opposite_ns: times of requests for a scan in the opposite direction, newest last.
     """
 
     def __init__(self) -> None:
         self.running: RunningScan | None = None
+        self.count = 0
         self.opposite_ns: deque[int] = deque(maxlen=20)
         self._done: deque[DoneScan] = deque(maxlen=20)
         self._scans: dict[tuple[object, ...], ScanSummary] = {}
@@ -155,11 +157,16 @@ class MeasurementHistory:
         return self.running.progress(now_ns, round(median(took_ns)) if took_ns else None)
 
     def end_scan(self, time_ns: int, *, interrupted: bool) -> None:
-        """End the running scan. After an interruption, add a summary for each channel with received lines."""
+        """End the running scan. After an interruption, add a summary for each channel with received lines.
+
+        A scan whose channels were published is complete, as for the record.
+        """
         running = self.running
         if running is None:
             return
-        if interrupted:
+        if interrupted and not running.published:
+            if not running.channels:
+                self.count += 1
             for channel, lines in running.channels.items():
                 summary = ScanSummary(
                     time_ns, running.began_ns, channel, lines.unit, lines.region, lines.shape,
@@ -175,6 +182,7 @@ class MeasurementHistory:
         began_ns = None
         if self.running is not None:
             began_ns, holder = self.running.began_ns, self.running.holder
+            self.running.published = True
         summary = ScanSummary(
             scan.time_ns or time_ns, began_ns, scan.channel, scan.unit, scan.region, scan.shape, scan.filename, holder
         )
@@ -186,10 +194,10 @@ class MeasurementHistory:
         key = (summary.time_ns, summary.channel, summary.region, summary.interrupted)
         if key in self._scans:
             return
-        before = 0 if last is None else last.number
-        number = before if last is not None and summary.is_of_scan(last) else before + 1
+        if last is None or last.number != self.count or not summary.is_of_scan(last):
+            self.count += 1
         setpoint = self.running.setpoint if self.running else None
-        _keep(self._scans, key, replace(summary, number=number, setpoint=setpoint))
+        _keep(self._scans, key, replace(summary, number=self.count, setpoint=setpoint))
 
     def add_spectrum(self, spectrum: Spectrum, time_ns: int, holder: str | None) -> None:
         measured_ns = spectrum.time_ns or time_ns

@@ -203,6 +203,11 @@ class Overview:
         return self._measured.scans
 
     @property
+    def scan_count(self) -> int:
+        """The number of scans so far, interrupted scans included: the number of the newest in the record."""
+        return self._measured.count
+
+    @property
     def spectra(self) -> Sequence[SpectrumSummary]:
         return self._measured.spectra
 

@@ -40,6 +40,7 @@ class RunningScan:
         parameters: the scan parameters in force at the start; None if unknown.
         setpoint: the feedback setpoint at the start; None if not published.
         channels: received lines of each channel, where the microscope delivers lines.
+        published: whether a whole channel was published.
     """
 
     began_ns: int | None
@@ -47,6 +48,7 @@ class RunningScan:
     parameters: ScanParameters | None
     setpoint: float | None = None
     channels: dict[str, ChannelLines] = field(default_factory=dict)
+    published: bool = False
 
     def take(self, lines: ScanLines) -> None:
         if self.began_ns is None:

@@ -20,6 +20,7 @@ from afspm import wire
 from afspm.basics.errors import FileError
 from afspm.model import Problem, RegistrationOutcome, RescanKind, ScopeState, Spectrum
 from afspm.record.journal import JOURNAL_FILE, open_to_write, read_only
+from afspm.record.overview import Overview
 from afspm.record.run import Run
 from afspm.record.store import RecordStore
 
@@ -343,3 +344,30 @@ def test_journal_with_anything_but_tables_is_refused(
         journal.execute(statement)
     with pytest.raises(FileError, match="is not a table"):
         afspm.open_run(tmp_path)
+
+
+def test_page_and_record_number_scans_alike_after_interruptions(
+    night: Night, store: RecordStore, tmp_path: Path
+) -> None:
+    scanning, interrupted, free = ScopeState.SCANNING, ScopeState.INTERRUPTED, ScopeState.FREE
+    page = Overview()
+    for given in (
+        [night.control(), night.state(free)],
+        night.whole_scan(1),
+        [night.state(scanning), night.state(interrupted), night.state(free)],  # before its first line
+        night.whole_scan(2),
+        [night.state(scanning), night.lines(2), night.state(interrupted), night.state(free)],
+        night.whole_scan(3),
+    ):
+        store.take(given)
+        for packet, _ in given:
+            message = wire.message_of(packet.envelope)
+            page.take(message, wire.decode(message, packet.payload), packet.time_ns or 0, packet.envelope)
+    run = afspm.open_run(tmp_path)
+    numbers = {row.filename: row.number for row in run.scans if row.filename}
+    past = run.overview([one.name for one in wire.declared() if one.in_past])  # as of a restarted page
+    assert list(numbers.values()) == [1, 3, 5]
+    assert [row.number for row in run.scans] == [1, 2, 3, 4, 5]
+    for overview in (page, past, run.overview()):
+        assert {one.filename: one.number for one in overview.scans if one.filename} == numbers
+        assert overview.scan_count == 5

@@ -70,8 +70,8 @@ def _centre(xy_m: XY) -> str:
 
 
 def _growing(frame: ChannelFrame, overview: Overview, now_ns: int) -> Facts:
-    # an interrupted scan is already in the list
-    number = (overview.scans[-1].number if overview.scans else 0) + (overview.running is not None)
+    # a scan is counted with its first published channel, or once it was interrupted
+    number = overview.scan_count + (overview.running is not None and not overview.running.published)
     facts = [("Scan", f"no. {number}")]
     if frame.began_ns is not None:
         facts.append(("Began", time_of_day(frame.began_ns)))
