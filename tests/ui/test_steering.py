@@ -150,6 +150,20 @@ def test_adjustable_parameters_are_set_while_a_component_measures(night: Night, 
         scope.set("scan-speed", "4 um/s")
 
 
+def test_parameters_follow_other_persons_and_keep_unsent_edits(night: Night, page: Any, opened: Opened) -> None:
+    take_over(page, night)
+    before = read(page, "tip-bias-voltage")
+    fill(page, "scan-size-x", "700 n")
+    other = opened(night.url, person="Max")
+    for value, shown in (("0.5 V", "500 mV"), (before, before)):
+        fill(other, "tip-bias-voltage", value)
+        press(other, "Set")
+        said(other, f"tip-bias-voltage is now {shown}")
+        field_value = "document.querySelector('.parameters input[aria-label=tip-bias-voltage]').value"
+        page.wait_for_function(f"{field_value} === '{shown}'")
+    assert read(page, "scan-size-x") == "700 n"
+
+
 def test_a_number_without_its_unit_is_not_sent(night: Night, page: Any) -> None:
     take_over(page, night)
     after = seen(night)
@@ -159,7 +173,8 @@ def test_a_number_without_its_unit_is_not_sent(night: Night, page: Any) -> None:
     said(page, "Nothing was set.")
     assert "write the unit as well" in page.inner_text(".outcomes")
     seen(night)
-    asked = [one for one in list(night.follower.overview.entries)[after:] if one.request == ControlRequest.PARAM]
+    entries = list(night.follower.overview.entries)[after:]
+    asked = [one for one in entries if one.request == ControlRequest.PARAM and one.value]
     assert not [one for one in asked if one.who == ADA]
 
 

@@ -172,6 +172,7 @@ class Overview:
         proposals: the proposals of agents by id, newest last, bounded.
         approvals: the approvals in force.
         of_conditions: the numbers of the problems flagged by conditions.
+        set_ns: the time of the last accepted request that set each parameter.
         log, notes, entries, refusals: newest last, bounded.
     """
 
@@ -188,6 +189,7 @@ class Overview:
         self.approvals = Approvals()
         self._approved_ns: dict[str, int] = {}
         self.of_conditions: set[int] = set()
+        self.set_ns: dict[str, int] = {}
         self.log: deque[LogLine] = deque(maxlen=MOST_LINES)
         self.notes: deque[Note] = deque(maxlen=most_entries)
         self.entries: deque[JournalEntry] = deque(maxlen=most_entries)
@@ -395,6 +397,8 @@ class Overview:
             if entry.refused:
                 self.refusals.append(entry)
                 continue
+            if entry.request == ControlRequest.PARAM and entry.value:
+                self.set_ns[entry.subject] = entry.time_ns
             if entry.kind == "control":
                 self._take_change(entry)
             for number, lane in self.timelines.problems.items():

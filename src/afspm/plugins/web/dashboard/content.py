@@ -11,7 +11,7 @@ from html import escape
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.formatting import day_and_time, duration_text, time_of_day, typeset_area
-from afspm.model import ControlMode, JournalEntry, LogLine, Note, ProcessCondition, ProcessState, Region
+from afspm.model import ControlMode, Feedback, JournalEntry, LogLine, Note, ProcessCondition, ProcessState, Region
 from afspm.model.events import PERSON
 from afspm.plugins.web.dashboard.charts import Chart, drift_chart
 from afspm.plugins.web.dashboard.flags import Flag, flags
@@ -54,6 +54,8 @@ class Content:
     Attributes:
         trouble: the reason why the page may be out of date; empty: the page is current.
         unheard: time without a report in ns, by process, while other processes report.
+        set_ns: the time at which each parameter was set last.
+        feedback: the last published state of the feedback.
     """
 
     status: str = ""
@@ -68,6 +70,8 @@ class Content:
     log: tuple[LogLine, ...] = ()
     is_manual: bool = False
     adjustable: tuple[str, ...] = ()
+    set_ns: Mapping[str, int] = field(default_factory=dict)
+    feedback: Feedback | None = None
     agents: tuple[str, ...] = ()
     ended: bool = False
 
@@ -135,6 +139,8 @@ class Contents:
                 log=tuple(overview.log),
                 is_manual=control is not None and control.mode is ControlMode.MANUAL,
                 adjustable=self._adjustable,
+                set_ns=dict(overview.set_ns),
+                feedback=overview.readings.feedback,
                 agents=tuple(dict.fromkeys((*(one.who for one in overview.proposals.values()), *self._agents))),
                 ended=watch.ended,
             )

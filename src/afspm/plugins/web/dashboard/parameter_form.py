@@ -19,22 +19,29 @@ class ParameterForm:
     def __init__(self, session: SteeringSession) -> None:
         self._session = session
         self._offered: tuple[str, ...] = ()
+        self._settings: object = None
+        self._is_reading = False
         self._in_force: dict[str, str] = {}
         self._fields: dict[str, ui.input] = {}
         with ui.element("div").classes("parameters") as self._box:
             self._rows = ui.element("div").classes("fields")
             with ui.element("div").classes("acts"):
                 button("Set", self._set, "primary")
-                button("Read again", self._read)
+                button("Read again", lambda: self._read())
         self._box.set_visibility(False)
 
     def show(self) -> None:
         """Show the parameters that may be set at present."""
         content = self._session.content
         offered = () if content.ended else PARAMETERS if content.is_manual else content.adjustable
+        settings = (tuple(map(content.set_ns.get, offered)), content.feedback)
         if offered == self._offered:
+            # set by another person or a component; the feedback also at the controller
+            if offered and settings != self._settings and not self._is_reading:
+                self._settings = settings
+                background_tasks.create(self._read(edited_too=False))
             return
-        self._offered = offered
+        self._offered, self._settings = offered, settings
         self._box.set_visibility(bool(offered))
         self._rows.clear()
         self._fields, self._in_force = {}, {}
@@ -42,13 +49,16 @@ class ParameterForm:
             # not awaited: while the microscope is slow to answer, the page must go on, with its button to stop
             background_tasks.create(self._read())
 
-    async def _read(self) -> None:
-        offered = self._offered
-        result = await self._session.carry_out(lambda a: a.read(offered))
+    async def _read(self, *, edited_too: bool = True) -> None:
+        offered, self._is_reading = self._offered, True
+        try:
+            result = await self._session.carry_out(lambda a: a.read(offered))
+        finally:
+            self._is_reading = False
         if offered == self._offered and not self._rows.is_deleted:
-            self._take(result.each)
+            self._take(result.each, edited_too=edited_too)
 
-    def _take(self, told: Mapping[str, ActionResult]) -> None:
+    def _take(self, told: Mapping[str, ActionResult], *, edited_too: bool = True) -> None:
         # a refused parameter does not exist on this microscope
         for name, one in told.items():
             if not one.ok:
@@ -56,7 +66,10 @@ class ParameterForm:
             if name not in self._fields:
                 with self._rows:
                     self._fields[name] = ui.input(name).props("dense outlined").on("keydown.enter", self._set)
+            is_edited = name in self._in_force and self._fields[name].value != self._in_force[name]
             self._in_force[name] = one.text
+            if is_edited and not edited_too:
+                continue
             self._fields[name].set_value(one.text)
             self._fields[name].props(remove="error error-message")
 
