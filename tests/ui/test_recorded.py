@@ -137,7 +137,7 @@ def test_notes_of_the_night_and_of_the_morning_are_kept(ended: Night, opened: Op
         assert (last.who, last.scan, last.time_ns) == ("dashboard:Eve", 2, time_ns)
     assert page.locator(".notes b b").count() == 0, "text is no markup"
     assert page.locator("#scrubber .marks .note").count() >= 2
-    page.wait_for_selector("text=Noted.")  # once the report is written again
+    page.wait_for_selector("text=Noted")  # once the report is written again
     report = page.request.get(f"{ended.url}/night/report")
     assert report.ok
     assert "double tip" in report.text()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from html import escape
 
 from nicegui import context, events, ui
@@ -15,6 +16,7 @@ from afspm.plugins.web.dashboard.access import Visitor
 from afspm.plugins.web.dashboard.actions import ActionResult, Steering
 from afspm.plugins.web.dashboard.charts import Chart, spectrum_chart
 from afspm.plugins.web.dashboard.content import NO_REPORT
+from afspm.plugins.web.dashboard.scan_facts import summary_of
 from afspm.plugins.web.dashboard.steering_panel import ask_restart
 from afspm.plugins.web.dashboard.steering_session import SteeringSession
 from afspm.plugins.web.watch import Watch
@@ -23,7 +25,7 @@ from afspm.record.drawing.timeline import tint_class
 MOST_LINES = 300
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
 MOMENT, SCAN = "this moment", "the scan shown"
-_SHOWN = "return window.afspm?.image?.head?.time_ns ?? ''"
+_SHOWN = "return [window.afspm?.image?.head?.time_ns ?? '', Boolean(window.afspm?.image?.pinned)]"
 _EVERYTHING = "all"
 _BAD = {ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.GIVEN_UP}
 
@@ -218,9 +220,15 @@ class NotesPanel:
         self._steering = steering
         self._visitor = visitor
         self._client = context.client
+        self._seen: str | None = None  # the scan shown when the note was begun: a later scan may replace it meanwhile
         if visitor.person:
             with ui.element("div").classes("acts"):
-                self._text = ui.input("note").props("dense outlined").classes("text").on("keydown.enter", self._write)
+                self._text = (
+                    ui.input("note", on_change=self._begin)
+                    .props("dense outlined")
+                    .classes("text")
+                    .on("keydown.enter", self._write)
+                )
                 self._on = ui.select([SCAN, MOMENT], value=SCAN, label="on").props("dense outlined")
                 ui.button("Note", on_click=self._write, color=None).props("no-caps outline")
         else:
@@ -230,18 +238,33 @@ class NotesPanel:
     def show(self, notes: str) -> None:
         self._list.set_content(notes)
 
+    async def _begin(self) -> None:
+        if not self._text.value:
+            self._seen = None
+        elif self._seen is None and self._watch.moment_ns is None:
+            self._seen = ""
+            self._seen, _ = await ui.run_javascript(_SHOWN)
+
     async def _write(self) -> None:
         text, time_ns, scan_ns = str(self._text.value or "").strip(), self._watch.moment_ns, None
         if self._on.value == SCAN:
-            shown = await ui.run_javascript(_SHOWN)
+            shown, is_pinned = await ui.run_javascript(_SHOWN)
+            shown = shown if is_pinned else self._seen or shown
             if not shown:
                 self._say(ActionResult("The scan shown is not finished: write the note on this moment.", ok=False))
                 return
             scan_ns, time_ns = int(shown), None
         doing = self._steering.do(self._visitor, lambda actions: actions.note(text, scan_ns, time_ns))
         result = await asyncio.wrap_future(doing)
+        if result.ok and scan_ns is not None:
+            result = replace(result, text=self._noted_on(scan_ns) or result.text)
         if not self._client.is_deleted:
             self._say(result)
+
+    def _noted_on(self, scan_ns: int) -> str:
+        with self._watch.reading() as overview:
+            summary = summary_of(scan_ns, overview)
+        return "" if summary is None else f"Noted on scan {summary.number}."
 
     def _say(self, result: ActionResult) -> None:
         with self._client:
