@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import re
+import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
+from datetime import UTC
 from types import MappingProxyType
 from typing import Any
 
@@ -14,7 +16,7 @@ import pytest
 
 from afspm import wire
 from afspm.basics.clock import ExperimentClock
-from afspm.basics.formatting import typeset_position
+from afspm.basics.formatting import time_of_day, typeset_position
 from afspm.model import (
     ControlMode,
     ControlState,
@@ -32,7 +34,7 @@ from afspm.model import (
     Spectrum,
 )
 from afspm.model.planned_work import PlannedWork
-from afspm.plugins.web.dashboard.charts import drift_chart, spectrum_chart
+from afspm.plugins.web.dashboard.charts import _offset_ms, drift_chart, spectrum_chart
 from afspm.plugins.web.dashboard.content import refusals_html, rows_of, status_html, unheard
 from afspm.plugins.web.dashboard.panels import log_html, process_words
 from afspm.plugins.web.dashboard.sample_map import MapContent, map_html, places_of
@@ -352,12 +354,12 @@ def test_drift_is_drawn_against_time_with_its_state_in_words() -> None:
     points = [DriftPoint(i * S, (i * 1e-9, -i * 1e-9), (1e-9, 0.0), correcting=True) for i in range(10)]
     chart = drift_chart(points)
     x, y = lines(chart.options)
-    assert x[-1] == [9000.0, 9.0]
-    assert y[-1] == [9000.0, -9.0]
+    assert x[-1] == [9000.0 + _offset_ms(9 * S), 9.0]
+    assert y[-1] == [9000.0 + _offset_ms(9 * S), -9.0]
     assert "corrected" in chart.words
     lost = drift_chart([*points, DriftPoint(11 * S, (0.0, 0.0), (0.0, 0.0), lost=True, reason="no overlap")])
     assert "The sample is lost: no overlap" in lost.words
-    assert lines(lost.options)[0][-1] == [11000.0, None], "a gap, and no line to zero"
+    assert lines(lost.options)[0][-1] == [11000.0 + _offset_ms(9 * S), None], "a gap, and no line to zero"
 
 
 def test_predicted_positions_are_drawn_as_dots() -> None:
@@ -410,3 +412,20 @@ def test_values_that_are_not_finite_are_gaps_in_a_spectrum(gone: float) -> None:
 def test_positions_read_well() -> None:
     assert typeset_position((1.2e-6, -5e-7)) == "(1.2, −0.5) µm"
     assert typeset_position((0.0, 0.0)) == "(0, 0) nm"
+
+
+def test_times_of_the_drift_have_the_zone_of_the_page_not_of_the_browser(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not hasattr(time, "tzset"):
+        pytest.skip("this system has one zone")
+    monkeypatch.setenv("TZ", "XYZ-5:30")
+    time.tzset()
+    try:
+        options = drift_chart([DriftPoint(10 * S, (0.0, 0.0), (0.0, 0.0))]).options
+        shown = time_of_day(10 * S)
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    assert options is not None
+    assert options["useUTC"] is True
+    ((at_ms, _),) = options["series"][0]["data"]
+    assert time_of_day(round(at_ms) * 1_000_000, UTC) == shown == "05:30:10"
