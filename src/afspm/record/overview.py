@@ -334,9 +334,11 @@ class Overview:
             if before is None or before.state is not ScopeState.SCANNING or self.running is None:
                 readings = self.readings
                 setpoint = readings.feedback.setpoint if readings.feedback else None
-                # a late joiner has not observed the start of a scan that was running already
+                # a late joiner has not observed the start of a scan that was running already; nor has anyone after a
+                # loss of contact with the controller
+                observed = before is not None and before.state is not ScopeState.UNDEFINED
                 self._measured.running = RunningScan(
-                    time_ns if before else None, self._holder, readings.scan_parameters, setpoint
+                    time_ns if observed else None, self._holder, readings.scan_parameters, setpoint
                 )
         elif status.state in (ScopeState.FREE, ScopeState.INTERRUPTED):
             self._measured.end_scan(time_ns, interrupted=status.state is ScopeState.INTERRUPTED)

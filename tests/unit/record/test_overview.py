@@ -200,6 +200,17 @@ def test_progress_of_a_scan_without_lines_follows_earlier_scans() -> None:
     assert seen(*without_lines).scan_progress(22 * S) == (0.4, 3 * S)  # the one before took 5 s
 
 
+def test_scan_found_running_after_lost_contact_has_no_start_and_predicts_no_other() -> None:
+    states = (ScopeState.FREE, ScopeState.SCANNING, ScopeState.UNDEFINED, ScopeState.SCANNING)
+    packets: list[tuple[str, object, int]] = [
+        ("ScopeStateMsg", status(state), time_s) for time_s, state in zip((1, 10, 30, 70), states, strict=True)
+    ]
+    overview = seen(*packets, ("Scan2d", scan("Height", 70), 71), ("ScopeStateMsg", status(ScopeState.FREE), 72))
+    assert [one.began_ns for one in overview.scans] == [None]
+    overview.take("ScopeStateMsg", status(ScopeState.SCANNING), 80 * S)
+    assert overview.scan_progress(81 * S) is None, "a scan of 2 s would be predicted"
+
+
 def test_progress_ignores_scans_of_other_pixels() -> None:
     wide = ("ScanParameters2d", model.ScanParameters(REGION, (400, 400)), 16)
     without_lines = [*NIGHT[:4], *NIGHT[5:7], wide, NIGHT[7]]
