@@ -33,8 +33,8 @@ def _nothing(*args: Any, **given: Any) -> str:
 def grant_is_not_checked_on_set(patch: Patch) -> None:
     real = GrantChecker._refused_by_grant
 
-    def refused(self: GrantChecker, held: HeldGrant, who: str, request: Request, now_ns: int) -> str:
-        return "" if request.kind == ControlRequest.PARAM else real(self, held, who, request, now_ns)
+    def refused(self: GrantChecker, held: HeldGrant, who: str, request: Request, *rest: Any) -> str:
+        return "" if request.kind == ControlRequest.PARAM else real(self, held, who, request, *rest)
 
     patch.setattr(GrantChecker, "_refused_by_grant", refused)
 

@@ -32,6 +32,7 @@ from afspm.model import (
     Note,
     OrderOutcome,
     Parameter,
+    ProbePosition,
     Problem,
     ProblemNames,
     ProcessStates,
@@ -82,6 +83,7 @@ class AgentLab:
         self.lab = Lab(self.settings)
         self.lab.translator()
         self.place: Region = FAR
+        self.in_force: dict[str, Any] = {}
         self.ids = 0
 
     def grant(self, **changes: Any) -> Grant:
@@ -114,7 +116,7 @@ class AgentLab:
         effects = self.lab.ask(who, kind, subject, "" if id_ == NO_ID else id_ or f"{who}/1/{self.ids}")
         left, low = (self.place.center_m[i] - self.place.size_m[i] / 2 for i in (0, 1))
         effects += self.lab.answer_reads(
-            scan_size_x=str(self.place.size_m[0]), scan_size_y=str(self.place.size_m[1]),
+            **self.in_force, scan_size_x=str(self.place.size_m[0]), scan_size_y=str(self.place.size_m[1]),
             scan_top_left_x=str(left), scan_top_left_y=str(low), scan_angle="0",
             probe_pos_x="0", probe_pos_y="0",
         )  # fmt: skip
@@ -449,6 +451,28 @@ def test_actions_without_ids_count_within_the_hour() -> None:
     asked = [agent.do(ACTION, names.START_SCAN, id_=NO_ID, who="series") for _ in range(3)]
     assert asked[:2] == ["", ""]
     assert "2 are allowed" in asked[2]
+
+
+PULSES = RoleLimits(ExperimentLimits({names.PULSE_VOLTAGE: Limit(-2.0, 2.0, unit="V", source="experiment.toml:9")}))
+
+
+def test_pulse_with_a_voltage_in_force_beyond_the_role_is_refused() -> None:
+    agent = AgentLab(replace(LIMITS, roles={"series": PULSES}))
+    assert agent.lab.take_control("series") is OK
+    agent.in_force = {"x_pulse_voltage": "5"}
+    assert "x-pulse-voltage = 5 V is above the highest allowed, 2 V" in agent.do(ACTION, names.PULSE, who="series")
+    agent.in_force = {"x_pulse_voltage": "2"}
+    assert agent.do(ACTION, names.PULSE, who="series") == ""
+
+
+def test_pulse_with_a_voltage_in_force_beyond_the_grant_is_refused(agent: AgentLab) -> None:
+    ranges = (GrantedRange(names.PULSE_VOLTAGE, -2.0, 2.0),)
+    agent.begin(agent.grant(ranges=ranges, counts=(GrantedCount(names.PULSE, 5),)))
+    assert agent.do(int(ControlRequest.SET_PROBE_POS), ProbePosition((0.0, 0.0))) == ""
+    agent.in_force = {"x_pulse_voltage": "-5"}
+    assert "x-pulse-voltage = -5 is below the lowest allowed" in agent.do(ACTION, names.PULSE)
+    agent.in_force = {"x_pulse_voltage": "-2"}
+    assert agent.do(ACTION, names.PULSE) == ""
 
 
 # --- parameters of other instruments --------------------------------------------------------------------------------

@@ -77,8 +77,7 @@ def _refused(draft: StateDraft, job: ForwardedRequest) -> str:
     # a frozen scheduler finds the request and the end of the lease at the same time
     if draft.env.settings.rules.is_agent(job.client) and until_s is not None and draft.now_s > until_s:
         return f"the lease of {job.client} has ended"
-    position = draft.limits.state.position
-    return draft.grants.refused(job.client, job.request, draft.now_ns, offset_m(draft), position)
+    return draft.grants.refused(job.client, job.request, draft.now_ns, offset_m(draft), draft.limits.state)
 
 
 def sending(draft: StateDraft, job: ForwardedRequest) -> None:

@@ -40,7 +40,7 @@ from afspm.model import (
 )
 from afspm.model.geometry import XY
 from afspm.model.names import BASE_PARAMETERS
-from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES, KnownPosition
+from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES
 from afspm.model.snapshot import to_plain
 from afspm.scheduler.control.arbitration import ArbitrationState, Rules
 from afspm.scheduler.safety.limit_checker import LimitChecker, is_get
@@ -307,14 +307,14 @@ class GrantChecker:
             needed.update(dict.fromkeys(LimitChecker(limits).depends_on(request)))
         return list(needed)
 
-    def refused(self, who: str, request: Request, now_ns: int, offset_m: XY | None, position: KnownPosition) -> str:
+    def refused(self, who: str, request: Request, now_ns: int, offset_m: XY | None, state: LimitState) -> str:
         """Return the reason why a command may not be sent now; empty if it may.
 
         Args:
             offset_m: the origin of component coordinates in microscope coordinates; None: both are the same.
-            position: the position of the tip, in the microscope's coordinates.
+            state: the values in force, and the position of the tip in the microscope's coordinates.
         """
-        if why := self._refused_by_role(who, request, now_ns, offset_m, position):
+        if why := self._refused_by_role(who, request, now_ns, offset_m, state):
             return why
         if not self.rules.is_agent(who):
             return ""
@@ -324,7 +324,7 @@ class GrantChecker:
         if (known := self._spent(who, request.id)) is not None:
             is_same = (known.request, known.payload) == (request.kind, request.payload)
             return "" if is_same else "this id is of another request"
-        if why := self._refused_at_place(who, request, now_ns, offset_m, position):
+        if why := self._refused_at_place(who, request, now_ns, offset_m, state):
             return why
         plan, grant = self.book.plans.get(who), self.book.grants.get(who)
         why_not = "no plan is approved"
@@ -332,7 +332,7 @@ class GrantChecker:
             return ""
         if grant is None:
             return f"{why_not}, and there is no grant"
-        refused = self._refused_by_grant(grant, who, request, now_ns)
+        refused = self._refused_by_grant(grant, who, request, now_ns, state)
         return f"{refused}; {why_not}" if refused and plan is not None else refused
 
     def sending(self, who: str, request: Request, now_ns: int, offset_m: XY | None) -> GrantChecker:
@@ -394,17 +394,17 @@ class GrantChecker:
     def _sets_of_limits(self, who: str) -> list[ExperimentLimits]:
         role, placed = self._role(who), self.book.placed
         found = [] if role is None else [role.limits]
+        if who in self.book.grants:
+            found.append(ExperimentLimits(_limits_of(self.book.grants[who].grant).parameters))
         # with any region, so that the microscope is asked where it stands before an action
         places = (placed.region, None if placed.probe_m is None else Region(placed.probe_m, (_PROBE_M, _PROBE_M)))
         return found + [ExperimentLimits(region=one) for one in places if one is not None and placed.who == who]
 
-    def _refused_by_role(
-        self, who: str, request: Request, now_ns: int, offset_m: XY | None, position: KnownPosition
-    ) -> str:
+    def _refused_by_role(self, who: str, request: Request, now_ns: int, offset_m: XY | None, state: LimitState) -> str:
         role = self._role(who)
         if role is None or is_get(request):
             return ""
-        if why := _outside(role.limits, who, request, now_ns, offset_m, position):
+        if why := _outside(role.limits, who, request, now_ns, offset_m, state):
             return why
         if request.kind != ControlRequest.ACTION:
             others = _others(request, role.limits) if role.parameters_only else []
@@ -434,9 +434,7 @@ class GrantChecker:
             return f"this is not request {held.step + 1} of {grant.plan}"
         return ""
 
-    def _refused_at_place(
-        self, who: str, request: Request, now_ns: int, offset_m: XY | None, position: KnownPosition
-    ) -> str:
+    def _refused_at_place(self, who: str, request: Request, now_ns: int, offset_m: XY | None, state: LimitState) -> str:
         # a person at the panel, or another component before, may have set another place than the one approved
         action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
         if not action or action in _STOPS:
@@ -445,9 +443,9 @@ class GrantChecker:
         if place is None:
             return f"{who} has not set the place for {action} since it got control"
         set_by = ExperimentLimits(region=place, region_source=f"set by {who}")
-        return _outside(set_by, who, request, now_ns, offset_m, position)
+        return _outside(set_by, who, request, now_ns, offset_m, state)
 
-    def _refused_by_grant(self, held: HeldGrant, who: str, request: Request, now_ns: int) -> str:
+    def _refused_by_grant(self, held: HeldGrant, who: str, request: Request, now_ns: int, state: LimitState) -> str:
         grant = held.grant
         if held.until_ns <= now_ns:
             return "the grant has run out"
@@ -466,6 +464,7 @@ class GrantChecker:
             # rotated as it may be: its corners, as of a request that sets it
             asked = Request(_SET_REGION, ScanParameters(placed))
             refusal = LimitChecker(_limits_of(grant)).check(who, asked, now_ns)
+            refusal = refusal or LimitChecker(_limits_of(grant), state).check_treatment(request)
             return "" if refusal is None else refusal.reason
         if others := _others(request, _limits_of(grant)):
             return f"the grant does not include {others[0]}"
@@ -511,13 +510,14 @@ def _outside(
     request: Request,
     now_ns: int,
     offset_m: XY | None,
-    position: KnownPosition,
+    state: LimitState,
 ) -> str:
-    # in the coordinates of components: a place is known in those of the microscope, which are the same without a frame
-    known = LimitState() if offset_m is not None else LimitState(position=position)
-    # a part of a place would be completed from the microscope; the whole is what a person sees
     checker = LimitChecker(limits)
+    # in the coordinates of components: a part of a place would be completed from the microscope; the whole is what a
+    # person sees
     if (refusal := checker.check(who, request, now_ns)) is None and request.kind == ControlRequest.ACTION:
-        # with a frame the microscope is moved to the place that the agent has set, which was checked then
-        refusal = None if offset_m is not None else replace(checker, state=known).check_place(request)
+        checker = replace(checker, state=state)
+        # A place is known in the coordinates of the microscope, which are the same without a frame. With a frame the
+        # microscope is moved to the place that the agent has set, which was checked then.
+        refusal = checker.check_place(request) if offset_m is None else checker.check_treatment(request)
     return "" if refusal is None else refusal.reason

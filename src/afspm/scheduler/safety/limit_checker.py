@@ -19,6 +19,7 @@ from typing import NamedTuple
 from afspm.basics.errors import InvalidValue
 from afspm.basics.formatting import lengths_text, position_text, quantity
 from afspm.basics.frozen import replace
+from afspm.basics.units import si_unit_or_none
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -113,10 +114,20 @@ class LimitChecker:
         """
         try:
             self._check_place(str(request.subject))
-            self._check_treatment(str(request.subject))
         except _Breach as breach:
-            reason = f"{request.subject}: {breach.reason}"
-            return Response(int(ControlResponse.ACTION_ERROR), b"", reason, request.id)
+            return _action_error(request, breach)
+        return self.check_treatment(request)
+
+    def check_treatment(self, request: Request) -> Response | None:
+        """Return the refusal of a treatment of the tip with the values in force; None: it may start."""
+        for name in _TREATMENTS.get(str(request.subject), ()):
+            limit, known = self.limits.parameters.get(name), self.state.usage.known.get(name)
+            if limit is None or known is None:
+                continue
+            try:
+                self._check_range(name, known.value, limit, _TOLD_REACH)
+            except _Breach as breach:
+                return _action_error(request, breach)
         return None
 
     def depends_on(self, request: Request, *, is_mapped: bool = False) -> list[str]:
@@ -279,7 +290,14 @@ class LimitChecker:
             return []
 
     def _number(self, reported: Parameter) -> float | None:
-        return next((value.number for value in self._valid_values(reported)), None)
+        limits = self.limits.parameters
+        if reported.name in _OF_TREATMENTS and reported.name not in limits:
+            # in SI, for the ranges of roles and grants
+            limits = {reported.name: Limit(unit=si_unit_or_none(reported.unit or ""))}
+        try:
+            return next((value.number for value in values_of(reported, limits)), None)
+        except ParameterValueError:
+            return None
 
     # --- checks ---
 
@@ -430,18 +448,16 @@ class LimitChecker:
                 raise _param_error("the microscope has not reported its probe position")
             self._check_point(self.state.position.probe_m, _TOLD_REACH)
 
-    def _check_treatment(self, action: str) -> None:
-        for name in _TREATMENTS.get(action, ()):
-            limit, known = self.limits.parameters.get(name), self.state.usage.known.get(name)
-            if limit is not None and known is not None:
-                self._check_range(name, known.value, limit, _TOLD_REACH)
-
     def _check_move(self, change: PositionChange) -> None:
         if self.limits.region is None:
             return
         if self.state.position.probe_m is None:
             raise _param_error("the microscope has not reported its probe position, so a part of it can't be checked")
         self._check_point(moved(self.state.position.probe_m, change))
+
+
+def _action_error(request: Request, breach: _Breach) -> Response:
+    return Response(int(ControlResponse.ACTION_ERROR), b"", f"{request.subject}: {breach.reason}", request.id)
 
 
 def _param_error(reason: str) -> _Breach:
