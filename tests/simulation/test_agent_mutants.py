@@ -133,7 +133,7 @@ def repeated_id_is_not_compared(patch: Patch) -> None:
 
 
 def nothing_is_checked_when_it_is_sent(patch: Patch) -> None:
-    patch.setattr(approvals, "refused", _nothing)
+    patch.setattr(approvals, "_refused", _nothing)
 
 
 def agent_has_no_lease(patch: Patch) -> None:
