@@ -246,7 +246,8 @@ class Scope(ExperimentView):
         Args:
             value: a number in `unit` (default: SI), a quantity as text ("0.5 V"), True, "on" …
             wait: whether to wait until a parameter of another instrument, such as a temperature, has arrived at
-                `value`. The call then returns the measured value. The wait needs no control.
+                `value`. The call then returns the measured value. Neither this wait nor that for a first reading,
+                of a minute at most, needs control.
 
         Raises:
             NoResponse: with `wait`, the target was changed meanwhile, was not reached within the timeout, or the
@@ -254,9 +255,18 @@ class Scope(ExperimentView):
         """
         with self._call():
             asked, until_s = to_parameter(parameter, value, unit), self._link.until(timeout_s)
+            if wait:
+                self._await_reading(asked, until_s)
             response = self._commands.in_control(ControlRequest.PARAM, asked, until_s)
             in_force = value_in(response, asked, asked.unit)
             return self._arrived(asked, float(in_force), until_s) if wait else in_force
+
+    def _await_reading(self, asked: Parameter, until_s: float | None) -> None:
+        # an instrument that is not connected yet, as when a run begins, would refuse the setting
+        link = self._link
+        give_up_s = link.earlier(PATIENCE_S, until_s)
+        while self._read_again(asked.name, asked.unit, until_s)[0] is None and link.clock.monotonic_s() < give_up_s:
+            link.wait(lambda: False, link.earlier(_LOOK_S, until_s))
 
     def _arrived(self, asked: Parameter, target: float, until_s: float | None) -> Value:
         link, name = self._link, asked.name

@@ -858,15 +858,32 @@ def test_properties_of_a_scope_show_the_present_state(lab: Lab, scope: Scope) ->
 
 
 def test_wait_accepts_a_target_that_the_instrument_has_rounded(lab: Lab, scope: Scope) -> None:
-    lab.values |= {"source.bias.target": "0.1667", "source.bias.busy": "false"}
+    lab.values |= {"source.bias": "0", "source.bias.target": "0.1667", "source.bias.busy": "false"}
     assert scope.set("source.bias", 1 / 6, "V", wait=True) == pytest.approx(1 / 6)
     lab.values["source.bias.target"] = "0.2"
     with pytest.raises(NoResponse, match=r"its target is 0\.2 now"):
         scope.set("source.bias", 1 / 6, "V", wait=True)
 
 
+def test_setting_with_wait_is_sent_after_the_first_reading(lab: Lab, scope: Scope) -> None:
+    lab.values |= {"source.bias": "0", "source.bias.target": "0.25", "source.bias.busy": "false"}
+    connected_s = lab.clock.passed_s + 6.0
+
+    def answer(request: model.Request) -> Response | str:
+        is_bias = request.kind == ControlRequest.PARAM and request.subject.name == "source.bias"
+        if is_bias and lab.clock.passed_s < connected_s:
+            return Response(ControlResponse.PARAM_ERROR, reason="source.bias is not known: not connected yet")
+        return "go on"
+
+    lab.intercept = answer
+    assert scope.set("source.bias", 0.25, "V", wait=True) == 0.25
+    connected_s = math.inf
+    with pytest.raises(Refused, match="not connected yet"):
+        scope.set("source.bias", 0.25, "V", wait=True)
+
+
 def test_wait_outlasts_a_restart_of_the_instrument_but_not_an_error(lab: Lab, scope: Scope) -> None:
-    lab.values |= {"source.bias.target": "0.25", "source.bias.busy": "false"}
+    lab.values |= {"source.bias": "0", "source.bias.target": "0.25", "source.bias.busy": "false"}
     begun_s, lasts_s = lab.clock.passed_s, 30.0
     unknown = Response(ControlResponse.PARAM_ERROR, reason="source.bias is not known: status 400: no sensor")
 
