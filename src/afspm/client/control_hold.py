@@ -8,6 +8,7 @@ from contextlib import contextmanager, nullcontext
 from afspm.basics.errors import ControlLost, ExperimentEnded, NoResponse, Refused
 from afspm.client.experiment_link import ExperimentLink
 from afspm.model import (
+    LEASE_AT_ONCE_S,
     LEASE_REQUEST,
     WAIT_FOR_CONTROL,
     ControlMode,
@@ -21,7 +22,6 @@ from afspm.transport.process.parent import StopRequested
 from afspm.wire.messages import FEEDBACK
 
 ASK_AGAIN_S = 10.0  # in case a published control state was lost
-_AT_ONCE_S = 1e-3  # lease of a block that failed with the tip in danger
 
 
 class ControlHold:
@@ -89,14 +89,14 @@ class ControlHold:
             yield
         except (ExperimentEnded, StopRequested):
             self._wanted.pop()
-            if not self._wanted and self._is_off and not self._was_off:
+            if not self._wanted and self._has_switched_off:
                 self.held = False  # not given back: once this process has ended, the scheduler retracts the tip
             elif not self._wanted:
                 self.leave()
             raise
         except BaseException as error:  # also Ctrl-C: control must be released on every way out of the block
             # after Ctrl-C a person attends to the tip
-            self._end_block(quietly=True, in_danger=isinstance(error, Exception) and self._is_off and not self._was_off)
+            self._end_block(quietly=True, in_danger=isinstance(error, Exception) and self._has_switched_off)
             raise
         else:
             self._end_block(quietly=False)
@@ -216,14 +216,17 @@ class ControlHold:
             self.lost(self.obstacle(self._solving) or "it was revoked")
 
     def _is_revoked(self, until_s: float | None) -> bool:
-        # by a lease that ends at once: after a release the scheduler leaves the tip alone
         link = self._link
         link.log.error("an error ended a block that had switched the feedback off: the tip is left to the scheduler")
-        if not link.request(LEASE_REQUEST, _AT_ONCE_S, until_s=until_s).ok:
+        if not link.request(LEASE_REQUEST, LEASE_AT_ONCE_S, until_s=until_s).ok:
             return False
         view = link.view
         link.wait(lambda: view.control is not None and view.control.holder != link.name, until_s)
         return True
+
+    @property
+    def _has_switched_off(self) -> bool:
+        return self._is_off and not self._was_off
 
     @property
     def _is_off(self) -> bool:

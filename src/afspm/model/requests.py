@@ -44,6 +44,8 @@ LEASE_REQUEST = 104
 The subject is the time in real seconds without another command or lease request.
 """
 LONGEST_LEASE_S = 86_400.0
+LEASE_AT_ONCE_S = 1e-3
+"""A lease that ends at once. Unlike a release it is no decision: the scheduler retracts a tip in danger."""
 GRANT_REQUEST = 105
 """Request of a person to approve an agent's plan, to give a grant, or to revoke its approvals; an extension of afspm.
 

@@ -16,6 +16,7 @@ from afspm.basics.plain_data import Plain
 from afspm.client.targets import Target
 from afspm.model import (
     CLOCK_REQUEST,
+    LEASE_AT_ONCE_S,
     RELAY_REQUEST,
     STOPPED_BY_AGENT,
     Approvals,
@@ -43,8 +44,6 @@ from afspm.transport.process.parent import StopRequested
 LEASE_S = 30.0
 """Real seconds after which an agent whose process is gone loses control."""
 RENEW_S = 10.0
-AT_ONCE_S = 1e-3
-"""Lease of an agent whose plan has failed with the feedback off."""
 STOP_ANSWERED_S = 5.0
 STOP_AGAIN_S = 0.5
 MOST_RUNS = 200
@@ -251,8 +250,7 @@ class Workplace:
             self._save(run)
         try:
             if run.state == "failed" and _is_off_after(plan.steps[: run.step]):
-                # after a release the scheduler would leave the tip alone; after a lease it retracts the tip
-                await self.do(person, lambda commands: commands.renew(AT_ONCE_S))
+                await self.do(person, lambda commands: commands.renew(LEASE_AT_ONCE_S))
             else:
                 await self.do(person, lambda commands: commands.release_control())
         except RefusedRequest as error:  # control then ends with its lease
