@@ -19,7 +19,8 @@ ENGAGE: Final = "x-engage"
 
 EXTENSION_ACTIONS: Final = (PULSE, CRASH, RETRACT, ENGAGE)
 
-AT_PROBE: Final = frozenset({START_SPEC, PULSE, CRASH})
+TREATMENTS: Final = (PULSE, CRASH)
+AT_PROBE: Final = frozenset({START_SPEC, *TREATMENTS})
 """The actions that take place at the probe position."""
 
 SCAN_TOP_LEFT_X: Final = "scan-top-left-x"

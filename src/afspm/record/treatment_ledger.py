@@ -112,7 +112,7 @@ def _once(journal: Sequence[JournalEntry]) -> list[JournalEntry]:
 
 
 def _is_treatment(entry: JournalEntry) -> bool:
-    return entry.request == ControlRequest.ACTION and entry.subject in (names.PULSE, names.CRASH)
+    return entry.request == ControlRequest.ACTION and entry.subject in names.TREATMENTS
 
 
 def _sending(entry: JournalEntry) -> tuple[str, str, int | None]:

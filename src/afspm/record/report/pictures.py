@@ -166,7 +166,7 @@ def night_of(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -
     record.marks += [
         NightMark(entry.time_ns, entry.who, entry.what)
         for entry in run.journal
-        if entry.what in (names.PULSE, names.CRASH) and entry.response == 0
+        if entry.what in names.TREATMENTS and entry.response == 0
     ]
     return record
 

@@ -44,7 +44,7 @@ SCHEDULER = "scheduler"
 """The author of requests of the scheduler itself."""
 _UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})  # sent all the time by supervisors and starting processes
 # with the treatments of a tip: a kill must not lose a pulse, and its repetitions must not look like other pulses
-_STARTS = frozenset({names.START_SCAN, names.START_SPEC, names.PULSE, names.CRASH})
+_STARTS = frozenset({names.START_SCAN, names.START_SPEC, *names.TREATMENTS})
 _STARTS_KEPT = 16
 """Number of starts kept over a restart: many more than can be forwarded while one entry waits to be published."""
 _CUT_OFF = "the scheduler was restarted before the answer was written down"

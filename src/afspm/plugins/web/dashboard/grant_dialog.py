@@ -21,7 +21,6 @@ from afspm.plugins.web.dashboard.steering_session import SteeringSession
 
 MEASURED = {names.START_SCAN: 10, names.START_SPEC: 0}
 """The first offered actions, with their initial numbers."""
-TREATMENTS = (names.PULSE, names.CRASH)
 LASTS = "1 h"
 Pair = tuple[str, str]
 
@@ -121,7 +120,7 @@ class GrantDialog:
             self._counts = {name: _field(name, str(count)) for name, count in MEASURED.items()}
         ui.label("Treatments of the tip: 0 unless you trust it with the tip").classes("quiet")
         with ui.element("div").classes("fields"):
-            self._counts |= {name: _field(name, "0") for name in TREATMENTS}
+            self._counts |= {name: _field(name, "0") for name in names.TREATMENTS}
 
     def _add_range(self) -> None:
         number = len(self._ranges) + 1
