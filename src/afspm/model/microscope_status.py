@@ -31,6 +31,11 @@ class TipRisk:
     feedback_on: bool | None = None
     tip_away: bool = False
 
+    @property
+    def has_no_feedback(self) -> bool:
+        """Whether the feedback is off while the tip is at the surface."""
+        return self.feedback_on is False and not self.tip_away
+
 
 @dataclass(frozen=True)
 class MicroscopeStatus:
@@ -112,8 +117,7 @@ class MicroscopeStatus:
 
     @property
     def endangered_by_feedback(self) -> bool:
-        risk = self.risk
-        return risk.feedback_on is False and FEEDBACK_OFF in self.dangerous and not risk.tip_away
+        return self.risk.has_no_feedback and FEEDBACK_OFF in self.dangerous
 
     @property
     def danger(self) -> str | None:

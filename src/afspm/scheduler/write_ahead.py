@@ -51,8 +51,7 @@ class StateFile:
             self._log.critical("the saved state is missing: control is free, and no problem is flagged (%s)", self.path)
         if state is None or not damage:
             return state
-        risk = state.tip_risk
-        is_kept = state.control.holder is not None and risk.feedback_on is False and not risk.tip_away
+        is_kept = state.control.holder is not None and state.tip_risk.has_no_feedback
         holder = f"{state.control.holder} in control, as the feedback is off" if is_kept else "no component in control"
         self._log.critical("the newest saved state is damaged, the one before it is used, with %s: %s", holder, damage)
         return state if is_kept else state.without_holder()

@@ -446,7 +446,7 @@ class GrantChecker:
         return _outside(set_by, who, request, now_ns, offset_m, state)
 
     def _refused_by_grant(self, held: HeldGrant, who: str, request: Request, now_ns: int, state: LimitState) -> str:
-        grant = held.grant
+        grant, limits = held.grant, _limits_of(held.grant)
         if held.until_ns <= now_ns:
             return "the grant has run out"
         if request.kind == ControlRequest.ACTION:
@@ -463,12 +463,12 @@ class GrantChecker:
             placed = self.book.placed.for_action(who, action)
             # rotated as it may be: its corners, as of a request that sets it
             asked = Request(_SET_REGION, ScanParameters(placed))
-            refusal = LimitChecker(_limits_of(grant)).check(who, asked, now_ns)
-            refusal = refusal or LimitChecker(_limits_of(grant), state).check_treatment(request)
+            refusal = LimitChecker(limits).check(who, asked, now_ns)
+            refusal = refusal or LimitChecker(limits, state).check_treatment(request)
             return "" if refusal is None else refusal.reason
-        if others := _others(request, _limits_of(grant)):
+        if others := _others(request, limits):
             return f"the grant does not include {others[0]}"
-        refusal = LimitChecker(_limits_of(grant)).check(who, request, now_ns)
+        refusal = LimitChecker(limits).check(who, request, now_ns)
         return "" if refusal is None else refusal.reason
 
     def _with(self, **changes: object) -> GrantChecker:

@@ -14,6 +14,7 @@ import dataclasses
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 from afspm.basics.errors import InvalidValue
@@ -354,9 +355,7 @@ class LimitChecker:
             )
 
     def _check_range(self, name: str, value: float, limit: Limit, reach: float = _REACH) -> None:
-        def text(amount: float) -> str:
-            return quantity(amount, limit.unit or BASE_PARAMETERS.get(name) or "", 6)
-
+        text = partial(_amount_text, name, limit)
         setting = f"{name} = {text(value)}"
         if limit.low is not None and value < limit.low - abs(limit.low) * reach:
             raise _param_error(f"{setting} is below the lowest allowed, {text(limit.low)} ({limit.source})")
@@ -364,9 +363,7 @@ class LimitChecker:
             raise _param_error(f"{setting} is above the highest allowed, {text(limit.high)} ({limit.source})")
 
     def _check_value(self, name: str, value: float, limit: Limit, now_ns: int) -> None:
-        def text(amount: float, digits: int = 6) -> str:
-            return quantity(amount, limit.unit or BASE_PARAMETERS.get(name) or "", digits)
-
+        text = partial(_amount_text, name, limit)
         setting = f"{name} = {text(value)}"
         self._check_range(name, value, limit)
         if not limit.bounds_changes:
@@ -454,6 +451,10 @@ class LimitChecker:
         if self.state.position.probe_m is None:
             raise _param_error("the microscope has not reported its probe position, so a part of it can't be checked")
         self._check_point(moved(self.state.position.probe_m, change))
+
+
+def _amount_text(name: str, limit: Limit, amount: float, digits: int = 6) -> str:
+    return quantity(amount, limit.unit or BASE_PARAMETERS.get(name) or "", digits)
 
 
 def _action_error(request: Request, breach: _Breach) -> Response:
