@@ -100,6 +100,12 @@ def period_text(begin_ns: int, end_ns: int, zone: tzinfo | None = None) -> str:
     return f"{_moment(begin_ns, zone):%Y-%m-%d %H:%M} to {until}"
 
 
+def zone_offset_s(time_ns: int) -> float:
+    """Return the lead of this computer's zone over UTC at a time; summer time may begin or end during a night."""
+    offset = _moment(time_ns, None).utcoffset()
+    return offset.total_seconds() if offset else 0.0
+
+
 def _zone(zone: tzinfo | None) -> str:
     return " UTC" if zone is UTC else ""
 

@@ -16,7 +16,7 @@ import pytest
 
 from afspm import wire
 from afspm.basics.clock import ExperimentClock
-from afspm.basics.formatting import time_of_day, typeset_position
+from afspm.basics.formatting import time_of_day, typeset_position, zone_offset_s
 from afspm.model import (
     ControlMode,
     ControlState,
@@ -34,7 +34,7 @@ from afspm.model import (
     Spectrum,
 )
 from afspm.model.planned_work import PlannedWork
-from afspm.plugins.web.dashboard.charts import _offset_ms, drift_chart, spectrum_chart
+from afspm.plugins.web.dashboard.charts import drift_chart, spectrum_chart
 from afspm.plugins.web.dashboard.content import refusals_html, rows_of, status_html, unheard
 from afspm.plugins.web.dashboard.panels import log_html, process_words
 from afspm.plugins.web.dashboard.sample_map import MapContent, map_html, places_of
@@ -354,12 +354,12 @@ def test_drift_is_drawn_against_time_with_its_state_in_words() -> None:
     points = [DriftPoint(i * S, (i * 1e-9, -i * 1e-9), (1e-9, 0.0), correcting=True) for i in range(10)]
     chart = drift_chart(points)
     x, y = lines(chart.options)
-    assert x[-1] == [9000.0 + _offset_ms(9 * S), 9.0]
-    assert y[-1] == [9000.0 + _offset_ms(9 * S), -9.0]
+    assert x[-1] == [9000.0 + 1e3 * zone_offset_s(9 * S), 9.0]
+    assert y[-1] == [9000.0 + 1e3 * zone_offset_s(9 * S), -9.0]
     assert "corrected" in chart.words
     lost = drift_chart([*points, DriftPoint(11 * S, (0.0, 0.0), (0.0, 0.0), lost=True, reason="no overlap")])
     assert "The sample is lost: no overlap" in lost.words
-    assert lines(lost.options)[0][-1] == [11000.0 + _offset_ms(9 * S), None], "a gap, and no line to zero"
+    assert lines(lost.options)[0][-1] == [11000.0 + 1e3 * zone_offset_s(9 * S), None], "a gap, and no line to zero"
 
 
 def test_predicted_positions_are_drawn_as_dots() -> None:

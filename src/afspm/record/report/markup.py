@@ -7,7 +7,7 @@ from datetime import UTC
 from html import escape
 
 from afspm.basics.clock import NS_PER_S, utc_time
-from afspm.basics.formatting import day, day_and_time, period_text, time_of_day
+from afspm.basics.formatting import day, day_and_time, period_text, time_of_day, zone_offset_s
 from afspm.record.report.style import CSS
 
 _DAY_NS = 86_400 * NS_PER_S
@@ -26,7 +26,7 @@ class PageTimes:
     def __init__(self, start_ns: int, end_ns: int) -> None:
         self._start_ns, self._end_ns = start_ns, end_ns
         self._days = end_ns - start_ns > _DAY_NS
-        self.is_local = any(_offset_s(time_ns) for time_ns in (start_ns, end_ns))
+        self.is_local = any(zone_offset_s(time_ns) for time_ns in (start_ns, end_ns))
         self._zones = tuple(_zone(time_ns) for time_ns in (start_ns, end_ns))
         self.zone = ", then ".join(dict.fromkeys(self._zones))
 
@@ -124,8 +124,3 @@ def _lines(rows: Sequence[Sequence[str]]) -> Iterator[str]:
 def _zone(time_ns: int) -> str:
     # summer time may begin or end during the run
     return utc_time(time_ns).astimezone().strftime("%Z") or "local"
-
-
-def _offset_s(time_ns: int) -> float:
-    offset = utc_time(time_ns).astimezone().utcoffset()
-    return offset.total_seconds() if offset else 0.0

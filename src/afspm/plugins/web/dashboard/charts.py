@@ -9,8 +9,7 @@ from html import escape
 
 import numpy as np
 
-from afspm.basics.clock import utc_time
-from afspm.basics.formatting import quantity, time_of_day, typeset_position
+from afspm.basics.formatting import quantity, time_of_day, typeset_position, zone_offset_s
 from afspm.basics.plain_data import Plain
 from afspm.model import RegistrationOutcome, Spectrum, registration_summary
 from afspm.record.drawing.chart import Axis, Curve
@@ -44,7 +43,7 @@ def drift_chart(points: Sequence[DriftPoint]) -> Chart:
     registered = registration_summary(point.outcome for point in points)
     points = points[-MOST_DRIFT:]
     # shown as UTC: the chart knows only UTC and the zone of the browser
-    time_ms = np.array([point.time_ns / 1e6 for point in points]) + _offset_ms(points[-1].time_ns)
+    time_ms = np.array([point.time_ns / 1e6 for point in points]) + 1e3 * zone_offset_s(points[-1].time_ns)
     xy = np.array([point.translation_m for point in points])
     lost = np.array([point.lost for point in points])
     guessed = np.array([not point.matched for point in points]) & ~lost
@@ -58,14 +57,6 @@ def drift_chart(points: Sequence[DriftPoint]) -> Chart:
         series.append({**dots, "data": _pairs(np.tile(time_ms[guessed], 2), either)})
     options = _options(series, {"type": "time"}, y)
     return Chart(_drift_words(points[-1], registered), {**options, "legend": _LEGEND, "useUTC": True})
-
-
-def _offset_ms(time_ns: int) -> float:
-    try:
-        offset = utc_time(time_ns).astimezone().utcoffset()
-    except OSError:  # Windows knows no local time before 1970
-        return 0.0
-    return offset.total_seconds() * 1e3 if offset else 0.0
 
 
 def _drift_words(point: DriftPoint, registered: str) -> str:

@@ -10,7 +10,6 @@ import json
 import logging
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from datetime import datetime
 from html import escape
 from typing import ClassVar
 
@@ -19,9 +18,9 @@ from fastapi import FastAPI, Response
 from fastapi.responses import FileResponse, PlainTextResponse
 from nicegui import events, ui
 
-from afspm.basics.clock import NS_PER_S, ExperimentClock
+from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import AfspmError, InvalidValue
-from afspm.basics.formatting import time_of_day, typeset_area
+from afspm.basics.formatting import time_of_day, typeset_area, zone_offset_s
 from afspm.basics.plain_data import Plain
 from afspm.model.events import PERSON
 from afspm.model.line_levelling import Levelling, levelled
@@ -101,7 +100,6 @@ class NightRequests:
         # times are texts: JavaScript has no exact integers of 64 bits
         night = self._night
         drifted = night.drifted()
-        offset = datetime.fromtimestamp(night.end_ns / NS_PER_S).astimezone().utcoffset()
         published_ns = night.published_ns()
         scans = [_scan(row) for row in night.scans if row.region is not None and row.shape is not None]
         for scan in scans:
@@ -111,7 +109,7 @@ class NightRequests:
         return {
             "begin": str(night.begin_ns),
             "end": str(night.end_ns),
-            "offset_s": offset.total_seconds() if offset is not None else 0.0,
+            "offset_s": zone_offset_s(night.end_ns),
             "scans": scans,
             "notes": [
                 {"time": str(one.time_ns), "text": one.thing.text} for one in night.events if one.message == "Note"
