@@ -63,6 +63,12 @@ def fill(page: Any, parameter: str, value: str) -> None:
     field(page, parameter).fill(value)
 
 
+def set_speed(page: Any, value: str, shown: str) -> None:
+    fill(page, "scan-speed", value)
+    press(page, "Set")
+    said(page, f"scan-speed is now {shown}")
+
+
 def test_a_person_takes_over_and_hands_back(night: Night, page: Any, keep: Any) -> None:
     after = seen(night)
     take_over(page, night)
@@ -267,34 +273,26 @@ def test_a_spectrum_is_taken_by_a_click_and_shown(night: Night, page: Any, keep:
 
 def test_a_scan_is_stopped_after_taking_over(night: Night, page: Any) -> None:
     take_over(page, night)
-    fill(page, "scan-speed", "50 nm/s")
-    press(page, "Set")
-    said(page, "scan-speed is now 50 nm/s")
+    set_speed(page, "50 nm/s", "50 nm/s")
     press(page, "Scan as set")
     night.until(lambda: night.state is ScopeState.SCANNING)
     press(page, "Stop the scan")
     said(page, "The scan is stopped")
     night.until(lambda: night.state is ScopeState.FREE)
     assert any(span.label == "interrupted" for span in night.follower.overview.timelines.scope_state.spans)
-    fill(page, "scan-speed", "4 um/s")
-    press(page, "Set")
-    said(page, "scan-speed is now 4 µm/s")
+    set_speed(page, "4 um/s", "4 µm/s")
 
 
 def test_a_scan_requested_twice_does_not_delay_its_stop(night: Night, page: Any) -> None:
     take_over(page, night)
-    fill(page, "scan-speed", "10 nm/s")
-    press(page, "Set")
-    said(page, "scan-speed is now 10 nm/s")
+    set_speed(page, "10 nm/s", "10 nm/s")
     press(page, "Scan as set")
     night.until(lambda: night.state is ScopeState.SCANNING)
     press(page, "Scan as set")
     press(page, "Stop the scan")
     said(page, "The scan is stopped")
     night.until(lambda: night.state is ScopeState.FREE)
-    fill(page, "scan-speed", "4 um/s")
-    press(page, "Set")
-    said(page, "scan-speed is now 4 µm/s")
+    set_speed(page, "4 um/s", "4 µm/s")
 
 
 def test_stopping_in_automated_announces_the_takeover(night: Night, page: Any) -> None:

@@ -82,15 +82,21 @@ def test_key_outlives_a_kill_right_after_forwarding(lab: Lab) -> None:
     assert "restarted" in start.reason
 
 
-def test_repeated_start_keeps_its_first_time_of_forwarding_over_a_kill(lab: Lab) -> None:
-    lab.take_control("survey")
-    lab.ask("survey", R.ACTION, "start-scan", "survey/key/tile-1/1")
+def repeated_after_a_kill(lab: Lab, who: str, action: str, id_: str) -> tuple[list[JournalEntry], int]:
+    """Return the entries of a restarted scheduler after a repeated request, and the time of its first forwarding."""
+    lab.take_control(who)
+    lab.ask(who, R.ACTION, action, id_)
     sent_ns = lab.now_ns
     after = killed_after(lab, Forward)
     after.later(1.0, 1.0)
-    after.ask("survey", R.ACTION, "start-scan", "survey/key/tile-1/1")
+    after.ask(who, R.ACTION, action, id_)
     after.answer(after.forwarded[-1])
-    starts = [entry for entry in after.entries() if entry.what == "start-scan"]
+    return after.entries(), sent_ns
+
+
+def test_repeated_start_keeps_its_first_time_of_forwarding_over_a_kill(lab: Lab) -> None:
+    entries, sent_ns = repeated_after_a_kill(lab, "survey", "start-scan", "survey/key/tile-1/1")
+    starts = [entry for entry in entries if entry.what == "start-scan"]
     assert [(entry.response, entry.key, entry.sent_ns) for entry in starts] == [
         (C.NO_RESPONSE, "tile-1", sent_ns),
         (C.SUCCESS, "tile-1", sent_ns),
@@ -98,14 +104,8 @@ def test_repeated_start_keeps_its_first_time_of_forwarding_over_a_kill(lab: Lab)
 
 
 def test_repeated_treatment_keeps_its_first_time_of_forwarding_over_a_kill(lab: Lab) -> None:
-    lab.take_control("corrector")
-    lab.ask("corrector", R.ACTION, "x-pulse", "corrector/a/1")
-    sent_ns = lab.now_ns
-    after = killed_after(lab, Forward)
-    after.later(1.0, 1.0)
-    after.ask("corrector", R.ACTION, "x-pulse", "corrector/a/1")
-    after.answer(after.forwarded[-1])
-    pulses = [entry for entry in after.entries() if entry.subject == "x-pulse"]
+    entries, sent_ns = repeated_after_a_kill(lab, "corrector", "x-pulse", "corrector/a/1")
+    pulses = [entry for entry in entries if entry.subject == "x-pulse"]
     assert [(entry.response, entry.sent_ns) for entry in pulses] == [(C.NO_RESPONSE, sent_ns), (C.SUCCESS, sent_ns)]
 
 

@@ -109,14 +109,7 @@ def test_all_processes_are_asked_at_once_whether_they_are_gone(monkeypatch: pyte
     _wait_until_gone({"processes": processes}, tmp_path)
 
 
-EMULATED = """
-[clock]
-speed = 60.0
-
-[controller]
-component = true
-class = "NanonisEmulator"
-
+REAL = """
 [microscope]
 component = true
 class = "Nanonis"
@@ -125,6 +118,14 @@ class = "Nanonis"
 component = true
 class = "Scheduler"
 """
+EMULATED = f"""
+[clock]
+speed = 60.0
+
+[controller]
+component = true
+class = "NanonisEmulator"
+{REAL}"""
 
 
 def test_experiment_without_its_emulator_does_not_have_simulated_time(tmp_path: Path) -> None:
@@ -150,17 +151,6 @@ def test_simulated_time_goes_on_where_other_computers_have_parts_of_the_run(
         assert clock.now_s() == pytest.approx(before.now_s(), abs=60.0)
     else:  # nothing has happened meanwhile
         assert clock.now_s() < 6000.0
-
-
-REAL = """
-[microscope]
-component = true
-class = "Nanonis"
-
-[scheduler]
-component = true
-class = "Scheduler"
-"""
 
 
 @pytest.mark.parametrize(("ahead_s", "goes_on"), [(-60.0, False), (1.0, False), (3600.0, True)])
