@@ -44,8 +44,8 @@ def send_frames(socket: Socket, frames: Sequence[bytes]) -> bool:
         try:
             socket.send(frame, _NOW if index == last else _NOW | _MORE)
         except zmq.Again:
-            # The connection was lost between two frames, and libzmq drops everything up to the next last frame. It gets
-            # the rest of this message to drop, or it would drop the next message and report success.
+            # The connection was lost between two frames, and libzmq drops all frames up to the next end of a message.
+            # So it gets the rest of this one: otherwise it would drop the next message, and report success.
             if 0 < index < last:
                 send_frames(socket, frames[index + 1 :])
             return False

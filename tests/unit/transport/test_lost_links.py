@@ -139,7 +139,7 @@ def test_connection_lost_behind_an_answer_ends_neither_scheduler_nor_answer(tmp_
 @pytest.mark.parametrize("cut_at", range(4))
 def test_request_after_one_that_was_cut_off_is_sent(cut_at: int) -> None:
     class Cut:
-        """As libzmq after a connection lost in a message: all frames up to the next last one are dropped."""
+        """As libzmq after a connection lost in a message: all frames up to the next end of a message are dropped."""
 
         def __init__(self) -> None:
             self.sent: list[bytes] = []
