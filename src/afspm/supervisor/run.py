@@ -128,20 +128,21 @@ def go(
         facts[PLANNED] = before.get(PLANNED) or {name: work and work.as_dict() for name, work in works}
         if before.get(ENDED) and REAL_S in before:
             facts[REAL_S] = before[REAL_S]
-        run_folder.write_run(folder, facts)
-        if {start.launch.name for start in starts} & set(experiment.recorders):
-            expect_recorder(log_folder(folder / STATE_DIR))
-        log.write(LOGGED_AS, logging.INFO, f"{name}: {counted(len(starts), 'process', 'processes')}, into {folder}")
-        if not common.simulated and (warning := _ahead_of_wall(clock)):
-            log.write(LOGGED_AS, logging.WARNING, warning)
         handed = key_handout.hand_over(experiment, starts)
-        reporter = reporter_of(experiment, starts, clock, common.run, handed.supervisor)
-        tasks = [from_start(start) for start in handed.starts]
-        ends_idle = experiment.ends_idle([task.name for task in tasks])
-        encrypts = not security.insecure
-        beats = HeartbeatListener(take_address=addresses.of_heartbeat, encrypts=encrypts)
-        supervisor = Supervisor(tasks, log, clock, _child_policy(experiment), reporter, beats, ends_idle=ends_idle)
+        # before run.json: whoever finds it may join at once
         with handed.laid_down(folder):
+            run_folder.write_run(folder, facts)
+            if {start.launch.name for start in starts} & set(experiment.recorders):
+                expect_recorder(log_folder(folder / STATE_DIR))
+            log.write(LOGGED_AS, logging.INFO, f"{name}: {counted(len(starts), 'process', 'processes')}, into {folder}")
+            if not common.simulated and (warning := _ahead_of_wall(clock)):
+                log.write(LOGGED_AS, logging.WARNING, warning)
+            reporter = reporter_of(experiment, starts, clock, common.run, handed.supervisor)
+            tasks = [from_start(start) for start in handed.starts]
+            ends_idle = experiment.ends_idle([task.name for task in tasks])
+            encrypts = not security.insecure
+            beats = HeartbeatListener(take_address=addresses.of_heartbeat, encrypts=encrypts)
+            supervisor = Supervisor(tasks, log, clock, _child_policy(experiment), reporter, beats, ends_idle=ends_idle)
             outcome = supervisor.run()
         try:
             ending = {**facts, ENDED: outcome.text, HOW: outcome.why.name.lower()}

@@ -16,7 +16,10 @@ import pytest
 from afspm.basics.errors import ConfigError
 from afspm.client.connect import GUEST_KEYS, _keys_in
 from afspm.experiment import Experiment, load
+from afspm.supervisor import run as running
+from afspm.supervisor import run_folder
 from afspm.supervisor.key_handout import KeyHandout, hand_over
+from afspm.supervisor.run import RunOptions
 from afspm.transport.keys import Keys, from_launch, generate
 
 FILE = """
@@ -161,6 +164,20 @@ def test_a_secret_that_others_may_read_is_refused(tmp_path: Path) -> None:
     loose.chmod(0o640)
     with pytest.raises(ConfigError, match="other users may read this secret key: its mode is 0640"):
         handed(experiment(tmp_path, '[security]\nkeys = "keys"\n'))
+
+
+def test_guests_key_is_in_the_run_folder_before_run_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[object] = []
+
+    def write(folder: Path, _facts: object) -> None:
+        found.append(_keys_in(folder))
+        raise ConfigError("not started")
+
+    monkeypatch.setattr(run_folder, "write_run", write)
+    with pytest.raises(ConfigError, match="not started"):
+        running.run(experiment(tmp_path), RunOptions(runs=tmp_path / "runs"))
+    assert found
+    assert found[0] != {}
 
 
 def test_run_folder_has_the_guests_key_while_the_run_lasts(tmp_path: Path) -> None:
