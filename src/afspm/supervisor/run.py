@@ -129,7 +129,7 @@ def go(
         if before.get(ENDED) and REAL_S in before:
             facts[REAL_S] = before[REAL_S]
         handed = key_handout.hand_over(experiment, starts)
-        # before run.json: whoever finds it may join at once
+        # before run.json: a program that finds it may join at once
         with handed.laid_down(folder):
             run_folder.write_run(folder, facts)
             if {start.launch.name for start in starts} & set(experiment.recorders):
