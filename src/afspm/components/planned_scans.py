@@ -17,12 +17,23 @@ from afspm.client.component import Component
 from afspm.client.events import PublishedEvent
 from afspm.client.parameter_text import to_parameter
 from afspm.components import tip_verdict
-from afspm.components.scan_plan import XY, PlanRest, PlanStep, RoundSchedule, ScanPlan, grid_centers, rounds_within
+from afspm.components.scan_plan import (
+    XY,
+    PlanRest,
+    PlanStep,
+    Retakes,
+    RoundSchedule,
+    ScanPlan,
+    grid_centers,
+    rounds_within,
+)
 from afspm.model import Region, ScanSet, ScopeState, ScopeStatus, names
 from afspm.model.names import BASE_PARAMETERS
 from afspm.model.planned_work import PlannedWork, planned_rounds
 
 Pixels = tuple[int, int]
+VERDICT_WITHIN_S = 10.0
+"""Limit on the wait for the verdict on the last scan, in real time."""
 # parameters that every scan with a region needs of the microscope
 FRAME = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
 
@@ -50,6 +61,8 @@ class PlannedScans(Component):
         missed: treatment of scans that were due while control was lost (MANUAL, the repair of a tip). "extend": they
             are taken after the others, with the same period; "catch-up": at once, one after the other; "skip": never;
             "rest": as "extend", and of a scan that a `LineWatch` stopped only the rows since the change are taken.
+        retakes: how often a complete scan is taken again if a component, such as `TipClassifier`, judges it to show a
+            bad tip: after the repair, before the next scan, with the bad one left in the record. 0: never.
 
     Attributes:
         plan: the regions, and the number of rounds.
@@ -69,7 +82,11 @@ class PlannedScans(Component):
         end_when_done: bool = False,
         parameters: dict[str, str | float] | None = None,
         missed: Missed = "extend",
+        retakes: int = 0,
     ) -> None:
+        if retakes < 0:
+            raise ConfigError(f"{retakes} retakes", where="retakes", hint="0 or more")
+        self.retakes = retakes
         self.keep_control, self.end_when_done, self.missed = keep_control, end_when_done, missed
         self.parameters = checked_parameters(parameters, "parameters")
         self.needs_parameters = (*FRAME, *self.parameters)
@@ -93,11 +110,19 @@ class PlannedScans(Component):
         done = int(self.memory.get("done", 0))
         if done and done != self._total:
             self.log.info("going on with scan %d%s", done + 1, self._of_total())
+        self._retakes = Retakes(self.retakes, self.memory)
+        self._verdicts = self.scope.events(tip_verdict.MESSAGE) if self.retakes else None
         with self.scope.control() if self.keep_control else nullcontext():
             for step in self.plan.steps(done):
                 if not self._await(step, rhythm):
                     break
+                # a scan that was running at a restart comes first: nothing was due when it began
+                if step.index != done or self._retakes.due:
+                    self._retake()
                 self._take(step)
+            self._retake()
+            while self._is_last_bad():
+                self._retake()
         left_out = (self.plan.total or 0) - (self._total or 0)
         taken = "the scan is" if self._total == 1 else f"all {self._total} scans are"
         self.log.info("%s taken%s", taken, f", {left_out} left out" if left_out else "")
@@ -158,7 +183,7 @@ class PlannedScans(Component):
     def _take(self, step: PlanStep) -> None:
         if step.starts_round:
             self._round_began_s = self.clock.now_s()
-        scans = self._scan_rest(step) if self.missed == "rest" and step.shape else self._scan(step)
+        scans = self._measured(step)
         if scans.interruptions:
             self._round_began_s = None
         if self._round_began_s is not None and (step.index + 1) % len(self.plan.regions) == 0:
@@ -166,23 +191,69 @@ class PlannedScans(Component):
             # the fastest round counts, since a slower round may have waited for control
             self.memory["pace_s"] = min(round_s, float(self.memory.get("pace_s", round_s)))
         self.memory["done"], self.memory["done_s"] = step.index + 1, self.clock.now_s()
-        rest = self.memory.pop("rest", None)
-        if self.memory.save(synced=False):  # if not saved, a restart requests the same scan
-            self.scope.forget(PlanRest(*rest).of(step).key if rest else step.key)
-        for interruption in scans.interruptions:
-            self.log.warning("%s was interrupted, and taken again: %s", step.key, interruption)
+        self._save_taken(step, 0, scans)
         if (total := self._total) is not None:
             self.scope.progress(step.index + 1, total, left_s=self._left_s(step.index + 1, total))
-        at = "" if scans.time is None else f"at {day_and_time(round(scans.time.timestamp() * NS_PER_S), UTC)}"
-        self.log.info("scan %d%s %s", step.index + 1, self._of_total(), at)
+        self._log_taken(step, scans)
+
+    def _retake(self) -> None:
+        self._judge()
+        while (due := self._retakes.due) is not None:
+            index, again = due
+            step = self.plan.step(index).again(again)
+            self._round_began_s = None  # a repetition would count as the pace of a round
+            self.log.warning("scan %d showed a bad tip, and is taken again", index + 1)
+            self.memory.save()  # before the request: a restart requests the same scan first
+            scans = self._measured(step)
+            self._save_taken(step, again, scans)
+            self._log_taken(step, scans, " again")
+            self._judge()
+
+    def _judge(self) -> None:
+        messages = [event.message for event in self._verdicts.waiting()] if self._verdicts else ()
+        verdicts = (tip_verdict.read_verdict(message) for message in messages)
+        for index in self._retakes.judge(verdict for verdict in verdicts if verdict is not None):
+            self.log.warning("scan %d showed a bad tip again, and is left so", index + 1)
+
+    def _is_last_bad(self) -> bool:
+        if self.retakes:
+            is_judged = self.scope.wait_until(self._newest_is_judged, timeout_s=VERDICT_WITHIN_S)
+            if not is_judged and not self._retakes.has_verdicts:
+                self.log.warning("no scan was taken again, as no verdict has arrived: does a component judge scans?")
+        return self._retakes.due is not None
+
+    def _newest_is_judged(self) -> bool:
+        self._judge()
+        return not self._retakes.awaits_newest
+
+    def _measured(self, step: PlanStep) -> ScanSet:
+        return self._scan_rest(step) if self.missed == "rest" and step.shape else self._scan(step)
+
+    def _save_taken(self, step: PlanStep, again: int, scans: ScanSet) -> None:
+        self._retakes.add(step.index, again, (scan.time_ns for scan in scans.values()))
+        rest = self._rest_of(step)
+        if rest is not None:
+            del self.memory["rest"]
+        if self.memory.save(synced=False):  # if not saved, a restart requests the same scan
+            self.scope.forget((rest.of(step) if rest else step).key)
+        for interruption in scans.interruptions:
+            self.log.warning("%s was interrupted, and taken again: %s", step.key, interruption)
+
+    def _log_taken(self, step: PlanStep, scans: ScanSet, again: str = "") -> None:
+        at = "" if scans.time_ns is None else f" at {day_and_time(scans.time_ns, UTC)}"
+        self.log.info("scan %d%s%s%s", step.index + 1, self._of_total(), again, at)
 
     def _scan(self, step: PlanStep, *, repeat: bool = True) -> ScanSet:
         return self.scope.scan(step.region, shape=step.shape, key=step.key, repeat=repeat)
 
+    def _rest_of(self, step: PlanStep) -> PlanRest | None:
+        # after a restart, a scan with a bad tip may be taken again before the interrupted one
+        key, *rows = self.memory.get("rest", ("",))
+        return PlanRest(*rows) if key == step.key else None
+
     def _scan_rest(self, step: PlanStep) -> ScanSet:
         rows, _ = step.shape or (0, 0)
-        kept = self.memory.get("rest")
-        rest = PlanRest(*kept) if kept else PlanRest(0, rows - 1)
+        rest = self._rest_of(step) or PlanRest(0, rows - 1)
         with self.scope.events(tip_verdict.OF_LINES, "ScopeStateMsg") as events:
             while True:
                 part, lasted_ns = rest.of(step), None
@@ -204,11 +275,12 @@ class PlannedScans(Component):
                 with self.scope.control():  # in control again: the tip is repaired, and all verdicts have arrived
                     pass
                 seen += events.waiting()
-                rest = self._since_change(rest, part, seen, lasted_ns)
+                rest = self._since_change(step, rest, seen, lasted_ns)
 
     def _since_change(
-        self, rest: PlanRest, part: PlanStep, seen: Sequence[PublishedEvent], lasted_ns: tuple[int, int] | None
+        self, step: PlanStep, rest: PlanRest, seen: Sequence[PublishedEvent], lasted_ns: tuple[int, int] | None
     ) -> PlanRest:
+        part = rest.of(step)
         messages = (event.message for event in seen if not isinstance(event.message, ScopeStatus))
         found = [one for one in map(tip_verdict.read_line_verdict, messages) if one is not None and one.stops]
         # of this scan only: a verdict on an earlier scan, or on another component's scan, would leave out rows here
@@ -220,7 +292,7 @@ class PlannedScans(Component):
         rest = max(rests, key=lambda one: one.last - one.first)
         self.log.info("%s: rows %d to %d are left", part.key, rest.first, rest.last)
         # saved before the request: after a kill the same rows are requested, under the same key
-        self.memory["rest"] = [rest.first, rest.last]
+        self.memory["rest"] = [step.key, rest.first, rest.last]
         self.memory.save()
         return rest
 

@@ -1,17 +1,20 @@
-"""Plans of scans, and their due times, as plain values that need no microscope."""
+"""Plans of scans, their due times and repetitions: decisions that need no microscope."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, MutableMapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from afspm.basics.errors import InvalidValue
 from afspm.basics.formatting import lengths_text
 from afspm.model import Region
+from afspm.record.bad_scans import BAD
 
 XY = tuple[float, float]
 REST_OVERLAP = 2  # rows before the estimated change that are taken again
+MOST_UNJUDGED = 16  # scans of a classifier's reference never get a verdict
 FEWEST_ROWS = 8  # of the rest of a scan: fewer rows show too little to be judged or registered
 
 
@@ -32,6 +35,10 @@ class PlanStep:
     region: Region
     shape: tuple[int, int] | None
     starts_round: bool
+
+    def again(self, number: int) -> PlanStep:
+        """Return the step of a repetition, under its own key."""
+        return replace(self, key=f"{self.key}-again-{number}")
 
 
 @dataclass(frozen=True)
@@ -143,6 +150,68 @@ class PlanRest:
         region = replace(step.region, center_m=center_m, size_m=size_m)
         shape = (self.last - self.first + 1, columns)
         return replace(step, key=f"{step.key}-rows-{self.first}-{self.last}", region=region, shape=shape)
+
+
+class Retakes:
+    """The scans to take again since they were judged to show a bad tip.
+
+    Args:
+        most: how often each scan is taken again; 0: never.
+        memory: memory of the component, for the state.
+    """
+
+    def __init__(self, most: int, memory: MutableMapping[str, Any]) -> None:
+        self._most, self._memory = most, memory
+        self.has_verdicts = False
+
+    @property
+    def due(self) -> tuple[int, int] | None:
+        """Return (index of the step, number of the repetition, from 1) of the next scan to take again, if any."""
+        for index, again in self._memory.get("retake", ()):
+            return index, again
+        return None
+
+    @property
+    def awaits_newest(self) -> bool:
+        """Return whether the newest scan has no verdict yet."""
+        return bool(self._unjudged) and self._unjudged[-1][0] == self._memory["newest"]
+
+    def add(self, index: int, again: int, times_ns: Iterable[int | None]) -> None:
+        """Add a scan that was taken, and awaits its verdict.
+
+        Args:
+            index: index of the step in the plan.
+            again: number of the repetition; 0: the first scan of the step.
+            times_ns: ends of its channels.
+        """
+        if not self._most:
+            return
+        step = [index, again]
+        self._memory["retake"] = [due for due in self._memory.get("retake", ()) if due != step]
+        self._memory["unjudged"] = [*self._unjudged, (step, list(times_ns))][-MOST_UNJUDGED:]
+        self._memory["newest"] = step
+
+    def judge(self, verdicts: Iterable[tuple[int, float]]) -> list[int]:
+        """Make bad scans due again, up to `most` times; return the steps that are bad after all repetitions.
+
+        Args:
+            verdicts: time of the scan and score.
+        """
+        given_up = []
+        for time_ns, score in verdicts:
+            self.has_verdicts = True
+            judged = [step for step, times_ns in self._unjudged if time_ns in times_ns]
+            self._memory["unjudged"] = [one for one in self._unjudged if one[0] not in judged]
+            for index, again in judged if score == BAD else ():
+                if again < self._most:
+                    self._memory["retake"] = [*self._memory.get("retake", ()), [index, again + 1]]
+                else:
+                    given_up.append(index)
+        return given_up
+
+    @property
+    def _unjudged(self) -> list[tuple[list[int], list[int | None]]]:
+        return list(self._memory.get("unjudged", ()))
 
 
 def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad: float = 0.0) -> tuple[XY, ...]:

@@ -7,11 +7,13 @@ import json
 import re
 import subprocess
 import sys
+from datetime import UTC
 from pathlib import Path
 
 import pytest
 from systems import PATIENCE
 
+from afspm.basics.formatting import day_and_time
 from afspm.model import Problem
 from afspm.record.night_record import NightRecord
 from afspm.record.run import open_run
@@ -23,9 +25,10 @@ tip_changes = { schedule = [[2700, "double"]], pulse_cures = 0.6 }
 
 [series]
 duration = "90 min"
+retakes = 1
 """
 DEADLINE_S = 110 * PATIENCE
-TAKEN = re.compile(r"scan \d+ of \d+ at (\S+ \S+) UTC")
+TAKEN = re.compile(r"scan \d+ of \d+(?: again)? at (\S+ \S+) UTC")
 """What the series says of each scan; on a busy computer one may be due before the one before is done."""
 
 pytest.importorskip("matplotlib")
@@ -84,6 +87,16 @@ def test_each_requested_scan_is_in_the_table_once(night: Path) -> None:
     assert tests
     assert {row["problems"] for row in tests} == {"tip-shape-changed"}
     assert all(Path(row["filename"]).exists() for row in heights)
+
+
+def test_scan_with_the_bad_tip_is_taken_again_after_the_repair(night: Path) -> None:
+    log = (night / "log.txt").read_text(encoding="utf-8")
+    (bad,) = re.findall(r"scan (\d+) showed a bad tip, and is taken again", log)
+    (first,) = re.findall(rf"scan {bad} of \d+ at (\S+ \S+) UTC", log)
+    (again,) = re.findall(rf"scan {bad} of \d+ again at (\S+ \S+) UTC", log)
+    with open_run(night) as run:
+        verdicts = {day_and_time(time_ns, UTC): score for time_ns, score in run.verdicts()}
+    assert (verdicts[f"{first} UTC"], verdicts[f"{again} UTC"]) == (0.0, 1.0)
 
 
 def test_ledger_of_the_record_equals_the_truth(night: Path) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from tests.unit.client.client_lab import EPOCH_S, SCAN_S, Kill9, Lab, LabPort, context_of, run
 
@@ -15,7 +16,7 @@ from afspm.basics.exit_codes import ExitCode
 from afspm.client.component import Component
 from afspm.components.planned_scans import ScanList, ScanSeries
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
-from afspm.components.tip_verdict import LineVerdict, line_verdict_message
+from afspm.components.tip_verdict import BAD, GOOD, MESSAGE, LineVerdict, line_verdict_message, verdict_message
 from afspm.model import (
     RELAY_REQUEST,
     ControlRequest,
@@ -26,6 +27,7 @@ from afspm.model import (
     Region,
     Request,
     Response,
+    Scan,
     ScanParameters,
 )
 
@@ -152,10 +154,12 @@ def test_missed_scan_is_logged_in_the_singular(caplog: pytest.LogCaptureFixture)
     assert "missed 1 scan while it could not scan; to be taken at the end" in caplog.text
 
 
-def _killed_at(call: int, make: type[Component] | object, state_dir: Path, *, is_late: bool) -> Lab:
-    lab = Lab("series")
+def _killed_at(
+    call: int, make: type[Component] | object, state_dir: Path, *, is_late: bool, lab: Lab | None = None
+) -> Lab:
+    lab = lab or Lab("series")
     context = context_of(lab, state_dir)
-    context.open_port = lambda: LabPort(lab, call, is_late=is_late)
+    context.open_port, context.session = lambda: LabPort(lab, call, is_late=is_late), "killed"
     try:
         make().run_process(context)  # type: ignore[operator]
     except Kill9:
@@ -414,3 +418,92 @@ def test_rest_is_taken_once_over_a_kill(tmp_path: Path) -> None:
     lab.restart_component()
     assert run(rest_series(), lab, tmp_path) == ExitCode.ENDED
     assert [round(region.size_m[1] * 1e9) for region in lab.finished] == [419, 1000]
+
+
+PLACES_M = (1e-6, 2e-6, 3e-6)
+
+
+def places(**planned: Any) -> ScanList:
+    regions = [{"center": [x, 0.0], "size": [1e-6, 1e-6]} for x in PLACES_M]
+    return ScanList(regions=regions, pixels=(8, 8), end_when_done=True, **planned)  # type: ignore[arg-type]
+
+
+def judged(lab: Lab, *bad: int, in_s: float = 5.0) -> Lab:
+    """Publish a verdict on each scan `in_s` after its end; bad ones on the scans of these numbers, from 1."""
+    publish_scan = lab.publish_scan
+
+    def publish_and_judge(region: Region, shape: tuple[int, int] = (8, 8)) -> None:
+        publish_scan(region, shape)
+        score = BAD if len(lab.finished) in bad else GOOD
+        scan = Scan(region, "Height", "m", np.zeros(shape), lab.clock.now_ns())
+        lab.at(in_s, lambda: lab.publish(verdict_message(scan, score), f"{MESSAGE}_tip_classifier"))
+
+    lab.publish_scan = publish_and_judge  # type: ignore[method-assign]
+    return lab
+
+
+def taken(lab: Lab) -> list[float]:
+    return [round(region.center_m[0] * 1e6) for region in lab.finished]
+
+
+def test_bad_scan_is_taken_again_before_the_next() -> None:
+    lab = judged(Lab("list"), 1, in_s=0.0)
+    assert run(places(retakes=1), lab) == ExitCode.ENDED
+    assert taken(lab) == [1, 1, 2, 3]
+
+
+def test_verdict_that_comes_during_the_next_scan_counts() -> None:
+    lab = judged(Lab("list"), 1, in_s=50.0)
+    assert run(places(retakes=1), lab) == ExitCode.ENDED
+    assert taken(lab) == [1, 2, 1, 3]
+
+
+def test_verdict_on_the_last_scan_is_awaited() -> None:
+    lab = judged(Lab("list"), 3, 4)
+    assert run(places(retakes=2), lab) == ExitCode.ENDED
+    assert taken(lab) == [1, 2, 3, 3, 3]
+
+
+def test_scan_is_not_taken_again_for_ever(caplog: pytest.LogCaptureFixture) -> None:
+    lab = judged(Lab("list"), *range(1, 20), in_s=0.0)
+    with caplog.at_level("WARNING"):
+        assert run(places(retakes=2), lab) == ExitCode.ENDED
+    assert taken(lab) == [1, 1, 1, 2, 2, 2, 3, 3, 3]
+    assert caplog.text.count("showed a bad tip again, and is left so") == 3
+
+
+def test_without_retakes_a_verdict_changes_nothing() -> None:
+    lab = judged(Lab("list"), 1, 2, 3)
+    assert run(places(), lab) == ExitCode.ENDED
+    assert taken(lab) == [1, 2, 3]
+
+
+def test_retakes_without_any_verdict_are_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab("list")
+    with caplog.at_level("WARNING"):
+        assert run(places(retakes=1), lab) == ExitCode.ENDED
+    assert taken(lab) == [1, 2, 3]
+    assert "does a component judge scans?" in caplog.text
+
+
+@pytest.mark.parametrize("in_s", [0.0, 50.0])
+@pytest.mark.parametrize("is_late", [False, True])
+def test_bad_scan_is_taken_again_once_over_a_kill_anywhere(tmp_path: Path, in_s: float, is_late: bool) -> None:
+    for call in range(1, 90, 7):
+        lab = judged(Lab("list"), 2, in_s=in_s)
+        _killed_at(call, lambda: places(retakes=1), tmp_path / str(call), is_late=is_late, lab=lab)
+        assert sorted(taken(lab)) == [1, 2, 2, 3], f"killed at call {call}"
+
+
+def test_rest_of_an_interrupted_scan_is_kept_while_another_is_taken_again(tmp_path: Path) -> None:
+    lab = judged(Lab("series"), 1, in_s=20.0)
+    lab.at(150.0, lambda: stop_at_row(lab, 20))
+    lab.at(400.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    series = ScanSeries(size=(1e-6, 1e-6), pixels=(8, 32), scans=2, end_when_done=True, missed="rest", retakes=1)
+    assert run(series, lab, tmp_path) == ExitCode.ENDED
+    assert [round(region.size_m[1] * 1e9) for region in lab.finished] == [1000, 419, 1000]
+
+
+def test_number_of_retakes_below_zero_is_refused() -> None:
+    with pytest.raises(ConfigError, match="-1 retakes"):
+        places(retakes=-1)
