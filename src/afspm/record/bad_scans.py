@@ -1,7 +1,8 @@
-"""The rule that marks a scan as bad: for the report, its map, and pictures of the night."""
+"""The rule that marks a scan as bad: for tables, the report, its map, and pictures of the night."""
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -21,6 +22,23 @@ def read_verdict(message: Any) -> tuple[int, float] | None:
     if not message.spatials or not message.HasField("timestamp"):
         return None
     return message.timestamp.ToNanoseconds(), float(message.spatials[0].score)
+
+
+def last_scores(times_ns: Iterable[int], verdicts: Iterable[tuple[int, float]]) -> dict[int, float]:
+    """Return the last score of each judged scan, by its time.
+
+    Args:
+        times_ns: ends of scans.
+        verdicts: time of the scan and score, in the order of arrival.
+    """
+    times_ns = sorted(times_ns)
+    scores: dict[int, float] = {}
+    for of_ns, score in verdicts:
+        after = bisect_left(times_ns, of_ns)
+        near = min(times_ns[max(after - 1, 0) : after + 1], key=lambda time_ns: abs(time_ns - of_ns), default=None)
+        if near is not None and abs(near - of_ns) <= _SAME_SCAN_NS:
+            scores[near] = score
+    return scores
 
 
 def bad_scans(
@@ -43,10 +61,7 @@ def bad_scans(
         interrupted_ns: the times of the interruptions.
         of_conditions: the numbers of the problems flagged by conditions, which judge other instruments.
     """
-    judged: dict[int, float] = {}
-    for of_ns, score in verdicts:
-        near = [time_ns for time_ns in times_ns if abs(time_ns - of_ns) <= _SAME_SCAN_NS]
-        judged |= dict.fromkeys(near, score)
+    judged = last_scores(times_ns, verdicts)
     bad = {time_ns for time_ns, score in judged.items() if score == BAD}
     bad |= set(times_ns) & set(interrupted_ns)
     if judged:

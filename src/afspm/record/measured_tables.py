@@ -22,6 +22,7 @@ from afspm.model import (
     component_of,
     names,
 )
+from afspm.record.bad_scans import last_scores
 from afspm.record.tables import ScanRow, SpectrumRow, SweptSetting, Table
 
 if TYPE_CHECKING:
@@ -144,11 +145,13 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
         return SpectrumTable(rows, self._read)
 
 
-def read_scans(query: Query) -> KeyedTable[ScanRow]:
+def read_scans(query: Query, verdicts: Iterable[tuple[int, float]]) -> KeyedTable[ScanRow]:
     found = query("SELECT * FROM scans ORDER BY number")
     keys = _keys(query, "scans", names.START_SCAN, found)
     positions = _positions(query)
     rows = [scan_row(row, keys.get(row[0], ""), *positions.get(row[0], (None, None))) for row in found]
+    scores = last_scores((row.time_ns for row in rows), verdicts)
+    rows = [replace(row, tip_score=scores.get(row.time_ns)) for row in rows]
     return KeyedTable(_with_settings(query, "scans", rows), ScanRow)
 
 

@@ -92,7 +92,7 @@ class Run:
     @property
     def scans(self) -> KeyedTable[ScanRow]:
         """One row for each scan, also if interrupted, in the order of recording."""
-        return read_scans(self._query)
+        return read_scans(self._query, self.verdicts())
 
     @property
     def spectra(self) -> SpectrumTable:
@@ -284,12 +284,13 @@ class Run:
         """
         sql = "SELECT payload FROM packets WHERE message = ? ORDER BY time_ns, rowid"
         found: dict[int, int] = {}
+        ends_ns = [row.time_ns for row in self.scans]
         for (payload,) in self._query(sql, (LINE_VERDICT_MESSAGE,)):
             verdict: Any = self._decoded(LINE_VERDICT_MESSAGE, payload)
             if verdict is None or not verdict.HasField("timestamp"):
                 continue
             began_ns = verdict.timestamp.ToNanoseconds()
-            ended_ns = next((row.time_ns for row in self.scans if row.time_ns > began_ns), None)
+            ended_ns = next((end_ns for end_ns in ends_ns if end_ns > began_ns), None)
             if ended_ns is not None:
                 found[ended_ns] = verdict.since_row
         return found

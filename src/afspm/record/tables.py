@@ -66,6 +66,7 @@ class ScanRow:
         registration: how the position of the scan on the sample is known; None without drift correction.
         position_sd_m: standard deviation of the position along its most uncertain axis; None if unknown.
         settings: parameters that a sweep had set for the scan, as the microscope reported them; a column for each.
+        tip_score: the last verdict on the tip: 1 good, 0.5 unclear, 0 bad; None if the scan was not judged.
     """
 
     number: int
@@ -84,6 +85,7 @@ class ScanRow:
     registration: RegistrationOutcome | None = None
     position_sd_m: float | None = None
     settings: tuple[SweptSetting, ...] = ()
+    tip_score: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,9 @@ from tests.unit.record.record_lab import ABOUT, Night
 import afspm
 from afspm import wire
 from afspm.basics.errors import FileError
-from afspm.model import Problem, RegistrationOutcome, RescanKind, ScopeState, Spectrum
+from afspm.components.tip_verdict import BAD, GOOD, verdict_message
+from afspm.model import Problem, Region, RegistrationOutcome, RescanKind, Scan, ScopeState, Spectrum
+from afspm.record.bad_scans import VERDICT_MESSAGE
 from afspm.record.journal import JOURNAL_FILE, open_to_write, read_only
 from afspm.record.overview import Overview
 from afspm.record.run import Run
@@ -293,6 +295,20 @@ def test_scan_rows_have_registration_and_uncertainty(night: Night, store: Record
     assert run.about(run.scans[2])["drift"]["registration"] == "failed"
     assert run.about(run.scans[2])["drift"]["sd_m"] == pytest.approx(30e-9)
     assert run.drift.columns()["outcome"] == ["registered", "failed"]
+
+
+def test_scan_rows_have_the_last_verdict_on_the_tip(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    for number in (1, 2, 3):
+        store.take(night.whole_scan(number))
+    ends_ns = [row.time_ns for row in afspm.open_run(tmp_path).scans]
+    for number, score in ((1, GOOD), (2, GOOD), (2, BAD)):
+        later_ns = ends_ns[number - 1] + 1_000_000  # the channels of a scan need not end at the same time
+        judged = Scan(Region((0.0, 0.0), (1e-6, 1e-6)), "Height Retrace", "m", np.zeros((2, 2)), later_ns)
+        store.take([night.packet(verdict_message(judged, score), f"{VERDICT_MESSAGE}_judge")])
+    scans = afspm.open_run(tmp_path).scans
+    assert [row.tip_score for row in scans] == [1.0, 0.0, None]
+    assert [row.number for row in scans.where(lambda row: row.tip_score != BAD)] == [1, 3]
+    assert scans.columns()["tip_score"] == [1.0, 0.0, None]
 
 
 def test_first_thermal_drift_is_not_among_the_problems(night: Night, store: RecordStore, tmp_path: Path) -> None:
