@@ -221,6 +221,8 @@ def test_oldest_segment_is_given_up_and_reported_if_the_recorder_is_too_late(
         kept.append(log.clean([]))
     assert kept[0]
     assert not all(kept)
+    SYNCER.now(packet_log.SYNCED_WITHIN_S)  # Windows frees a segment once it is on the disk
+    log.clean([])
     assert sum(file.stat().st_size for file in segments(folder)) <= 2000 + 6 * SMALL_SEGMENT
     assert times(folder)[-1] == 99
 
@@ -325,6 +327,7 @@ def test_a_reader_of_segments_that_are_gone_goes_on_with_the_oldest_there_is(
         log.append(entry(time_ns, 40))
     reader = LogReader(folder)
     reader.read(1)
+    SYNCER.now(packet_log.SYNCED_WITHIN_S)  # Windows removes no open file
     for file in segments(folder)[:3]:
         file.unlink()
     found = [one.packet.time_ns for one, _ in reader.read(1 << 20)]
