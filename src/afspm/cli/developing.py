@@ -94,7 +94,7 @@ def _check(options: CheckOptions, console: Console, copy: Path | None) -> None:
     # SIGTERM, like Ctrl-C, first restores all settings
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        report = run(options, begin, done=lambda result: show_result(result, console))
+        report = run(options, begin, done=lambda result: show_result(result, console, begun[0].results))
     except KeyboardInterrupt:
         for report in begun:
             show_end(report, console)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -67,6 +68,7 @@ class Failed(CheckEnded, AssertionError):
 
     def __init__(self, expected: str, came: str) -> None:
         super().__init__(f"expected {expected}; came {came}")
+        self.expected, self.came = expected, came
 
 
 class Skipped(CheckEnded):
@@ -99,6 +101,7 @@ class CheckResult:
         line: expectation and observation, or the reason for skipping.
         complaints: the evidence of a failed check: warnings and errors logged meanwhile, the remedy.
         real_s: duration of the check.
+        expected, came: both halves of the line of a failed check.
     """
 
     name: str
@@ -107,6 +110,13 @@ class CheckResult:
     line: str = ""
     real_s: float = 0.0
     complaints: tuple[str, ...] = ()
+    expected: str = ""
+    came: str = ""
+
+    @property
+    def evidence(self) -> tuple[str, ...]:
+        """The line and the complaints of a failed check without their numbers, which differ when a failure recurs."""
+        return (self.line, *(re.sub(r"\d+", "#", text) for text in self.complaints))
 
 
 def expect(holds: object, expected: str, came: str) -> None:
@@ -208,6 +218,7 @@ def attempt(check: K, fixture: Fixture[K]) -> CheckResult:
     """
     began_s = fixture.clock.monotonic_s()
     outcome, line = CheckOutcome.PASSED, ""
+    expected, came = "", ""
     complaints: tuple[str, ...] = ()
     try:
         try:
@@ -215,9 +226,11 @@ def attempt(check: K, fixture: Fixture[K]) -> CheckResult:
         except Failed as failure:
             complaints = fixture.explain(check, failure)
             outcome, line = failure.outcome, str(failure)
+            expected, came = failure.expected, failure.came
     except CheckEnded as verdict:
         outcome, line = verdict.outcome, str(verdict)
-    return CheckResult(check.name, check.title, outcome, line, fixture.clock.monotonic_s() - began_s, complaints)
+    real_s = fixture.clock.monotonic_s() - began_s
+    return CheckResult(check.name, check.title, outcome, line, real_s, complaints, expected, came)
 
 
 @dataclass
@@ -333,13 +346,32 @@ def mark(outcome: CheckOutcome) -> tuple[str, str]:
     return _MARKS.get(outcome, _OTHERWISE)
 
 
-def show_result(result: CheckResult, console: Console) -> None:
-    """Print a check's result, with its line and complaints below."""
+def show_result(result: CheckResult, console: Console, earlier: Iterable[CheckResult] = ()) -> None:
+    """Print a check's result, with its line and complaints below.
+
+    A failure with the evidence of an `earlier` result is shown as a reference to the earlier check.
+    """
     symbol, style = mark(result.outcome)
     text = Text.assemble((symbol, style), f" {result.name:{NAME_WIDTH}} ", (result.title, "dim"))
-    for line in filter(None, (result.line, *result.complaints)):
+    lines = (result.line, *result.complaints)
+    if result.outcome is CheckOutcome.FAILED:
+        same = (one.name for one in earlier if one is not result and one.evidence == result.evidence)
+        if first := next(same, None):
+            lines = (f"for the same reason as {first}",)
+    for line in filter(None, lines):
         text.append(f"\n    {line}", style)
     console.print(text, soft_wrap=True)
+
+
+def show_failures(failed: Sequence[CheckResult], console: Console) -> None:
+    """Print each observation of failed checks once, with the names of these checks and their expectations."""
+    reasons: dict[str, dict[str, list[str]]] = {}
+    for result in failed:
+        reasons.setdefault(result.came, {}).setdefault(result.expected, []).append(result.name)
+    for came, expectations in reasons.items():
+        lines = [f"{', '.join(names)}: expected {expected}" for expected, names in expectations.items()]
+        reason = f"{lines[0]}; came {came}" if len(lines) == 1 else "\n    ".join((f"came {came}", *lines))
+        console.print(Text.assemble(("✗ ", "bold red"), reason), soft_wrap=True)
 
 
 def show_verdict(report: SuiteReport, verdict: str, console: Console) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from afspm.model import ScopeState, ScopeStatus
 from afspm.testing.conformance import CheckOutcome, show_result
 from afspm.testing.translators import CheckOptions, CheckReport, client, run
 from afspm.testing.translators.session import SPEED
@@ -89,6 +90,20 @@ def test_what_a_translator_logs_is_shown_with_the_check_that_failed(tmp_path: Pa
     with console.capture() as shown:
         show_result(failure, console)
     assert "is lost" in shown.get()
+
+
+def test_checks_without_their_scan_name_the_check_with_the_reason(tmp_path: Path) -> None:
+    report = checked(tmp_path, "broken.LosesScans", "scan/frame", "scan/in-force")
+    assert [failure.name for failure in report.failed] == ["scan/frame"]
+    assert report.results[-1].line == "the scan of the plain frame failed, see scan/frame"
+
+
+def test_repeated_states_are_shown_once_with_their_number() -> None:
+    status, other = (
+        client.Observation("", ScopeStatus(state), None) for state in (ScopeState.UNDEFINED, ScopeState.FREE)
+    )
+    shown = client.describe_all([*[status] * 29, other, other])
+    assert shown == "SS_UNDEFINED (29 times), SS_FREE, SS_FREE"
 
 
 def test_what_a_controller_is_known_not_to_do_is_skipped_with_the_reason(tmp_path: Path) -> None:

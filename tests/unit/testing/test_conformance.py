@@ -17,6 +17,7 @@ from afspm.testing.conformance import (
     REPORT_FILE,
     Check,
     CheckOutcome,
+    CheckResult,
     Declined,
     Failed,
     Lost,
@@ -26,6 +27,7 @@ from afspm.testing.conformance import (
     Unsupported,
     attempt,
     expect,
+    show_failures,
     show_result,
     show_verdict,
 )
@@ -157,6 +159,50 @@ def test_terminal_shows_line_and_evidence_of_a_failure_and_the_verdict() -> None
     assert "    expected a scan; came none\n    a warning\n" in text
     assert "1 passed, 1 failed, 1 skipped: it fails" in text
     assert "report.json: runs/one" in text
+
+
+def failed(name: str, failure: Failed, *complaints: str) -> CheckResult:
+    return CheckResult(name, "t", CheckOutcome.FAILED, str(failure), 0.0, complaints, failure.expected, failure.came)
+
+
+def test_recurring_failure_refers_to_its_first_check_and_another_one_is_shown_whole() -> None:
+    console = Console(width=200, record=True, highlight=False)
+    results = [
+        failed("first", FAILURE, "scan1.npz can't be read"),
+        failed("again", FAILURE, "scan2.npz can't be read"),
+        failed("other", FAILURE, "scan3.npz is empty"),
+        failed("else", Failed("a scan", "2 scans"), "scan4.npz can't be read"),
+    ]
+    for number, result in enumerate(results):
+        show_result(result, console, results[: number + 1])
+    shown = [line.strip() for line in console.export_text().splitlines()]
+    assert [line for line in shown if line[0] not in "✗"] == [
+        "expected a scan; came none",
+        "scan1.npz can't be read",
+        "for the same reason as first",
+        "expected a scan; came none",
+        "scan3.npz is empty",
+        "expected a scan; came 2 scans",
+        "scan4.npz can't be read",
+    ]
+
+
+def test_list_of_failures_gives_each_observation_once_with_the_checks_and_their_expectations() -> None:
+    console = Console(width=200, record=True, highlight=False)
+    refused = "REP_PARAM_ERROR (KeyError: 'X')"
+    results = [
+        failed("frame/set", Failed("a new frame", refused)),
+        failed("scan/order", FAILURE),
+        failed("frame/turned", Failed("a new frame", refused)),
+        failed("probe/move", Failed("a move", refused)),
+    ]
+    show_failures(results, console)
+    assert console.export_text().splitlines() == [
+        f"✗ came {refused}",
+        "    frame/set, frame/turned: expected a new frame",
+        "    probe/move: expected a move",
+        "✗ scan/order: expected a scan; came none",
+    ]
 
 
 def test_nothing_checked_is_not_passed() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, TypeVar
 
 from afspm import wire
@@ -104,7 +105,12 @@ def _is_always_published(message: wire.MessageDeclaration) -> bool:
 
 
 def describe_all(observed: Iterable[Observation]) -> str:
-    return ", ".join(map(str, observed)) or "nothing"
+    """Return the observations in words; more than two equal ones in a row as their number."""
+    groups = [(text, len(list(same))) for text, same in groupby(map(str, observed))]
+    return (
+        ", ".join(f"{text} ({count} times)" if count > 2 else ", ".join([text] * count) for text, count in groups)
+        or "nothing"
+    )
 
 
 def scans(observed: Iterable[Observation]) -> list[Scan]:

@@ -181,7 +181,8 @@ class CheckMeasurements:
         self.support = support
         self._excused, self._complaints = excused, complaints
         self._heeded = len(complaints)
-        self._kept: dict[str, Taken | Exception] = {}
+        self._kept: dict[str, Taken | Skipped] = {}
+        self._checked = ""
         initial = client.observations.newest(ScanParameters)
         region = None if initial is None else initial.region
         self._whole = region if isinstance(region, Region) else None
@@ -198,7 +199,7 @@ class CheckMeasurements:
         Raises:
             CheckEnded: a check that did not pass; Skipped if the microscope does not support it.
         """
-        self._heeded = len(self._complaints)
+        self._checked, self._heeded = check.name, len(self._complaints)
         if missing := self.support.missing(check.needs):
             raise Skipped(f"not supported: {', '.join(missing)}")
         check.do(self)
@@ -336,11 +337,11 @@ class CheckMeasurements:
         if found is None:
             try:
                 found = self._kept[what] = take()
-            except Failed as failure:
-                self._kept[what] = failure
+            except Failed:
+                self._kept[what] = Skipped(f"the {what} failed, see {self._checked}")
                 raise
-        if isinstance(found, Exception):
-            raise Skipped(f"{what} is not supported, as reported before")
+        if isinstance(found, Skipped):
+            raise Skipped(str(found))
         return found
 
 

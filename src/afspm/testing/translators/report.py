@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from afspm.model import names
-from afspm.testing.conformance import SuiteReport, show_verdict
+from afspm.testing.conformance import SuiteReport, show_failures, show_verdict
 from afspm.testing.translators.session import CheckSession
 from afspm.testing.translators.support import Support
 
@@ -71,10 +71,10 @@ def show_beginning(report: CheckReport, console: Console) -> None:
 
 def show_end(report: CheckReport, console: Console) -> None:
     """Print the tables and the verdict."""
-    console.print(_actions(report))
-    console.print(_parameters(report))
-    for failure in report.failed:
-        console.print(Text.assemble(("✗ ", "bold red"), f"{failure.name}: {failure.line}"), soft_wrap=True)
+    if report.support.parameters:  # else the microscope could not be queried
+        console.print(_actions(report))
+        console.print(_parameters(report))
+    show_failures(report.failed, console)
     for what, lines in (("wrong answer", report.support.errors), ("not restored", report.unrestored)):
         for line in lines:
             console.print(Text(f"{what}: {line}", "bold red"), soft_wrap=True)
