@@ -20,6 +20,7 @@ from afspm.basics.clock import NS_PER_S, ExperimentClock
 from afspm.basics.errors import AfspmError
 from afspm.basics.launch import Launch, Sockets
 from afspm.basics.plain_data import Plain
+from afspm.client.component import Component
 from afspm.client.connect import find_run, guest_of
 from afspm.experiment import Experiment, Role
 from afspm.model import CLOCK_REQUEST, ProcessCondition, ProcessStates, Request
@@ -65,6 +66,7 @@ def examine(experiment: Experiment | None, runs: Path, listen_s: float, commands
     if experiment is not None and diagnosis.is_well(found.found):
         found.found += _keys(experiment)
         _Connections(experiment, found).examine(listen_s)
+        found.found += _devices(experiment)
     found.found += _disk(runs)
     found.found.append(diagnosis.of_memory(psutil.virtual_memory().available, _sizes(found.pids)))
     return found
@@ -104,6 +106,23 @@ def _keys(experiment: Experiment) -> Iterator[Diagnosis]:
         yield Diagnosis("key-missing", Severity.ERROR, str(folder / "private"), what, hint)
     if not wrong:
         yield diagnosis.fine("keys", str(folder), f"secret keys here: {', '.join(here)}")
+
+
+def _devices(experiment: Experiment) -> Iterator[Diagnosis]:
+    for process in experiment.resolved.with_role(Role.COMPONENT):
+        class_ = process.component
+        if class_ is None or not issubclass(class_, Component) or not entry_points.is_declared(class_):
+            continue
+        if class_.try_connection is Component.try_connection:
+            continue
+        try:
+            if what := class_(**process.settings).try_connection():
+                yield diagnosis.fine("device", process.name, what)
+        except AfspmError as error:
+            yield Diagnosis("device", Severity.ERROR, f"{process.name} at {error.where}", error.what, error.hint)
+        except Exception as error:  # of a class of another package, which may raise anything
+            what = f"can't be tried: {type(error).__name__}: {error}"
+            yield Diagnosis("device", Severity.ERROR, process.name, what, f"mend {class_.__qualname__}")
 
 
 def _disk(runs: Path) -> Iterator[Diagnosis]:

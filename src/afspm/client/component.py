@@ -114,6 +114,17 @@ class Component:
         """
         return None
 
+    def try_connection(self) -> str:
+        """Connect once to the component's own device, change nothing, and describe the device; "" without a device.
+
+        `afspm doctor` calls it after `__init__`, without `on_start`, and only for classes that a package declares as
+        entry points and for classes derived from them.
+
+        Raises:
+            AfspmError: the device is not usable; `where` is its address.
+        """
+        return ""
+
     def run(self) -> None:
         """Run the experiment as a script; the component is done once this returns. Such a component has no ticks."""
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import random
+import socket
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +13,7 @@ import pytest
 from tests.plugins.secop.ramp_night import RATE_K_S, Cryostat
 from tests.unit.client.client_lab import FakeClock
 
+from afspm.basics.errors import TransportError
 from afspm.model import InstrumentOrder, InstrumentOrders, InstrumentReadings, Parameter
 from afspm.plugins.secop import instrument
 from afspm.plugins.secop.instrument import GOES_ON_WITHIN_S, Instrument
@@ -99,3 +102,35 @@ def test_steps_halt_if_the_component_is_stopped_or_away_for_long(
     cryo.later(5.0)
     assert cryo.cryostat.target_k == before_k
     assert "the steps of cryo.t" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("sent", "reason"),
+    [
+        (b"", "no SECoP server answers: no description within 0.2 s, and nothing last"),
+        (
+            b"SSH-2.0-OpenSSH_9.2\r\n",
+            "no SECoP server answers: no description within 0.2 s, and 'SSH-2.0-OpenSSH_9.2' last",
+        ),
+    ],
+    ids=["silent", "another program"],
+)
+def test_trial_of_the_connection_names_what_answers_instead_of_a_server(
+    sent: bytes, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(instrument, "DESCRIBED_S", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as server, ThreadPoolExecutor(1) as other:
+        address = "{}:{}".format(*server.getsockname())
+
+        def answer() -> None:
+            peer, _ = server.accept()
+            with peer:
+                peer.sendall(sent)
+                while peer.recv(1 << 10):
+                    pass
+
+        done = other.submit(answer)
+        with pytest.raises(TransportError, match=reason) as error:
+            Instrument(f"secop://{address}", {"cryo.t": "tt"}).try_connection()
+        done.result(10.0)
+    assert error.value.where == address

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import subprocess
@@ -99,6 +100,35 @@ def server(tmp_path: Path) -> Iterator[Server]:
     made = Server(tmp_path)
     yield made
     made.kill()
+
+
+def devices(folder: Path) -> tuple[int, list[dict[str, str]]]:
+    """Return the exit code of `afspm doctor`, and its findings about devices."""
+    command = [sys.executable, "-P", "-m", "afspm", "doctor", "experiment.toml", "--json", "--listen", "0.1"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, encoding="utf-8", timeout=60 * PATIENCE)
+    return done.returncode, [one for one in json.loads(done.stdout)["found"] if one["code"] == "device"]
+
+
+def test_doctor_tries_the_server_of_an_instrument(server: Server, tmp_path: Path) -> None:
+    file, where = tmp_path / "experiment.toml", f"127.0.0.1:{server.port}"
+    experiment = EXPERIMENT.replace("PORT", str(server.port))
+    file.write_text(experiment, encoding="utf-8")
+    wait_until(lambda: devices(tmp_path)[1][0]["severity"] == "fine")
+    _, (found,) = devices(tmp_path)
+    assert found["where"] == "cryo"
+    assert found["what"] == f"{where} is the SECoP server cryomagnet.afspm, and has cryo.temperature, cryo.field"
+
+    file.write_text(experiment.replace('= "mf"', '= "magnet"'), encoding="utf-8")
+    code, (found,) = devices(tmp_path)
+    assert (code, found["where"]) == (1, f"cryo at {where}")
+    assert found["what"] == "there is no module 'magnet'; the server has mf, sw, tt"
+
+    file.write_text(experiment, encoding="utf-8")
+    server.kill()
+    code, (found,) = devices(tmp_path)
+    assert (code, found["severity"], found["where"]) == (1, "error", f"cryo at {where}")
+    assert "no SECoP server answers" in found["what"]
+    assert "start the server" in found["remedy"]
 
 
 @pytest.fixture

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import select
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import ClassVar, Literal
 from urllib.parse import urlsplit
 
-from afspm.basics.errors import ConfigError
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import ConfigError, TransportError
 from afspm.client.component import Component
 from afspm.model import InstrumentReadings
+from afspm.plugins.secop import lines
 from afspm.plugins.secop.lines import LONGEST
 from afspm.plugins.secop.secop_client import SecopClient, ServerUnfit
 
 PORT = 10767
 AGAIN_S = 2.0
 CONNECT_S = 1.0
+DESCRIBED_S = 5.0
 GOES_ON_WITHIN_S = 60.0
 """Real time after which a restarted process does not continue steps of a target: a person may have seen them halt."""
 _KEPT_AGAIN_S = 20.0  # real time: unchanged steps must not look older than GOES_ON_WITHIN_S after a kill
@@ -49,6 +53,24 @@ class Instrument(Component):
         self._again_s = 0.0
         self._last_fault = ""
         self._token = 0
+
+    def try_connection(self) -> str:
+        """Connect to the server, and compare its description with the parameters.
+
+        Raises:
+            TransportError: no SECoP server answers, or the server lacks a module.
+        """
+        where = f"{self._host}:{self._port}"
+        try:
+            description = _description_of(self._host, self._port, SecopClient(self._client.wanted))
+        except ServerUnfit as error:
+            hint = "correct `address` or `parameters` in the experiment file"
+            raise TransportError(str(error), where=where, hint=hint) from error
+        except OSError as error:
+            hint = "start the server, or correct `address`; a firewall must accept the port"
+            raise TransportError(f"no SECoP server answers: {error}", where=where, hint=hint) from error
+        server = " ".join(str(description.get("equipment_id") or "without a name").split())
+        return f"{where} is the SECoP server {server[:80]}, and has {', '.join(self._client.wanted)}"
 
     def on_start(self) -> None:
         """Continue the steps of a target that the kill of an earlier process has interrupted."""
@@ -160,6 +182,10 @@ class LineSocket:
         *whole, self._in = self._in.split(b"\n")
         return [line.decode("utf-8", "replace") for line in whole if line.strip()]
 
+    def wait(self, within_s: float) -> None:
+        """Wait for data of the server, at most for `within_s`."""
+        select.select([self._socket], [], [], within_s)
+
     def send(self, lines: list[str]) -> None:
         self._out += "".join(f"{line}\n" for line in lines).encode()
         if len(self._out) > LONGEST:
@@ -174,6 +200,26 @@ class LineSocket:
         with suppress(BlockingIOError):
             while self._out:
                 self._out = self._out[self._socket.send(self._out) :]
+
+
+def _description_of(host: str, port: int, client: SecopClient) -> Mapping[str, object]:
+    clock, answered = ExperimentClock.real(), "nothing"
+    connection = LineSocket(host, port)
+    try:
+        now_s = clock.monotonic_s()
+        until_s = now_s + DESCRIBED_S
+        connection.send(client.connected(now_s))
+        while (left_s := until_s - clock.monotonic_s()) > 0.0:
+            connection.wait(left_s)
+            for text in connection.receive():
+                answered = repr(text.strip()[:80])
+                client.take(text, clock.monotonic_s())
+                line = lines.parse(text)
+                if client.is_described and line is not None and isinstance(line.data, dict):
+                    return line.data
+    finally:
+        connection.close()
+    raise TimeoutError(f"no description within {DESCRIBED_S:g} s, and {answered} last")
 
 
 def _host_and_port(address: str) -> tuple[str, int]:
