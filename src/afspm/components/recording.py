@@ -13,6 +13,7 @@ from typing import NamedTuple
 from afspm.basics.clock import Clock
 from afspm.basics.errors import FileError
 from afspm.model import Packet
+from afspm.model.events import NO_LONGER_TRUE
 from afspm.record.journal import JOURNAL_FILE, SCHEDULER, damaged, is_damage
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.storage.packet_log import SEGMENT_BYTES, START, LogReader, Position, commit, committed
@@ -35,6 +36,7 @@ LAST_WORDS_S = 30.0
 STOPPING_S = 1.0
 
 _MOST_NAMED = 3
+_UNRECORDED = "nothing can be recorded"
 
 DISK_ERRORS = (OSError, sqlite3.OperationalError)
 
@@ -207,7 +209,7 @@ class RecordWriter:
                 continue
             if self._told_full:
                 self._told_full = False
-                self._logger.info("there is room on the disk again")
+                self._logger.info("there is room on the disk again; %s%s", NO_LONGER_TRUE, _UNRECORDED)
             if self._inbox.has_room_for_missed():
                 self._wake()
             return True
@@ -216,7 +218,7 @@ class RecordWriter:
         # the disk is full or gone: logged once, then tried again until it has room, or the run ends
         if not self._told_full:
             self._told_full = True
-            self._logger.critical("nothing can be recorded, the experiment goes on: %s", error)
+            self._logger.critical("%s, the experiment goes on: %s", _UNRECORDED, error)
         until_s = self._inbox.pause()
         return until_s is None or self._clock.monotonic_s() < until_s
 

@@ -16,6 +16,9 @@ SUPERVISOR = "supervisor"
 """Owner of the key that allows reports on processes. A supervisor's own name is "supervisor:" and a suffix."""
 LOGGED_AS = "afspm"
 """Name of the supervisor's own log lines."""
+NO_LONGER_TRUE = "no longer true: "
+"""In a log line, the words before the first clause of an earlier CRITICAL line, whose cause has ended. A process logs
+to its standard error, which has no field for this."""
 LONGEST_ANNOUNCEMENT = 256 * 1024
 """Largest size, in bytes, of a message that the scheduler publishes for another process."""
 PERSON = ":"
@@ -171,6 +174,18 @@ class LogLine:
     name: str
     level: str
     text: str
+
+    @property
+    def is_alarm(self) -> bool:
+        """Whether the line is CRITICAL; the indented lines of a traceback belong to the line above."""
+        return self.level == "CRITICAL" and not self.text[:1].isspace()
+
+    def ends(self, alarm: LogLine) -> bool:
+        """Return whether this line says that an alarm of the same process is over; see `NO_LONGER_TRUE`."""
+        _, says_so, over = self.text.partition(NO_LONGER_TRUE)
+        if not (says_so and over) or self.name != alarm.name or not alarm.text.startswith(over):
+            return False
+        return alarm.text[len(over) : len(over) + 1] in ("", ":", ";", ",")
 
 
 @dataclass(frozen=True, slots=True)

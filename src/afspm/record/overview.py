@@ -105,6 +105,7 @@ __all__ = [
 
 MOST_LINES = 2_000
 MOST_PROPOSALS = 200
+MOST_ALARMS = 200
 MOST_ENTRIES = 5_000
 OLD_S = 6.0  # real time; a supervisor reports its processes every 2 s
 OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
@@ -156,6 +157,14 @@ class ProcessHistory:
             self.restarts.append(ProcessRestart(state.since_ns, state.name, state.starts, state.last_exit))
 
 
+@dataclass(slots=True)
+class Alarm:
+    """A CRITICAL line of the log, and the time of the line that ended it; None while it is not known to be over."""
+
+    line: LogLine
+    ended_ns: int | None = None
+
+
 class Overview:
     """The present state and the history of an experiment, reduced from packets. Pure: no clock, socket or file.
 
@@ -173,7 +182,7 @@ class Overview:
         approvals: the approvals in force.
         of_conditions: the numbers of the problems flagged by conditions.
         set_ns: the time of the last accepted request that set each parameter.
-        log, notes, entries, refusals: newest last, bounded.
+        log, alarms, notes, entries, refusals: newest last, bounded.
     """
 
     def __init__(self, problems: ProblemNames | None = None, *, most_entries: int = MOST_ENTRIES) -> None:
@@ -191,6 +200,7 @@ class Overview:
         self.of_conditions: set[int] = set()
         self.set_ns: dict[str, int] = {}
         self.log: deque[LogLine] = deque(maxlen=MOST_LINES)
+        self.alarms: deque[Alarm] = deque(maxlen=MOST_ALARMS)
         self.notes: deque[Note] = deque(maxlen=most_entries)
         self.entries: deque[JournalEntry] = deque(maxlen=most_entries)
         self.refusals: deque[JournalEntry] = deque(maxlen=most_entries)
@@ -275,6 +285,11 @@ class Overview:
         """The end of the experiment; None if the run continues, was stopped, or was cut off."""
         entries = reversed(self.entries)
         return next((one.time_ns for one in entries if one.event is ControlEvent.EXPERIMENT_ENDED), None)
+
+    @property
+    def open_alarms(self) -> tuple[LogLine, ...]:
+        """The CRITICAL lines that are not known to be over, oldest first."""
+        return tuple(alarm.line for alarm in self.alarms if alarm.ended_ns is None)
 
     @property
     def note_spans(self) -> list[Span]:
@@ -437,6 +452,14 @@ class Overview:
 
     def _on_log_lines(self, lines: LogLines, time_ns: int) -> None:
         self.log.extend(lines.lines)
+        for line in lines.lines:
+            if line.is_alarm:
+                if not any((one.name, one.text) == (line.name, line.text) for one in self.open_alarms):
+                    self.alarms.append(Alarm(line))
+                continue
+            for alarm in self.alarms:
+                if alarm.ended_ns is None and line.ends(alarm.line):
+                    alarm.ended_ns = line.time_ns
 
     def _on_note(self, note: Note, time_ns: int) -> None:
         self.notes.append(note)

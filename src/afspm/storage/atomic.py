@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from afspm.basics.errors import FileError
+from afspm.model.events import NO_LONGER_TRUE
 from afspm.storage.disk import SYNCER, DiskBacklogFull, DiskTask, DiskThread, DiskTimeout, sync_file, sync_folder
 
 T = TypeVar("T")
@@ -210,7 +211,7 @@ class OutageLog:
             lasted = ""
             if self._slow_since_s is not None:
                 lasted = f"; the disk had not answered for {self._monotonic_s() - self._slow_since_s:.0f} s"
-            self._log.info("writing works again%s; no longer true: %s", lasted, self._loss)
+            self._log.info("writing works again%s; %s%s", lasted, NO_LONGER_TRUE, self._loss)
         self._slow_since_s = self._logged = None
 
 

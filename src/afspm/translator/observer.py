@@ -14,6 +14,7 @@ from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import AfspmError
 from afspm.basics.formatting import duration_text
 from afspm.model import ScopeState, ScopeStatus, names
+from afspm.model.events import NO_LONGER_TRUE
 from afspm.storage.disk import is_full
 from afspm.translator import setting_groups
 from afspm.translator.driver_base import LOST, MEASURING, DriverBase
@@ -265,9 +266,13 @@ class OverdueScan:
     def __init__(self, log: logging.Logger) -> None:
         self._log = log
         self._began_s = self._again_s = math.inf
+        self._logged = ""
 
     def state_changed(self, now_s: float, *, is_scanning: bool) -> None:
         """Process a published change of state, at a real monotonic time."""
+        if self._logged:
+            self._log.info("the controller reports the scan no longer; %s%s", NO_LONGER_TRUE, self._logged)
+            self._logged = ""
         self._began_s, self._again_s = (now_s, now_s + OVERDUE_S) if is_scanning else (math.inf, math.inf)
 
     def look(self, now_s: float, expected_s: Callable[[], float | None]) -> None:
@@ -283,7 +288,8 @@ class OverdueScan:
         if lasts_s is not None and passed_s > OVERDUE_RATIO * lasts_s + OVERDUE_S:
             self._again_s = math.inf
             took, due = duration_text(passed_s), duration_text(lasts_s)
-            self._log.critical("the scan has lasted for %s, %s was expected: does the controller hang?", took, due)
+            self._logged = f"the scan has lasted for {took}"
+            self._log.critical("%s, %s was expected: does the controller hang?", self._logged, due)
 
 
 def _live_lines_s(microscope: DriverBase) -> float | None:

@@ -149,7 +149,7 @@ def test_script_with_the_same_fault_twice_is_not_restarted_again(run: Run, tmp_p
     )
     with connect(one.folder, "person") as scope:
         scope.restart("survey")
-    one.wait_for("gave up survey", count=2)
+    one.wait_for("CRITICAL gave up survey", count=2)
     assert sum(" survey " in line and "started, process" in line for line in one.lines) == 4, one.output
     interrupt(one.process)
     one.end()

@@ -25,7 +25,7 @@ from afspm.basics.exit_codes import ExitCode
 from afspm.basics.launch import Launch
 from afspm.components import recorder, recording
 from afspm.components.recording import RecordWriter
-from afspm.model import ControlMode, ControlState, LoggedPacket, Packet, Region, Scan, ScanLines
+from afspm.model import ControlMode, ControlState, LoggedPacket, LogLine, Packet, Region, Scan, ScanLines
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.storage.packet_log import LogReader, PacketLog, committed, expect_recorder
@@ -176,6 +176,7 @@ def test_committed_packets_are_on_the_disk(
 def test_full_disk_is_logged_once_and_all_is_recorded_once_there_is_room(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level(logging.INFO)
     disk = _Disk(monkeypatch)
     writer = bench.writer()
     _until(lambda: (bench.folder / JOURNAL_FILE).exists())
@@ -187,7 +188,9 @@ def test_full_disk_is_logged_once_and_all_is_recorded_once_there_is_room(
     bench.publish(control(3))
     writer.finish(ended=True)
     assert bench.times() == [1, 2, 3]
-    assert [r.levelname for r in caplog.records if "can be recorded" in r.message] == ["CRITICAL"]
+    lines = [LogLine(1, "recorder", r.levelname, r.message) for r in caplog.records if "can be recorded" in r.message]
+    assert [line.level for line in lines] == ["CRITICAL", "INFO"]
+    assert lines[1].ends(lines[0])
     assert not writer.wants_replay()
 
 

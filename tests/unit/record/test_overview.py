@@ -19,6 +19,7 @@ from afspm.model import (
     RescanKind,
     ScopeState,
 )
+from afspm.model.events import NO_LONGER_TRUE
 from afspm.record.overview import MOST_LINES, MOST_POINTS, Overview
 
 S = 1_000_000_000
@@ -370,3 +371,26 @@ def test_readings_of_instruments_become_bounded_curves() -> None:
     assert 1000 < len(curve.times_ns) == len(curve.values) <= MOST_POINTS
     assert (curve.times_ns[0], curve.times_ns[-1]) == (0, 19_999 * S)
     assert sum(math.isnan(value) for value in curve.values) == 1
+
+
+def logged(time_s: int, name: str, level: str, text: str) -> tuple[str, object, int]:
+    return "LogLines", model.LogLines((model.LogLine(time_s * S, name, level, text),)), time_s
+
+
+def test_alarm_is_open_until_a_line_of_its_process_ends_it() -> None:
+    full = "nothing can be recorded, the experiment goes on: No space left on device"
+    over = f"there is room on the disk again; {NO_LONGER_TRUE}nothing can be recorded"
+    packets = [
+        logged(1, "recorder", "CRITICAL", full),
+        logged(2, "recorder", "CRITICAL", "  Traceback (most recent call last):"),
+        logged(3, "recorder", "CRITICAL", full),
+        logged(4, "scheduler", "CRITICAL", full),
+        logged(5, "recorder", "INFO", "scan 3 is recorded"),
+        logged(6, "recorder", "INFO", f"{NO_LONGER_TRUE}nothing can be"),
+    ]
+    assert [(one.name, one.time_ns // S) for one in seen(*packets).open_alarms] == [("recorder", 1), ("scheduler", 4)]
+    night = seen(*packets, logged(7, "recorder", "INFO", over))
+    assert [one.name for one in night.open_alarms] == ["scheduler"]
+    assert [one.ended_ns for one in night.alarms] == [7 * S, None]
+    night = seen(*packets, logged(7, "recorder", "INFO", over), logged(8, "recorder", "CRITICAL", full))
+    assert [(one.name, one.time_ns // S) for one in night.open_alarms] == [("scheduler", 4), ("recorder", 8)]

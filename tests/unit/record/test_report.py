@@ -275,6 +275,30 @@ def test_equal_refusals_are_listed_once_with_their_number(run: Path) -> None:
     assert (refused.count, refused.who, refused.last_ns - refused.first_ns) == (2, "corrector", S)
 
 
+def test_critical_messages_are_listed_with_their_end(tmp_path: Path) -> None:
+    folder = tmp_path / "night-1"
+    folder.mkdir()
+    store = RecordStore(folder, RecordSettings({"experiment": "night"}))
+    lines = (
+        ("recorder", "CRITICAL", "nothing can be recorded: <full>"),
+        ("microscope", "CRITICAL", "can't restore scan-speed"),
+        ("recorder", "INFO", "no longer true: nothing can be recorded"),
+    )
+    for at_s, line in enumerate(lines):
+        time_ns = START + at_s * 60 * S
+        name, payload = wire.encode(model.LogLines((model.LogLine(time_ns, *line),)))
+        store.take([(model.Packet(name, payload, time_ns), "")])
+    store.finish()
+    store.close()
+    text = write(folder).read_text(encoding="utf-8")
+    section = text.partition("<h2>Critical messages</h2>")[2].partition("</section>")[0]
+    rows = re.findall("<tr>(.*?)</tr>", section)[1:]
+    assert "nothing can be recorded: &lt;full&gt;" in rows[0]
+    assert "22:15" in rows[0]
+    assert "not known to be over" in rows[1]
+    assert "2 critical messages" in text
+
+
 def test_problem_is_listed_with_its_repairers(run: Path) -> None:
     (problem,) = told(run).problems
     assert (problem.by, problem.lasted_ns(0 if problem.end_ns is None else problem.end_ns)) == ("judge", 100 * S)

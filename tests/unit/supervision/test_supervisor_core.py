@@ -8,7 +8,7 @@ from typing import NamedTuple
 import pytest
 
 from afspm.basics.exit_codes import ExitCode
-from afspm.model import Role
+from afspm.model import LogLine, Role
 from afspm.supervisor.supervision.child import ChildPolicy, RestartPolicy
 from afspm.supervisor.supervision.liveness import LivenessPolicy
 from afspm.supervisor.supervision.run_end import ASK_AGAIN_S, IDLE_AFTER_S, KILL_AFTER_S, OWN_PACE_S, TIP_S, EndReason
@@ -258,7 +258,11 @@ def test_process_without_heartbeats_is_killed_unless_seen_to_work(
 def test_restart_order_starts_a_process_that_was_given_up() -> None:
     run = Run()
     run.exits("series", ExitCode.CONFIG)
+    critical = run.lines[-1]
     assert run.step(RestartOrdered("series")) == [(START, "series")]
+    given_up, *later = (LogLine(1, one.name, one.level, one.text) for one in run.lines[run.lines.index(critical) :])
+    assert given_up.is_alarm
+    assert any(one.ends(given_up) for one in later)
     assert run.step(RestartOrdered("nobody")) == []
     report = run.core.reports()[2]
     assert (report.starts, report.ordered, report.given_up) == (2, 1, False)

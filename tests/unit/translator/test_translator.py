@@ -21,6 +21,7 @@ from afspm.model import (
     ControlRequest,
     ControlResponse,
     Feedback,
+    LogLine,
     Parameter,
     ProbePosition,
     Region,
@@ -30,6 +31,7 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
+from afspm.model.events import NO_LONGER_TRUE
 from afspm.storage.memory import Memory
 from afspm.translator.driver_base import ControllerLost
 from afspm.translator.observer import OVERDUE_RATIO, OVERDUE_S
@@ -919,6 +921,7 @@ def test_setting_lost_with_its_controller_is_carried_out_when_it_is_repeated(ben
 
 
 def test_scan_that_does_not_end_is_logged_once(bench: Any, scan: Any, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
     bench.microscope.values["Speed"] = 0.01
     bench.look(after_s=1.0)
     assert bench.ask(ACTION, names.START_SCAN).code == OK
@@ -934,6 +937,12 @@ def test_scan_that_does_not_end_is_logged_once(bench: Any, scan: Any, caplog: py
         bench.look(after_s=OVERDUE_RATIO * lasts_s + OVERDUE_S)
     (logged,) = [one for one in caplog.records if one.levelno == logging.CRITICAL]
     assert "does the controller hang?" in logged.message
+    bench.microscope.state = ScopeState.FREE
+    bench.microscope.files["b"] = [scan()]
+    bench.look()
+    (over,) = [one for one in caplog.records if NO_LONGER_TRUE in one.message]
+    critical, info = (LogLine(1, "microscope", one.levelname, one.message) for one in (logged, over))
+    assert info.ends(critical)
 
 
 def test_restarted_translator_does_not_repeat_requests(bench: Any) -> None:

@@ -37,6 +37,7 @@ def html(
         section("", _cards(story) + estimate.html(story)),
         section("Time line", f'<div class="scroll">{_timeline(story)}</div>{_zones(clock)}'),
         section("Problems and repairs", _problems(story, clock)),
+        section("Critical messages", _alarms(story, clock)),
         section("Treatments of the tip", _treatments(story)),
         section("Parameters changed", parameters.html(story.changes, clock)),
         section("Agents", agents.html(story.agents, clock)),
@@ -200,6 +201,19 @@ def _problems(story: RunStory, clock: PageTimes) -> str:
         table(["problem", "flagged", "by", "in control meanwhile", "done to the tip", "for", "cleared"], rows)
         or "<p>None.</p>"
     ) + routine
+
+
+def _alarms(story: RunStory, clock: PageTimes) -> str:
+    rows = [
+        [
+            clock.both(alarm.line.time_ns),
+            escape(alarm.line.name),
+            f'<span class="text">{escape(alarm.line.text)}</span>',
+            "<b>not known to be over</b>" if alarm.ended_ns is None else clock.both(alarm.ended_ns),
+        ]
+        for alarm in story.overview.alarms
+    ]
+    return table(["when", "process", "message", "over"], rows)
 
 
 def _treatments(story: RunStory) -> str:

@@ -221,6 +221,8 @@ def sentence(story: RunStory) -> str:
     flagged = Counter(span.label for span in story.problems)
     parts += [f"{name} flagged {_times(count)}" for name, count in flagged.items()]
     parts += [f"{story.problem_name(entry)} seen after the end" for entry in story.seen_late]
+    if story.overview.alarms:
+        parts.append(counted(len(story.overview.alarms), "critical message"))
     if story.restarts:
         parts.append(counted(len(story.restarts), "restart"))
     parts += [f"{name} given up" for name in story.given_up]

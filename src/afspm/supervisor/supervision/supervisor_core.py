@@ -8,7 +8,7 @@ from dataclasses import replace
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.formatting import duration_text
 from afspm.model import Role
-from afspm.model.events import LOGGED_AS
+from afspm.model.events import LOGGED_AS, NO_LONGER_TRUE
 from afspm.supervisor.supervision.child import (
     ChildEffect,
     ChildLog,
@@ -259,6 +259,8 @@ class SupervisorCore:
         child = self.children.get(name)
         if child is None or self.ending is not None:
             return
+        if child.given_up:
+            self._log(LOGGED_AS, "INFO", f"{name} is started again; {NO_LONGER_TRUE}gave up {name}")
         child.given_up, child.ordered = False, child.ordered + 1
         self._apply(child, child.watch.restart(self._now_s))
 

@@ -65,6 +65,7 @@ class Content:
     notes: str = ""
     channels: tuple[str, ...] = ()
     problems: tuple[Flag, ...] = ()
+    alarms: tuple[LogLine, ...] = ()
     processes: tuple[ProcessState, ...] = ()
     unheard: Mapping[str, int] = field(default_factory=dict)
     log: tuple[LogLine, ...] = ()
@@ -134,6 +135,7 @@ class Contents:
                 notes=notes_html(overview),
                 channels=watch.frames.channels,
                 problems=tuple(flags(overview)),
+                alarms=overview.open_alarms,
                 processes=tuple(processes_of(watch, overview)),
                 unheard=silent,
                 log=tuple(overview.log),

@@ -18,7 +18,7 @@ from afspm.plugins.web.dashboard.actions import Steering
 from afspm.plugins.web.dashboard.approvals import ApprovalBar
 from afspm.plugins.web.dashboard.conditions import Conditions
 from afspm.plugins.web.dashboard.content import Content, Contents
-from afspm.plugins.web.dashboard.panels import ChartPanel, HealthPanel, LogPanel, NotesPanel, SpectraPanel
+from afspm.plugins.web.dashboard.panels import AlarmBar, ChartPanel, HealthPanel, LogPanel, NotesPanel, SpectraPanel
 from afspm.plugins.web.dashboard.sign_in import SIGN_IN
 from afspm.plugins.web.dashboard.steering_panel import ModeButtons, ProblemBar, SteeringPanel
 from afspm.plugins.web.dashboard.steering_session import SteeringSession
@@ -101,6 +101,7 @@ class Page:
                 button.props('flat round dense aria-label="Light or dark"')
                 self._sign_in_or_out()
         self._problems = ProblemBar(self._session)
+        self._alarms = AlarmBar()
         self._approvals = ApprovalBar(self._session)
         ui.html('<div id="trouble" role="alert" hidden></div>', sanitize=False)
 
@@ -126,6 +127,7 @@ class Page:
         self._status.set_content(content.status)
         self._mode.show()
         self._problems.show()
+        self._alarms.show(content.alarms)
         self._approvals.show()
         self._sections.show(content)
         state = self._state(content)

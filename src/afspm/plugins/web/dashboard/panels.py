@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from html import escape
 
 from nicegui import context, events, ui
@@ -18,7 +19,7 @@ from afspm.plugins.web.dashboard.charts import Chart, spectrum_chart
 from afspm.plugins.web.dashboard.content import NO_REPORT
 from afspm.plugins.web.dashboard.scan_facts import summary_of
 from afspm.plugins.web.dashboard.steering_panel import ask_restart
-from afspm.plugins.web.dashboard.steering_session import SteeringSession
+from afspm.plugins.web.dashboard.steering_session import SteeringSession, button
 from afspm.plugins.web.watch import Watch
 from afspm.record.drawing.timeline import tint_class
 
@@ -144,6 +145,43 @@ def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: 
 def _level_html(level: str) -> str:
     # INFO is the usual level, and not shown
     return "" if level == "INFO" else f"<i>{escape(level)}</i> "
+
+
+class AlarmBar:
+    """A line for each CRITICAL message that is not over, with a button that hides it from this viewer."""
+
+    def __init__(self) -> None:
+        self._alarms: tuple[LogLine, ...] = ()
+        self._shown: tuple[LogLine, ...] = ()
+        self._seen: set[LogLine] = set()
+        self._box = ui.element("div").classes("problems alarms").props('role="alert"')
+        self._box.set_visibility(False)
+
+    def show(self, alarms: tuple[LogLine, ...]) -> None:
+        self._alarms = alarms
+        shown = tuple(alarm for alarm in alarms if alarm not in self._seen)
+        if shown == self._shown:
+            return
+        self._shown = shown
+        self._box.set_visibility(bool(shown))
+        self._box.clear()
+        with self._box:
+            for alarm in shown:
+                with ui.element("div").classes("flag"):
+                    ui.html(alarm_html(alarm), sanitize=False)
+                    button("Seen", partial(self._hide, alarm)).props["aria-label"] = f"Hide the message of {alarm.name}"
+
+    def _hide(self, alarm: LogLine) -> None:
+        self._seen.add(alarm)
+        self.show(self._alarms)
+
+
+def alarm_html(alarm: LogLine) -> str:
+    """Return a CRITICAL line as HTML, with its process and time."""
+    return (
+        f'<b data-part="alarm">{escape(alarm.name)}</b> <small>at {time_of_day(alarm.time_ns)}</small>'
+        f'<span class="advice">{escape(alarm.text)}</span>'
+    )
 
 
 class HealthPanel:
