@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import hashlib
 import json
 import re
@@ -19,7 +20,7 @@ import afspm
 from afspm.basics.errors import FileError, InvalidValue
 from afspm.model import Scan, ScopeState, Spectrum
 from afspm.model.line_levelling import flattened
-from afspm.record.export import chosen, export, png
+from afspm.record.export import chosen, eln, export, png
 from afspm.record.run import Run
 from afspm.record.store import RecordStore
 
@@ -329,6 +330,36 @@ def test_damaged_file_costs_its_own_measurement_only(run: Run, tmp_path: Path, t
         list(export(run, to, tmp_path / "out"))
 
 
+def test_deleted_file_is_named_in_the_archive_and_costs_nothing_else(run: Run, tmp_path: Path) -> None:
+    scan, spectrum = run.scans[1].file, run.spectra[0].file
+    for file in (scan, spectrum):
+        (tmp_path / file).unlink()
+    told: list[str] = []
+    (path,) = export(run, "eln", tmp_path / "out", tell=told.append)
+    assert [Path(scan).name in told[0], Path(spectrum).name in told[1], len(told)] == [True, True, 2]
+    with zipfile.ZipFile(path) as container:
+        names = {name.partition("/")[2].partition("/")[2] for name in container.namelist()}
+        crate = json.loads(container.read(f"{path.stem}/ro-crate-metadata.json"))
+    assert run.scans[0].file in names
+    assert run.scans[2].file in names
+    assert not {scan, spectrum} & names
+    (experiment,) = (node for node in crate["@graph"] if node.get("genre") == "experiment")
+    assert f"missing here</h2><ul><li>{scan}</li><li>{spectrum}</li></ul>" in experiment["text"]
+    assert "2 scans and 0 spectra" in experiment["description"]
+    with pytest.raises(FileError, match="can't be read"):
+        list(export(run, "eln", tmp_path / "out"))
+
+
+def test_film_is_made_of_the_files_that_are_there(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    store.take([night.control(), *night.whole_scan(1), *night.whole_scan(2), *night.whole_scan(3)])
+    run = afspm.open_run(tmp_path)
+    (tmp_path / run.scans[0].file).unlink()
+    told: list[str] = []
+    assert [file.suffix for file in export(run, "gif", tmp_path / "out", tell=told.append)] == [".gif"]
+    assert len(told) == 1
+
+
 def test_packets_of_a_damaged_file_are_left_out_on_request(run: Run, tmp_path: Path) -> None:
     (tmp_path / run.scans[1].file).unlink()
     told: list[str] = []
@@ -383,8 +414,13 @@ def test_lab_notebook_archive_of_chosen_scans_has_only_their_files(run: Run, tmp
     assert "1 scan and 0 spectra" in next(node for node in crate["@graph"] if node["@id"] == "./")["description"]
 
 
-def test_lab_notebook_archive_that_cannot_be_written_leaves_nothing(run: Run, tmp_path: Path) -> None:
-    (tmp_path / run.scans[0].file).unlink()
+def test_lab_notebook_archive_that_cannot_be_written_leaves_nothing(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(eln, "_file_node", full)
     with pytest.raises(FileError, match="can't be written"):
         list(export(run, "eln", tmp_path / "out"))
     assert list((tmp_path / "out").iterdir()) == []

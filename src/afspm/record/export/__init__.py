@@ -4,7 +4,8 @@ An exporter is a module that a package declares by its format. `write(run, row)`
 of a scan or spectrum. Two functions are optional: `tables(run, scans, spectra)` yields (name, content) of files about
 the whole run, and `grid_file(stack, metadata)` returns the spectra of a grid as one file.
 A format with one file for many measurements has `archive(run, scans, spectra, folder)` instead of `write`: it
-writes such files, which may be larger than memory, and yields their paths.
+writes such files, which may be larger than memory, and yields their paths. Measurements whose file can't be opened are
+not among `scans` and `spectra`.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import TypeVar
 
 from afspm.basics import entry_points
 from afspm.basics.errors import FileError, InvalidValue
 from afspm.model import Spectrum
+from afspm.record.journal import measured_file
 from afspm.record.measured_files import write_synced
 from afspm.record.run import Run
 from afspm.record.spectrum_stack import SpectrumStack, stacked
@@ -58,7 +61,8 @@ def export(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if hasattr(module, "archive"):
-            yield from module.archive(run, wanted, spectra, folder)
+            there = [*_with_files(run, wanted, tell)], [*_with_files(run, spectra, tell)]
+            yield from module.archive(run, *there, folder)
             return
         for name, content in module.tables(run, wanted, spectra) if hasattr(module, "tables") else ():
             yield _written(folder / name, content)
@@ -67,6 +71,31 @@ def export(
             yield _written(folder / f"{name}.{to}", module.grid_file(stack, run.metadata))
     except OSError as error:
         raise FileError(f"can't be written: {error}", where=str(folder)) from error
+
+
+def unreadable(run: Run, row: ScanRow | SpectrumRow) -> FileError | None:
+    """Return the reason why the file of a measurement can't be opened; None if it can be opened."""
+    try:
+        with measured_file(run.folder, row.file).open("rb"):
+            return None
+    except FileError as error:
+        return error
+    except OSError as error:
+        return FileError(f"can't be read: {error.strerror or error}", where=str(run.folder / row.file))
+
+
+Row = TypeVar("Row", ScanRow, SpectrumRow)
+
+
+def _with_files(run: Run, rows: Sequence[Row], tell: Callable[[str], None] | None) -> Iterator[Row]:
+    for row in rows:
+        error = unreadable(run, row)
+        if error is None:
+            yield row
+        elif tell is None:
+            raise error
+        else:
+            tell(str(error))
 
 
 def _write_each(

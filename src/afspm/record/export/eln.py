@@ -21,6 +21,7 @@ from typing import IO, Final
 from afspm.basics.clock import iso_utc
 from afspm.basics.formatting import counted
 from afspm.record import journal
+from afspm.record.export import unreadable
 from afspm.record.nexus_writer import afspm_version
 from afspm.record.report import REPORT_FILE
 from afspm.record.run import Run
@@ -205,10 +206,14 @@ def _text(run: Run, description: str) -> str:
         "Ended": str(run.facts.get("ended") or "not ended"),
         **{k.capitalize(): v for k, v in run.metadata.items()},
     }
+    # the journal in the archive still names these files
+    lost = [row.file for row in (*run.scans, *run.spectra) if row.file and unreadable(run, row) is not None]
+    missing = "".join(f"<li>{escape(file)}</li>" for file in lost)
     rows = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in facts.items())
     notes = "".join(f"<li>{iso_utc(note.time_ns)}, {escape(note.who)}: {escape(note.text)}</li>" for note in run.notes)
     listed = f"<h2>Notes</h2><ul>{notes}</ul>" if notes else ""
-    return f"<p>{escape(description)}</p><table>{rows}</table>{listed}"
+    gaps = f"<h2>Files that could not be read, and are missing here</h2><ul>{missing}</ul>" if missing else ""
+    return f"<p>{escape(description)}</p><table>{rows}</table>{gaps}{listed}"
 
 
 def _person(metadata: Mapping[str, str]) -> Node | None:
