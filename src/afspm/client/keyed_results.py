@@ -15,7 +15,7 @@ from typing import Any
 from afspm import wire
 from afspm.basics.errors import FileError, InvalidValue, WireError
 from afspm.basics.plain_data import Plain
-from afspm.model import LoggedPacket, Packet, Parameter, ScanSet, Spectrum
+from afspm.model import LoggedPacket, Note, Packet, Parameter, ScanSet, Spectrum
 from afspm.model.snapshot import to_plain
 from afspm.storage.atomic import OutageLog, write_atomic
 from afspm.storage.disk import is_full
@@ -85,6 +85,30 @@ class KeyedResults:
         """Save the intent of a measurement, before the measurement is requested."""
         self._memory["pending"] = intent
         self._memory.save(synced=False)  # a power cut may have it measured again, which costs a scan and no harm
+
+    def intend_note(self, key: str, note: Note) -> Note | None:
+        """Save the intent of a note; return the note to send, as first intended. None if it was written already.
+
+        Raises:
+            InvalidValue: the key was used for another text.
+        """
+        notes, print_ = self._memory.setdefault("notes", {}), zlib.crc32(note.text.encode())
+        if key not in notes:
+            notes[key] = [print_, note.time_ns, note.scan_ns, note.written_ns]
+            self._memory.save(synced=False)
+        kept_print, *times_ns = notes[key]
+        if kept_print != print_:
+            raise InvalidValue(
+                f"the key {key!r} was used for another note in this run", hint="give each note its own key"
+            )
+        return Note(times_ns[0], note.who, note.text, *times_ns[1:]) if times_ns else None
+
+    def finish_note(self, key: str, *, is_written: bool) -> None:
+        """Save that a note was written; or forget it, if it was refused."""
+        print_, *_ = self._memory["notes"].pop(key)
+        if is_written:
+            self._memory["notes"][key] = [print_]
+        self._memory.save(synced=False)
 
     def before_sweep(self, key: str) -> list[Parameter] | None:
         """Return the parameter values from before an unfinished sweep; None if the sweep has set no parameter."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from afspm import wire
-from afspm.basics.errors import ExperimentEnded, InvalidValue, NoResponse, RequestError
+from afspm.basics.errors import ExperimentEnded, InvalidValue, NoResponse, Refused, RequestError
 from afspm.basics.plain_data import Plain
 from afspm.client.command_retry import PATIENCE_S, CommandRetry, refused
 from afspm.client.control_hold import ControlHold
@@ -47,6 +47,7 @@ from afspm.model import (
     ScanSet,
     Spectrum,
 )
+from afspm.model.sessions import KEYED
 from afspm.model.sweep_plan import SweepOrder, SweepPlan, SweptValues
 from afspm.transport.process.parent import StopRequested
 
@@ -466,7 +467,9 @@ class Scope(ExperimentView):
             left_s = (now_ns - begun_ns) * 1e-9 / (done - begun) * (of - done)
         self._link.relay(Progress(now_ns, self._link.name, done, of, left_s))
 
-    def note(self, text: str, *, scan: HasTime | None = None, time_ns: int | None = None) -> None:
+    def note(
+        self, text: str, *, scan: HasTime | None = None, time_ns: int | None = None, key: str | None = None
+    ) -> None:
         """Write a note about a scan or a moment (default: now) into the record of the run. Needs no control.
 
             scope.note("the tip changed here", scan=scans)
@@ -475,17 +478,32 @@ class Scope(ExperimentView):
             text: at most 1000 characters.
             scan: scan of the note: a `ScanSet`, a `Scan`, or a row of `Run.scans`.
             time_ns: moment of the note, experiment time; None: the end of the scan, or now.
+            key: name of the note, which is then written only once in this run: after a restart of the component the
+                call does nothing. Each note of a component needs its own key; a measurement may have the same.
 
         Raises:
-            InvalidValue: the text is empty, too long, or has control characters other than line feeds and tabs; or the
-                end of the scan is unknown.
+            InvalidValue: the text is empty, too long, or has control characters other than line feeds and tabs; the
+                end of the scan is unknown; or the key was used for another text.
         """
         if scan is not None and scan.time_ns is None:
             raise InvalidValue("the scan has no time of its end", hint="give time_ns instead")
         scan_ns, now_ns = None if scan is None else scan.time_ns, self._link.clock.now_ns()
         about_ns = next(one for one in (time_ns, scan_ns, now_ns) if one is not None)
         note = Note(about_ns, self._link.name, text, scan_ns, now_ns)
-        self._ask_scheduler(RELAY_REQUEST, RelayedMessage(*wire.encode(note)))
+        if key is None:
+            self._ask_scheduler(RELAY_REQUEST, RelayedMessage(*wire.encode(note)))
+            return
+        unwritten = self._results.intend_note(check_key(key), note)
+        if unwritten is None:
+            return
+        # the same id and bytes in every life: the scheduler publishes the note once
+        request_id = f"{self._link.name}/{KEYED}/{key}/note-{unwritten.written_ns}"
+        try:
+            self._ask_scheduler(RELAY_REQUEST, RelayedMessage(*wire.encode(unwritten)), request_id)
+        except Refused:
+            self._results.finish_note(key, is_written=False)
+            raise
+        self._results.finish_note(key, is_written=True)
 
     def report_readings(self, report: InstrumentReadings) -> InstrumentOrders:
         """Report the values of this component's instrument, and return the orders for it.
@@ -536,8 +554,8 @@ class Scope(ExperimentView):
         # ever, and the scheduler would not retract a tip left in danger
         self.give_back_inherited()
 
-    def _ask_scheduler(self, kind: int, subject: object) -> None:
+    def _ask_scheduler(self, kind: int, subject: object, request_id: str = "") -> None:
         with self._call():
-            response = self._link.request(kind, subject)
+            response = self._link.request(kind, subject, request_id=request_id)
             if not response.ok:
                 raise refused(kind, response, self._link.name)

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from systems import PATIENCE
 
+import afspm
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import ConfigError, FileError
 from afspm.plugins.web.commands import resumed_with_page
@@ -127,6 +128,42 @@ def test_killed_run_is_resumed_with_an_added_dashboard(tmp_path: Path) -> None:
     assert set(facts["processes"]) == {"microscope", "scheduler", "short", "recorder", "dashboard"}
     again.terminate()
     again.communicate(timeout=DEADLINE_S)
+
+
+NOTING = """
+from afspm import Component
+
+
+class Short(Component):
+    def run(self):
+        lives = self.memory["lives"] = self.memory.get("lives", 0) + 1
+        self.memory.save()
+        scans = self.scope.scan(shape=(16, 16), key="a")
+        self.scope.note("the tip is new", scan=scans, key="a")
+        self.log.info("noted in life %d", lives)
+        if lives > 1:
+            self.scope.note("the night is over", key="end")
+            self.scope.end_experiment()
+        while True:
+            self.scope.sleep(60.0)
+"""
+
+
+def test_notes_with_a_key_are_written_once_over_a_kill_and_a_resume(tmp_path: Path) -> None:
+    (tmp_path / "night.toml").write_text(EXPERIMENT, encoding="utf-8")
+    (tmp_path / "short.py").write_text(NOTING, encoding="utf-8")
+    first = afspm_run(tmp_path, "night.toml")
+    run = tmp_path / output_until(first, "processes, into").strip().rpartition(", into ")[2]
+    output_until(first, "noted in life 1")
+    first.kill()
+    first.wait()
+    assert first.stdout is not None
+    first.stdout.close()
+    again = afspm_run(tmp_path, "--resume", "runs")
+    output_until(again, "noted in life 2")
+    again.communicate(timeout=DEADLINE_S)
+    with afspm.open_run(run) as record:
+        assert [note.text for note in record.notes] == ["the tip is new", "the night is over"]
 
 
 def test_run_with_a_dashboard_is_resumed_with_it(tmp_path: Path) -> None:

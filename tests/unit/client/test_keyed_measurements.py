@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -11,10 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.unit.client.client_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, LabPort
 
+from afspm import wire
 from afspm.basics.errors import ControlLost, InvalidValue, NoResponse, Refused
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
-from afspm.model import ControlRequest, ControlResponse, Problem, Request, Response, ScanSet
+from afspm.model import RELAY_REQUEST, ControlRequest, ControlResponse, Note, Problem, Request, Response, ScanSet
 from afspm.scheduler.control.arbitration import ArbitrationEvent
 
 TILES = [REGION.moved_to((i * 2e-6, 0.0)) for i in range(3)]
@@ -335,3 +337,41 @@ def test_scan_whose_start_was_lost_is_requested_with_another_id(lives: int, tmp_
     assert lab.finished == [REGION]
     assert len(scans.interruptions) == 1
     assert lab.control.holder is None
+
+
+def notes_of(lab: Lab) -> list[Note]:
+    """Return the published notes; a repetition with the id of an earlier request is not published again."""
+    sent = {(request.id, request.payload): request.subject for request in lab.requests if request.kind == RELAY_REQUEST}
+    return [wire.decode("Note", one.payload) for one in sent.values() if one.message == "Note"]
+
+
+@pytest.mark.parametrize("is_late", [False, True])
+@pytest.mark.parametrize("deadly_call", range(12))
+def test_note_with_a_key_is_written_once_for_a_kill_at_any_call(
+    tmp_path: Path, deadly_call: int, *, is_late: bool
+) -> None:
+    lab = Lab()
+
+    def script(life: int, port: LabPort) -> None:
+        scope = scope_of(lab, tmp_path, life, port)
+        scope.note("the tip changed", key="tip")
+        scope.sleep(1.0)
+        scope.note("all is done", key="done")
+
+    for life, port in enumerate((LabPort(lab, deadly_call, is_late=is_late), LabPort(lab), LabPort(lab))):
+        with suppress(Kill9):
+            script(life, port)
+        lab.restart_component()
+    assert [note.text for note in notes_of(lab)] == ["the tip changed", "all is done"]
+
+
+def test_key_of_a_note_is_not_used_for_another_text(tmp_path: Path) -> None:
+    lab = Lab()
+    scope = scope_of(lab, tmp_path, 0)
+    scope.scan(REGION, shape=(8, 8), key="tip")
+    scope.note("the tip changed", key="tip")
+    with pytest.raises(InvalidValue, match="used for another note"):
+        scope.note("the tip is blunt", key="tip")
+    with pytest.raises(InvalidValue, match="can't be a key"):
+        scope.note("the tip is blunt", key="a/b")
+    assert len(notes_of(lab)) == 1
