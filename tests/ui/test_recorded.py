@@ -104,6 +104,21 @@ def test_a_moment_of_the_night_is_shown_as_it_was(
     keep(page, "recorded-night")
 
 
+def test_time_of_each_moment_has_the_offset_in_force(ended: Night, opened: Opened) -> None:
+    page = opened(ended.url)
+    page.wait_for_function("window.afspm?.scrubber")
+    shown = page.evaluate("""() => {
+        const scrubber = window.afspm.scrubber, begin = scrubber.begin, middle = begin + 60_000_000_000n;
+        scrubber.night.offsets = [[String(begin), 7200], [String(middle), 3600]];
+        return [59_000, 61_000].map((ms) => {
+            scrubber.go(ms);
+            const utc_ms = Number(begin / 1_000_000n) + ms;
+            return (Date.parse(`${scrubber.find("time").textContent.replace(" ", "T")}Z`) - utc_ms) / 1000;
+        });
+    }""")
+    assert shown == pytest.approx([7200, 3600], abs=1.0)
+
+
 def test_a_recorded_night_is_played(ended: Night, opened: Opened) -> None:
     page = opened(ended.url)
     look_at(page, ended, 1)

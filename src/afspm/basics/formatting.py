@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from datetime import UTC, datetime, tzinfo
 
-from afspm.basics.clock import utc_time
+from afspm.basics.clock import NS_PER_S, utc_time
 
 _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"),
              (1e-12, "p"), (1e-15, "f"))  # fmt: skip
@@ -14,6 +14,7 @@ _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, 
 PREFIXABLE = frozenset(
     {"m", "V", "A", "s", "N", "Hz", "W", "F", "m/s", "m/V", "V/m", "C", "S", "Pa", "Ohm", "Ω", "T", "g"}
 )
+_DAY_NS = 86_400 * NS_PER_S
 _LENGTHS = ((1e-3, "mm"), (1e-6, "µm"), (1e-9, "nm"), (1e-12, "pm"))
 
 
@@ -104,6 +105,20 @@ def zone_offset_s(time_ns: int) -> float:
     """Return the lead of this computer's zone over UTC at a time; summer time may begin or end during a night."""
     offset = _moment(time_ns, None).utcoffset()
     return offset.total_seconds() if offset else 0.0
+
+
+def zone_offsets_s(start_ns: int, end_ns: int) -> list[tuple[int, float]]:
+    """Return the offsets of this computer's zone in a period, each with its first time: the start, and each change."""
+    offsets = [(start_ns, zone_offset_s(start_ns))]
+    for day_ns in range(start_ns, end_ns, _DAY_NS):
+        before_ns, after_ns = day_ns, min(day_ns + _DAY_NS, end_ns)
+        if (new_s := zone_offset_s(after_ns)) == offsets[-1][1]:
+            continue
+        while after_ns - before_ns > 1:
+            middle_ns = (before_ns + after_ns) // 2
+            before_ns, after_ns = (before_ns, middle_ns) if zone_offset_s(middle_ns) == new_s else (middle_ns, after_ns)
+        offsets.append((after_ns, new_s))
+    return offsets
 
 
 def _zone(zone: tzinfo | None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from datetime import UTC, datetime, timedelta, timezone
 
 import pytest
@@ -84,3 +85,33 @@ def test_quantities_read_well(value: float | None, unit: str, text: str) -> None
 def test_the_prefix_and_the_factor_belong_together() -> None:
     factor, unit = formatting.scale(3e-7, "m")
     assert (3e-7 * factor, unit) == (pytest.approx(300.0), "nm")
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "offsets"),
+    [
+        # summer time ends at 01:00 UTC, and begins at that time half a year later
+        ("2026-10-24T20:00", "2026-10-25T06:00", [("2026-10-24T20:00", 7200), ("2026-10-25T01:00", 3600)]),
+        ("2026-10-20T20:00", "2026-10-26T06:00", [("2026-10-20T20:00", 7200), ("2026-10-25T01:00", 3600)]),
+        ("2027-03-27T20:00", "2027-03-28T06:00", [("2027-03-27T20:00", 3600), ("2027-03-28T01:00", 7200)]),
+        ("2026-10-25T20:00", "2026-10-26T06:00", [("2026-10-25T20:00", 3600)]),
+        ("2026-10-25T00:00", "2026-10-25T00:00", [("2026-10-25T00:00", 7200)]),
+    ],
+)
+def test_offsets_of_a_period_begin_at_the_changes_of_the_clock(
+    start: str, end: str, offsets: list[tuple[str, int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not hasattr(time, "tzset"):
+        pytest.skip("this system has one zone")
+
+    def ns(text: str) -> int:
+        return round(datetime.fromisoformat(f"{text}+00:00").timestamp()) * 10**9
+
+    monkeypatch.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
+    time.tzset()
+    try:
+        found = formatting.zone_offsets_s(ns(start), ns(end))
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    assert found == [(ns(since), float(offset_s)) for since, offset_s in offsets]

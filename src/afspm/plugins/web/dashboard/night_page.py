@@ -20,7 +20,7 @@ from nicegui import events, ui
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import AfspmError, InvalidValue
-from afspm.basics.formatting import time_of_day, typeset_area, zone_offset_s
+from afspm.basics.formatting import time_of_day, typeset_area, zone_offsets_s
 from afspm.basics.plain_data import Plain
 from afspm.model.events import PERSON
 from afspm.model.line_levelling import Levelling, levelled
@@ -109,7 +109,9 @@ class NightRequests:
         return {
             "begin": str(night.begin_ns),
             "end": str(night.end_ns),
-            "offset_s": zone_offset_s(night.end_ns),
+            "offsets": [
+                [str(since_ns), offset_s] for since_ns, offset_s in zone_offsets_s(night.begin_ns, night.end_ns)
+            ],
             "scans": scans,
             "notes": [
                 {"time": str(one.time_ns), "text": one.thing.text} for one in night.events if one.message == "Note"

@@ -98,7 +98,8 @@ export class Scrubber {
 
   #tell() {
     const ns = this.begin + BigInt(Math.round(Number(this.slider.value))) * 1_000_000n;
-    const local = new Date(Number(ns / 1_000_000n) + this.night.offset_s * 1000);
+    const [, offset_s] = this.night.offsets.findLast(([since], i) => i === 0 || BigInt(since) <= ns);
+    const local = new Date(Number(ns / 1_000_000n) + offset_s * 1000);
     const text = local.toISOString().slice(0, 19).replace("T", " ");
     this.find("time").textContent = text;
     this.slider.setAttribute("aria-valuetext", text);
