@@ -74,7 +74,7 @@ def treatment_ledger(
         keep_away_m: distance from scanned regions within which a treatment counts as near.
     """
     ledger, values, retracted = TreatmentLedger(), dict[str, float](), list[tuple[int, bool]]()
-    for entry in _once(list(journal)):
+    for entry in treatments_once(list(journal)):
         if entry.response not in _COUNTS:
             continue
         if entry.request == ControlRequest.PARAM and entry.subject:
@@ -94,9 +94,12 @@ def treatment_ledger(
     return replace(ledger, feedback_off_s=_off_s(feedback, retracted, end_ns))
 
 
-def _once(journal: Sequence[JournalEntry]) -> list[JournalEntry]:
-    # the entries without unsent treatments, and one entry, with the last response, of each treatment that was sent: a
-    # long treatment has an entry for each repetition of its request, and another for a late answer
+def treatments_once(journal: Sequence[JournalEntry]) -> list[JournalEntry]:
+    """Return the journal with one entry, the first with the last response, for each treatment that was sent.
+
+    A long treatment has an entry for each repetition of its request, and another for a late answer. Unsent treatments
+    with an unknown outcome are left out.
+    """
     treatments = {i for i, one in enumerate(journal) if _is_treatment(one)}
     last = {_sending(journal[i]): i for i in sorted(treatments)}
     first = {_sending(journal[i]): i for i in sorted(treatments, reverse=True)}

@@ -275,6 +275,33 @@ def test_equal_refusals_are_listed_once_with_their_number(run: Path) -> None:
     assert (refused.count, refused.who, refused.last_ns - refused.first_ns) == (2, "corrector", S)
 
 
+def test_treatment_with_a_repeated_request_is_drawn_and_counted_once(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path, RecordSettings({"experiment": "night"}))
+    asked: dict[str, Any] = {
+        "request": int(model.ControlRequest.ACTION),
+        "subject": names.PULSE,
+        "sent_ns": START + 1550 * S,
+    }
+    none, done = int(model.ControlResponse.NO_RESPONSE), int(model.ControlResponse.SUCCESS)
+    answers = ((1555, none, False), (1560, done, True), (1561, done, False))
+    things = night() + [
+        (at_s, entry(at_s, "request", "corrector", names.PULSE, response, late=late, **asked))
+        for at_s, response, late in answers
+    ]
+    for at_s, thing in sorted(things, key=lambda one: one[0]):
+        message, payload = wire.encode(thing)
+        suffix = f"_{thing.channel}" if isinstance(thing, model.Scan) else ""
+        store.take([(model.Packet(message + suffix, payload, START + round(at_s * S)), "")])
+    store.finish()
+    store.close()
+    with open_run(tmp_path) as opened:
+        read = story.read(opened)
+        marks = pictures.night_of(opened, read, []).marks
+    assert [(mark.time_ns - START) // S for mark in marks] == [1520, 1530, 1555]
+    (problem,) = read.problems
+    assert read.done_meanwhile(problem) == ["3 × pulse"]
+
+
 def test_critical_messages_are_listed_with_their_end(tmp_path: Path) -> None:
     folder = tmp_path / "night-1"
     folder.mkdir()

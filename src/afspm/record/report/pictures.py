@@ -21,6 +21,7 @@ from afspm.record.night_record import NightMark, NightRecord, Shot, Thumbnail, t
 from afspm.record.report.story import RunStory
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow
+from afspm.record.treatment_ledger import treatments_once
 
 MOST = 98
 LARGEST_PX = 192
@@ -165,7 +166,7 @@ def night_of(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -
     record.marks = [NightMark(of_ns, "", "verdict", score, of_ns) for of_ns, score in run.verdicts()]
     record.marks += [
         NightMark(entry.time_ns, entry.who, entry.what)
-        for entry in run.journal
+        for entry in treatments_once(run.journal)
         if entry.what in names.TREATMENTS and entry.response == 0
     ]
     return record

@@ -29,7 +29,7 @@ from afspm.record.run_json import REAL_S, UNFINISHED
 from afspm.record.run_lock import describe_state
 from afspm.record.tables import NoteRow, ScanRow
 from afspm.record.timeline import Span, Timeline
-from afspm.record.treatment_ledger import TreatmentLedger
+from afspm.record.treatment_ledger import TreatmentLedger, treatments_once
 
 COLOURS = 5  # of holders, repeated in turn: the CSS classes c0 to c4
 MOST_ROWS = 200
@@ -179,7 +179,11 @@ def read(run: Run) -> RunStory:
         # late flags are listed with the problems instead
         refusals=gathered([entry for entry in run.refusals if entry not in late]),
         ledger=run.ledger(),
-        actions=[entry for entry in run.journal if entry.what in names.EXTENSION_ACTIONS and entry.response == 0],
+        actions=[
+            entry
+            for entry in treatments_once(run.journal)
+            if entry.what in names.EXTENSION_ACTIONS and entry.response == 0
+        ],
         notes=list(run.notes),
         seen_late=list({entry.problem: entry for entry in reversed(late)}.values()),
         comparisons=compare(plans_of(run.facts), scans, run.spectra),
