@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 
 from afspm import wire
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import AfspmError
-from afspm.basics.formatting import duration_text
 from afspm.model import ScopeState, ScopeStatus, names
-from afspm.model.events import NO_LONGER_TRUE
 from afspm.storage.disk import is_full
 from afspm.translator import setting_groups
 from afspm.translator.driver_base import LOST, MEASURING, DriverBase
 from afspm.translator.outbox import Outbox, Outgoing
 from afspm.translator.parameters import Value
-from afspm.translator.polling import AdaptivePolling
+from afspm.translator.polling import AdaptivePolling, OverdueScan
 from afspm.translator.sequence import DiscardResults, LogError, PublishResults, PublishStatus, SequenceStep
 from afspm.translator.state import TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
@@ -56,7 +53,7 @@ class Observer:
         self._all_at_s = 0.0
         self._result_since_s: float | None = None
         self._replayed = False
-        self._overdue = OverdueScan(log)
+        self._overdue = OverdueScan()
 
     def begin(self) -> None:
         """Publish the last results again (once, after a restart), then all settings and the state.
@@ -81,7 +78,8 @@ class Observer:
         elif (status := self._status()) != published:
             # the end of a measurement changes no setting; any other change of state may
             self.observe(values=published.state not in MEASURING, status=status)
-        self._overdue.look(self._clock.monotonic_s(), self._expected_s)
+        if overdue := self._overdue.look(self._clock.monotonic_s(), self._expected_s):
+            self._log.critical("%s", overdue)
         for name, payload in self._new_lines():
             self._port.publish(name, payload, self._state.stamp()[0], keep=False)
 
@@ -222,7 +220,8 @@ class Observer:
 
     def _adapt_polling(self, state: ScopeState) -> None:
         before, self._polled_for, now_s = self._polled_for, state, self._clock.monotonic_s()
-        self._overdue.state_changed(now_s, is_scanning=state is ScopeState.SCANNING)
+        if over := self._overdue.state_changed(now_s, is_scanning=state is ScopeState.SCANNING):
+            self._log.info("%s", over)
         if state is ScopeState.SCANNING:
             self._live.begin(self._clock.now_ns())
         else:
@@ -252,44 +251,6 @@ class Observer:
                 width_m, rows = float(extent[0]), float(extent[1])
                 return self._clock.real_s(2.0 * width_m * rows / speed_m_s), (*extent, speed_m_s)
         return None, extent
-
-
-OVERDUE_RATIO = 3.0
-"""Ratio of a scan's duration to its expected duration above which the scan is overdue."""
-OVERDUE_S = 600.0
-"""Real time added to it: a controller may be slow to begin, and a person may pause a scan."""
-
-
-class OverdueScan:
-    """A watch over a scan that does not end, as of a controller that hangs: everything waits for it."""
-
-    def __init__(self, log: logging.Logger) -> None:
-        self._log = log
-        self._began_s = self._again_s = math.inf
-        self._logged = ""
-
-    def state_changed(self, now_s: float, *, is_scanning: bool) -> None:
-        """Process a published change of state, at a real monotonic time."""
-        if self._logged:
-            self._log.info("the controller reports the scan no longer; %s%s", NO_LONGER_TRUE, self._logged)
-            self._logged = ""
-        self._began_s, self._again_s = (now_s, now_s + OVERDUE_S) if is_scanning else (math.inf, math.inf)
-
-    def look(self, now_s: float, expected_s: Callable[[], float | None]) -> None:
-        """Log an overdue scan once.
-
-        Args:
-            expected_s: returns the expected duration in real time; None if unknown.
-        """
-        if now_s < self._again_s:
-            return
-        lasts_s, self._again_s = expected_s(), now_s + OVERDUE_S
-        passed_s = now_s - self._began_s
-        if lasts_s is not None and passed_s > OVERDUE_RATIO * lasts_s + OVERDUE_S:
-            self._again_s = math.inf
-            took, due = duration_text(passed_s), duration_text(lasts_s)
-            self._logged = f"the scan has lasted for {took}"
-            self._log.critical("%s, %s was expected: does the controller hang?", self._logged, due)
 
 
 def _live_lines_s(microscope: DriverBase) -> float | None:

@@ -1,4 +1,4 @@
-"""The polling interval of a controller: short near the expected end of a measurement, long otherwise. Pure.
+"""The expected end of a measurement: the polling interval follows it, and a scan far beyond it is overdue. Pure.
 
 The end of a scan must be noticed within 20 ms of the controller's report. But polling must not keep a controller busy
 that serves one request at a time. So the interval shrinks in proportion to the time left until the expected end, and
@@ -7,9 +7,13 @@ grows again in proportion to the time since.
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
+
+from afspm.basics.formatting import duration_text
+from afspm.model.events import NO_LONGER_TRUE
 
 EAGER_S = 0.01
 """Interval between polls when the end may come at any moment; the poll takes the rest of the 20 ms."""
@@ -104,3 +108,39 @@ class AdaptivePolling:
             return self._eager_s
         away_s = max(0.0, abs(expected.end_s - now_s) - expected.doubt_s)
         return min(self._idle_s, max(self._eager_s, _PART * away_s))
+
+
+OVERDUE_RATIO = 3.0
+"""Ratio of a scan's duration to its expected duration above which the scan is overdue."""
+OVERDUE_S = 600.0
+"""Real time added to it: a controller may be slow to begin, and a person may pause a scan."""
+
+
+class OverdueScan:
+    """A watch over a scan that does not end, as of a controller that hangs: everything waits for it."""
+
+    def __init__(self) -> None:
+        self._began_s = self._again_s = math.inf
+        self._lasted = ""
+
+    def state_changed(self, now_s: float, *, is_scanning: bool) -> str:
+        """Process a change of state at a real monotonic time; return the log line that ends an overdue scan, or ""."""
+        lasted, self._lasted = self._lasted, ""
+        self._began_s, self._again_s = (now_s, now_s + OVERDUE_S) if is_scanning else (math.inf, math.inf)
+        return f"the controller reports the scan no longer; {NO_LONGER_TRUE}{lasted}" if lasted else ""
+
+    def look(self, now_s: float, expected_s: Callable[[], float | None]) -> str:
+        """Return the log line about an overdue scan, once; "" otherwise.
+
+        Args:
+            expected_s: returns the expected duration in real time; None if unknown.
+        """
+        if now_s < self._again_s:
+            return ""
+        lasts_s, self._again_s = expected_s(), now_s + OVERDUE_S
+        passed_s = now_s - self._began_s
+        if lasts_s is None or passed_s <= OVERDUE_RATIO * lasts_s + OVERDUE_S:
+            return ""
+        self._again_s = math.inf
+        self._lasted = f"the scan has lasted for {duration_text(passed_s)}"
+        return f"{self._lasted}, {duration_text(lasts_s)} was expected: does the controller hang?"

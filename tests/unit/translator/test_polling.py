@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
-from afspm.translator.polling import EAGER_S, AdaptivePolling
+from afspm.model import LogLine
+from afspm.translator.polling import EAGER_S, OVERDUE_RATIO, OVERDUE_S, AdaptivePolling, OverdueScan
 
 IDLE_S = 0.25
 
@@ -102,3 +103,14 @@ def test_polling_is_never_faster_than_the_period(change: Callable[[AdaptivePolli
     pace = AdaptivePolling(0.001)
     change(pace)
     assert pace.wait_s(0.0) == 0.001
+
+
+def test_overdue_scan_is_reported_once_and_then_its_end() -> None:
+    watch, lasts_s = OverdueScan(), 60.0
+    late_s = OVERDUE_RATIO * lasts_s + OVERDUE_S
+    watch.state_changed(100.0, is_scanning=True)
+    told = [watch.look(100.0 + passed_s, lambda: lasts_s) for passed_s in (late_s, late_s + OVERDUE_S, 9 * late_s)]
+    assert told == ["", "the scan has lasted for 23 min, 1 min 00 s was expected: does the controller hang?", ""]
+    critical = LogLine(1, "microscope", "CRITICAL", told[1])
+    assert LogLine(2, "microscope", "INFO", watch.state_changed(9e4, is_scanning=False)).ends(critical)
+    assert watch.state_changed(9e4, is_scanning=True) == ""

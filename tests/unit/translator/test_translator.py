@@ -34,7 +34,7 @@ from afspm.model import (
 from afspm.model.events import NO_LONGER_TRUE
 from afspm.storage.memory import Memory
 from afspm.translator.driver_base import ControllerLost
-from afspm.translator.observer import OVERDUE_RATIO, OVERDUE_S
+from afspm.translator.polling import OVERDUE_RATIO, OVERDUE_S
 from afspm.transport.port import ParentGone, RequestReceived, SubscriberJoined
 from afspm.transport.process.parent import TIP_WITHIN_S
 from afspm.wire.generated import feedback_pb2, scan_pb2
