@@ -20,11 +20,10 @@ import logging
 import zlib
 from base64 import b64decode, b64encode
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import Enum
 from pathlib import Path
-from typing import Any
 
 from afspm import wire
 from afspm.basics.errors import WireError
@@ -42,8 +41,10 @@ from afspm.model import (
 )
 from afspm.model.snapshot import from_plain, snapshot, to_plain
 from afspm.scheduler import events
+from afspm.scheduler.coordinate_frame import TIP_FRAME, CoordinateFrame
 from afspm.scheduler.saved_state import KIND, VERSION, SavedState
 from afspm.scheduler.scheduler_core import SchedulerCore
+from afspm.scheduler.settings import SchedulerSettings
 from afspm.scheduler.state import SchedulerState
 from afspm.storage.line_log import REQUESTS_FOLDER, LineLog
 from afspm.wire import Buffer
@@ -56,7 +57,7 @@ _PLAIN = (
     events.Connected, events.Disconnected, events.Greeted, events.TranslatorUp, events.TranslatorDown,
     events.TranslatorCaughtUp, events.ProblemSeen, events.Announced, events.Stopped, events.Tick,
 )  # fmt: skip
-_BY_NAME: dict[str, type[Any]] = {one.__name__: one for one in _PLAIN}
+_BY_NAME: dict[str, type] = {one.__name__: one for one in _PLAIN}
 
 
 @dataclass(frozen=True)
@@ -102,12 +103,14 @@ class RecordedCore(SchedulerCore):
     """A `SchedulerCore` that records every step.
 
     Args:
+        settings, codec, frame: as for `SchedulerCore`.
         keep: called with the beginning of a life, then after every step.
-        given: the arguments of `SchedulerCore`.
     """
 
-    def __init__(self, *given: Any, keep: Keep) -> None:
-        super().__init__(*given)
+    def __init__(
+        self, settings: SchedulerSettings, codec: events.Codec, frame: CoordinateFrame = TIP_FRAME, *, keep: Keep
+    ) -> None:
+        super().__init__(settings, codec, frame)
         self._keep = keep
         self._beginning = Restored()
         self._sums = StateSums()
@@ -161,12 +164,12 @@ def log_path(run_dir: Path, name: str) -> Path:
     return run_dir / REQUESTS_FOLDER / f"{name}{SUFFIX}"
 
 
-def read_cached(plain: Sequence[Any]) -> tuple[LoggedPacket, ...]:
+def read_cached(plain: PlainList) -> tuple[LoggedPacket, ...]:
     """Return the packets from the field `cached` of a line "life"."""
     return tuple(LoggedPacket(_packet(packet), source_ns, history) for packet, source_ns, history in plain)
 
 
-def read_event(plain: Sequence[Any] | None, reports: Iterable[type] = ()) -> events.Input | None:
+def read_event(plain: PlainList | None, reports: Iterable[type] = ()) -> events.Input | None:
     """Return the input from the field `event` of a line "step"; None for the start.
 
     Args:
@@ -265,7 +268,7 @@ def _plain_packet(packet: Packet, message: str = "") -> PlainList:
     return [packet.envelope, packet.time_ns, kept]
 
 
-def _packet(plain: Sequence[Any]) -> Packet:
+def _packet(plain: PlainList) -> Packet:
     envelope, time_ns, kept = plain
     if isinstance(kept, int):
         return Packet(envelope, bytes(kept), time_ns)
