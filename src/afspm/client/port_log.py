@@ -23,10 +23,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import TypedDict
 
 from afspm import wire
 from afspm.basics.clock import Clock
-from afspm.basics.plain_data import PlainList
+from afspm.basics.plain_data import Plain, PlainList
 from afspm.client.keyed_results import kept_in
 from afspm.model import Packet
 from afspm.storage.line_log import REQUESTS_FOLDER, LineLog
@@ -37,6 +38,26 @@ INLINE_BYTES = 4096
 """Packets of scans and spectra above this size are in the run's record only."""
 SUFFIX = ".jsonl"
 _IN_FILES = ("Scan2d", "Spec1d")
+
+
+class LifeFacts(TypedDict):
+    """The facts in a line "life".
+
+    Attributes:
+        launch: the launch line of the process, without its keys.
+        speed: experiment time per real time.
+        memory, measurements: texts of the files saved by the previous life; None if missing or damaged.
+        results: names of the files with kept results.
+    """
+
+    launch: Plain
+    session: str
+    speed: float
+    monotonic_s: float
+    now_ns: int
+    memory: str | None
+    measurements: str | None
+    results: list[str]
 
 
 class RecordedClock:
@@ -173,21 +194,17 @@ def recorded(
     launch = context.launch
     log = LineLog(log_path(Path(launch.run_dir or "."), launch.name), context.log)
     state = Path(launch.state_dir) if launch.state_dir else None
-    log.add(
-        [
-            "life",
-            {
-                "launch": json.loads(replace(launch, keys=None, beat_token="").to_json()),
-                "session": context.session,
-                "speed": 1.0 / (port.clock.real_s(1.0) or 1.0),
-                "monotonic_s": port.clock.monotonic_s(),
-                "now_ns": port.clock.now_ns(),
-                "memory": _content(state, f"{launch.name}.json"),
-                "measurements": _content(state, f"{launch.name}.scope.json"),
-                "results": [] if state is None else kept_in(state, launch.name),
-            },
-        ]
-    )
+    facts: LifeFacts = {
+        "launch": json.loads(replace(launch, keys=None, beat_token="").to_json()),
+        "session": context.session,
+        "speed": 1.0 / (port.clock.real_s(1.0) or 1.0),
+        "monotonic_s": port.clock.monotonic_s(),
+        "now_ns": port.clock.now_ns(),
+        "memory": _content(state, f"{launch.name}.json"),
+        "measurements": _content(state, f"{launch.name}.scope.json"),
+        "results": [] if state is None else kept_in(state, launch.name),
+    }
+    log.add(["life", facts])
     return RecordedPort(port, log, wants, handled)
 
 

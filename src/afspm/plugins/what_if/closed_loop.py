@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TextIO
+from typing import TextIO, TypeAlias
 
 from afspm.basics.clock import NS_PER_S, utc_time
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.basics.formatting import duration_text
+from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.experiment.toml_writer import dumps
 from afspm.plugins.what_if.what_if import changed_experiment
 from afspm.record.report import story
@@ -28,6 +29,9 @@ _TRUTH = "truth.jsonl"
 _LASTED = "lasted"
 _ALIKE, _ALIKE_REAL_S = 0.01, 5.0
 _DAMAGE = ("pulse", "crash")
+
+SettingChanges: TypeAlias = Mapping[str, Mapping[str, object]]
+"""New settings, by the name of a component."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,7 @@ class Outcomes:
 
 def rerun(
     run: str | Path,
-    changes: Mapping[str, Mapping[str, Any]] | str | Path,
+    changes: SettingChanges | str | Path,
     *,
     runs: Path = Path("runs"),
     terminal: TextIO | None = None,
@@ -79,7 +83,7 @@ def rerun(
             return Outcomes(ended.folder, _rows(record, again), _lasted_alike(record, again, speed))
 
 
-def _require_simulated(record: Run, facts: Mapping[str, Any]) -> None:
+def _require_simulated(record: Run, facts: PlainMapping) -> None:
     if not record.simulated:
         raise InvalidValue(
             "only a simulated night can be run again", where=str(record.folder), hint="without --closed it is replayed"
@@ -88,14 +92,14 @@ def _require_simulated(record: Run, facts: Mapping[str, Any]) -> None:
         raise InvalidValue("the run has not ended", where=str(record.folder), hint="compare it once it has")
 
 
-def _files(changes: Mapping[str, Mapping[str, Any]] | str | Path) -> list[Path]:
+def _files(changes: SettingChanges | str | Path) -> list[Path]:
     return [] if isinstance(changes, Mapping) else [Path(changes)]
 
 
-def _overlay(changes: Mapping[str, Mapping[str, Any]] | str | Path, facts: Mapping[str, Any]) -> str:
+def _overlay(changes: SettingChanges | str | Path, facts: PlainMapping) -> str:
     # the new night begins at the experiment time of the recorded one
     start_s = facts.get("clock", {}).get("start_s")
-    start: dict[str, Any] = {}
+    start: dict[str, object] = {}
     if start_s is not None:
         begun: datetime = utc_time(round(start_s * NS_PER_S))
         start = {"clock": {"start": begun}}
@@ -121,8 +125,8 @@ def _lasted_alike(before: Run, now: Run, speed: float | None) -> bool:
     return abs(lasted_s - lasts_s) <= max(_ALIKE * lasted_s, _ALIKE_REAL_S * (speed or 1.0))
 
 
-def _truth(folder: Path) -> list[dict[str, Any]]:
-    lines: dict[int, dict[str, Any]] = {}  # after a kill of the microscope the last line may come twice
+def _truth(folder: Path) -> list[Plain]:
+    lines: dict[int, Plain] = {}  # after a kill of the microscope the last line may come twice
     with suppress(OSError):
         for text in (folder / _TRUTH).read_text(encoding="utf-8").splitlines():
             with suppress(ValueError):
@@ -131,19 +135,19 @@ def _truth(folder: Path) -> list[dict[str, Any]]:
     return list(lines.values())
 
 
-def _usable(_: RunStory, run: Run, truth: list[dict[str, Any]]) -> str:
+def _usable(_: RunStory, run: Run, truth: list[Plain]) -> str:
     # by the truth, not by the verdicts of the night: the change may concern the verdicts
     scans = [line.get("scan", {}).get("tips") for line in truth if line.get("event") == "scan"]
     known = [tips for tips in scans if tips]
     return f"{sum(not any(tip['flaws'] for tip in tips) for tips in known)} of {len(known)}" if known else "unknown"
 
 
-def _damage(_: RunStory, run: Run, truth: list[dict[str, Any]]) -> str:
+def _damage(_: RunStory, run: Run, truth: list[Plain]) -> str:
     counts = Counter(line["event"] for line in truth if line.get("event") in _DAMAGE)
     return ", ".join(f"{count} × {name}" for name, count in sorted(counts.items())) or "none"
 
 
-_OUTCOMES: Mapping[str, Callable[[RunStory, Run, list[dict[str, Any]]], str]] = {
+_OUTCOMES: Mapping[str, Callable[[RunStory, Run, list[Plain]], str]] = {
     _LASTED: lambda story, run, truth: duration_text(story.lasted_ns / NS_PER_S),
     "whole scans": lambda story, run, truth: str(len(story.scans) - story.interrupted),
     "interrupted scans": lambda story, run, truth: str(story.interrupted),

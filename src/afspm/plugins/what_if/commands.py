@@ -7,7 +7,7 @@ import sys
 import tomllib
 from datetime import UTC
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
@@ -25,6 +25,8 @@ DIFFERS = 3
 INCOMPLETE = 1
 """Exit code: no night differs, but a night, or a process of a night, could not be replayed."""
 _MOST_SHOWN = 10
+GivenChanges: TypeAlias = dict[str, dict[str, object]] | Path | None
+"""The changed experiment file, or new settings by component."""
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
 
 
@@ -75,7 +77,7 @@ def what_if(
         raise typer.Exit(code)
 
 
-def _given(paths: list[Path], change: list[str]) -> tuple[list[Path], Any]:
+def _given(paths: list[Path], change: list[str]) -> tuple[list[Path], GivenChanges]:
     files = [path for path in paths if path.suffix == ".toml"]
     # `runs/*` has the newest run twice, as `latest` is a link, and files: the index of `afspm runs`
     others = (path for path in paths if path.suffix != ".toml" and not path.is_file())
@@ -88,7 +90,7 @@ def _given(paths: list[Path], change: list[str]) -> tuple[list[Path], Any]:
         raise typer.BadParameter("write it into the changed file, too", param_hint="--set")
     if files:
         return folders, files[0]
-    changes: dict[str, dict[str, Any]] = {}
+    changes: dict[str, dict[str, object]] = {}
     for text in change:
         place, _, value = text.partition("=")
         name, _, key = place.partition(".")
@@ -98,7 +100,7 @@ def _given(paths: list[Path], change: list[str]) -> tuple[list[Path], Any]:
     return folders, changes or None
 
 
-def _value(text: str) -> Any:
+def _value(text: str) -> object:
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
@@ -113,7 +115,9 @@ def _require_page(page: Path, *, closed: bool) -> None:
         raise typer.BadParameter(f"there is no folder {page.parent}", param_hint="--page")
 
 
-def _replay(folders: list[Path], changes: Any, only: tuple[str, ...], target: Path | None, *, as_json: bool) -> int:
+def _replay(
+    folders: list[Path], changes: GivenChanges, only: tuple[str, ...], target: Path | None, *, as_json: bool
+) -> int:
     from afspm.plugins.what_if.page import DifferencePage
     from afspm.plugins.what_if.what_if import what_if
 
@@ -143,7 +147,7 @@ def _replay(folders: list[Path], changes: Any, only: tuple[str, ...], target: Pa
     return DIFFERS if differs else 0 if is_whole else INCOMPLETE
 
 
-def _rerun(folder: Path, changes: Any, runs: Path) -> bool:
+def _rerun(folder: Path, changes: GivenChanges, runs: Path) -> bool:
     from afspm.cli.joining import plain_console, plain_table
     from afspm.plugins.what_if.closed_loop import rerun
 
@@ -193,11 +197,11 @@ def _print(result: WhatIf) -> None:
         typer.echo(f"[{name}] {why}", err=True)
 
 
-def _facts(result: WhatIf) -> dict[str, Any]:
+def _facts(result: WhatIf) -> dict[str, object]:
     def side(output: Output | None) -> dict[str, str] | None:
         return None if output is None else {"message": output.message, "key": output.key, "text": output.text}
 
-    def difference(one: Difference) -> dict[str, Any]:
+    def difference(one: Difference) -> dict[str, object]:
         return {
             "component": one.component,
             "at": iso_utc(one.at_ns),

@@ -13,7 +13,6 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from afspm.basics.clock import NS_PER_S, ExperimentClock
 from afspm.basics.errors import AfspmError, ConfigError
@@ -91,7 +90,7 @@ def replay(
     run_dir: Path,
     *,
     make: Make = load,
-    settings: Mapping[str, Any] | None = None,
+    settings: Mapping[str, object] | None = None,
     watch: bool = False,
 ) -> ComponentReplay:
     """Replay all lives of a component, and compare the outputs with the recorded outputs.
@@ -130,7 +129,7 @@ def _replay(
     packet_of: PacketOf,
     run_dir: Path,
     make: Make,
-    settings: Mapping[str, Any] | None,
+    settings: Mapping[str, object] | None,
     *,
     watch: bool,
 ) -> ComponentReplay:
@@ -172,10 +171,10 @@ def _unheard(launch: Launch, component: object) -> tuple[str, ...]:
 
 
 def _until_ns(life: Life) -> int:
-    return next((line.now_ns for line in reversed(life.lines) if isinstance(line, Poll)), int(life.facts["now_ns"]))
+    return next((line.now_ns for line in reversed(life.lines) if isinstance(line, Poll)), life.facts["now_ns"])
 
 
-def _launch(life: Life, folder: Path, settings: Mapping[str, Any] | None) -> Launch:
+def _launch(life: Life, folder: Path, settings: Mapping[str, object] | None) -> Launch:
     launch = Launch.from_json(json.dumps(life.facts["launch"]))
     return replace(
         launch,
@@ -270,10 +269,10 @@ class _Home:
         """
         if is_own:
             return
-        for kept, path in (("memory", self.memory), ("measurements", self._state / f"{self._name}.scope.json")):
-            text = life.facts[kept]
-            if kept == "memory" and remembers:
-                continue
+        kept = {self._state / f"{self._name}.scope.json": life.facts["measurements"]}
+        if not remembers:
+            kept[self.memory] = life.facts["memory"]
+        for path, text in kept.items():
             if text is None:
                 path.unlink(missing_ok=True)
             else:

@@ -191,11 +191,11 @@ class HazardGuard:
         if place := _place(sys._getframe(1), through_afspm=through_afspm):
             self.seen.setdefault(f"{what} ({place})")
 
-    def _profile(self, frame: FrameType, event: str, called: Any) -> None:
+    def _profile(self, frame: FrameType, event: str, called: object) -> None:
         if event == "c_call" and (what := _hazard(called)) and (place := _place(frame)):
             self.seen.setdefault(f"{what} ({place})")
 
-    def _profile_thread(self, frame: FrameType, event: str, called: Any) -> None:
+    def _profile_thread(self, frame: FrameType, event: str, called: object) -> None:
         sys.setprofile(self._profile if _guard_here() is self else None)
 
 
@@ -262,11 +262,11 @@ def _hook() -> None:
         _before(zmq.Socket, name, _on_socket)
 
 
-def _before(class_: Any, name: str, check: Callable[..., None]) -> None:
+def _before(class_: type, name: str, check: Callable[..., None]) -> None:
     method = getattr(class_, name)
 
     @wraps(method)
-    def checked(self: Any, *given: Any, **named: Any) -> Any:
+    def checked(self: object, *given: object, **named: object) -> object:
         if (guard := _guard_here()) is not None:
             check(guard, self, *given, **named)
         return method(self, *given, **named)
@@ -274,17 +274,17 @@ def _before(class_: Any, name: str, check: Callable[..., None]) -> None:
     setattr(class_, name, checked)
 
 
-def _on_hdf5(guard: HazardGuard, _: Any, name: object, mode: str = "r", *__: Any, **___: Any) -> None:
+def _on_hdf5(guard: HazardGuard, _: object, name: object, mode: str = "r", *__: object, **___: object) -> None:
     if mode != "r":
         guard.on_event("open", (name, "w", 0))
 
 
-def _on_socket(guard: HazardGuard, _: Any, addr: str, *__: Any, **___: Any) -> None:
+def _on_socket(guard: HazardGuard, _: object, addr: str, *__: object, **___: object) -> None:
     if not addr.startswith("inproc:"):
         guard.on_event("socket.connect", (None, addr))
 
 
-def _on_audit(event: str, args: tuple[Any, ...]) -> None:
+def _on_audit(event: str, args: tuple[object, ...]) -> None:
     if (_guards or _threads) and (guard := _guard_here()) is not None:
         guard.on_event(event, args)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from afspm import wire
 from afspm.basics.errors import AfspmError, WireError
@@ -54,7 +53,7 @@ class OutputReader:
         """Return a published message as an output; the creation time is not part of its value."""
         try:
             message = wire.message_of(envelope)
-            thing: Any = wire.decode(message, payload)
+            thing = wire.decode(message, payload)
             made_at = dict.fromkeys(_CREATION_TIMES & {*getattr(thing, "__dataclass_fields__", ())}, 0)
             if made_at:
                 thing = replace(thing, **made_at)

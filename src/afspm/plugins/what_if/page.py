@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from datetime import UTC
 from html import escape
 from pathlib import Path
-from typing import Any
 
 from afspm.basics.errors import FileError
 from afspm.basics.formatting import counted, day_and_time
@@ -33,7 +32,7 @@ class DifferencePage:
         changes: as for `what_if`.
     """
 
-    def __init__(self, changes: Mapping[str, Mapping[str, Any]] | Path | None) -> None:
+    def __init__(self, changes: Mapping[str, Mapping[str, object]] | Path | None) -> None:
         self._changes = changes
         self._names: list[str] = []
         self._nights: list[str] = []

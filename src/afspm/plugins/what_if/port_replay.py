@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from afspm import wire
 from afspm.basics.errors import FileError, WireError
+from afspm.basics.plain_data import PlainList
+from afspm.client.port_log import LifeFacts
 from afspm.model import CLOCK_REQUEST, LEASE_REQUEST, RELAY_REQUEST, ControlRequest, ControlResponse, Packet, Response
 from afspm.plugins.what_if.alignment import Output, PacketName
 from afspm.plugins.what_if.outputs import OutputReader
@@ -56,8 +57,8 @@ class Poll:
     timeout_s: float | None
     monotonic_s: float
     now_ns: int
-    events: list[Any]
-    readings: list[Any]
+    events: PlainList
+    readings: PlainList
 
 
 @dataclass(slots=True)
@@ -72,7 +73,7 @@ class Sent:
 
     frames: tuple[bytes, ...]
     handled: PacketName | None
-    readings: list[Any]
+    readings: PlainList
     is_request: bool = True
 
 
@@ -88,7 +89,7 @@ class Life:
         end: the exit code, or the type of the error; None if the process was killed.
     """
 
-    facts: dict[str, Any]
+    facts: LifeFacts
     lines: list[Line] = field(default_factory=list)
     end: int | str | None = None
 
@@ -120,7 +121,7 @@ def read_lives(path: Path) -> list[Life]:
     return lives
 
 
-def _name(handled: Sequence[Any] | None) -> PacketName | None:
+def _name(handled: PlainList | None) -> PacketName | None:
     return None if handled is None else PacketName(handled[0] or 0, handled[1])
 
 
@@ -136,8 +137,8 @@ class ReplayClock:
 
     def __init__(self, monotonic_s: float, now_ns: int, speed: float) -> None:
         self._speed = speed or 1.0
-        self._shown: dict[str, Any] = {"m": monotonic_s, "n": now_ns, "s": now_ns / 1e9}
-        self._coming: dict[str, deque[Any]] = defaultdict(deque)
+        self._shown: dict[str, float] = {"m": monotonic_s, "n": now_ns, "s": now_ns / 1e9}
+        self._coming: dict[str, deque[float]] = defaultdict(deque)
         self._thread = threading.get_ident()
         self._unrecorded = 0  # readings since the last event
         self.stuck = ""
@@ -168,7 +169,7 @@ class ReplayClock:
         """The last shown experiment time."""
         return int(self._shown["n"])
 
-    def expect(self, readings: Sequence[Any]) -> None:
+    def expect(self, readings: PlainList) -> None:
         """Take the readings up to the next recorded line; drop earlier readings that were not shown."""
         self._coming.clear()
         for kind, value in zip(readings[::2], readings[1::2], strict=True):
@@ -183,9 +184,9 @@ class ReplayClock:
 
     def pass_by(self, seconds: float) -> None:
         """Advance the clock by real seconds without events."""
-        self.move(self._shown["m"] + seconds, self._shown["n"] + round(seconds * self._speed * 1e9))
+        self.move(self._shown["m"] + seconds, self.shown_ns + round(seconds * self._speed * 1e9))
 
-    def _read(self, kind: str) -> Any:
+    def _read(self, kind: str) -> float:
         if threading.get_ident() != self._thread:
             return self._shown[kind]
         if coming := self._coming[kind]:
@@ -360,7 +361,7 @@ class ReplayPort:
             self.differs = True
             self._advance()
 
-    def _incoming(self, written: Sequence[Any]) -> list[Incoming]:
+    def _incoming(self, written: PlainList) -> list[Incoming]:
         came: list[Incoming] = []
         for kind, *rest in written:
             if kind == "packet":

@@ -9,11 +9,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import NoReturn
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError, FileError, WireError
 from afspm.basics.launch import Launch
+from afspm.basics.plain_data import PlainList
 from afspm.model.snapshot import restored
 from afspm.plugins.what_if.alignment import Difference, Output, PacketName, aligned
 from afspm.scheduler import events
@@ -81,7 +82,7 @@ def read_steps(path: Path, core_of: CoreOf) -> Iterator[tuple[MakeCore, Restored
         raise FileError(f"is not a step log: {error!r}", where=str(path)) from error
 
 
-def replay_file(path: Path, settings: Mapping[str, Any] | None = None) -> SchedulerReplay:
+def replay_file(path: Path, settings: Mapping[str, object] | None = None) -> SchedulerReplay:
     """Replay the scheduler of a run.
 
     Args:
@@ -144,13 +145,13 @@ def replay(recorded: Iterable[tuple[MakeCore, Restored] | Step]) -> SchedulerRep
     return SchedulerReplay(steps, same, differences, first, parted, stopped, real_s, recorded_s, note, until_ns)
 
 
-def _stepped(core: SchedulerCore, one: Step) -> list[list[Any]]:
+def _stepped(core: SchedulerCore, one: Step) -> list[PlainList]:
     if one.event is None:
         return [*map(facts_of, core.start(one.now_s, one.now_ns))]
     return [*map(facts_of, core.step(one.event, one.now_s, one.now_ns))]
 
 
-def _first(recorded: list[list[Any]], now: list[list[Any]], place: PacketName, life: int) -> Difference:
+def _first(recorded: list[PlainList], now: list[PlainList], place: PacketName, life: int) -> Difference:
     before, after = next((a, b) for a, b in zip_longest(recorded, now) if a != b)
     if before is not None and after is not None and before[:2] != after[:2]:  # one of them lacks an effect
         before, after = (before, None) if len(recorded) > len(now) else (None, after)
@@ -162,7 +163,7 @@ def _first(recorded: list[list[Any]], now: list[list[Any]], place: PacketName, l
     return Difference("scheduler", there, here)
 
 
-def _output(facts: list[Any], place: PacketName, life: int) -> Output:
+def _output(facts: PlainList, place: PacketName, life: int) -> Output:
     kind, key, text, *rest = facts
     reaches = kind in _REACHING
     return Output(kind, key, json.dumps([text, *rest]), text, place, place.time_ns, life, reaches)
@@ -180,7 +181,7 @@ def _input_name(event: events.Input | None) -> str:
             return type(event).__name__
 
 
-def _core_of(launch: Launch, settings: Mapping[str, Any] | None) -> tuple[MakeCore, CoordinateFrame]:
+def _core_of(launch: Launch, settings: Mapping[str, object] | None) -> tuple[MakeCore, CoordinateFrame]:
     launch = replace(launch, settings=launch.settings if settings is None else dict(settings), keeps_requests=False)
     scheduler = load(launch)
     if not isinstance(scheduler, Scheduler):
@@ -192,5 +193,5 @@ def _core_of(launch: Launch, settings: Mapping[str, Any] | None) -> tuple[MakeCo
     return (lambda: SchedulerCore(core_settings, WireCodec(), frame)), frame
 
 
-def _no_port(*_: object) -> Any:
+def _no_port(*_: object) -> NoReturn:
     raise AssertionError("the decisions open no port")

@@ -6,7 +6,7 @@ import dataclasses
 from binascii import crc32
 from collections.abc import Iterator, Mapping
 from datetime import UTC
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from google.protobuf.json_format import MessageToDict
@@ -82,7 +82,7 @@ def _fields(output: Output | None) -> dict[str, str]:
     return dict(_flat("", thing))
 
 
-def _flat(name: str, value: Any) -> Iterator[tuple[str, str]]:
+def _flat(name: str, value: object) -> Iterator[tuple[str, str]]:
     if dataclasses.is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):

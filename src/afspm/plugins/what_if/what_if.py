@@ -45,7 +45,7 @@ _UNRECORDED = {
 }
 _PLACES = ("source", "region_source")
 
-Changes = Mapping[str, Mapping[str, Any] | type[Component]] | str | Path | None
+Changes = Mapping[str, Mapping[str, object] | type[Component]] | str | Path | None
 
 
 @dataclass(frozen=True)
@@ -258,7 +258,7 @@ def _short(result: WhatIf, record: Run) -> dict[str, int]:
     return {name: until_ns for name, until_ns in ends.items() if until_ns is not None and until_ns < latest_ns}
 
 
-Changed = tuple[Mapping[str, Any] | None, component_replay.Make | None]
+Changed = tuple[Mapping[str, object] | None, component_replay.Make | None]
 
 
 def _replay(
@@ -355,7 +355,7 @@ def _changed(folder: Path, changes: Changes, logs: Mapping[str, Path]) -> tuple[
     return found, {}
 
 
-def _in_si(folder: Path, name: str, change: Mapping[str, Any]) -> Mapping[str, Any]:
+def _in_si(folder: Path, name: str, change: Mapping[str, object]) -> Mapping[str, object]:
     # texts may have units, as in an experiment file
     if not ('"' in json.dumps([*change.values()], default=repr) and (folder / EXPERIMENT_FILE).is_file()):
         return change
@@ -374,7 +374,7 @@ def _made_by(class_: type[Component]) -> component_replay.Make:
     return lambda launch: class_(**launch.settings)
 
 
-def _settings(path: Path) -> dict[str, Any]:
+def _settings(path: Path) -> dict[str, object]:
     launch = _launch(path)
     return dict(launch.settings)
 
@@ -412,7 +412,7 @@ def _changed_by_file(folder: Path, file: Path, logs: Mapping[str, Path]) -> tupl
     return found, untried
 
 
-def at_recorded_places(before: Any, now: Any) -> Any:
+def at_recorded_places(before: object, now: object) -> Any:
     """Return changed settings of a scheduler in which each limit keeps its recorded file and line.
 
     A refusal names file and line, which would differ for the same limits in another file.
