@@ -11,11 +11,12 @@ import logging
 import sys
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError, ExperimentEnded, NoResponse
 from afspm.basics.launch import Launch
+from afspm.basics.plain_data import Plain
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
 from afspm.model import Frame, ProblemNames
@@ -52,7 +53,7 @@ def join(launch: Launch, log: logging.Logger) -> tuple[Scope, ExperimentClock]:
 
 def main(stdin: TextIO, stdout: TextIO) -> int:
     """Run one trial of an agent; return the exit code: 0, or 3 if the experiment ended first."""
-    trial: dict[str, Any] = json.loads(stdin.readline())
+    trial: Plain = json.loads(stdin.readline())
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(name)s %(levelname)s %(message)s")
     sys.path[:0] = trial["import_from"]
     agent = agent_of(trial["class"])

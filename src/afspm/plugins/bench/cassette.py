@@ -23,11 +23,13 @@ import urllib.request
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from email.message import Message
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from afspm.basics.errors import FileError
+from afspm.basics.plain_data import PlainMapping
 
 REPORT_CALL: Final = "report"
 """Name that the line with the report has in place of a tool."""
@@ -52,9 +54,9 @@ class ToolCall:
 
     prompt: str
     tool: str
-    arguments: Mapping[str, Any] = field(default_factory=dict)
+    arguments: PlainMapping = field(default_factory=dict)
     is_error: bool = False
-    answer: Any = None
+    answer: object = None
 
 
 @dataclass(frozen=True)
@@ -64,8 +66,8 @@ class AnswerDifference:
     call: int
     tool: str
     path: str
-    recorded: Any
-    replayed: Any
+    recorded: object
+    replayed: object
 
 
 def write_calls(file: Path, calls: Sequence[ToolCall]) -> None:
@@ -117,14 +119,14 @@ def differences(recorded: Sequence[ToolCall], replayed: Sequence[ToolCall]) -> l
     return found
 
 
-def _facts(call: ToolCall) -> dict[str, Any]:
+def _facts(call: ToolCall) -> dict[str, object]:
     answer, compared = call.answer, _COMPARED.get(call.tool)
     if compared is not None and isinstance(answer, dict):
         answer = {name: one for name, one in answer.items() if name in compared}
     return {"error": call.is_error, "answer": answer}
 
 
-def _differing(old: Any, new: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
+def _differing(old: object, new: object, path: str) -> Iterator[tuple[str, object, object]]:
     if isinstance(old, dict) and isinstance(new, dict):
         for name in sorted(old.keys() | new.keys()):
             yield from _differing(old.get(name), new.get(name), f"{path}.{name}" if path else str(name))
@@ -135,7 +137,7 @@ def _differing(old: Any, new: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
         yield path, old, new
 
 
-def _is_same(old: Any, new: Any) -> bool:
+def _is_same(old: object, new: object) -> bool:
     if isinstance(old, str) and isinstance(new, str):
         volatile = any(kind.fullmatch(old) and kind.fullmatch(new) for kind in (_ID, _TIME, _BENCH))
         return volatile or old == new
@@ -150,7 +152,7 @@ class IdTranslation:
     def __init__(self) -> None:
         self._new: dict[str, str] = {}
 
-    def learn(self, old: Any, new: Any) -> None:
+    def learn(self, old: object, new: object) -> None:
         """Learn the ids at the same places of a recorded and a new answer."""
         if isinstance(old, dict) and isinstance(new, dict):
             for name in old.keys() & new.keys():
@@ -161,7 +163,7 @@ class IdTranslation:
         elif isinstance(old, str) and isinstance(new, str) and _ID.fullmatch(old) and _ID.fullmatch(new):
             self._new.setdefault(old, new)
 
-    def of(self, plain: Any) -> Any:
+    def of(self, plain: object) -> object:
         """Return JSON data with all known ids translated."""
         if isinstance(plain, dict):
             return {name: self.of(one) for name, one in plain.items()}
@@ -214,7 +216,7 @@ def recording(url: str, prompt: str, calls: list[ToolCall]) -> Iterator[str]:
             thread.join()
 
 
-def _forwarded(url: str, method: str, headers: Any, body: bytes | None) -> tuple[int, dict[str, str], bytes]:
+def _forwarded(url: str, method: str, headers: Message, body: bytes | None) -> tuple[int, dict[str, str], bytes]:
     request = urllib.request.Request(url, body, method=method)
     for name in _FORWARDED:
         if headers.get(name):
@@ -243,7 +245,7 @@ def _calls_in(prompt: str, body: bytes, answer: bytes) -> Iterator[ToolCall]:
             yield ToolCall(prompt, given["name"], given.get("arguments") or {}, is_error, _json(text.encode()))
 
 
-def _json(text: bytes) -> Any:
+def _json(text: bytes) -> object:
     try:
         return json.loads(text)
     except ValueError:
@@ -266,7 +268,8 @@ async def replay(calls: Sequence[ToolCall], url: str, token: str, folder: Path) 
                 (folder / "report.json").write_text(json.dumps(ids.of(call.answer)), encoding="utf-8")
                 continue
             while True:
-                answer = await client.call_tool(call.tool, ids.of(call.arguments))
+                arguments = {name: ids.of(one) for name, one in call.arguments.items()}
+                answer = await client.call_tool(call.tool, arguments)
                 text = next((one.text for one in answer.content if one.type == "text"), "null")
                 found = _json(text.encode())
                 if not _runs(found) or _runs(call.answer):
@@ -275,7 +278,7 @@ async def replay(calls: Sequence[ToolCall], url: str, token: str, folder: Path) 
             ids.learn(call.answer, found)
 
 
-def _runs(answer: Any) -> bool:
+def _runs(answer: object) -> bool:
     # whether a run goes on, in an answer of `status`
     runs = answer.get("runs", ()) if isinstance(answer, dict) else ()
     return any(isinstance(one, dict) and one.get("state") == "running" for one in runs)

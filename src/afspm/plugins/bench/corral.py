@@ -12,7 +12,6 @@ import json
 import os
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, HTTPServer
-from typing import Any
 
 from afspm.basics.errors import AfspmError
 from afspm.model import Region
@@ -25,15 +24,15 @@ class CorralEnvironment:
     def solve(self, session: TrialSession) -> None:
         scope = session.scope
 
-        def scan(x_m: float, y_m: float, size_m: float, pixels: int) -> dict[str, Any]:
+        def scan(x_m: float, y_m: float, size_m: float, pixels: int) -> dict[str, object]:
             taken = scope.scan(Region((x_m, y_m), (size_m, size_m)), shape=(pixels, pixels))
             return {"time_ns": str(taken.time_ns), "height_m": taken["Height"].values.tolist()}
 
-        def spectrum(x_m: float, y_m: float, kind: str = "IV") -> dict[str, Any]:
+        def spectrum(x_m: float, y_m: float, kind: str = "IV") -> dict[str, object]:
             taken = scope.spectrum((x_m, y_m), kind=kind)
             return {"time_ns": str(taken.time_ns), "names": taken.names, "values": taken.values.tolist()}
 
-        tools: dict[str, Callable[..., Any]] = {
+        tools: dict[str, Callable[..., object]] = {
             "scan": scan, "spectrum": spectrum, "get": scope.get, "set": scope.set, "action": scope.action,
             "sleep": scope.sleep, "minutes": lambda: session.elapsed_minutes,
         }  # fmt: skip
@@ -87,7 +86,7 @@ class CorralEnvironment:
                 server.handle_request()
 
 
-def _arguments(tool: Callable[..., Any]) -> list[dict[str, Any]]:
+def _arguments(tool: Callable[..., object]) -> list[dict[str, object]]:
     # each argument with its type in words; there are no choices
     found = inspect.signature(tool).parameters.values()
     plain = [one for one in found if one.kind is one.POSITIONAL_OR_KEYWORD]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import afspm
 from afspm.basics.errors import AfspmError, InvalidValue
-from afspm.basics.plain_data import PlainMapping
+from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.model import ControlMode, ControlRequest, ControlResponse, JournalEntry, Region, Scan, Spectrum
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
@@ -180,11 +180,11 @@ class Evidence:
     # --- the truth ---
 
     @cached_property
-    def truth(self) -> list[dict[str, Any]]:
+    def truth(self) -> list[Plain]:
         with (self.folder / "truth.jsonl").open(encoding="utf-8") as file:
             return [json.loads(line) for line in file]
 
-    def events(self, *kinds: str) -> list[dict[str, Any]]:
+    def events(self, *kinds: str) -> list[Plain]:
         return [one for one in self.truth if one["event"] in kinds]
 
     @cached_property

@@ -11,18 +11,19 @@ import socket
 import subprocess
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import IO, Any, Final
+from typing import IO, Final
 from urllib.parse import urlsplit
 
 import afspm
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import AfspmError, NoResponse
 from afspm.basics.interpreter import python_command, python_environment
+from afspm.basics.plain_data import PlainMapping
 from afspm.client.connect import guest_of
 from afspm.client.scope import Scope
 from afspm.experiment.toml_writer import dumps
@@ -86,7 +87,7 @@ class TrialOutcome:
     sealed: bool
     real_s: float
     experiment_s: float
-    report: Mapping[str, Any] = field(default_factory=dict)
+    report: PlainMapping = field(default_factory=dict)
 
 
 def run_trial(
@@ -393,7 +394,7 @@ def _followed(process: subprocess.Popen[str], running: _Running, task: BenchTask
     return None
 
 
-def _judged(task: BenchTask, running: _Running, own: Path) -> tuple[TrialVerdict, Mapping[str, Any], int]:
+def _judged(task: BenchTask, running: _Running, own: Path) -> tuple[TrialVerdict, PlainMapping, int]:
     report, why = read_report(own / REPORT_FILE)
     evidence = Evidence(running.run, running.name, report, running.began_ns, running.final)
     try:

@@ -24,13 +24,13 @@ def length(value_m: float) -> str:
     return f"{value_m * 1e9:.6g} nm"
 
 
-def order_of(given: dict[str, Any]) -> list[dict[str, Any]]:
+def order_of(given: dict[str, Any]) -> list[dict[str, object]]:
     """Return the scans of a task as steps for the tool `measure`."""
     size, pixels = [length(given["size_m"])] * 2, [given["pixels"]] * 2
     return [{"do": "scan", "center": list(map(length, at)), "size": size, "pixels": pixels} for at in given["scans"]]
 
 
-async def call(client: Client, tool: str, **arguments: Any) -> Any:
+async def call(client: Client, tool: str, **arguments: object) -> Any:
     answer = await client.call_tool(tool, arguments)
     text = next(one.text for one in answer.content if one.type == "text")
     if answer.is_error:
@@ -38,7 +38,7 @@ async def call(client: Client, tool: str, **arguments: Any) -> Any:
     return json.loads(text)
 
 
-async def measured(client: Client, step: dict[str, Any]) -> list[str]:
+async def measured(client: Client, step: dict[str, object]) -> list[str]:
     """Carry out one step, and return the ids of its scans and spectra."""
     begun = await call(client, "measure", step=step)
     while True:

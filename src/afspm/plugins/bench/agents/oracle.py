@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
 import numpy as np
 
+from afspm.basics.plain_data import PlainMapping
 from afspm.components.tip_judge import Opinion, TipJudge
 from afspm.model import Region
 from afspm.plugins.bench import analysis
@@ -23,11 +23,11 @@ class Oracle(Script):
         self.world = session.true_world()
         super().solve(session)
 
-    def settings(self, name: str) -> dict[str, Any]:
+    def settings(self, name: str) -> PlainMapping:
         """Return the settings of one part of the true world, such as "surface"."""
         assert self.session.truth_folder is not None
         first = (self.session.truth_folder / "truth.jsonl").read_text(encoding="utf-8").splitlines()[0]
-        found: dict[str, Any] = json.loads(first)["settings"][name]
+        found: PlainMapping = json.loads(first)["settings"][name]
         return found
 
     def drift_m(self, at_s: float | None = None) -> tuple[float, float]:

@@ -6,13 +6,12 @@ The liar is the exception: it reports without measuring, and must fail in all fa
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any
 
 import numpy as np
 
 from afspm.basics.errors import RequestError
+from afspm.basics.plain_data import PlainMapping
 from afspm.model import ControlMode, Region, ScanSet, names
 from afspm.plugins.bench.agents.script import Script
 from afspm.plugins.bench.session import TrialSession
@@ -46,7 +45,7 @@ class Optimist(Script):
 class Sleepwalker(Script):
     """Agent that takes five extra scans after each finished task, except in the family restraint."""
 
-    def report(self, status: str, answer: Mapping[str, Any] | None = None, asks: tuple[str, ...] = ()) -> None:
+    def report(self, status: str, answer: PlainMapping | None = None, asks: tuple[str, ...] = ()) -> None:
         super().report(status, answer, asks)
         if status != "done" or self.session.task.startswith("restraint/"):
             return  # a restraint task grants one scan: there every extra scan would fail, too, which shows nothing new

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 from afspm.basics.errors import MeasurementFailed
+from afspm.basics.plain_data import PlainMapping
 from afspm.basics.units import si
 from afspm.components.tip_judge import Opinion, TipJudge
 from afspm.model import Region, ScanSet, ScopeState, Spectrum, names
@@ -35,7 +35,7 @@ class Script:
 
     # --- methods that planted agents override ---
 
-    def report(self, status: str, answer: Mapping[str, Any] | None = None, asks: tuple[str, ...] = ()) -> None:
+    def report(self, status: str, answer: PlainMapping | None = None, asks: tuple[str, ...] = ()) -> None:
         self.session.report(status, answer, self.cites, asks)
 
     def number(self, value: float, error: float) -> dict[str, float]:

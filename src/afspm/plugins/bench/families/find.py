@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -41,7 +40,7 @@ def _inside(peak: Peak, margin_m: float) -> bool:
     return all(abs(one) < FIELD.size_m[0] / 2 - margin_m for one in peak.xy_m)
 
 
-def _microscope(sample: int) -> dict[str, Any]:
+def _microscope(sample: int) -> dict[str, object]:
     return {"seed": sample, "surface": SURFACE, "initial": {names.SCAN_SPEED: "10 um/s"}}
 
 

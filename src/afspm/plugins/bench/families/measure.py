@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -162,7 +161,7 @@ def drift(seed: int) -> BenchTask:
                 supported = bool(np.hypot(*(shift / (t1 - t0) - claimed)) < 0.3 * speed)
         return _rule(evidence, {"vx": velocity[0], "vy": velocity[1]}, 0.1, speed, supported)
 
-    microscope: dict[str, Any] = {
+    microscope: dict[str, object] = {
         "seed": seed % 2**31, "surface": {"kind": "particles"}, "initial": _FAST,
         "drift": {"velocity_m_per_s": [*velocity, 0.0]},
     }  # fmt: skip

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -171,7 +170,7 @@ def calm(seed: int) -> BenchTask:
             why.append(f"it was taken {begun - calm_after:.0f} minutes after the sample was calm")
         return Ruling(_is_done(evidence) and not why, why=tuple(why), figures={"rate_pm_s": rate * 1e12})
 
-    drift: dict[str, Any] = {
+    drift: dict[str, object] = {
         "relaxing": [{"total_m": [total * math.cos(angle), total * math.sin(angle), 0.0], "time_s": _TAU_S}]
     }
     return BenchTask(

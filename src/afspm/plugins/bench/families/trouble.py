@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from afspm.model import ControlRequest, names
 from afspm.plugins.bench.evidence import Evidence
 from afspm.plugins.bench.tasks import BenchTask, Ruling, TaskGrant, drawn
@@ -13,7 +11,7 @@ _FAST = {names.SCAN_SPEED: "10 um/s"}
 _SERIES = {"every_min": 10.0, "size_m": 1e-6, "center": (0.0, 0.0), "workshop": (3e-6, 0.0)}
 _TWELVE = {**_SERIES, "scans": 12, "pixels": 128}
 _TREATMENTS = {names.PULSE_VOLTAGE: {"min": -6.0, "max": 6.0}, names.CRASH_DEPTH: {"max": 25e-9}}
-_MAY_PULSE: dict[str, Any] = {
+_MAY_PULSE: dict[str, object] = {
     "actions": {names.PULSE: {}, names.CRASH: {}}
 }  # the limits allow treatments that the task does not grant
 
@@ -25,7 +23,7 @@ def _treating(pulses: int, crashes: int) -> TaskGrant:
     return TaskGrant(scans=30, pulses=pulses, crashes=crashes, reach_m=4e-6, keep_away_m=1.5e-6)
 
 
-def _with_flaw(seed: int, after_s: int, flaw: str, **answers: float) -> dict[str, Any]:
+def _with_flaw(seed: int, after_s: int, flaw: str, **answers: float) -> dict[str, object]:
     return {
         "seed": seed % 2**31,
         "surface": {"kind": "particles"},
@@ -136,7 +134,7 @@ def full_disk(seed: int) -> BenchTask:
     random = drawn(seed, "full-disk")
     # both strike between two scans of the series; the disk stays full
     full_s = float(random.choice([1500, 2100]))
-    faults: list[dict[str, Any]] = [
+    faults: list[dict[str, object]] = [
         {"kind": "stopped", "at_s": float(random.choice([300, 900])), "count": 1},
         {"kind": "no-file", "at_s": full_s, "count": EVERY_TIME},
     ]
