@@ -7,11 +7,11 @@ lines of a running scan is a `TipVerdict`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from afspm import wire
 from afspm.model import Region, Scan, ScanParameters
 from afspm.record.bad_scans import BAD, LINE_VERDICT_MESSAGE, VERDICT_MESSAGE, read_verdict
+from afspm.wire.messages import SpatialROIWithScoreList, TipVerdict
 
 __all__ = [
     "BAD",
@@ -57,9 +57,9 @@ class LineVerdict:
     reason: str = ""
 
 
-def line_verdict_message(verdict: LineVerdict) -> Any:
+def line_verdict_message(verdict: LineVerdict) -> TipVerdict:
     """Return a verdict as a `TipVerdict` message."""
-    message: Any = wire.message_type(OF_LINES)(
+    message = TipVerdict(
         channel=verdict.channel,
         row=verdict.row,
         since_row=verdict.since_row,
@@ -74,7 +74,7 @@ def line_verdict_message(verdict: LineVerdict) -> Any:
     return message
 
 
-def read_line_verdict(message: Any) -> LineVerdict | None:
+def read_line_verdict(message: TipVerdict) -> LineVerdict | None:
     """Return the content of a `TipVerdict`; None without region and pixels."""
     parameters = wire.decode("ScanParameters2d", message.params.SerializeToString())
     if not (isinstance(parameters, ScanParameters) and isinstance(parameters.region, Region)):
@@ -95,9 +95,9 @@ def read_line_verdict(message: Any) -> LineVerdict | None:
     )
 
 
-def verdict_message(scan: Scan, score: float) -> Any:
+def verdict_message(scan: Scan, score: float) -> SpatialROIWithScoreList:
     """Return a `SpatialROIWithScoreList` with the region, time and channel of a scan, and a score."""
-    message: Any = wire.message_type(MESSAGE)(channel=scan.channel)
+    message = SpatialROIWithScoreList(channel=scan.channel)
     if scan.time_ns is not None:
         message.timestamp.FromNanoseconds(scan.time_ns)
     entry = message.spatials.add(score=score)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 from afspm.model import Problem
+
+if TYPE_CHECKING:
+    from afspm.wire.messages import SpatialROIWithScoreList
 
 BAD = 0.0
 """The score of a scan that was judged to show a bad tip."""
@@ -17,7 +20,7 @@ _NOT_OF_A_SCAN = frozenset({int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFU
 """Problems without a verdict on the previous scan: they concern the sample's position or the controller."""
 
 
-def read_verdict(message: Any) -> tuple[int, float] | None:
+def read_verdict(message: SpatialROIWithScoreList) -> tuple[int, float] | None:
     """Return (time of the scan in ns, score) of a verdict message; None for a verdict that is not about a scan."""
     if not message.spatials or not message.HasField("timestamp"):
         return None

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.model.registration_outcome import RegistrationOutcome
 
+if TYPE_CHECKING:
+    from afspm.wire.messages import DriftMapping
+
 Array = NDArray[np.float64]
-
-
-class OutcomeFields(Protocol):
-    """The fields of the message about the registration of its scan."""
-
-    outcome: int
-    matched: bool
-    covariance: Sequence[float]
 
 
 def drift_at(matrix: Array, center_m: Sequence[float]) -> Array:
@@ -29,7 +24,7 @@ def drift_at(matrix: Array, center_m: Sequence[float]) -> Array:
     return drift
 
 
-def drift_knowledge(message: OutcomeFields) -> tuple[RegistrationOutcome, float | None]:
+def drift_knowledge(message: DriftMapping) -> tuple[RegistrationOutcome, float | None]:
     """Return how a scan's position is known, and its largest standard deviation in m (None: unknown)."""
     outcome = RegistrationOutcome.of(message.outcome, matched=message.matched)
     if len(message.covariance) != 4:

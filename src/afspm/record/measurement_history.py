@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import median
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from afspm.model import Frame, Region, RegistrationOutcome, Scan, Spectrum
 from afspm.model.geometry import XY
 from afspm.record.drift_mapping import drift_at, drift_knowledge
 from afspm.record.running_scan import DoneScan, RunningScan
+
+if TYPE_CHECKING:
+    from afspm.wire.messages import DriftMapping, SpatialPointWithScoreList
 
 MOST_MEASURED = 100_000
 MOST_TARGETS = 1_000
@@ -207,21 +210,21 @@ class MeasurementHistory:
         )  # fmt: skip
         _keep(self._spectra, (measured_ns, spectrum.kind, spectrum.position_m), summary)
 
-    def add_drift(self, message: Any) -> None:
-        """Add a `DriftMapping` message; a message without a mapping is ignored."""
+    def add_drift(self, message: DriftMapping) -> None:
+        """Add a displacement of the sample; a message without a mapping is ignored."""
         if len(message.matrix) != 6 or len(message.center) != 2:
             return
         drift_x, drift_y = drift_at(np.array(message.matrix).reshape(2, 3), message.center)
-        rate = tuple(message.rate) if len(message.rate) == 2 else (0.0, 0.0)
+        rate_x, rate_y = message.rate if len(message.rate) == 2 else (0.0, 0.0)
         at_ns = message.timestamp.ToNanoseconds()
         point = DriftPoint(
-            at_ns, (float(drift_x), float(drift_y)), rate, message.matched, message.lost, message.correcting,
-            message.reason, *drift_knowledge(message), message.failures, message.filename,
+            at_ns, (float(drift_x), float(drift_y)), (rate_x, rate_y), message.matched, message.lost,
+            message.correcting, message.reason, *drift_knowledge(message), message.failures, message.filename,
         )  # fmt: skip
         _keep(self._drift, at_ns, point)
 
-    def set_places(self, message: Any) -> None:
-        """Replace a channel's places by the places with length units in a `SpatialPointWithScoreList` message."""
+    def set_places(self, message: SpatialPointWithScoreList) -> None:
+        """Replace a channel's places by the places with length units in the message."""
         found = ((one.spatial.point, one.spatial.units or "m", one) for one in message.spatials[-MOST_TARGETS:])
         self._places[message.channel] = tuple(
             FoundPlace(

@@ -7,7 +7,7 @@ import sys
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 from afspm import wire
 from afspm.basics.clock import NS_PER_S
@@ -54,6 +54,9 @@ from afspm.record.measurement_history import (
 )
 from afspm.record.running_scan import RunningScan
 from afspm.record.timeline import Span, Timeline, Timelines
+
+if TYPE_CHECKING:
+    from afspm.wire.messages import DriftMapping, DriftRescan, SpatialPointWithScoreList
 
 MOST_POINTS = 4000
 
@@ -464,14 +467,14 @@ class Overview:
     def _on_note(self, note: Note, time_ns: int) -> None:
         self.notes.append(note)
 
-    def _on_drift_mapping(self, message: object, time_ns: int) -> None:
+    def _on_drift_mapping(self, message: DriftMapping, time_ns: int) -> None:
         self._measured.add_drift(message)
 
-    def _on_drift_rescan(self, message: Any, time_ns: int) -> None:
-        if message.kind == RescanKind.OPPOSITE:
+    def _on_drift_rescan(self, message: DriftRescan, time_ns: int) -> None:
+        if int(message.kind) == RescanKind.OPPOSITE:
             self._measured.opposite_ns.append(message.timestamp.ToNanoseconds())
 
-    def _on_spatial_point_with_score_list(self, message: object, time_ns: int) -> None:
+    def _on_spatial_point_with_score_list(self, message: SpatialPointWithScoreList, time_ns: int) -> None:
         self._measured.set_places(message)
 
     def _on_scan_parameters(self, parameters: ScanParameters, time_ns: int) -> None:

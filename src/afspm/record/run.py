@@ -46,6 +46,7 @@ from afspm.record.packets import packets, without_reading_files
 from afspm.record.run_json import EXPERIMENT_FILE, METADATA, REPLAY_OF, latest_run, run_json_or_empty
 from afspm.record.tables import ControlRow, NoteRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
 from afspm.record.treatment_ledger import KEEP_AWAY_M, TreatmentLedger, treatment_ledger
+from afspm.wire.messages import SpatialROIWithScoreList, TipVerdict
 
 if TYPE_CHECKING:
     from afspm.record.film import Film
@@ -274,7 +275,7 @@ class Run:
         """Return (time of the scan, score) of each verdict on a scan, in the order of arrival."""
         sql = "SELECT payload FROM packets WHERE message = ? ORDER BY time_ns, rowid"
         found = (self._decoded(VERDICT_MESSAGE, payload) for (payload,) in self._query(sql, (VERDICT_MESSAGE,)))
-        verdicts = (read_verdict(message) for message in found if message is not None)
+        verdicts = (read_verdict(message) for message in found if isinstance(message, SpatialROIWithScoreList))
         return [verdict for verdict in verdicts if verdict is not None]
 
     def changed_rows(self) -> dict[int, int]:
@@ -286,8 +287,8 @@ class Run:
         found: dict[int, int] = {}
         ends_ns = [row.time_ns for row in self.scans]
         for (payload,) in self._query(sql, (LINE_VERDICT_MESSAGE,)):
-            verdict: Any = self._decoded(LINE_VERDICT_MESSAGE, payload)
-            if verdict is None or not verdict.HasField("timestamp"):
+            verdict = self._decoded(LINE_VERDICT_MESSAGE, payload)
+            if not isinstance(verdict, TipVerdict) or not verdict.HasField("timestamp"):
                 continue
             began_ns = verdict.timestamp.ToNanoseconds()
             ended_ns = next((end_ns for end_ns in ends_ns if end_ns > began_ns), None)

@@ -38,13 +38,25 @@ from afspm.wire.generated import (
     scan_pb2,
     spectroscopy_pb2,
 )
+from afspm.wire.generated.analysis_pb2 import SpatialPointWithScoreList, SpatialROIWithScoreList
 from afspm.wire.generated.control_pb2 import ParameterMsg
 from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
 from afspm.wire.generated.feedback_pb2 import ZCtrlParameters
+from afspm.wire.generated.lines_pb2 import TipVerdict
 from afspm.wire.generated.scan_pb2 import ScanParameters2d
 from afspm.wire.generated.spectroscopy_pb2 import ProbePosition
 
-__all__ = ["DriftMapping", "DriftRescan", "ParameterMsg", "ProbePosition", "ScanParameters2d", "ZCtrlParameters"]
+__all__ = [
+    "DriftMapping",
+    "DriftRescan",
+    "ParameterMsg",
+    "ProbePosition",
+    "ScanParameters2d",
+    "SpatialPointWithScoreList",
+    "SpatialROIWithScoreList",
+    "TipVerdict",
+    "ZCtrlParameters",
+]
 
 M = TypeVar("M", bound=Message)
 
@@ -249,13 +261,13 @@ DRIFT_RESCAN: Final = MessageDeclaration(
     type=DriftRescan, kind=MessageKind.RESULT, source=Role.SCHEDULER, always=False, in_past=True
 )
 REGIONS: Final = MessageDeclaration(
-    type=analysis_pb2.SpatialROIWithScoreList,
+    type=SpatialROIWithScoreList,
     kind=MessageKind.RESULT,
     source=Role.COMPONENT,
     always=False,
 )
 POINTS: Final = MessageDeclaration(
-    type=analysis_pb2.SpatialPointWithScoreList,
+    type=SpatialPointWithScoreList,
     kind=MessageKind.RESULT,
     source=Role.COMPONENT,
     always=False,
@@ -264,7 +276,7 @@ FEEDBACK_ANALYSIS: Final = MessageDeclaration(
     type=feedback_pb2.FeedbackAnalysis, kind=MessageKind.RESULT, source=Role.COMPONENT, always=False
 )
 TIP_VERDICT: Final = MessageDeclaration(
-    type=lines_pb2.TipVerdict, kind=MessageKind.RESULT, source=Role.COMPONENT, always=False, named=True
+    type=TipVerdict, kind=MessageKind.RESULT, source=Role.COMPONENT, always=False, named=True
 )
 
 _MODULES = (

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, overload
+from typing import TYPE_CHECKING, ClassVar, Literal, overload
 
 import numpy as np
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from afspm.plugins.drift.figures.album import RunPart
     from afspm.plugins.drift.record import DriftRecord
     from afspm.plugins.drift.registration import DriftScan, Registration
+    from afspm.wire.messages import DriftMapping
 
 COLUMNS = ("datetime", "filename", "offset_x", "offset_y", "rate_x", "rate_y", "units", *RECORD, "lost", "correcting")
 _ALBUM = "afspm.plugins.drift.figures.album"
@@ -55,7 +56,7 @@ class DriftTable(Component):
         self._table = LineFile(Path(self.run_dir) / self.file, ",".join(COLUMNS))
         self._written = {tuple(row[:2]) for row in csv.reader(self._table.lines())}
 
-    def on_drift_mapping(self, message: Any) -> None:
+    def on_drift_mapping(self, message: DriftMapping) -> None:
         row = drift_row(message)
         if tuple(row[:2]) in self._written:
             return  # replayed after a restart
@@ -63,7 +64,7 @@ class DriftTable(Component):
         self._written.add(tuple(row[:2]))
 
 
-def drift_row(message: Any) -> list[str]:
+def drift_row(message: DriftMapping) -> list[str]:
     """Return the row of a DriftMapping, in the order of `COLUMNS`."""
     time_ns = message.timestamp.ToNanoseconds()
     drift_x, drift_y = drift_at(np.array(message.matrix).reshape(2, 3), message.center)
@@ -182,7 +183,7 @@ class DriftPictures(DriftTable):
             # comparisons made before a restart are repeated now, since the end must be quick
             self._compared(*self._to_repeat.popleft())
 
-    def on_drift_mapping(self, message: Any) -> None:
+    def on_drift_mapping(self, message: DriftMapping) -> None:
         super().on_drift_mapping(message)
         self._known_scans.setdefault(message.filename, TabledScan(message.filename, message.correcting))
         tabled, newest = list(self._known_scans.values()), list(self._known_scans).index(message.filename)

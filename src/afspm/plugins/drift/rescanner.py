@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from afspm import wire
 from afspm.basics.errors import ConfigError, ControlLost, Refused
@@ -11,13 +11,16 @@ from afspm.client.component import Component
 from afspm.client.events import Events
 from afspm.model import Problem, Region, RescanKind, ScanParameters, names
 
+if TYPE_CHECKING:
+    from afspm.wire.messages import DriftRescan
+
 WANTED, MAPPINGS = "DriftRescan", "DriftMapping"
 FLAGGED_WITHIN_S = 5.0
 BACK_WITHIN_S = 60.0
 _DIRECTION_BEFORE, _FRAME_BEFORE = "direction_before", "frame_before"
 Pixels = tuple[int, int] | None
 
-_IN_WORDS = {
+_IN_WORDS: dict[int, str] = {
     RescanKind.AGAIN: "the same region again",
     RescanKind.OPPOSITE: "the other direction",
     RescanKind.SEARCH: "a wider region",
@@ -68,17 +71,18 @@ class Rescanner(Component):
                 self.memory["done_ns"] = self.clock.now_ns()
                 self.memory.save()
 
-    def _rescan(self, message: Any, mappings: Events) -> None:
+    def _rescan(self, message: DriftRescan, mappings: Events) -> None:
         parameters: ScanParameters = wire.decode("ScanParameters2d", message.params.SerializeToString())
         if not isinstance(parameters.region, Region):
             self.log.error("a request for a rescan names no region: %s", message.reason)
             return
-        self.log.info("%s: %s", _IN_WORDS.get(message.kind, "a scan"), message.reason)
+        kind = int(message.kind)
+        self.log.info("%s: %s", _IN_WORDS.get(kind, "a scan"), message.reason)
         if not self._is_flagged():
             self.scope.flag(self.problem)
             self.scope.wait_until(self._is_flagged, timeout_s=FLAGGED_WITHIN_S)
         with self.scope.control(solving=self.problem):
-            optional = message.kind == RescanKind.OPPOSITE
+            optional = kind == RescanKind.OPPOSITE
             try:
                 found = self._scan_as_requested(message, parameters, mappings)
             except Refused as refused:
@@ -87,7 +91,7 @@ class Rescanner(Component):
                 found = False
             if not found and optional:
                 self.log.info("the velocity of drift stays unknown until the second scan")
-            elif not found and message.kind == RescanKind.SEARCH:
+            elif not found and kind == RescanKind.SEARCH:
                 # before the other flag is cleared, so that no component scans in between
                 self.log.critical(
                     "the sample can't be found again; nothing is scanned until a person clears the problem"
@@ -97,28 +101,28 @@ class Rescanner(Component):
                 self.log.error("%d rescans did not help; the experiment goes on, please check it", self.attempts)
             self.scope.clear(self.problem)
 
-    def _scan_as_requested(self, message: Any, parameters: ScanParameters, mappings: Events) -> bool:
+    def _scan_as_requested(self, message: DriftRescan, parameters: ScanParameters, mappings: Events) -> bool:
         # changed settings are restored after success and failure alike
-        region, shape = parameters.region, parameters.shape
+        region, shape, kind = parameters.region, parameters.shape, int(message.kind)
         assert isinstance(region, Region)
         assert shape is None or isinstance(shape, tuple)
         try:
             self._set_direction(message)
-            if message.kind == RescanKind.SEARCH:
+            if kind == RescanKind.SEARCH:
                 self._save_setting(_FRAME_BEFORE, [*region.center_m, *region.size_m, region.angle_rad, shape])
-            for attempt in range(1 if message.kind == RescanKind.OPPOSITE else self.attempts):
+            for attempt in range(1 if kind == RescanKind.OPPOSITE else self.attempts):
                 self._drop_waiting(mappings)
-                if message.kind == RescanKind.SEARCH:
+                if kind == RescanKind.SEARCH:
                     self._search(region, shape, attempt + 1)
                 else:
                     self.scope.scan(region, shape=shape)
-                if self._is_accepted(message.kind, mappings):
+                if self._is_accepted(kind, mappings):
                     return True
             return False
         finally:
             self._restore_settings()
 
-    def _set_direction(self, message: Any) -> None:
+    def _set_direction(self, message: DriftRescan) -> None:
         if message.HasField("upwards"):
             self._save_setting(_DIRECTION_BEFORE, str(self.scope.get(names.SCAN_DIRECTION)))
             self.scope.set(names.SCAN_DIRECTION, names.UP if message.upwards else names.DOWN)

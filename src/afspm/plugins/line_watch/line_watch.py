@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from afspm.components.channel_pairs import ChannelPairing, HeightPair, MissingCh
 from afspm.model import ControlState, Feedback, Scan, ScanLines, ScopeState, ScopeStatus
 from afspm.plugins.line_watch.line_judge import Alarm, AlarmLevel, Kind, LineJudge, ScanJudge, confidence
 from afspm.plugins.line_watch.registration import Array
+from afspm.wire.messages import SpatialROIWithScoreList
 
 KEPT_TIMES = 16  # number of scans learnt from whose times are saved: a restarted process may receive them again
 _SCANS_WITHOUT_LINES = 3  # a short scan may end before its first lines are published
@@ -174,7 +175,7 @@ class LineWatch(Component):
             self._lines.is_disturbed, self._lines.judge = True, None
         self._condition = condition
 
-    def on_spatial_roi_with_score_list(self, message: Any) -> None:
+    def on_spatial_roi_with_score_list(self, message: SpatialROIWithScoreList) -> None:
         verdict, finished = tip_verdict.read_verdict(message), self._finished
         if verdict is None or finished is None or finished.pair.trace.time_ns != verdict[0]:
             return

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from afspm.plugins.web.watch import SpectrumStore, Watch
 from afspm.record.overview import Overview
 from afspm.record.packets import RecordPlayback
 from afspm.record.run import Run, open_run
+
+if TYPE_CHECKING:
+    from afspm.wire.messages import DriftMapping
 
 _log = logging.getLogger("afspm.plugins.web.dashboard")
 
@@ -98,15 +101,16 @@ class Night:
         """Return the drift-corrected scans by number; empty without drift correction."""
         by_time = {row.time_ns: row for row in self.scans}
         found: dict[int, DriftedScan] = {}
-        mapping: Any = None
+        mapping: DriftMapping | None = None
         for event in self.events:
             if event.message == "DriftMapping":
                 mapping = event.thing
             elif event.message == "Scan2d" and mapping is not None and len(mapping.center) == 2:
                 row = by_time.get(event.thing.time_ns)
                 if row is not None:
-                    x, y = _matrix(mapping) @ (*mapping.center, 1.0)
-                    found.setdefault(row.number, DriftedScan(tuple(mapping.center), (float(x), float(y))))
+                    tip_x, tip_y = mapping.center
+                    x, y = _matrix(mapping) @ (tip_x, tip_y, 1.0)
+                    found.setdefault(row.number, DriftedScan((tip_x, tip_y), (float(x), float(y))))
         return found
 
 
@@ -212,5 +216,5 @@ def _events(run: Run) -> Iterator[NightEvent]:
             yield NightEvent(packet.time_ns or 0, message, thing, packet.envelope)
 
 
-def _matrix(mapping: Any) -> Array:
+def _matrix(mapping: DriftMapping) -> Array:
     return np.array(mapping.matrix, dtype=np.float64).reshape(2, 3)
