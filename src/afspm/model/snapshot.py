@@ -48,7 +48,7 @@ def restored(type_: type[T], plain: Mapping[str, object], kind: str, version: in
     return made
 
 
-def _numpy() -> Any:
+def _numpy() -> types.ModuleType | None:
     # Without a loaded numpy there are no arrays, and most processes do not load it. While another thread imports it,
     # the module is there without its names.
     numpy = sys.modules.get("numpy")

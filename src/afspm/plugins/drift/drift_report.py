@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,9 @@ from afspm.plugins.drift.record import DriftRecord
 from afspm.record.drift_mapping import drift_at, drift_knowledge
 from afspm.record.report.pictures import OFFSET, OWN_OFFSET, is_ours
 from afspm.record.run import Run
+
+if TYPE_CHECKING:
+    from afspm.wire.messages import DriftMapping
 
 
 def draw(run: Run, title: str) -> None:
@@ -26,10 +30,12 @@ def draw(run: Run, title: str) -> None:
 
 def drift_of(run: Run) -> DriftRecord:
     """Return the drift that the scheduler published during a run; messages without a mapping are left out."""
-    published = [wire.decode("DriftMapping", packet.payload) for packet in run.packets(messages=("DriftMapping",))]
-    published = [message for message in published if len(message.matrix) == 6 and len(message.center) == 2]
+    decoded: list[DriftMapping] = [
+        wire.decode("DriftMapping", packet.payload) for packet in run.packets(messages=("DriftMapping",))
+    ]
+    published = [message for message in decoded if len(message.matrix) == 6 and len(message.center) == 2]
 
-    def square(values: Any) -> NDArray[np.float64]:
+    def square(values: Sequence[float]) -> NDArray[np.float64]:
         # before the first registration the scheduler publishes no covariance
         return np.array(values if len(values) == 4 else [np.nan] * 4, dtype=np.float64).reshape(2, 2)
 

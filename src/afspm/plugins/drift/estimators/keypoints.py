@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from types import ModuleType
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +75,7 @@ def sift(image: Image, count_max: int) -> Keypoints:
 KINDS = {"brief": brief, "orb": orb, "sift": sift}
 
 
-def _skimage() -> Any:
+def _skimage() -> ModuleType:
     from skimage import feature
 
     return feature
@@ -131,7 +132,13 @@ def _sharpened(response: Array, corners: np.ndarray) -> Array:
     return position
 
 
-def _strongest_blobs(values: Array, detector: Any, count_max: int) -> NDArray[np.intp]:
+class _Blobs(Protocol):
+    # what scikit-image's SIFT has found
+    positions: Array  # (row, column) of each
+    sigmas: Array
+
+
+def _strongest_blobs(values: Array, detector: _Blobs, count_max: int) -> NDArray[np.intp]:
     count = len(detector.positions)
     if count <= count_max:
         return np.arange(count)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,7 +72,7 @@ def shear_by_drift(prior: Prior | None, reference: DriftScan, scan: DriftScan) -
     return prior.velocity_difference_m_s * pace_s_m, prior.velocity_sd_m_s * abs(pace_s_m)
 
 
-Spectrum = NDArray[np.complexfloating[Any, Any]]
+Spectrum = NDArray[np.complexfloating]
 
 LEAST_OVERLAP = 0.2  # share of the smaller image
 PEAKS = 4  # number of peaks kept for each channel (smooth, band)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import matplotlib.style
 import numpy as np
@@ -46,7 +47,7 @@ _STYLE: Plain = {
 }
 
 
-def styled() -> Any:
+def styled() -> AbstractContextManager[None]:
     """Return a context for afspm's figure style, independent of the user's."""
     return matplotlib.style.context(["default", _STYLE])
 

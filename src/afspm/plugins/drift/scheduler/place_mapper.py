@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from collections.abc import Mapping as Table
 from dataclasses import dataclass, field, fields
-from typing import Any
 
 from afspm.basics.errors import AfspmError, InvalidValue
 from afspm.basics.formatting import position_text
@@ -111,8 +110,8 @@ class SavedPlaces:
 
     def restored(self, codec: PlaceCodec) -> Places:
         """Return the restored `Places`. Raises ValueError for an unreadable place."""
-        region = None if self.region is None else _place(codec, _SET_SCAN, self.region)
-        probe = None if self.probe is None else _place(codec, _SET_PROBE, self.probe)
+        region = None if self.region is None else _saved_region(codec, self.region)
+        probe = None if self.probe is None else _saved_probe(codec, self.probe)
         return Places(
             TargetPosition(region), TargetPosition(probe),
             self.shape, self.upwards, self.durations, self.remembered,
@@ -195,62 +194,61 @@ class PlaceMapper:
         return MappedRequest(Request(kind, subject, payload, request.id), _names(asked), _both_places(place))
 
     def _again(self, known: MappedBefore, request: Request) -> MappedRequest:
-        place = _place(self._codec, known.kind, known.place)
-        self._sending(place)
+        place: PositionPair[Region] | PositionPair[ProbePosition]
+        if known.kind == _SET_SCAN:
+            place = _saved_region(self._codec, known.place)
+            self.region = self.region.sending(place)
+        else:
+            place = _saved_probe(self._codec, known.place)
+            self.probe = self.probe.sending(place)
         subject = self._codec.decode_packet(_MESSAGES[known.kind], known.payload)
         return MappedRequest(
             Request(known.kind, subject, known.payload, request.id), _names(request.subject), _both_places(place)
         )
 
-    def _sending(self, place: PositionPair[Any]) -> None:
-        if isinstance(place.tip, Region):
-            self.region = self.region.sending(place)
-        else:
-            self.probe = self.probe.sending(place)
-
     def move_before(self, action: str, now_ns: int) -> MappedRequest | None:
         now_s = now_ns * 1e-9
         if self._mapping_at(now_s) is None:
             return None
-        here: PositionPair[Any] | None = None
+        here: PositionPair[Region] | PositionPair[ProbePosition] | None = None
         if action == names.START_SCAN:
             here = self.region.current
         elif action in names.AT_PROBE:
             here = self.probe.current
         if here is None:
             return None
-        there = self._tip_of(here.sample, now_s)
+        sample = here.sample
+        there = self._region_at_tip(sample, now_s) if isinstance(sample, Region) else self._probe_at_tip(sample, now_s)
         if away_m(there, here.tip) <= self._tolerance_m(here.tip):
             return None
         place, subject = self._to_tip(here.sample, here.requested, ScanParameters(), now_s)
         kind = _SET_SCAN if isinstance(place.tip, Region) else _SET_PROBE
         return MappedRequest(Request(kind, subject, place.sent), (), _both_places(place))
 
-    def _tip_of(self, sample: Region | ProbePosition, now_s: float) -> Any:
-        # a scan that begins now is placed for its middle, the probe for now
-        middle_s = now_s
-        if isinstance(sample, Region):
-            middle_s += self.durations.expected_s(self.shape, sample.size_m) / 2
-        mapping = self._mapping_at(middle_s) or Mapping.identity()
-        if isinstance(sample, Region):
-            return mapping.to_tip(sample)
-        x, y = mapping.inverse.apply(sample.xy_m)
+    def _region_at_tip(self, sample: Region, now_s: float) -> Region:
+        # a scan that begins now is placed for its middle
+        middle_s = now_s + self.durations.expected_s(self.shape, sample.size_m) / 2
+        return (self._mapping_at(middle_s) or Mapping.identity()).to_tip(sample)
+
+    def _probe_at_tip(self, sample: ProbePosition, now_s: float) -> ProbePosition:
+        x, y = (self._mapping_at(now_s) or Mapping.identity()).inverse.apply(sample.xy_m)
         return ProbePosition((float(x), float(y)))
 
     def _to_tip(
         self, sample: Region | ProbePosition, requested: bytes | None, rest: ScanParameters, now_s: float
-    ) -> tuple[PositionPair[Any], object]:
-        tip = self._tip_of(sample, now_s)
+    ) -> tuple[PositionPair[Region] | PositionPair[ProbePosition], object]:
         if isinstance(sample, Region):
-            subject: object = ScanParameters(tip, rest.shape, rest.unit)
+            region = self._region_at_tip(sample, now_s)
+            subject = ScanParameters(region, rest.shape, rest.unit)
             if requested is None:
                 requested = self._codec.encode(ScanParameters(sample))
-            region_place = PositionPair(sample, requested, tip, self._codec.encode(subject))
-            self._sending(region_place)
+            region_place = PositionPair(sample, requested, region, self._codec.encode(subject))
+            self.region = self.region.sending(region_place)
             return region_place, subject
+        tip = self._probe_at_tip(sample, now_s)
         requested = self._codec.encode(sample) if requested is None else requested
         probe_place = PositionPair(sample, requested, tip, self._codec.encode(tip))
-        self._sending(probe_place)
+        self.probe = self.probe.sending(probe_place)
         return probe_place, tip
 
     def _tolerance_m(self, tip: Region | ProbePosition) -> float:
@@ -389,13 +387,20 @@ class PlaceMapper:
         return self._codec.relocated("Spec1d", payload, self._codec.encode(_position(mapping, position_m)))
 
 
-def _place(codec: PlaceCodec, kind: int, saved: SavedPlace) -> PositionPair[Any]:
-    sample, tip = (codec.decode_packet(_MESSAGES[kind], part) for part in (saved.requested, saved.sent))
-    if isinstance(sample, ScanParameters) and isinstance(tip, ScanParameters):
-        sample, tip = sample.region, tip.region
-    if sample is None or tip is None:
+def _saved_region(codec: PlaceCodec, saved: SavedPlace) -> PositionPair[Region]:
+    sample, tip = (codec.decode_packet(_MESSAGES[_SET_SCAN], part) for part in (saved.requested, saved.sent))
+    if not (isinstance(sample, ScanParameters) and isinstance(tip, ScanParameters)):
         raise ValueError("a place in force that can't be read")
-    return PositionPair(sample, saved.requested, tip, saved.sent)
+    if isinstance(sample.region, Region) and isinstance(tip.region, Region):
+        return PositionPair(sample.region, saved.requested, tip.region, saved.sent)
+    raise ValueError("a place in force that can't be read")
+
+
+def _saved_probe(codec: PlaceCodec, saved: SavedPlace) -> PositionPair[ProbePosition]:
+    sample, tip = (codec.decode_packet(_MESSAGES[_SET_PROBE], part) for part in (saved.requested, saved.sent))
+    if isinstance(sample, ProbePosition) and isinstance(tip, ProbePosition):
+        return PositionPair(sample, saved.requested, tip, saved.sent)
+    raise ValueError("a place in force that can't be read")
 
 
 def _place_of(request: Request) -> Region | RegionChange | ProbePosition | PositionChange | None:
@@ -424,7 +429,7 @@ def _names(asked: object) -> tuple[str, ...]:
     return (names.PROBE_POS_X, names.PROBE_POS_Y)
 
 
-def _both_places(place: PositionPair[Any]) -> str:
+def _both_places(place: PositionPair[Region] | PositionPair[ProbePosition]) -> str:
     def centre(where: Region | ProbePosition) -> str:
         x, y = where.center_m if isinstance(where, Region) else where.xy_m
         return position_text((x, y))

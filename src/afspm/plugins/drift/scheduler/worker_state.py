@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,7 @@ def _without_arrays(thing: object, arrays: dict[str, np.ndarray]) -> object:
     return thing
 
 
-def _with_arrays(thing: object, arrays: Any) -> Any:
+def _with_arrays(thing: object, arrays: Mapping[str, np.ndarray]) -> Any:
     if isinstance(thing, dict):
         if thing.keys() == {_ARRAY}:
             return arrays[thing[_ARRAY]]

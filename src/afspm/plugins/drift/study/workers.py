@@ -78,7 +78,7 @@ def on_cluster(
         ConfigError: `distributed` is not installed, or the address does not answer.
     """
     try:
-        distributed: Any = importlib.import_module("distributed")
+        distributed = importlib.import_module("distributed")
     except ImportError as error:
         raise ConfigError("a cluster needs Dask", hint='pip install "afspm[study]"') from error
     try:
