@@ -34,10 +34,10 @@ async def serve(url: str, name_and_token: str) -> None:
         async with joined() as client:
             tools, instructions, version = await client.list_tools(), client.instructions, client.protocol_version
 
-        async def list_tools(context: Any, asked: Any) -> types.ListToolsResult:
+        async def list_tools(context: object, asked: object) -> types.ListToolsResult:
             return tools
 
-        async def call_tool(context: Any, asked: types.CallToolRequestParams) -> types.CallToolResult:
+        async def call_tool(context: object, asked: types.CallToolRequestParams) -> types.CallToolResult:
             # a client for each call: the library's connection ends for good with the first failed request, and an agent
             # server that was killed is started again
             try:

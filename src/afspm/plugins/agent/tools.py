@@ -31,6 +31,7 @@ from afspm.plugins.web.gateway import views
 from afspm.plugins.web.gateway.guard import PERSON
 from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest, of_error
 from afspm.plugins.web.gateway.services import READER
+from afspm.plugins.web.person_commands import PersonCommands
 from afspm.record.drawing.raster import indices, png, value_range
 from afspm.record.overview import ScanSummary
 from afspm.record.run_json import EXPERIMENT_FILE
@@ -43,7 +44,7 @@ BLOCKS = 16
 """Rows and columns of block averages in `scan_numbers`; fewer for a scan with fewer pixels."""
 _log = logging.getLogger("afspm.plugins.agent")
 Content = dict[str, object] | tuple[dict[str, object], bytes]
-Tool = Callable[[str, Any], Awaitable[Content]]
+Tool = Callable[[str, object], Awaitable[Content]]
 _READS = types.ToolAnnotations(read_only_hint=True)
 _PROPOSES = types.ToolAnnotations(destructive_hint=False)
 _ACTS = types.ToolAnnotations(destructive_hint=True)
@@ -145,7 +146,7 @@ class AgentTools:
         wanted = (*names.BASE_PARAMETERS, *names.EXTENSION_PARAMETERS)
         actions = (*names.BASE_ACTIONS, *names.EXTENSION_ACTIONS)
 
-        def read(commands: Any) -> tuple[list[Plain], list[str]]:
+        def read(commands: PersonCommands) -> tuple[list[Plain], list[str]]:
             found = [(name, commands.get(name)) for name in wanted]
             models = [views.parameter_model(name, one) for name, one in found if one.ok]
             return (
@@ -304,14 +305,14 @@ class AgentTools:
         return frame.values
 
 
-def _schema(model: type[arguments.Arguments]) -> dict[str, Any]:
+def _schema(model: type[arguments.Arguments]) -> dict[str, object]:
     schema = model.model_json_schema()
     schema.pop("description", None)
-    short: dict[str, Any] = _without_titles(schema)
+    short: dict[str, object] = _without_titles(schema)
     return short
 
 
-def _without_titles(schema: Any) -> Any:
+def _without_titles(schema: object) -> Any:
     # pydantic gives each field a title, its own name again; a model reads the list of tools in every conversation
     if isinstance(schema, list):
         return [_without_titles(one) for one in schema]

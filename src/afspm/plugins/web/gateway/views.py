@@ -6,7 +6,6 @@ import base64
 import io
 from collections.abc import Iterator, Sequence
 from itertools import groupby
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,7 +95,7 @@ def spectrum_model(spectrum: SpectrumSummary) -> SpectrumModel:
     )
 
 
-def parameter_model(name: str, response: Response, asked: Any = None) -> ParameterModel:
+def parameter_model(name: str, response: Response, asked: float | str | bool | None = None) -> ParameterModel:
     """Return the parameter in a response; without a payload, the requested value."""
     if not response.payload:
         return ParameterModel(name=name, value=asked, unit=names.BASE_PARAMETERS.get(name) or "")
