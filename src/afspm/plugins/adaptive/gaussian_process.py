@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,7 +58,7 @@ class GaussianProcess:
     def __init__(self, xy_m: Floats, values: Floats, times_s: Floats, parameters: Parameters) -> None:
         self.parameters = parameters
         self._at_m: Floats = xy_m - np.outer(times_s - times_s[0], parameters.velocity_m_s)
-        factor: Any = cho_factor(_covariance(self._at_m, parameters), lower=True, overwrite_a=True, check_finite=False)
+        factor = cho_factor(_covariance(self._at_m, parameters), lower=True, overwrite_a=True, check_finite=False)
         solved = cho_solve(factor, np.stack([values, np.ones(len(values))], axis=1), check_finite=False)
         self.mean = float(solved[:, 0].sum() / solved[:, 1].sum())
         self._weights = solved[:, 0] - self.mean * solved[:, 1]
@@ -167,8 +167,13 @@ def _covariance(at_m: Floats, parameters: Parameters) -> Floats:
 
 def _lowest(cost: Callable[[Floats], float], first: Floats, steps: Floats) -> Floats:
     simplex = np.vstack([first, first + np.diag(steps)])
-    options: Any = {"initial_simplex": simplex, "maxfev": 22 * len(first), "xatol": 0.03, "fatol": 0.1}
-    return np.asarray(minimize(cost, first, method="Nelder-Mead", options=options).x)
+    found = minimize(
+        cost,
+        first,
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "maxfev": 22 * len(first), "xatol": 0.03, "fatol": 0.1},
+    )
+    return np.asarray(found.x)
 
 
 def _log_likelihood(at_m: Floats, values: Floats, length_m: float, noise: float) -> float:

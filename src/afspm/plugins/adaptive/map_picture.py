@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -55,7 +57,13 @@ def draw_map(found: MapProgress, region: Region, path: Path, *, title: str = "",
 
 
 def _panel(
-    axes: Any, values: Floats, size_um: tuple[float, ...], name: str, unit: str, colours: Any, low: float | None = None
+    axes: Axes,
+    values: Floats,
+    size_um: tuple[float, ...],
+    name: str,
+    unit: str,
+    colours: str | Colormap,
+    low: float | None = None,
 ) -> None:
     factor, shown_unit = scale(float(np.abs(values).max()), unit)
     span = value_range(values * factor)

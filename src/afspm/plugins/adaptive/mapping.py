@@ -14,7 +14,7 @@ from afspm.basics.formatting import position_text
 from afspm.basics.plain_data import Plain
 from afspm.basics.units import si_or_text
 from afspm.client.scope import Scope
-from afspm.model import Region
+from afspm.model import Region, Spectrum
 from afspm.plugins.adaptive.quantities import Evaluation, evaluation
 from afspm.plugins.adaptive.refinement import ID, AdaptiveMap, LatticeMap, NestedGrid, Optimizer
 from afspm.transport.process.loading import find_object
@@ -74,7 +74,7 @@ class MeasuredPoint:
         seconds: time since the end of the spectrum before; 0 for the first spectrum.
     """
 
-    name: Any
+    name: object
     x_m: float
     y_m: float
     value: float
@@ -117,7 +117,7 @@ class MapProgress:
         self._in_a_row = 0
         self._looked = 0
 
-    def restore(self, measured: list[MeasuredPoint], failures: list[Any]) -> None:
+    def restore(self, measured: list[MeasuredPoint], failures: list[object]) -> None:
         """Restore the measurements before a restart of the component, and the names of failed suggestions."""
         with self._planning():
             for one in measured:
@@ -238,7 +238,7 @@ def optimizer_of(name: str, region: Region, quantity: str, **settings: Any) -> O
 def measure_map(
     scope: Scope,
     region: Region,
-    quantity: str | Callable[[Any], float],
+    quantity: str | Callable[[Spectrum], float],
     until: Mapping[str, float | str],
     *,
     unit: str = "",

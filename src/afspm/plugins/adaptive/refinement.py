@@ -185,7 +185,7 @@ class LatticeMap:
             self._done.add(self._cell(point[ID]))
             self._asked.pop(str(point[ID]), None)
 
-    def get_best_points(self) -> Sequence[tuple[Any, Point, Point]]:
+    def get_best_points(self) -> Sequence[tuple[int, Point, Point]]:
         """Return a list with the highest measured value as (number, position, value); empty without measurements."""
         if not self._rows:
             return []
