@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.requirements import imports_of_extra
@@ -154,7 +155,9 @@ class _Measurement(StandardReadable, Triggerable):
         except InterruptedError:
             return None
 
-    def _keep(self, channels: Sequence[str], units: Sequence[str], arrays: Sequence[Any], time_s: float) -> None:
+    def _keep(
+        self, channels: Sequence[str], units: Sequence[str], arrays: Sequence[NDArray[np.float64]], time_s: float
+    ) -> None:
         fields = field_names(channels)
         self._keys = {
             field: DataKey(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, TypedDict
+from typing import TypedDict
 
 import numpy as np
 
@@ -108,11 +108,10 @@ def _digest(stored: np.ndarray) -> str:
     return kind + hashlib.blake2b(values.tobytes(), digest_size=12).hexdigest()
 
 
-def _is_shape(found: Any) -> bool:
-    is_shape = (
-        isinstance(found, tuple | list) and len(found) == 4 and all(isinstance(one, int | float) for one in found)
-    )
-    return is_shape and 0 < found[0] < _MOST  # without a scan GXSM reports 4294967295
+def _is_shape(found: object) -> bool:
+    if not (isinstance(found, tuple | list) and len(found) == 4 and all(isinstance(one, int | float) for one in found)):
+        return False
+    return bool(0 < found[0] < _MOST)  # without a scan GXSM reports 4294967295
 
 
 def _factor(ask: Asking, channel: int) -> float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 from afspm.basics.formatting import lengths_text
 from afspm.model import Region, names
@@ -135,7 +135,7 @@ class Probe(Group):
         """Discard the target, so that the measured position counts."""
         self._goal_m = self._seen_m = None
 
-    def _near(self, a: tuple[Any, ...], b: tuple[float, float]) -> bool:
+    def _near(self, a: tuple[float, ...], b: tuple[float, float]) -> bool:
         return all(
             abs(one - other) <= max(1e-6 * abs(other), 0.0 if math.isinf(whole) else self._finest_part * whole)
             for one, other, whole in zip(a, b, self._range_m, strict=True)

@@ -73,7 +73,7 @@ class Link:
         """Wait for the reply to `begin`, at most `within_s` of real time. Raises ControllerLost."""
         self._connection.wait(within_s)
 
-    def reply(self, what: str) -> tuple[bool, Any]:
+    def reply(self, what: str) -> tuple[bool, object]:
         """Return whether the reply has arrived, and its value; None for a reply without a value.
 
         Raises:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from afspm.basics.errors import FileError
 from afspm.model import Region, Scan, Spectrum
@@ -147,9 +148,7 @@ def _places(raw: bytes, count: int) -> list[XY | None]:
     return [place if all(map(math.isfinite, place)) else None for place in places]
 
 
-def _numbers(
-    tags: Tags, tag: int, header: np.void, shape: tuple[int, ...], *, newer: bool
-) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _numbers(tags: Tags, tag: int, header: np.void, shape: tuple[int, ...], *, newer: bool) -> NDArray[np.float64]:
     # The first version of the format has 16-bit integers only.
     data, number = bytes(tags.get(tag, b"")), int(header["numbers"]) if newer else 0
     if number not in NUMBERS:
@@ -160,5 +159,5 @@ def _numbers(
     return np.frombuffer(data, kind, size).reshape(shape).astype(np.float64)
 
 
-def _plain(value: Any) -> object:
+def _plain(value: np.generic) -> object:
     return text(value) if isinstance(value, np.void) else value.item()

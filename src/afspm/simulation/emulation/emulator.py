@@ -14,7 +14,7 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from afspm.basics import entry_points
 from afspm.basics.addresses import Listens
@@ -123,7 +123,7 @@ class Emulator(ABC):
         port: Annotated[int, Listens()] = 0,
         seed: int = 1,
         faults: Sequence[str | PlainMapping | Fault] = (),
-        **world: Any,
+        **world: object,
     ) -> None:
         self.port = port
         self.seed = seed

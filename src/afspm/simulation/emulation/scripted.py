@@ -12,7 +12,7 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Protocol
+from typing import ClassVar, Final, Protocol
 
 from afspm.basics.errors import AfspmError
 from afspm.simulation.emulation.emulator import Crashed, Emulator
@@ -202,7 +202,7 @@ class ScriptedEmulator(Emulator):
             reply = self.not_a_number(request)
         self._send_if_due(Waiting(client, self._guarded(request, reply)), now_s)
 
-    def _answered(self, request: bytes, answer: Callable[[], Any]) -> Any:
+    def _answered(self, request: bytes, answer: Callable[[], bytes | Unfinished]) -> bytes | Unfinished:
         try:
             return answer()
         except Crashed:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 from collections import deque
 from dataclasses import dataclass
-from typing import Any
 
 import zmq
 
@@ -34,7 +33,7 @@ class XopServer:
 
     def __init__(self, port: int, wakes: object, log: logging.Logger) -> None:
         self._log = log
-        self._context: zmq.Context[Any] = zmq.Context()
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._wakes = wakes
         self.queue: deque[QueuedCall] = deque()
         self.port = port

@@ -128,7 +128,7 @@ class GxsmEmulator(Emulator):
 
     def serve(self, timeout_s: float) -> None:
         """Wait up to `timeout_s` real seconds for a call, and answer the received calls."""
-        watched: list[Any] = [self.woken] if self._block is None else [self.woken, self._block]
+        watched = [one for one in (self.woken, self._block) if one is not None]
         ready = select.select(watched, [], [], timeout_s)[0]
         if self._block is not None and self._block in ready:
             self._block.take()

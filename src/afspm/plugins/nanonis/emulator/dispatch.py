@@ -7,12 +7,13 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
+from typing import Final, TypeVar
 
 import numpy as np
 
 from afspm.plugins.nanonis.emulator.registers import Registers
 
+T = TypeVar("T")
 Results = tuple[object, ...]
 _STORED: Final = (
     "Bias", "BiasSpectr", "Current", "ZCtrl", "SafeTip", "AutoApproach", "ZSpectr", "Piezo", "Scan", "FolMe", "Pattern",
@@ -99,7 +100,7 @@ def _bound(handler: Handler, name: str) -> Handler:
     return partial(handler, name) if "name" in inspect.signature(handler).parameters else handler
 
 
-def chosen(number: int, *choices: object) -> Any:
+def chosen(number: int, *choices: T) -> T:
     """Return the choice with this number. Raises FunctionRefused: there is no such choice.
 
     In most functions 0 means no change: the first choice is then the present value.

@@ -5,13 +5,16 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from afspm.basics.plain_data import PlainMapping
 from afspm.simulation.activities import RETRACE, ScanActivity, SpectrumActivity
 from afspm.simulation.fields import Array
+
+if TYPE_CHECKING:
+    import h5py
 
 _MISSING: Final = -(2**31)
 _LARGEST: Final = 2**31 - 1
@@ -100,7 +103,7 @@ def _file(
     return content.getvalue()
 
 
-def _add(segment: Any, name: str, signal: str, unit: str, values: Array) -> None:
+def _add(segment: h5py.Group, name: str, signal: str, unit: str, values: Array) -> None:
     # Real files have integers over a range about zero, and NSFopen relies on this range.
     largest = float(np.max(np.abs(values), initial=0.0, where=np.isfinite(values))) or 1.0
     integers = np.where(np.isfinite(values), np.rint(values / largest * _LARGEST), _MISSING).astype(np.int32)
@@ -116,6 +119,6 @@ def _add(segment: Any, name: str, signal: str, unit: str, values: Array) -> None
     )
 
 
-def _add_blocks(segment: Any, sizes: Sequence[int]) -> None:
+def _add_blocks(segment: h5py.Group, sizes: Sequence[int]) -> None:
     dataset = segment.create_dataset("dataset_blocks", data=np.array(sizes, np.uint32))
     dataset.attrs["dataset_block_size_id"] = _BLOCKS

@@ -268,7 +268,7 @@ class StudioProgram(MakerProgram):
         points = np.stack([of.ravel() for of in region.pixels_m((rows, columns))], axis=1)
         self._start_grid(CurveGrid((rows, columns), [(px, py) for px, py in points.tolist()]), now_s)
 
-    def measure_at(self, kind: str, name: str, place: Sequence[Any], now_s: float) -> None:
+    def measure_at(self, kind: str, name: str, place: Sequence[float], now_s: float) -> None:
         """Start measuring a workspace item: a frame, a grid or a point.
 
         Args:

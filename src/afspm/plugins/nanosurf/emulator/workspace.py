@@ -7,7 +7,7 @@ import uuid
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path, PureWindowsPath
-from typing import Any, Final
+from typing import Final
 from xml.etree import ElementTree
 
 from afspm.basics.errors import AfspmError, InvalidValue
@@ -78,7 +78,7 @@ class Workspace:
         """Return the id of an item by name; all zeros: unknown."""
         return next((item_id for item_id, item in self._items.items() if item.name == name), NO_ITEM)
 
-    def change(self, item_id: str, **values: Any) -> None:
+    def change(self, item_id: str, **values: object) -> None:
         """Change an item.
 
         Raises:
@@ -209,5 +209,5 @@ class MeasurementQueue:
         return begun
 
     @staticmethod
-    def _values_of(item: WorkspaceItem) -> tuple[Any, ...]:
+    def _values_of(item: WorkspaceItem) -> tuple[float, ...]:
         return item.x_m, item.y_m, item.width_m, item.height_m, item.columns, item.rows, item.rotation_deg

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Thread
-from typing import Any, Final
+from typing import Final
 
 from afspm.basics.errors import AfspmError
 from afspm.simulation.emulation.scripted import ScriptFailed
@@ -39,7 +39,7 @@ class Wait:
     value: Callable[[], object] = lambda: None
 
 
-Ask = Callable[[str, str, list[Any]], object]
+Ask = Callable[[str, str, list[object]], object]
 """A function that executes a script's request: "get", "set" or "call", a path below `spm`, and the arguments.
 
 The request "now" returns the experiment time in ms. Raises AfspmError."""

@@ -6,9 +6,9 @@ import io
 import math
 from collections.abc import Collection, Iterator, Mapping
 from datetime import UTC, datetime
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from afspm.plugins.park.file_header import (
     CURVE_KINDS,
@@ -112,7 +112,7 @@ def curve(spectrum: SpectrumActivity, now_s: float, mode: str) -> bytes:
     return _tiff(header, data, _shown(np.array(columns)), now_s)
 
 
-def _tiff(header: Any, data: Mapping[int, bytes], shown: Picture, now_s: float) -> bytes:
+def _tiff(header: NDArray[np.void], data: Mapping[int, bytes], shown: Picture, now_s: float) -> bytes:
     # The maker's own reader, pspylib, needs a picture with a palette, in several strips: the tags of a single strip are
     # not parsed.
     from PIL import Image, TiffImagePlugin

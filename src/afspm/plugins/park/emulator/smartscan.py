@@ -135,7 +135,7 @@ class SmartScanProgram(MakerProgram):
         """The names below `spm` as JSON: an object with the lists "values" and "methods"."""
         return json.dumps({"values": [*self._values, *self._reported], "methods": list(self._methods)})
 
-    def ask(self, kind: str, path: str, given: list[Any]) -> object:
+    def ask(self, kind: str, path: str, given: list[object]) -> object:
         """Execute a request of a script, in the form of `Ask`. Raises AfspmError; TypeError: wrong arguments."""
         if kind == "now":
             return round(self.now_s * 1e3)
@@ -189,8 +189,8 @@ class SmartScanProgram(MakerProgram):
             raise InvalidValue(f"no points are given for {mode!r}, or there is no such spectroscopy")
         self.start_curve(_CURVES[wanted["mode"]], self.now_s)
 
-    def _measure_curve(self, *given: Any) -> Wait:
-        self._start_curve(*given)
+    def _measure_curve(self, mode: str | Plain = "fd", place: str = "given") -> Wait:
+        self._start_curve(mode, place)
         return Wait(lambda: self.measuring_curve)
 
     def _scan_line(self) -> None:
@@ -367,7 +367,11 @@ def _plain(name: object) -> str:
     return re.sub(r"[^A-Za-z0-9_-]", "_", str(name))[:100]
 
 
-def _number(name: str, value: Any, low: float, high: float, *, whole: bool = False) -> None:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not low <= value <= high or (whole and value != int(value)):
+def _number(name: str, value: object, low: float, high: float, *, whole: bool = False) -> None:
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or not low <= value <= high
+        or (whole and value != int(value))
+    ):
         raise InvalidValue(f"{name}: {value!r} is not within {low:g} to {high:g}")
