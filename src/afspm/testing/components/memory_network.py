@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 from afspm.model import Packet, Request, Response
+from afspm.testing.components.simulated_process import Cuttable
 from afspm.testing.components.simulated_time import SimulatedTime
 
 Deliver = Callable[..., None]
@@ -33,7 +34,7 @@ class Host(Protocol):
     @property
     def alive(self) -> bool: ...
     @property
-    def sockets(self) -> dict[Any, None]:
+    def sockets(self) -> dict[Cuttable, None]:
         """The lines that end at this process, and break when the process dies."""
 
     def take(self, do: Callable[..., None], *args: object) -> None:

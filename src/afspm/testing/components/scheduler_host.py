@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 from afspm.model import (
     HAS_ENDED,
@@ -120,10 +120,10 @@ class SchedulerHost(Process):
         *,
         journal_s: float = 0.1,
         dies_in_step: float = 0.0,
-        make_core: Callable[[], Any] | None = None,
+        make_core: Callable[[], SchedulerCore] | None = None,
     ) -> None:
         super().__init__(timeline, "scheduler")
-        self._make_core: Callable[[], Any] = make_core or (lambda: SchedulerCore(settings, codec))
+        self._make_core: Callable[[], SchedulerCore] = make_core or (lambda: SchedulerCore(settings, codec))
         self.core = self._make_core()
         self.disk = Disk()
         self.dies_in_step = dies_in_step

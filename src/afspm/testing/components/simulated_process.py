@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Protocol
 
 from afspm.testing.components.simulated_time import SimulatedTime, Timer
 
@@ -65,7 +65,7 @@ class Process:
         self.since_s = 0.0
         self.exited: Callable[[int], None] = lambda code: None
         self.sockets: dict[Cuttable, None] = {}
-        self._waiting: list[tuple[Callable[..., None], tuple[Any, ...]]] = []
+        self._waiting: list[tuple[Callable[..., None], tuple[object, ...]]] = []
 
     # --- for those who start and end it ---
 
