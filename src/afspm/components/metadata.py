@@ -6,7 +6,7 @@ import csv
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from afspm.basics.clock import iso_utc
 from afspm.basics.errors import UnitError
@@ -115,7 +115,7 @@ class Metadata(Component):
     def on_feedback(self, feedback: Feedback) -> None:
         self._feedback = feedback
 
-    def on_message(self, envelope: str, message: Any) -> None:
+    def on_message(self, envelope: str, message: object) -> None:
         if isinstance(message, JournalEntries) and message.entries:
             known_ns = self.memory.get("journal_ns", -1)
             if not self._follows_journal and 0 <= known_ns < message.entries[0].time_ns:

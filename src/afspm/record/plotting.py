@@ -14,6 +14,7 @@ from afspm.record.drawing.raster import value_range
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.colors import ListedColormap
 
     from afspm.model.scan import Scan
 
@@ -84,7 +85,7 @@ def _explain(scan: Scan, drawn: object, axes: Any, label: str, *, colorbar: bool
 
 
 def draw_scale_bar(
-    axes: Any, size_m: tuple[float, float], corner: tuple[float, float], length: float, *,
+    axes: Axes, size_m: tuple[float, float], corner: tuple[float, float], length: float, *,
     font: float | None = None, named: bool = True,
 ) -> None:  # fmt: skip
     """Draw a bar of round length into the lower left corner of a picture.
@@ -106,7 +107,7 @@ def draw_scale_bar(
         )  # fmt: skip
 
 
-def gold() -> Any:
+def gold() -> ListedColormap:
     """Return the colour map of heights as a matplotlib colour map."""
     from matplotlib.colors import ListedColormap
 

@@ -125,7 +125,7 @@ def _picture(scan: Scan) -> NDArray[np.float64]:
 def _sorted(settings: Iterable[tuple[SweptSetting, ...]]) -> list[tuple[SweptSetting, ...]]:
     # numbers ascending, other values in the order of occurrence
     found = list(dict.fromkeys(settings))
-    seen: list[Any] = [one.value for each in found for one in each]
+    seen: list[object] = [one.value for each in found for one in each]
 
     def rank(one: SweptSetting) -> float:
         return float(one.value) if isinstance(one.value, int | float) else float(seen.index(one.value))

@@ -112,7 +112,7 @@ class Memory(MutableMapping[str, Any]):
         return f"<Memory {self._values!r}>"
 
 
-def _number(value: Any) -> Any:
+def _number(value: Any) -> object:
     # numpy's scalars become Python's numbers
     if getattr(value, "shape", None) == ():
         return value.item()

@@ -11,7 +11,6 @@ import sys
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import psutil
 
@@ -98,7 +97,7 @@ def of_process(pid: int) -> ActivitySample | None:
         process = psutil.Process(pid)
         with process.oneshot():
             times, status = process.cpu_times(), process.status()
-            waits_for_disk = sys.platform == "linux" and any(map(_waits_for_disk, process.threads()))
+            waits_for_disk = sys.platform == "linux" and any(_waits_for_disk(one.id) for one in process.threads())
     except psutil.Error:
         return None
     return ActivitySample(
@@ -110,8 +109,8 @@ def of_process(pid: int) -> ActivitySample | None:
     )
 
 
-def _waits_for_disk(thread: Any) -> bool:
+def _waits_for_disk(thread_id: int) -> bool:
     try:
-        return bool(psutil.Process(thread.id).status() == psutil.STATUS_DISK_SLEEP)  # Linux knows threads as processes
+        return bool(psutil.Process(thread_id).status() == psutil.STATUS_DISK_SLEEP)  # Linux knows threads as processes
     except psutil.Error:  # threads come and go
         return False

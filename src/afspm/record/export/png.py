@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -55,7 +55,7 @@ def spectrum_figure(spectrum: Spectrum, title: str) -> Figure:
 
     others = list(zip(spectrum.names, spectrum.units, spectrum.values.T, strict=True))[1:]
     figure = Figure(figsize=(5.2, 1.2 + 2.0 * max(1, len(others))), layout="constrained")
-    panels: Any = figure.subplots(max(1, len(others)), 1, sharex=True, squeeze=False)[:, 0]
+    panels = figure.subplots(max(1, len(others)), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (name, unit, values) in zip(panels, others, strict=False):
         axes.plot(spectrum.values[:, 0], values, linewidth=1.0)
         axes.set_ylabel(f"{name} / {unit}" if unit else name)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from afspm.simulation import chance
 from afspm.simulation.fields import Array, is_separable, rough_field, smooth_field
@@ -64,7 +65,13 @@ def patches(seed: int, x_m: Array, y_m: Array, size_m: float) -> Array:
     return smooth_step(0.5 + 2.0 * smooth_field(seed, x_m, y_m, size_m))
 
 
-def around(x_m: Array, y_m: Array, x0_m: float, y0_m: float, reach_m: float) -> Iterator[tuple[Any, Array, Array]]:
+PositionIndex: TypeAlias = tuple[slice, slice] | NDArray[np.bool_]
+"""An index of positions: a rectangle, or a mask."""
+
+
+def around(
+    x_m: Array, y_m: Array, x0_m: float, y0_m: float, reach_m: float
+) -> Iterator[tuple[PositionIndex, Array, Array]]:
     """Yield (index, x - x0, y - y0) once for the positions near a point; nothing without positions.
 
     `index` selects the positions from the broadcast array.
