@@ -7,9 +7,12 @@ import selectors
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING
 
 from afspm.basics.plain_data import Plain
+
+if TYPE_CHECKING:
+    from _typeshed import HasFileno
 
 READ_AT_ONCE = 1 << 16
 
@@ -52,7 +55,7 @@ class TcpServer:
         *,
         stream_port: int | None = None,
         one_each: bool,
-        wakes: Any,
+        wakes: HasFileno,
         on_bytes: Callable[[ClientConnection], None],
     ) -> None:
         self._one_each = one_each

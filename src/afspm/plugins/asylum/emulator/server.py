@@ -8,11 +8,15 @@ from __future__ import annotations
 import logging
 from collections import deque
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import zmq
 
 from afspm.plugins.asylum.emulator.wire import LONGEST_REQUEST, CallFailed, FunctionCall, call, failure
 from afspm.simulation.emulation.emulator import LOOPBACK
+
+if TYPE_CHECKING:
+    from _typeshed import HasFileno
 
 
 @dataclass(frozen=True)
@@ -28,10 +32,10 @@ class XopServer:
 
     Args:
         port: listening port; 0: any free port.
-        wakes: object with a `fileno` that ends `poll`.
+        wakes: HasFileno with a `fileno` that ends `poll`.
     """
 
-    def __init__(self, port: int, wakes: object, log: logging.Logger) -> None:
+    def __init__(self, port: int, wakes: HasFileno, log: logging.Logger) -> None:
         self._log = log
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._wakes = wakes

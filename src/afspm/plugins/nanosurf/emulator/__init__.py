@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from typing import Any, ClassVar, Final, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Final, cast
 
 from afspm.basics.plain_data import PlainMapping
 from afspm.basics.units import Duration
@@ -14,6 +14,9 @@ from afspm.simulation.emulation.emulator import LOOPBACK
 from afspm.simulation.emulation.program import MakerProgram
 from afspm.simulation.emulation.scripted import Client, OnRequest, ScriptedEmulator, ScriptWire, Unfinished
 from afspm.simulation.emulation.tcp_server import ClientConnection, TcpServer
+
+if TYPE_CHECKING:
+    from _typeshed import HasFileno
 
 _LENGTH: Final = struct.Struct("<I")
 LONGEST_SCRIPT: Final = 1 << 20
@@ -94,7 +97,7 @@ class StudioWire:
     See `ScriptWire`.
     """
 
-    def __init__(self, port: int, on_request: OnRequest, wakes: object, *, one_client: bool) -> None:
+    def __init__(self, port: int, on_request: OnRequest, wakes: HasFileno, *, one_client: bool) -> None:
         self._on_request = on_request
         self._server = TcpServer(LOOPBACK, [port], one_each=one_client, wakes=wakes, on_bytes=self._split)
 

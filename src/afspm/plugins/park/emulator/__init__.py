@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, Final, Literal, NoReturn, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NoReturn, cast
 
 import zmq
 
@@ -24,6 +24,9 @@ from afspm.simulation.emulation.scripted import (
     ScriptWire,
     Unfinished,
 )
+
+if TYPE_CHECKING:
+    from _typeshed import HasFileno
 
 _DONE: Final = "Done"
 _FAILED: Final = -32000
@@ -193,7 +196,7 @@ class SmartRemoteWire:
     See `ScriptWire`.
     """
 
-    def __init__(self, port: int, on_request: OnRequest, wakes: object) -> None:
+    def __init__(self, port: int, on_request: OnRequest, wakes: HasFileno) -> None:
         self._on_request = on_request
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)
