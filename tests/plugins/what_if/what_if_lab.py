@@ -220,7 +220,7 @@ class Outsider(Remarks):
 
     def socket(self, outside: Path) -> None:
         with zmq.Context() as context, context.socket(zmq.PUSH) as push:
-            push.bind(f"ipc://{outside}")
+            push.bind(f"ipc://{outside}" if zmq.has("ipc") else "tcp://127.0.0.1:*")
 
 
 class Tidy(Remarks):

@@ -9,7 +9,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,6 +23,8 @@ from afspm.plugins.what_if.hazards import HazardGuard
 from afspm.plugins.what_if.outputs import OutputReader
 from afspm.plugins.what_if.port_replay import Life, LifeOver, PacketOf, Poll, ReplayPort, recorded_outputs
 from afspm.record.run_json import EXPERIMENT_FILE, RUN_FILE
+from afspm.storage.disk import SYNCER
+from afspm.storage.memory import SYNCED_WITHIN_S
 from afspm.transport.process.context import ExperimentProcess, ProcessActivity, ProcessContext
 from afspm.transport.process.loading import load
 from afspm.wire.message_types import register_all
@@ -150,6 +152,8 @@ def _replay(
                 port = ReplayPort(life, outputs, packet_of)
                 memories.begin(home.memory, port)
                 component = _run(launch, port, life, make, outputs)
+            with suppress(OSError):  # Windows removes no open file: let the syncer close the memory of this life
+                SYNCER.now(SYNCED_WITHIN_S)
             now += port.outputs
             if port.unanswered or port.clock.stuck:
                 stopped = port.clock.stuck or f"the record has no answer to: {port.unanswered}"

@@ -40,9 +40,8 @@ _CHANGES = {  # the positions of the changed files, and of the descriptors of th
     "shutil.rmtree": ((0, 1),), "os.link": ((1, 3),), "os.symlink": ((1, 2),), "shutil.move": ((0, None), (1, None)),
 }  # fmt: skip
 _AFSPM = Path(__file__).resolve().parents[2]
-_INFRASTRUCTURE = tuple(
-    str(_AFSPM / room) for room in ("basics", "client", "storage", "transport", "wire", "model", "plugins/what_if")
-)
+_ROOMS = ("basics", "client", "storage", "transport", "wire", "model", "plugins/what_if")
+_INFRASTRUCTURE = tuple(os.path.normcase(_AFSPM / room) for room in _ROOMS)
 _guards: dict[int, HazardGuard] = {}
 _threads: dict[threading.Thread, HazardGuard] = {}
 """Threads that a guarded thread has started; they stay guarded after the replay."""
@@ -220,12 +219,12 @@ def _hazard(called: Any) -> str:
 
 def _place(frame: FrameType | None, *, through_afspm: bool = False) -> str | None:
     # the nearest line outside of Python's library; "": none; None: afspm's own machinery, or the library for itself
-    library = str(Path(sysconfig.get_paths()["stdlib"]).resolve()) + os.sep
+    library = os.path.normcase(Path(sysconfig.get_paths()["stdlib"]).resolve()) + os.sep
     while frame is not None:
-        file = frame.f_code.co_filename
+        file = os.path.normcase(frame.f_code.co_filename)
         if frame.f_code.co_name == "<module>" or file.startswith(_IMPORT):
             return None  # a module that is imported: no decision of the component
-        is_ours = file == __file__ or file.startswith(_INFRASTRUCTURE)
+        is_ours = file.startswith(_INFRASTRUCTURE)
         in_library = file.startswith((library, "<frozen")) and "site-packages" not in file
         if is_ours and not through_afspm:
             return None
@@ -233,7 +232,7 @@ def _place(frame: FrameType | None, *, through_afspm: bool = False) -> str | Non
         if in_library and names & {*_SILENT} and not (through_afspm and names & {"threading"}):
             return None
         if not (in_library or is_ours):
-            return f"{Path(file).name}:{frame.f_lineno} in {frame.f_code.co_name}"
+            return f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno} in {frame.f_code.co_name}"
         frame = frame.f_back
     return ""
 
