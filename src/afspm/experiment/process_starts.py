@@ -270,8 +270,7 @@ def _keys(resolved: ResolvedExperiment, links: ProcessSockets, addresses: Mappin
 
 
 def _in_sample_coordinates(resolved: ResolvedExperiment) -> bool:
-    schedulers = resolved.with_role(Role.SCHEDULER)
-    return any(getattr(scheduler.component, "frame", None) is Frame.SAMPLE for scheduler in schedulers)
+    return any(scheduler.frame is Frame.SAMPLE for scheduler in resolved.with_role(Role.SCHEDULER))
 
 
 def _solved(resolved: ResolvedExperiment, without: Collection[str]) -> tuple[str, ...]:

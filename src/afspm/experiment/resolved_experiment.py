@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from afspm.experiment.planned_measurements import PlannedMeasurements
 from afspm.experiment.sections import ExperimentSections
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.wiring_classes import BoundSocket, Wiring, WiringKeys
-from afspm.model import ProblemNames, Role
+from afspm.model import Frame, ProblemNames, Role
 from afspm.scheduler.instruments.conditions import InstrumentSettings
 from afspm.scheduler.publishing.envelopes import CacheSettings
 from afspm.scheduler.safety.limits import ExperimentLimits
@@ -60,6 +60,12 @@ class ResolvedProcess:
     def is_microscope(self) -> bool:
         """Whether the process is a simulated microscope, by its class, or for a command by its table."""
         return self.part.own.get(SIMULATED) is True if self.part.command else self.declares(SIMULATED)
+
+    @property
+    def frame(self) -> Frame:
+        """The coordinates of components beside this scheduler; its settings may decide."""
+        frame_of: Callable[[Settings], Frame] | None = getattr(self.component, "frame_of", None)
+        return Frame.TIP if frame_of is None else frame_of(self.settings)
 
     @property
     def envelopes(self) -> tuple[str, ...] | None:

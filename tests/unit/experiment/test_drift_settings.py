@@ -73,6 +73,13 @@ def test_components_know_whether_places_are_in_sample_coordinates(write: Write) 
     assert not plain["rescanner"].sample_coordinates
 
 
+def test_components_of_a_scheduler_that_only_follows_drift_use_tip_coordinates(write: Write) -> None:
+    followed = launched(write, experiment("correct = false"))
+    assert not followed["rescanner"].sample_coordinates
+    later = launched(write, experiment('correct_after = "2 h"'))
+    assert later["rescanner"].sample_coordinates
+
+
 def test_rescanner_without_a_drift_scheduler_is_a_finding(write: Write) -> None:
     found = errors(write(experiment(name="Scheduler"), frame=""))
     assert ["no component publishes" in one.what for one in found] == [True, True]  # wishes, and what comes of them

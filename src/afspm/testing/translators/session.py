@@ -115,8 +115,7 @@ def prepare(options: CheckOptions) -> Experiment:
         file.write_text(overlay, encoding="utf-8")
         experiment = load(*options.files, file)
         experiment.require_valid()
-    schedulers = experiment.resolved.with_role(Role.SCHEDULER)
-    if any(getattr(scheduler.component, "frame", None) is Frame.SAMPLE for scheduler in schedulers):
+    if any(scheduler.frame is Frame.SAMPLE for scheduler in experiment.resolved.with_role(Role.SCHEDULER)):
         raise ConfigError(
             "a translator is checked in tip coordinates, but this scheduler uses sample coordinates",
             where=str(options.files[0]),

@@ -35,7 +35,7 @@ class DriftCompensatedScheduler(Scheduler):
     The scheduler flags thermal-drift when the sample is lost: its tracker reports so, three registrations in a row
     failed, or too many of the last ten scans were not registered. The flag also stands until the first scan was taken
     in both directions. Device-malfunction is flagged when no more scans will be registered; clearing this problem
-    restarts the worker. Without correction, no problem is flagged.
+    restarts the worker. Without correction, no problem is flagged, and components use tip coordinates.
 
     Args:
         drift: settings of drift tracking and correction.
@@ -43,7 +43,6 @@ class DriftCompensatedScheduler(Scheduler):
             coordinates.
     """
 
-    frame: ClassVar = Frame.SAMPLE
     flags: ClassVar = ("thermal-drift", "device-malfunction")
     publishes: ClassVar = (MAPPING, RESCAN)
     plain_settings: ClassVar = ("drift",)
@@ -65,6 +64,12 @@ class DriftCompensatedScheduler(Scheduler):
         )
         if (compensate := self.drift.compensate) is not None:
             self.needs_parameters = (compensate.x, compensate.y)
+
+    @classmethod
+    def frame_of(cls, settings: PlainMapping) -> Frame:
+        """Return the coordinates of components with these settings: of the tip, if drift is never corrected."""
+        drift: PlainMapping = settings.get("drift") or {}
+        return Frame.SAMPLE if drift.get("correct", True) else Frame.TIP
 
     def check(self) -> None:
         """Check that estimator and tracker can be created and support these settings. Raises ConfigError if not."""
