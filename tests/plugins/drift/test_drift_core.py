@@ -309,6 +309,17 @@ def test_a_paused_scan_has_no_known_direction(lab: Lab) -> None:
     assert (job.start_s, job.upwards) == (pytest.approx(began_s, abs=1e-6), None)
 
 
+def test_scan_that_was_broken_off_has_no_known_direction_and_teaches_no_duration(lab: Lab) -> None:
+    set_direction(lab, "up")
+    lab.scope_is(ScopeState.SCANNING)
+    lab.now_s += 25.6
+    values = np.full(SHAPE, np.nan)
+    values[:12] = 1.0
+    lab.publish(Scan(HERE, "Height", "m", values, lab.now_ns, "a.nc"))
+    assert lab.worker.jobs[0].upwards is None
+    assert lab.drift.places.durations.expected_s(SHAPE, HERE.size_m) == 0.0
+
+
 def test_a_continuous_scan_begins_with_its_scanning_state(lab: Lab) -> None:
     lab.scope_is(ScopeState.SCANNING)
     lab.now_s += 100.0

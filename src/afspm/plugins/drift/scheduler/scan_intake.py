@@ -130,7 +130,8 @@ def _register(draft: DriftDraft, held: HeldScan, scan: Scan, event: PacketIn) ->
     end_s = _end_s(scan, event, draft.now_ns)
     start_s, upwards = 2 * held.middle_s - end_s, None
     begun = draft.timing.of_scan(end_s)
-    if begun is not None and not begun.was_paused:
+    # a scan that was broken off shows neither how long such a scan takes, nor when its middle row was taken
+    if begun is not None and not begun.was_paused and not scan.lines_missing:
         upwards = begun.upwards
         durations = draft.places.durations.learn(scan.shape, scan.region.size_m, end_s - start_s)
         draft.places = replace(draft.places, durations=durations)
