@@ -246,6 +246,13 @@ def test_a_waiting_scan_is_published_before_the_end(lab: Lab) -> None:
     assert kinds.index("Kill") > max(i for i, kind in enumerate(kinds) if kind == "Publish")
 
 
+def test_late_report_after_the_end_announces_no_scan_twice(lab: Lab) -> None:
+    lab.scan()
+    lab.ask(ControlRequest.END_EXPERIMENT)
+    lab.says(registered(lab.worker.jobs[0], forecast(DRIFT)))
+    assert [told.outcome for told in lab.published("DriftMapping")] == [RegistrationOutcome.FAILED]
+
+
 def test_a_mapping_is_published_with_uncertainty_rate_and_references(lab: Lab) -> None:
     lab.scan()
     (job,) = lab.worker.jobs

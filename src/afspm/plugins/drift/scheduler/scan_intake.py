@@ -275,6 +275,7 @@ def publish_as_predicted(draft: DriftDraft, held: HeldScan, why: str, level: str
     mapping = draft.forecast.mapping_at(draft.env.settings, held.middle_s)
     draft.gate = draft.gate.settle(held.key, None if mapping is None else mapping.matrix.tolist())
     report = _predicted(draft, held, why)
+    draft.worker = replace(draft.worker, job=None)  # a late report would announce the scan once more
     _announce(draft, report, held.filename, held.center_m, draft.gate.next_ns())
     _log_outcome(draft, report, held.filename, level)
     _release(draft)
