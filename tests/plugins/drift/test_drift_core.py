@@ -7,7 +7,7 @@ from dataclasses import FrozenInstanceError
 
 import numpy as np
 import pytest
-from tests.plugins.drift.drift_lab import HERE, NS, SHAPE, Lab, forecast, registered
+from tests.plugins.drift.drift_lab import HERE, NS, SHAPE, START_S, Lab, forecast, registered
 
 from afspm import wire
 from afspm.model import (
@@ -633,6 +633,19 @@ def test_answers_equal_those_of_the_plain_scheduler(lab: Lab) -> None:
     """A drop-in: requests without places are decided by the same core."""
     lab.step(RequestIn(99, "stranger", Request(int(ControlRequest.ACTION), names.START_SCAN, b"", "stranger/1/1")))
     assert lab.replies()[-1].code == ControlResponse.NOT_IN_CONTROL
+
+
+def test_mapping_is_correcting_exactly_if_its_scan_is_published_in_sample_coordinates() -> None:
+    lab = Lab(DriftCompensationSettings(correct_after=1000.0, at_start="nothing"))
+    lab.in_force()
+    for begins_s, corrected in ((900.0, False), (1100.0, True)):
+        lab.now_s = START_S + begins_s
+        lab.scan(duration_s=150.0)
+        lab.now_s = START_S + begins_s + 160.0
+        lab.effects.clear()
+        lab.says(registered(lab.worker.jobs[-1], forecast(DRIFT)))
+        assert centers(lab) == [pytest.approx(BACK if corrected else (0.0, 0.0), abs=1e-16)]
+        assert [told.correcting for told in lab.published("DriftMapping")] == [corrected]
 
 
 def test_correction_that_begins_later_needs_no_scan_in_the_other_direction() -> None:

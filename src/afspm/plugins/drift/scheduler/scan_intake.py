@@ -285,7 +285,9 @@ def _announce(
     draft: DriftDraft, report: Registered, filename: str, center_m: tuple[float, float], before_ns: int | None
 ) -> None:
     draft.tally = draft.tally.add(report.outcome)
-    payload = draft.env.codec.encode_mapping(report, filename, center_m, correcting=draft.corrects)
+    # at the middle of the scan, as the scan itself is published
+    corrects = draft.forecast.corrects(draft.env.settings, report.time_s)
+    payload = draft.env.codec.encode_mapping(report, filename, center_m, correcting=corrects)
     draft.outputs.append(Announced(MAPPING, payload, before_ns))
 
 
