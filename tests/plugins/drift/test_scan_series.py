@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from typer.testing import CliRunner
 
 from afspm.basics.errors import InvalidValue
 from afspm.cli.app import app
-from afspm.model import Region, Scan
+from afspm.model import Frame, Region, Scan
 from afspm.plugins.drift.record import DriftRecord
 from afspm.plugins.drift.study.scan_series import series
 from afspm.simulation import World
@@ -54,6 +55,22 @@ def test_a_channel_without_two_scans_is_refused_with_the_existing_channels() -> 
         series([content("Height"), content("Phase")], "Phase")
     with pytest.raises(InvalidValue, match="no scan of a topography"):
         series([])
+
+
+@pytest.mark.parametrize("correcting", [True, False])
+def test_place_on_the_sample_is_mapped_to_the_place_under_the_tip(correcting: bool) -> None:
+    """A file of the record, where the controller's own files are elsewhere."""
+    drift_m = (30e-9, -20e-9)
+    header = {"drift": {"matrix": [1.0, 0.0, -drift_m[0], 0.0, 1.0, -drift_m[1]], "correcting": correcting}}
+    contents = []
+    for k, known in enumerate((header, header, {})):
+        one = content("Height", end_s=100.0 * (k + 1), name=f"{k}.h5")
+        scans = tuple(replace(scan, region=replace(REGION, frame=Frame.SAMPLE)) for scan in one.scans)
+        contents.append(replace(one, scans=scans, header=known))
+    found = series(contents)
+    expected = replace(REGION, center_m=drift_m) if correcting else REGION
+    assert [scan.region for scan in found.scans] == [expected] * 2
+    assert found.left_out == ("2.h5: it says where it is on the sample, but not where that was under the tip",)
 
 
 @pytest.fixture
