@@ -215,11 +215,15 @@ def recorded_drift(run: RecordedScans) -> Mapping[int, XY]:
     """Return the displacement of the sample (x, y) in m, in tip coordinates, by the time of the scan.
 
     Scans at which the position of the sample was lost are left out.
-    Empty if the regions are in sample coordinates, or if no drift was recorded.
+    Zero for scans with places in sample coordinates.
+    Empty if all places are in sample coordinates, or if no drift was recorded.
     """
-    if run.frame is Frame.SAMPLE:
+    points = [point for point in run.drift if not point.lost]
+    # a run may have begun without correction (`correct_after`)
+    corrected = {point.time_ns for point in points if point.correcting and run.frame is Frame.SAMPLE}
+    if len(corrected) == len(points):
         return {}
-    return {point.time_ns: point.translation_m for point in run.drift if not point.lost}
+    return {point.time_ns: (0.0, 0.0) if point.time_ns in corrected else point.translation_m for point in points}
 
 
 def _drift_at(row: ScanRow, drift: Mapping[int, XY]) -> XY:

@@ -50,8 +50,11 @@ def drifted(step: int) -> tuple[float, float]:
     return step * STEP_M[0], step * STEP_M[1]
 
 
-def recorded(folder: Path, frame: Frame, *, with_drift: bool) -> Run:
-    """Return a run with the same tip region SCANS times, on a sample that moves below it."""
+def recorded(folder: Path, frame: Frame, *, with_drift: bool, corrected_from: int = 0) -> Run:
+    """Return a run with the same tip region SCANS times, on a sample that moves below it.
+
+    In sample coordinates, the scans from `corrected_from` on have their place on the sample.
+    """
     folder.mkdir(exist_ok=True)
     night = Night()
     store = RecordStore(folder, replace(ABOUT, facts={**ABOUT.facts, "frame": frame.value}, frame=frame))
@@ -59,23 +62,31 @@ def recorded(folder: Path, frame: Frame, *, with_drift: bool) -> Run:
         moved = drifted(step)
         place = Region((0.0, 0.0), (SIDE_M, SIDE_M), 0.3)
         scan = scan_of(place, moved, night, step)
-        if frame is Frame.SAMPLE:
+        is_corrected = frame is Frame.SAMPLE and step >= corrected_from
+        if is_corrected:
             seen = Region((-moved[0], -moved[1]), place.size_m, place.angle_rad, Frame.SAMPLE)
             scan = replace(scan, region=seen)
         packets = [night.state(ScopeState.SCANNING), night.packet(scan, f"Scan2d_1000.0_{scan.channel}")]
         if with_drift:
             assert scan.time_ns is not None
-            packets.append(drift_packet(night, scan.time_ns, moved, step))
+            packets.append(drift_packet(night, scan.time_ns, moved, step, correcting=is_corrected))
         store.take([*packets, night.state(ScopeState.FREE)])
         night.now_ns += 300_000_000_000
     store.close()
     return afspm.open_run(folder)
 
 
-def drift_packet(night: Night, time_ns: int, moved_m: tuple[float, float], step: int) -> Given:
+def drift_packet(
+    night: Night, time_ns: int, moved_m: tuple[float, float], step: int, *, correcting: bool = False
+) -> Given:
     matrix = [1.0, 0.0, -moved_m[0], 0.0, 1.0, -moved_m[1]]
     message: Any = wire.message_type("DriftMapping")(
-        matrix=matrix, center=[0.0, 0.0], covariance=[0.0] * 4, matched=True, filename=f"scan-{step:04d}.nc"
+        matrix=matrix,
+        center=[0.0, 0.0],
+        covariance=[0.0] * 4,
+        matched=True,
+        filename=f"scan-{step:04d}.nc",
+        correcting=correcting,
     )
     message.timestamp.FromNanoseconds(time_ns)
     return night.packet(message)
@@ -98,6 +109,12 @@ def test_film_of_a_drifting_sample_stands_still(
     assert film.frames.shape == (SCANS, PIXELS, PIXELS)
     assert film.numbers == tuple(range(1, SCANS + 1))
     assert film.aligned_by == aligned_by
+    assert jitter(film) < 0.08
+
+
+def test_film_stands_still_if_correction_began_during_the_run(tmp_path: Path) -> None:
+    film = recorded(tmp_path, Frame.SAMPLE, with_drift=True, corrected_from=2).film()
+    assert film.numbers == tuple(range(1, SCANS + 1))
     assert jitter(film) < 0.08
 
 
