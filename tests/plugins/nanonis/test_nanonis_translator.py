@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -353,6 +354,37 @@ def test_drift_compensation_is_switched_on_by_a_rate_and_off_by_none(bench: Make
     assert (on, x, y) == (1, pytest.approx(2e-12), 0.0)
     assert peer.set("x-drift-rate-x", 0).ok
     assert made.emulator.software.core.registers.get("Piezo.DriftComp")[0] == 0
+
+
+def test_drift_rate_of_an_axis_at_its_limit_is_refused(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    peer.until(FREE)
+    registers = made.emulator.software.core.registers
+    assert peer.set("x-drift-rate-x", "2", "pm/s").ok
+    made.at_panel(lambda _: registers.put("Piezo.DriftSaturated", 1, 0, 0))
+    refused = peer.set("x-drift-rate-x", "4", "pm/s")
+    assert "has reached its limit of 10 % of the piezo's range" in refused.reason
+    assert peer.set("x-drift-rate-y", "3", "pm/s").ok
+    assert registers.get("Piezo.DriftComp")[:3] == (1, pytest.approx(2e-12), pytest.approx(3e-12))
+    assert peer.set("x-drift-rate-x", 0).ok
+    assert peer.set("x-drift-rate-y", 0).ok, "switched off, so that it can begin again"
+    assert peer.set("x-drift-rate-x", "4", "pm/s").ok
+
+
+def _left_by_earlier_work(on: int, emulator: Emulated) -> None:
+    emulator.software.core.registers.put("Piezo.DriftComp", on, 0.0, 0.0, 5e-11, 10.0)
+
+
+def test_drift_rate_in_z_comes_into_force_only_if_it_was(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    peer.until(FREE)
+    registers = made.emulator.software.core.registers
+    for was_on in (0, 1):
+        made.at_panel(partial(_left_by_earlier_work, was_on))
+        assert peer.set("x-drift-rate-x", "2", "pm/s").ok
+        assert registers.get("Piezo.DriftComp")[3] == pytest.approx(5e-11 * was_on)
 
 
 def test_parameters_and_actions_of_the_experiment_file(bench: Make) -> None:

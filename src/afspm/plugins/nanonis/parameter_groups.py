@@ -22,6 +22,8 @@ DRIFT_RATE_Y: Final = "x-drift-rate-y"
 
 _ON, _OFF = 1, 2
 """Values of a switch in `…Set`; `…Get` returns 1 and 0 instead."""
+_DRIFT_WITHOUT_LIMIT: Final = 7
+"""Number of results of Piezo.DriftCompGet in release 2021."""
 _KEEP_SPEED: Final = 1
 """Value of Scan.SpeedSet for the quantity that a change of the frame keeps; Scan.SpeedGet returns 0 instead."""
 
@@ -154,7 +156,8 @@ class Slope(Group):
 class DriftRate(Group):
     """The velocities in x and y of the controller's drift compensation, which is off if all velocities are 0.
 
-    The z velocity is kept.
+    The z velocity in force is kept. An axis stops at a share of the piezo's range, and its velocity is still reported.
+    Another velocity would have no effect then, and is refused.
     """
 
     names = (DRIFT_RATE_X, DRIFT_RATE_Y)
@@ -165,9 +168,20 @@ class DriftRate(Group):
         return {name: rate if on else 0.0 for name, rate in zip(self.names, rates_m_s, strict=True)}
 
     def write(self, values: Mapping[str, Value]) -> None:
-        on, _, _, up_m_s, _, _, _, *limit = self._numbers("Piezo.DriftCompGet")
+        on, _, _, up_m_s, *stopped, _, limit_percent = self._with_limit(self._numbers("Piezo.DriftCompGet"))
+        for name, is_stopped in zip(self.names, stopped, strict=True):
+            if on and is_stopped and values.get(name):
+                raise refuse_value(
+                    name,
+                    f"drift compensation has reached its limit of {limit_percent:g} % of the piezo's range and stopped "
+                    "along this axis; switch it off and on at the controller to begin again",
+                )
         x, y = (float(self.merged(values)[name]) for name in self.names)
-        follows = bool(x or y or (on and up_m_s))
-        # Release 2021 has no limit.
-        limit_percent = limit[0] if limit else self._usual_limit_percent
+        # while it is off, a velocity left from earlier is not in force, and must not come into force unasked
+        up_m_s = up_m_s if on else 0.0
+        follows = bool(x or y or up_m_s)
         self._ask("Piezo.DriftCompSet", _ON if follows else _OFF, x, y, up_m_s, limit_percent)
+
+    def _with_limit(self, found: tuple[Any, ...]) -> tuple[Any, ...]:
+        # release 2021 has no limit
+        return found if len(found) > _DRIFT_WITHOUT_LIMIT else (*found, self._usual_limit_percent)

@@ -263,6 +263,8 @@ class TipModules:
         was_on, *_ = (*self._core.registers.get("Piezo.DriftComp"), 0)
         x, y, z, *limit = rest
         now_on = chosen(on, was_on, 1, 0)
+        if not now_on:
+            self._core.registers.put("Piezo.DriftSaturated", 0, 0, 0)
         self._core.rig.follow((x, y) if now_on else (0.0, 0.0), self._core.now_s)
         self._core.registers.put("Piezo.DriftComp", now_on, x, y, z, limit[0] if limit else 10.0)
         return ()
@@ -270,7 +272,7 @@ class TipModules:
     @answers("Piezo.DriftCompGet")
     def _get_drift(self) -> Answer:
         on, x, y, z, limit = self._core.registers.get("Piezo.DriftComp") or (0, 0.0, 0.0, 0.0, 10.0)
-        return on, x, y, z, 0, 0, 0, limit
+        return on, x, y, z, *(self._core.registers.get("Piezo.DriftSaturated") or (0, 0, 0)), limit
 
     @answers("AtomTrack.QuickCompStart", "AtomTrack.DriftComp")
     def _compensate(self, *which: int) -> Answer:
