@@ -13,7 +13,9 @@ from afspm.model.geometry import XY, Region
 Array = NDArray[np.float64]
 
 
-def undistorted(values: Array, region: Region, velocity_m_s: XY, duration_s: float, *, upwards: bool = True) -> Array:
+def undistorted(
+    values: Array, region: Region, velocity_m_s: XY, duration_s: float, *, upwards: bool | None = True
+) -> Array:
     """Return a scan's values without drift, on the same grid, as at the middle of the scan.
 
     Rows are scanned one after the other. A sample point at the offset S from the region's centre at half time was
@@ -34,11 +36,15 @@ def undistorted(values: Array, region: Region, velocity_m_s: XY, duration_s: flo
     return _interpolated(values, np.broadcast_to(y + (ny - 1) / 2, values.shape), x + (nx - 1) / 2)
 
 
-def _per_scan_m(region: Region, velocity_m_s: XY, duration_s: float, *, upwards: bool) -> XY:
+def _per_scan_m(region: Region, velocity_m_s: XY, duration_s: float, *, upwards: bool | None) -> XY:
     # motion of the sample during a scan along the slow and the fast axis, counted from small y to large y
     x, y = (float(v) for v in velocity_m_s)
     if not (all(map(math.isfinite, (x, y, duration_s))) and duration_s >= 0.0):
         raise InvalidValue(f"a velocity of ({x}, {y}) m/s during {duration_s} s", hint="finite, and no time below zero")
+    if upwards is None:  # as a file without it is read; a wrong direction would double the distortion
+        raise InvalidValue(
+            "the direction of the slow axis is unknown", hint="upwards=True if small y was scanned first, else False"
+        )
     cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
     signed_s = duration_s if upwards else -duration_s
     return (-sin * x + cos * y) * signed_s, (cos * x + sin * y) * signed_s

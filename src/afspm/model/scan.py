@@ -153,21 +153,21 @@ class Scan:
         """Return whether all values are NaN, so that nothing was measured; False without values."""
         return bool(self.values.size) and self.lines_missing == self.shape[0]
 
-    def undistorted(self, velocity_m_s: XY, duration_s: float, *, upwards: bool = True) -> Scan:
+    def undistorted(self, velocity_m_s: XY, duration_s: float, *, upwards: bool | None = True) -> Scan:
         """Return the scan without the drift during its acquisition, as at the middle of that time.
 
         Args:
             velocity_m_s: (x, y) of the sample under the tip, e.g. from an up frame followed by a down frame
                 (`afspm.plugins.drift.shear`); constant during the scan.
             duration_s: from the first to the last row.
-            upwards: whether small y was scanned first.
+            upwards: whether small y was scanned first; None, from a file without the direction, is an error.
 
         Returns:
             The same region and pixels; NaN where nothing was measured.
 
         Raises:
-            InvalidValue: an argument is not finite, the duration is below zero, or the sample moves along the slow
-                axis as fast as the scan.
+            InvalidValue: an argument is not finite, the direction is unknown, the duration is below zero, or the sample
+                moves along the slow axis as fast as the scan.
         """
         from afspm.model.drift_removal import undistorted
 

@@ -127,3 +127,10 @@ def test_invalid_velocity_or_duration_is_refused(velocity: tuple[float, float], 
     scan = Scan(Region((0.0, 0.0), (1e-6, 1e-6)), "Height", "m", np.ones((5, 5)))
     with pytest.raises(InvalidValue):
         scan.undistorted(velocity, duration_s)
+
+
+def test_unknown_direction_is_refused() -> None:
+    """Files of the record, and those of some other programs, do not contain it."""
+    scan = Scan(Region((0.0, 0.0), (1e-6, 1e-6)), "Height", "m", np.ones((5, 5)))
+    with pytest.raises(InvalidValue, match="direction of the slow axis is unknown"):
+        scan.undistorted((1e-10, 0.0), 100.0, upwards=None)
