@@ -17,6 +17,7 @@ from afspm.model import (
     Packet,
     Parameter,
     Problem,
+    Region,
     RegistrationOutcome,
     Request,
     RescanKind,
@@ -360,6 +361,18 @@ def test_a_scan_too_far_off_is_requested_again_at_its_requested_region(lab: Lab)
     assert wanted.shape == SHAPE
     assert lab.envelopes()[-1] == "DriftRescan"  # after the scan itself
     assert not problems(lab)
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_rescan_is_of_the_region_of_its_scan_though_another_is_set_meanwhile(lab: Lab, lost: bool) -> None:
+    lab.take_control()
+    lab.scan()
+    elsewhere = Region((5e-6, 0.0), (1e-7, 1e-7))
+    lab.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(elsewhere, (32, 32)))
+    lab.answer(lab.sent())
+    lab.says(registered(lab.worker.jobs[0], forecast(DRIFT), rescan="too far off", lost=lost))
+    wanted = wire.decode("ScanParameters2d", lab.published("DriftRescan")[0].params.SerializeToString())
+    assert (wanted.region, wanted.shape) == (HERE, SHAPE)
 
 
 def test_a_lost_sample_is_flagged_and_searched_and_a_found_one_cleared(lab: Lab) -> None:

@@ -16,9 +16,11 @@ from afspm.model import (
     Request,
     RescanKind,
     Response,
+    ScanParameters,
     names,
 )
-from afspm.plugins.drift.scheduler.messages import Compensated, RescanWanted
+from afspm.plugins.drift.scheduler.messages import Compensated, RescanWanted, ScanJob
+from afspm.plugins.drift.scheduler.positions import is_same
 from afspm.plugins.drift.scheduler.state import CallPerson, DriftDraft, FollowUp, RespondToFailure, RespondToScan
 from afspm.plugins.drift.scheduler.tally import LATELY
 from afspm.scheduler.coordinate_frame import AskMicroscope
@@ -58,16 +60,16 @@ def _respond_to_scan(draft: DriftDraft, what: RespondToScan) -> None:
         if registered.matched and not registered.lost:
             _clear_own_flag(draft)
     elif registered.lost:
-        _search(draft, f"the sample is lost: {registered.reason}")
+        _search(draft, f"the sample is lost: {registered.reason}", what.job)
     elif not draft.duties.started:
-        _scan_in_opposite_direction(draft, what.job.upwards)
+        _scan_in_opposite_direction(draft, what.job)
     elif draft.tally.exceeds(draft.env.settings.most_unregistered):
         _respond_to_low_share(draft)
     else:
         if registered.matched:
             _clear_own_flag(draft)
         if registered.rescan:
-            _request_rescan(draft, RescanKind.AGAIN, registered.rescan)
+            _request_rescan(draft, RescanKind.AGAIN, registered.rescan, what.job)
 
 
 def _respond_to_failure(draft: DriftDraft, why: str) -> None:
@@ -99,23 +101,23 @@ def _respond_to_low_share(draft: DriftDraft) -> None:
     _search(draft, f"{share}: {draft.tally.summary()}")
 
 
-def _search(draft: DriftDraft, why: str) -> None:
+def _search(draft: DriftDraft, why: str, job: ScanJob | None = None) -> None:
     draft.outputs.append(ProblemSeen(_DRIFT, flagged=True, name=draft.env.name))
     # a searching component has widened the region itself: a request for that region would be wrong
     if draft.control.solving != _DRIFT:
-        _request_rescan(draft, RescanKind.SEARCH, why)
+        _request_rescan(draft, RescanKind.SEARCH, why, job)
 
 
-def _scan_in_opposite_direction(draft: DriftDraft, upwards: bool | None) -> None:
+def _scan_in_opposite_direction(draft: DriftDraft, job: ScanJob) -> None:
     # flagged, so that no component scans before both directions are there
     draft.duties = replace(draft.duties, started=True)
-    if upwards is None:
+    if job.upwards is None:
         why = f"the microscope does not report {names.SCAN_DIRECTION}"
         draft.log("INFO", f"{why}: the first scan is not taken in both directions")
         return
     draft.log("INFO", "thermal-drift is flagged until the first scan was taken in both directions: normal at the start")
     draft.outputs.append(ProblemSeen(_DRIFT, flagged=True, name=draft.env.name))
-    _request_rescan(draft, RescanKind.OPPOSITE, _AT_START, upwards=not upwards)
+    _request_rescan(draft, RescanKind.OPPOSITE, _AT_START, job, upwards=not job.upwards)
 
 
 def _clear_own_flag(draft: DriftDraft) -> None:
@@ -125,12 +127,18 @@ def _clear_own_flag(draft: DriftDraft) -> None:
         draft.outputs.append(ProblemSeen(_DRIFT, flagged=False, name=draft.env.name))
 
 
-def _request_rescan(draft: DriftDraft, kind: RescanKind, reason: str, *, upwards: bool | None = None) -> None:
-    place = draft.places.region.current
-    if place is None:
+def _request_rescan(
+    draft: DriftDraft, kind: RescanKind, reason: str, job: ScanJob | None, *, upwards: bool | None = None
+) -> None:
+    place, shape = draft.places.region.current, draft.places.shape
+    requested = None if place is None else place.requested
+    if job is not None and job.asked is not None and (place is None or not is_same(place.sample, job.asked)):
+        # another region was set while the scan waited for its registration
+        requested, shape = draft.env.codec.encode(ScanParameters(job.asked)), job.scan.shape
+    if requested is None:
         draft.log("ERROR", f"{reason}, and the region to scan again is unknown")
         return
-    wanted = RescanWanted(kind, place.requested, draft.places.shape, reason, draft.now_ns, upwards)
+    wanted = RescanWanted(kind, requested, shape, reason, draft.now_ns, upwards)
     level = "INFO" if kind is RescanKind.OPPOSITE else "WARNING"  # it belongs to the start of every night
     draft.log(level, f"requesting a rescan: {reason}")
     draft.outputs.append(Announced(RESCAN, draft.env.codec.encode_rescan(wanted)))
