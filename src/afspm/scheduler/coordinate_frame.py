@@ -53,7 +53,10 @@ class Reconsider:
 
 @dataclass(frozen=True, slots=True)
 class AskMicroscope:
-    """The output that sends a request in the scheduler's own name; the answer is the input `FrameAnswered`."""
+    """The output that sends a request in the scheduler's own name; the answer is the input `FrameAnswered`.
+
+    A request beyond a limit is not sent, and answered with the reason.
+    """
 
     request: Request
     purpose: object

@@ -303,6 +303,11 @@ def _on_reconsidered(draft: StateDraft, output: Reconsider) -> None:
 
 
 def _on_ask_microscope(draft: StateDraft, output: AskMicroscope) -> None:
+    # the values, and not who may set them: no component asks
+    refusal = draft.limits.check(SCHEDULER, output.request, draft.now_ns, used=())
+    if refusal is not None:
+        draft.raised.append(FrameAnswered(output.purpose, refusal))
+        return
     draft.forwarder, _ = draft.forwarder.ask_own(output.request, draft.now_s, AskForFrame(output.purpose))
 
 

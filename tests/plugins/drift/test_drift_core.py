@@ -32,6 +32,7 @@ from afspm.plugins.drift.scheduler.sample_frame import SampleFrame
 from afspm.plugins.drift.scheduler.settings import Compensate, DriftCompensationSettings
 from afspm.plugins.drift.scheduler.state import SavedDrift
 from afspm.scheduler.events import Log, PacketIn, Publish, RequestIn, Tick, TranslatorCaughtUp
+from afspm.scheduler.safety.limits import ExperimentLimits, Limit
 
 DRIFT = (100e-9, -50e-9)
 BACK = (-100e-9, 50e-9)
@@ -624,6 +625,17 @@ def test_a_controller_that_refuses_the_rate_is_logged() -> None:
     assert "x-rate-x" in logged(lab, "ERROR")[0]
     lab.answer(lab.sent())
     assert [velocity for _, velocity in lab.worker.velocities] == [(0.0, -2e-10)], "the other is as it was"
+
+
+def test_rate_beyond_a_limit_of_the_experiment_is_not_sent() -> None:
+    limits = ExperimentLimits({"x-rate-x": Limit(low=-5e-11, high=5e-11, unit="m/s")})
+    lab = Lab(DriftCompensationSettings(compensate=Compensate("x-rate-x", "x-rate-y")), limits)
+    lab.in_force()
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[0], forecast(DRIFT, (1e-10, -2e-10), at_s=lab.now_s)))
+    assert "x-rate-x = 100 pm/s is above the highest allowed, 50 pm/s" in logged(lab, "ERROR")[0]
+    assert lab.sent().request.subject.name == "x-rate-y"
+    assert not lab.worker.velocities
 
 
 def test_the_rate_stays_while_a_person_is_in_control() -> None:

@@ -188,7 +188,7 @@ def rate_answered(draft: DriftDraft, given: RateGiven, response: Response) -> No
     if not response.ok:
         # NOT_FREE: a scan has already begun; the rate is handed over after the next one
         if response.code != ControlResponse.NOT_FREE:
-            draft.log("ERROR", f"the controller refused the drift rate, {given.name}: {response.reason}")
+            draft.log("ERROR", f"the drift rate {given.name} was refused: {response.reason}")
         return
     if not given.is_new:
         return
