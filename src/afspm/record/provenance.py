@@ -138,6 +138,17 @@ def instruments(journal: sqlite3.Connection, time_ns: int, since_ns: int | None)
     ]
 
 
+def is_corrected(journal: sqlite3.Connection) -> bool:
+    """Return whether the newest `DriftMapping` says that drift is corrected; True without any."""
+    mapping = _last(journal, "DriftMapping", 2**63 - 1)
+    return mapping is None or corrects(mapping)
+
+
+def corrects(mapping: Any) -> bool:
+    """Return whether a `DriftMapping` says that drift is corrected; True for a message without this field."""
+    return bool(mapping.correcting) or not mapping.HasField("correcting")
+
+
 def last_state(journal: sqlite3.Connection) -> ScopeState:
     status = _last(journal, "ScopeStateMsg", 2**63 - 1)
     return status.state if isinstance(status, ScopeStatus) else ScopeState.UNDEFINED

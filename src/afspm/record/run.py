@@ -388,7 +388,10 @@ class Run:
 
     @property
     def frame(self) -> Frame:
-        """The frame of all positions: the sample frame if drift was compensated, else the tip frame."""
+        """The frame of positions: the sample frame if drift was compensated, else the tip frame.
+
+        Scans and spectra from before `correct_after` are in the tip frame.
+        """
         return Frame(self._note("frame") or Frame.TIP.value)
 
     def numbered(self, number: int) -> ScanRow:

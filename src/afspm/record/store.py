@@ -57,7 +57,7 @@ class RecordSettings:
     Attributes:
         facts: written into every file: the name of the experiment, seeds …
         problems: the names of the experiment's problems.
-        frame: the coordinate frame of published positions.
+        frame: the coordinate frame of published positions; of the sample only where drift is corrected.
         measured: write scans and spectra; otherwise only the journal.
     """
 
@@ -93,6 +93,7 @@ class RecordStore:
     def _begin(self, about: RecordSettings) -> None:
         self._files = MeasuredFiles(self._folder, self._journal, about.facts, about.problems)
         self._gathering = ScanAssembler(provenance.last_state(self._journal))
+        self._is_corrected = provenance.is_corrected(self._journal)
         for name, value in about.facts.items():
             self.note(name, value)
 
@@ -179,13 +180,16 @@ class RecordStore:
         if self.has(packet):
             return
         message, thing = _read(packet)
+        if message == "DriftMapping" and source == SCHEDULER:
+            # published right before its scan; correction may begin during a run
+            self._is_corrected = provenance.corrects(thing)
         match thing:
             case Scan() if thing.values.size and self._about.measured:
                 self._write(self._gathering.scan(packet, self._placed(thing)))
             case ScanLines() if self._about.measured:
                 self._write(self._gathering.lines(packet, self._placed(thing)))
             case Spectrum() if self._about.measured:
-                self._write(self._gathering.spectrum(packet, replace(thing, frame=self._about.frame)))
+                self._write(self._gathering.spectrum(packet, replace(thing, frame=self._frame)))
             case _:
                 self._add(packet, message, source, thing)
 
@@ -224,9 +228,13 @@ class RecordStore:
         for packet in taken.packets():
             insert_packet(self._journal, packet, wire.message_of(packet.envelope), bytes(packet.payload))
 
+    @property
+    def _frame(self) -> Frame:
+        return self._about.frame if self._is_corrected else Frame.TIP
+
     def _placed(self, image: Image) -> Image:
         # the wire format does not carry the frame
-        frame = self._about.frame
+        frame = self._frame
         return image if frame is Frame.TIP else replace(image, region=replace(image.region, frame=frame))
 
     def _add_entries(self, entries: JournalEntries) -> None:

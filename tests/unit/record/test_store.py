@@ -266,6 +266,21 @@ def test_sample_coordinates_are_named(night: Night, tmp_path: Path) -> None:
     assert run.scan(0)["Height"].region.frame is run.spectrum(0).frame is Frame.SAMPLE
 
 
+def test_scans_before_correction_begins_are_in_tip_coordinates(night: Night, tmp_path: Path) -> None:
+    about = RecordSettings({"frame": "sample"}, ProblemNames(), Frame.SAMPLE)
+    for number, correcting in enumerate((False, None, True)):
+        store = RecordStore(tmp_path, about)  # as after a restart
+        if correcting is not None:
+            store.take([night.packet(wire.message_type("DriftMapping")(correcting=correcting))])
+        store.take([*night.whole_scan(number + 1), night.spectrum()])
+        store.close()
+    run = afspm.open_run(tmp_path)
+    frames = [Frame.TIP, Frame.TIP, Frame.SAMPLE]
+    assert [row.region.frame for row in run.scans if row.region is not None] == frames
+    assert [run.scan(number)["Height"].region.frame for number in range(3)] == frames
+    assert [run.spectrum(number).frame for number in range(3)] == frames
+
+
 def test_without_scans_there_is_the_journal_alone(night: Night, tmp_path: Path) -> None:
     store = RecordStore(tmp_path, RecordSettings(measured=False))
     store.take([night.control(), *night.whole_scan(1)])
