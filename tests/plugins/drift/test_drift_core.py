@@ -557,6 +557,23 @@ def test_at_the_start_the_first_scan_is_requested_in_the_other_direction() -> No
     assert not again.published("DriftRescan")  # once in an experiment
 
 
+def test_scan_that_was_broken_off_does_not_replace_the_first_scan_in_both_directions() -> None:
+    lab = Lab(DriftCompensationSettings())
+    lab.in_force()
+    set_direction(lab, "up")
+    values = np.ones(SHAPE)
+    values[9:] = np.nan
+    lab.scope_is(ScopeState.SCANNING)
+    lab.now_s += 20.0
+    lab.publish(Scan(HERE, "Height", "m", values, lab.now_ns, "a.nc"))
+    lab.scope_is(ScopeState.FREE)
+    lab.says(registered(lab.worker.jobs[0], forecast()))
+    assert not lab.published("DriftRescan")
+    lab.scan()
+    lab.says(registered(lab.worker.jobs[1], forecast()))
+    assert [told.upwards for told in lab.published("DriftRescan")] == [False]
+
+
 def test_a_microscope_without_a_direction_is_not_waited_for() -> None:
     lab = Lab(DriftCompensationSettings())
     lab.in_force()

@@ -61,7 +61,7 @@ def _respond_to_scan(draft: DriftDraft, what: RespondToScan) -> None:
             _clear_own_flag(draft)
     elif registered.lost:
         _search(draft, f"the sample is lost: {registered.reason}", what.job)
-    elif not draft.duties.started:
+    elif not draft.duties.started and not what.job.scan.lines_missing:
         _scan_in_opposite_direction(draft, what.job)
     elif draft.tally.exceeds(draft.env.settings.most_unregistered):
         _respond_to_low_share(draft)
