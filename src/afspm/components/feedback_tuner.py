@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import Any, ClassVar
 
-from afspm.basics.errors import ConfigError, ControlLost, InvalidValue, Refused
+from afspm.basics.errors import ConfigError, ControlLost, InvalidValue, Refused, RequestError
 from afspm.components.feedback_metrics import FeedbackQuality, gain_search
 from afspm.components.feedback_signal import FeedbackObserver
 from afspm.model import Problem, names
@@ -19,8 +19,9 @@ class FeedbackTuner(FeedbackObserver):
 
     The component raises the gain while the feedback is too slow, and lowers the gain while the feedback oscillates. If
     no gain is good, the component restores the original gain, logs an error, and clears the flag, so that the
-    experiment continues as before. After a loss of control or a kill, it sets the last good gain of the search, or the
-    original gain if none was good.
+    experiment continues as before. After a failed scan, a loss of control or a kill, it sets the last good gain of the
+    search, or the original gain if none was good. If that gain is refused, the component flags `device-malfunction`, so
+    that nothing is scanned until a person has set a gain.
 
     Args:
         lowest_gain, highest_gain: bounds of the integral gain.
@@ -29,6 +30,7 @@ class FeedbackTuner(FeedbackObserver):
     """
 
     solves: ClassVar = ("feedback-non-optimal",)
+    flags: ClassVar = ("device-malfunction",)
     needs_actions = (names.START_SCAN,)
     needs_parameters = (names.ZCTRL_IGAIN,)
 
@@ -66,12 +68,19 @@ class FeedbackTuner(FeedbackObserver):
             self._finish(f"the feedback in force is {feedback}")
             return
         self.memory.setdefault("gain", feedback.integral_gain)
+        self.memory["way"] = [feedback.integral_gain]
         self.memory.save()
         try:
             found = self._search(min(max(feedback.integral_gain, self.lowest), self.highest))
         except InvalidValue as error:
             self._finish(error.what)
             return
+        except ControlLost:
+            raise
+        except RequestError:  # the scans may fail because of this gain, and the tip must not stay with it
+            with suppress(RequestError):
+                self._set_back(BACK_WITHIN_S)
+            raise
         if found is not None:
             self._keep(found)
         self._finish("" if found is not None else "no gain is good")
@@ -96,6 +105,8 @@ class FeedbackTuner(FeedbackObserver):
         except Refused as refused:
             self.log.warning("integral gain %g was refused: %s", gain, refused.reason)
             return None
+        self.memory["way"] = [*self.memory["way"], gain]
+        self.memory.save()
         scans = self.scope.scan()
         for name in (self.channel, self.height):
             if name and name not in scans:
@@ -111,10 +122,16 @@ class FeedbackTuner(FeedbackObserver):
         self.memory.save()
 
     def _finish(self, why: str) -> None:
-        self._set_back()
+        if not self._set_back():
+            return
         if why:
             self.log.error("the feedback can't be improved: %s. Its setting is as before; please check it", why)
         self.scope.clear(Problem.FEEDBACK_NON_OPTIMAL)
+
+    def on_end(self) -> None:
+        gain, way = self.memory.get("gain"), self.memory.get("way")
+        if gain is not None and way and gain != way[-1]:
+            self.log.warning("it ends before the integral gain, now %g, is set back to %g", way[-1], gain)
 
     def _leave_behind(self) -> None:
         # control was lost before `_finish`, or this process was killed
@@ -122,15 +139,32 @@ class FeedbackTuner(FeedbackObserver):
             with suppress(ControlLost), self.scope.control(timeout_s=BACK_WITHIN_S):
                 self._set_back()
 
-    def _set_back(self) -> None:
+    def _set_back(self, timeout_s: float | None = None) -> bool:
         gain = self.memory.get("gain")
         if gain is None:
-            return
+            return True
         try:
-            self.scope.set_feedback(integral_gain=gain)
+            self._go_back_to(gain, timeout_s)
         except Refused as refused:
-            self.log.warning("integral gain %g could not be set again: %s", gain, refused.reason)
+            text = "integral gain %g can't be set again: %s. The feedback in force is %s; set a gain by hand"
+            self.log.error(text, gain, refused.reason, self.scope.feedback)
+            self.scope.flag(Problem.DEVICE_MALFUNCTION)
+            is_back = False
         else:
             self.log.info("integral gain %g", gain)
+            is_back = True
         del self.memory["gain"]
+        self.memory.pop("way", None)
         self.memory.save()
+        return is_back
+
+    def _go_back_to(self, gain: float, timeout_s: float | None) -> None:
+        try:
+            self.scope.set_feedback(integral_gain=gain, timeout_s=timeout_s)
+        except Refused:
+            # a limit on steps may refuse the whole way, and allow the steps of the search
+            way = self.memory.get("way", [])
+            if gain not in way[:-1]:
+                raise
+            for one in reversed(way[way.index(gain) : -1]):
+                self.scope.set_feedback(integral_gain=one, timeout_s=timeout_s)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from tests.unit.client.client_lab import Lab, run
 
+from afspm.basics.errors import MeasurementFailed, Refused
 from afspm.basics.exit_codes import ExitCode
 from afspm.components.feedback_tuner import FeedbackTuner
 from afspm.model import (
@@ -23,6 +24,7 @@ from afspm.model import (
     Request,
     Response,
     Scan,
+    ScopeState,
     names,
 )
 
@@ -142,3 +144,80 @@ def test_original_gain_is_restored_after_a_kill(tmp_path: Path) -> None:
     later.at(250.0, later.kill)
     run(tuner(), later, tmp_path)
     assert later.gains == [BEFORE]
+
+
+class Unscannable(Rig):
+    """A laboratory whose scans break off while the integral gain is above 3."""
+
+    def _finish_scan(self) -> None:
+        if self.gains[-1] > 3.0:
+            self._go(ScopeState.INTERRUPTED)
+        else:
+            super()._finish_scan()
+
+
+def test_gain_is_set_back_when_the_scans_fail_with_it(tmp_path: Path) -> None:
+    lab = Unscannable(lambda gain: off_by(0.5))
+    with pytest.raises(MeasurementFailed):
+        run(tuner(), lab, tmp_path)
+    assert max(lab.gains) == 4.0
+    assert lab.gains[-1] == BEFORE
+    assert Problem.DEVICE_MALFUNCTION in lab.problems
+
+
+def test_gain_is_set_back_when_a_scan_is_refused_with_it() -> None:
+    lab = Rig(lambda gain: off_by(0.5))
+
+    def refuse(request: Request) -> Response | str:
+        if request.subject == names.START_SCAN and lab.gains[-1] > 3.0:
+            return Response(ControlResponse.ACTION_ERROR, reason="the tip swings")
+        return "go on"
+
+    lab.intercept = refuse
+    with pytest.raises(Refused):
+        run(tuner(), lab)
+    assert max(lab.gains) == 4.0
+    assert lab.gains[-1] == BEFORE
+
+
+def test_gain_to_be_set_back_is_named_when_the_experiment_ends_in_the_search(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Rig(lambda gain: off_by(0.5))
+    lab.at(250.0, lab.kill)
+    run(tuner(), lab)
+    assert lab.gains[-1] == 4.0
+    assert "before the integral gain, now 4, is set back to 1" in caplog.text
+
+
+def test_gain_goes_back_in_steps_if_a_limit_refuses_the_whole_way() -> None:
+    lab = Rig(lambda gain: off_by(0.5))
+
+    def refuse(request: Request) -> Response | str:
+        if request.kind == ControlRequest.SET_ZCTRL_PARAMS:
+            if abs(request.subject.integral_gain - in_force[-1]) > 4.0:
+                return Response(ControlResponse.PARAM_ERROR, reason="a step of 9")
+            in_force.append(request.subject.integral_gain)
+        return "go on"
+
+    in_force = [BEFORE]
+    lab.intercept = refuse
+    tuned(lab)
+    assert max(in_force) == 10.0
+    assert in_force[-1] == BEFORE
+    assert lab.problems == ()
+
+
+def test_a_gain_that_cannot_be_set_back_stops_the_scans_until_a_person_has_looked(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    lab = Rig(lambda gain: off_by(0.5))
+
+    def refuse(request: Request) -> Response | str:
+        if request.kind == ControlRequest.SET_ZCTRL_PARAMS and request.subject.integral_gain < max(lab.gains):
+            return Response(ControlResponse.PARAM_ERROR, reason="not downwards")
+        return "go on"
+
+    lab.intercept = refuse
+    tuned(lab)
+    assert set(lab.problems) == {Problem.FEEDBACK_NON_OPTIMAL, Problem.DEVICE_MALFUNCTION}
+    assert "integral gain 1 can't be set again: the setting of the feedback was refused: not downwards" in caplog.text
+    assert "as before" not in caplog.text
