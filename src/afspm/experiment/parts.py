@@ -94,6 +94,10 @@ def sort(document: Document, converters: Iterable[Converter] = ()) -> Experiment
     raw_components: dict[str, Settings] = {}
     for key, value in document.data.items():
         if not isinstance(value, dict):
+            if key in SECTIONS:  # as a variable, it would be without effect: limits that hold nothing back
+                document.error(
+                    f"{key} is a section, not a value or a list", key, hint=f"once, in single brackets: [{key}]"
+                )
             parts.variables[key] = value
         elif _is_component(key, value, document):
             raw_components[key] = value
@@ -101,7 +105,9 @@ def sort(document: Document, converters: Iterable[Converter] = ()) -> Experiment
             parts.sections[key] = value
         else:
             parts.intermediaries[key] = value
-    references = VariableReferences(document, {**parts.variables, **parts.intermediaries})
+    # a component that is switched off can still be named, as in `only` of a limit
+    values = {name: table for name, table in parts.intermediaries.items() if "component" not in table}
+    references = VariableReferences(document, {**parts.variables, **values})
     parts.variables = {k: references.expand(v, (k,)) for k, v in parts.variables.items()}
     parts.sections = {k: references.expand(v, (k,)) for k, v in parts.sections.items()}
     parts.intermediaries = {k: references.expand(v, (k,)) for k, v in parts.intermediaries.items()}

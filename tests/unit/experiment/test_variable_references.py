@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from .conftest import Write, errors, line_of, only_error
 
 SCANNER = '[scan]\ncomponent = true\nclass = "parts.Scanner"\n'
@@ -29,6 +31,19 @@ def test_a_component_s_name_stays_a_name(write: Write) -> None:
     )
     assert not errors(experiment)
     assert experiment.resolved.processes["scan"].settings["names"] == ["scan", "scheduler", "clock"]
+
+
+def test_a_component_that_is_switched_off_can_still_be_named(write: Write) -> None:
+    limit = '[limits.tip-bias-voltage]\nonly = ["scan"]\n'
+    experiment = write(SCANNER + limit, "[scan]\ncomponent = false\n")
+    assert "there is no component 'scan'" in only_error(experiment).what
+
+
+@pytest.mark.parametrize("text", ["[[limits]]\nmost_pixels = 10\n", "limits = 10\n"])
+def test_a_section_that_is_no_table_is_an_error(write: Write, text: str) -> None:
+    error = only_error(write(text))
+    assert (error.what, error.place.line) == ("limits is a section, not a value or a list", 1)
+    assert "[limits]" in error.hint
 
 
 def test_a_dotted_string_stays_a_string(write: Write) -> None:
