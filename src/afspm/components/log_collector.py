@@ -26,6 +26,7 @@ class LogCollector(Component):
     """
 
     listens: ClassVar = ("LogLines",)
+    file_suffix: ClassVar[str] = ""
 
     def __init__(self, file: str = "log-all.txt", level: Literal["INFO", "WARNING", "ERROR"] = "INFO") -> None:
         self.file = file

@@ -64,6 +64,8 @@ class Metadata(Component):
         "Scan2d", "Spec1d", "ControlState", "ScopeStateMsg", "Note", "ZCtrlParameters", "JournalEntries",
     )  # fmt: skip
 
+    file_suffix: ClassVar[str] = ""
+
     def __init__(self, file: str = "metadata.csv") -> None:
         self.file = file
         self._control: ControlState | None = None

@@ -29,6 +29,7 @@ class NightPicture(Component):
         title: title above the picture.
     """
 
+    file_suffix: ClassVar[str] = ""
     listens: ClassVar = ("",)  # also the journal, which names the problems of conditions
 
     def __init__(self, channel: str = "Height", file: str = "night.png", title: str = "") -> None:

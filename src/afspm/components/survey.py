@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 from afspm.basics.errors import ConfigError, Refused
 from afspm.basics.formatting import area_text, counted, lengths_text, position_text
@@ -71,6 +72,7 @@ class Survey(Component):
     drift_doubts: tuple[ConfigError, ...]
     """Warnings of `afspm check` if drift is corrected."""
     requires = ("afspm[features]",)
+    file_suffix: ClassVar[str] = ".csv"
     needs_actions: tuple[str, ...] = (names.START_SCAN,)
     _outage = OutageLog("the table of targets can't be written", logging.getLogger("afspm.records"))
 

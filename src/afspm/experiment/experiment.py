@@ -88,9 +88,11 @@ class Experiment:
         Raises:
             ConfigError: `only` or `without` names no component.
         """
+        from afspm.experiment.structure_checks import shared_files
+
         chosen = process_starts.chosen_names(self.resolved, only, without)
         missing = process_starts.not_installed(self.resolved, chosen)
-        return Findings([*self._document.findings.found, *missing]).ordered()
+        return Findings([*self._document.findings.found, *missing, *shared_files(self.resolved, chosen)]).ordered()
 
     @cached_property
     def resolved(self) -> ResolvedExperiment:

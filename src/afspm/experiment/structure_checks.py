@@ -6,15 +6,16 @@ import contextlib
 import inspect
 import re
 from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
 from typing import Final
 
 from afspm import wire
 from afspm.basics.addresses import EXAMPLE, hint_on, is_address, reaches
 from afspm.basics.errors import InvalidValue
 from afspm.client.component import Component
-from afspm.experiment import class_loader
-from afspm.experiment.findings import closest, nearest
-from afspm.experiment.implied_parts import check_notify, is_program
+from afspm.experiment import class_loader, settings
+from afspm.experiment.findings import Finding, Level, closest, nearest
+from afspm.experiment.implied_parts import RECORDS, check_notify, is_program
 from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
 from afspm.experiment.wiring_classes import WIRE_SETTINGS, BoundSocket, wire_of
 from afspm.model import Role, component_of, is_process_name
@@ -24,6 +25,9 @@ from afspm.wire.messages import SCAN_LINES
 
 OPENS_PLAIN: Final = "opens_plain"
 """Class attribute that marks a component through which programs without keys can send requests."""
+FILE_SUFFIX: Final = "file_suffix"
+"""Class attribute of a component that writes a file into the run folder: `file` of its settings, and this suffix."""
+_OF_EACH_RUN = ("experiment.toml", "journal.sqlite", "log.txt", "report.html", "run.json")
 ADDRESS: Final = "address"
 """Usual name of a translator's setting for the address of its controller."""
 _WORD = re.compile(r"[A-Za-z_][\w-]*")
@@ -179,6 +183,35 @@ def check_listens_to(resolved: ResolvedExperiment) -> None:
                 resolved.document.error(what, *path, hint=nearest(str(other), publishers))
             elif other not in publishers:
                 resolved.document.error(f"[{name}] listens to [{other}], which publishes nothing", *path)
+
+
+def shared_files(resolved: ResolvedExperiment, names: Collection[str]) -> Iterator[Finding]:
+    """Yield an error for a second recorder, and for a component that writes the same file as another.
+
+    Args:
+        names: processes that are started together, into one run folder.
+    """
+    recorders = [name for name in resolved.declaring(RECORDS) if name in names]
+    for name in recorders[1:]:
+        what = f"[{name}] is a second recorder beside [{recorders[0]}]"
+        place = resolved.document.place(name)
+        yield Finding(Level.ERROR, what, place, "one is enough: two write the same record, and spoil it")
+    written = dict.fromkeys(_OF_EACH_RUN, "")
+    for name, process in resolved.processes.items():
+        suffix, file = getattr(process.component, FILE_SUFFIX, None), _file_of(process)
+        if name not in names or not isinstance(suffix, str) or not isinstance(file, str):
+            continue
+        other = written.setdefault(f"{file}{suffix}".casefold(), name)
+        if other != name:
+            by = f"[{other}] writes, too" if other else "afspm writes in every run"
+            another = name if suffix else f"{name}{Path(file).suffix}"
+            place, hint = resolved.document.place(name, "file"), f'give it a file of its own: file = "{another}"'
+            yield Finding(Level.ERROR, f"[{name}] writes {file}{suffix}, which {by}", place, hint)
+
+
+def _file_of(process: ResolvedProcess) -> object:
+    default = None if process.component is None else settings.default_of(process.component, "file")
+    return process.settings.get("file", default)
 
 
 def check_problems(resolved: ResolvedExperiment) -> None:

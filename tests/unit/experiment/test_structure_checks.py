@@ -379,3 +379,40 @@ def _reload(experiment: Experiment) -> Experiment:
     file = experiment.folder / "expanded.toml"
     file.write_text(experiment.expanded(), encoding="utf-8")
     return load(file)
+
+
+MAP = 'component = true\nclass = "Adaptive"\nsize = ["1 um", "1 um"]\nquantity = "gap"\nuntil = { spectra = 9 }\n'
+
+
+def test_a_second_recorder_is_an_error(write: Write) -> None:
+    recorder = 'component = true\nclass = "Recorder"\n'
+    error = only_error(write(f"[one]\n{recorder}[two]\n{recorder}scans = false\n"))
+    assert error.what == "[two] is a second recorder beside [one]"
+
+
+@pytest.mark.parametrize(
+    ("text", "what", "hint"),
+    [
+        (f"[left]\n{MAP}[right]\n{MAP}", "[right] writes map.csv, which [left] writes, too", 'file = "right"'),
+        (f"[left]\n{MAP}[right]\n{MAP}file = 'Map'\n", "[right] writes Map.csv, which [left] writes", 'file = "right"'),
+        (
+            '[logs]\ncomponent = true\nclass = "LogCollector"\nfile = "log.txt"\n',
+            "[logs] writes log.txt, which afspm writes in every run",
+            'file = "logs.txt"',
+        ),
+    ],
+)
+def test_two_components_that_write_the_same_file_are_an_error(write: Write, text: str, what: str, hint: str) -> None:
+    error = only_error(write(text))
+    assert what in error.what
+    assert hint in error.hint
+
+
+def test_two_components_may_write_the_same_file_in_two_runs(write: Write) -> None:
+    experiment = write(f"[left]\n{MAP}[right]\n{MAP}")
+    assert not experiment.check(without=["left"])
+    assert not experiment.check(only=["left", "scheduler", "microscope"])
+
+
+def test_components_of_one_class_write_files_of_their_own(write: Write) -> None:
+    assert not errors(write(f"[left]\n{MAP}[right]\n{MAP}file = 'right'\n"))

@@ -6,7 +6,7 @@ import csv
 import io
 import logging
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final
 
 from afspm.basics.errors import ConfigError
 from afspm.basics.formatting import counted, quantity
@@ -58,6 +58,7 @@ class Adaptive(Component):
         file: name of table and picture, without suffix.
     """
 
+    file_suffix: ClassVar[str] = ".csv"
     needs_actions = (names.START_SPEC,)
     longest_step_s = 120.0  # a process with a thousand measurements takes seconds on a busy computer
     _outage = OutageLog("the table of the map can't be written", logging.getLogger("afspm.records"))

@@ -47,6 +47,7 @@ class DriftTable(Component):
         file: name of the table in the run folder.
     """
 
+    file_suffix: ClassVar[str] = ""
     listens: ClassVar = ("DriftMapping",)
 
     def __init__(self, file: str = "drift_correction.csv") -> None:
