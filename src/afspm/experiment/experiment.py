@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError
@@ -195,8 +195,42 @@ class Experiment:
         return ExperimentClock.starting_now(settings.start.timestamp() if settings.start else None, settings.speed)
 
     def expanded(self, *, secrets: bool = True) -> str:
-        """Return the whole experiment as one TOML text: references replaced, defaults filled in."""
-        return to_toml(self.parts, secrets=secrets)
+        """Return the whole experiment as one TOML text: references replaced, defaults filled in.
+
+        Relative paths in overlays of other folders become absolute, since the text has only one folder.
+        """
+        return to_toml(self._anchored(), secrets=secrets)
+
+    def _anchored(self) -> sorting.ExperimentParts:
+        parts, resolved = self.parts, self.resolved
+        variables, sections = dict(parts.variables), dict(parts.sections)
+        if self._is_elsewhere("messages"):
+            variables["messages"] = list(resolved.messages)
+        if resolved.keys_folder is not None and self._is_elsewhere("security", "keys"):
+            sections["security"] = sections["security"] | {"keys": str(resolved.keys_folder)}
+        components = []
+        for part in parts.components:
+            given, found = dict(part.settings), resolved.processes[part.name].settings
+            given |= {
+                key: _with_paths(one, found.get(key))
+                for key, one in given.items()
+                if self._is_elsewhere(part.name, key)
+            }
+            components.append(replace(part, settings=given))
+        return replace(parts, variables=variables, sections=sections, components=components)
+
+    def _is_elsewhere(self, *path: str) -> bool:
+        return self._document.folder_of(*path) != self.folder
+
+
+def _with_paths(given: Any, resolved: Any) -> Any:
+    # `given` as in the file, with its relative paths as they were resolved
+    if isinstance(given, dict) and isinstance(resolved, dict):
+        return {key: _with_paths(one, resolved.get(key)) for key, one in given.items()}
+    if isinstance(given, list) and isinstance(resolved, list) and len(given) == len(resolved):
+        return [_with_paths(*pair) for pair in zip(given, resolved, strict=True)]
+    is_path = isinstance(given, str) and isinstance(resolved, str) and Path(resolved).is_absolute()
+    return resolved if is_path else given
 
 
 def load_expanded(path: Path, homes: Sequence[Path], *overlays: Path) -> Experiment:

@@ -73,7 +73,9 @@ def _add(part: ExperimentPart, resolved: ResolvedExperiment) -> None:
     resolved.processes[name] = process
     process.declared = ComponentDeclaration.of_table(part.own)
     process.role = _written_role(part, resolved)
-    process.settings = settings.jsonable(part.settings, document.folder_of(name))
+    process.settings = {
+        key: settings.jsonable(one, document.folder_of(name, key)) for key, one in part.settings.items()
+    }
     if part.command:
         return
     try:

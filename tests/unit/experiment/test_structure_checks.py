@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from afspm.experiment import Experiment, load
+from afspm.experiment import Experiment, load, load_expanded
 
 from .conftest import FRAME, Write, errors, line_of, only_error
 
@@ -416,3 +416,27 @@ def test_two_components_may_write_the_same_file_in_two_runs(write: Write) -> Non
 
 def test_components_of_one_class_write_files_of_their_own(write: Write) -> None:
     assert not errors(write(f"[left]\n{MAP}[right]\n{MAP}file = 'right'\n"))
+
+
+def test_paths_of_an_overlay_in_another_folder_are_the_same_in_the_expanded_file(write: Write, tmp_path: Path) -> None:
+    scanner = '[scan]\ncomponent = true\nclass = "parts.Scanner"\nsize = ["1 um", "1 um"]\n'
+    command = '[own]\ncomponent = true\ncommand = ["python3"]\nread = "./first.txt"\n'
+    write(scanner + command)
+    lab = tmp_path / "lab"
+    (lab / "keys").mkdir(parents=True)
+    (lab / "own.proto").touch()
+    text = (
+        'messages = ["own.proto"]\n[scan]\nimage = "tip.png"\n[own]\nmore = "./more.txt"\n[security]\nkeys = "keys"\n'
+    )
+    (lab / "over.toml").write_text(text, encoding="utf-8")
+
+    def paths(experiment: Experiment) -> list[object]:
+        resolved = experiment.resolved
+        scan, own = (resolved.processes[name].settings for name in ("scan", "own"))
+        return [scan["image"], own["read"], own["more"], *resolved.messages, str(resolved.keys_folder)]
+
+    begun = load(tmp_path / "night.toml", lab / "over.toml")
+    (tmp_path / "run.toml").write_text(begun.expanded(), encoding="utf-8")
+    files = [lab / "tip.png", tmp_path / "first.txt", lab / "more.txt", lab / "own.proto", lab / "keys"]
+    assert paths(begun) == list(map(str, files))
+    assert paths(load_expanded(tmp_path / "run.toml", begun.folders)) == paths(begun)
