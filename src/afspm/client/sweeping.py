@@ -6,7 +6,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from afspm import wire
-from afspm.basics.errors import Refused
+from afspm.basics.errors import Refused, UnitError
+from afspm.basics.units import convert
 from afspm.client.command_retry import CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
@@ -94,14 +95,40 @@ class ParameterSweep:
         """
         if self._before is None:
             return
+        is_back = True
         with self._control.hold(until_s=until_s):
             for parameter in reversed(self._before):
                 try:
-                    self._commands.set_parameter(parameter, until_s)
+                    self._set_back(parameter, until_s)
                 except Refused as error:
-                    self._link.log.error("%s stays as the sweep has set it: %s", _text(parameter), error.what)
+                    is_back = False
+                    text = "%s stays as the sweep has set it, and is not set back to %s: %s"
+                    self._link.log.error(text, parameter.name, _amount(parameter), error.what)
             self._commands.publish_settings((), "")
         self._keep(None)
+        if is_back:
+            self._link.log.info("the parameters are set back")
+
+    def _set_back(self, before: Parameter, until_s: float | None) -> None:
+        try:
+            self._commands.set_parameter(before, until_s)
+        except Refused:
+            # a limit on steps may refuse the whole way, and allow the steps of the sweep
+            between = self._values_between(self._in_force(before.name, until_s), before)
+            if not between:
+                raise
+            for parameter in (*between, before):
+                self._commands.set_parameter(parameter, until_s)
+
+    def _values_between(self, now: Parameter, before: Parameter) -> list[Parameter]:
+        axis = next(axis for axis in self._plan.axes if axis.name == before.name)
+        ends = [_number(one, axis.unit) for one in (now, before)]
+        if None in ends or axis.in_steps() is axis:  # texts or switches have no order
+            return []
+        low, high = sorted(end for end in ends if end is not None)
+        places = [place for place, value in enumerate(axis.values) if low < float(value) < high]
+        places.sort(key=lambda place: float(axis.values[place]), reverse=ends[0] == high)
+        return [axis.parameter(place) for place in places]
 
     @property
     def left_behind(self) -> str:
@@ -124,4 +151,16 @@ class ParameterSweep:
 
 
 def _text(parameter: Parameter) -> str:
-    return " ".join(filter(None, (parameter.name, parameter.value, parameter.unit)))
+    return f"{parameter.name} {_amount(parameter)}"
+
+
+def _amount(parameter: Parameter) -> str:
+    return " ".join(filter(None, (parameter.value, parameter.unit)))
+
+
+def _number(parameter: Parameter, unit: str | None) -> float | None:
+    # in the unit of the axis; None for a text, or a unit that does not fit
+    try:
+        return convert(float(parameter.value or ""), parameter.unit or unit or "", unit or parameter.unit or "")
+    except (ValueError, UnitError):
+        return None

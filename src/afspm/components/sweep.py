@@ -118,7 +118,7 @@ class Sweep(Component):
                 per_point_s = (self.clock.now_s() - start_s) / point.number
                 self.scope.progress(point.number, total, left_s=per_point_s * (total - point.number))
                 self.log.info("point %d of %d: %s", point.number, total, self._text(point.values))
-        self.log.info("all %d points are measured; the parameters are set back", total)
+        self.log.info("all %d points are measured", total)
         if self.end_when_done:
             self.scope.end_experiment()
 

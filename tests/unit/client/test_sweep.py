@@ -152,8 +152,30 @@ def test_a_value_that_can_not_be_set_back_is_logged(caplog: pytest.LogCaptureFix
     lab.intercept = limit
     sweep(scope_of(lab))
     assert lab.in_force == ("0.2", BEFORE[1])
-    assert "tip-bias-voltage 0.5 V stays as the sweep has set it" in caplog.text
+    assert "tip-bias-voltage stays as the sweep has set it, and is not set back to 0.5 V" in caplog.text
     assert "only below 0.3 V" in caplog.text
+    assert "the parameters are set back" not in caplog.text
+
+
+@pytest.mark.parametrize("values", [["0.4 V", "0.2 V", "0.3 V", "0.1 V"], ["0.6 V", "0.8 V", "0.7 V", "0.9 V"]])
+def test_a_value_is_set_back_in_the_steps_of_the_sweep_if_a_limit_refuses_the_whole_way(
+    values: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    lab = SweepLab()
+
+    def limit(request: Request) -> Response | str:
+        if isinstance(request.subject, Parameter) and request.subject.value is not None:
+            step = abs(float(request.subject.value) - float(lab.values["tip-bias-voltage"]))
+            if step > 0.11:
+                return Response(ControlResponse.PARAM_ERROR, reason="a step of more than 0.1 V")
+        return "go on"
+
+    lab.intercept = limit
+    caplog.set_level("INFO")
+    sweep(scope_of(lab), swept={"tip-bias-voltage": values})
+    assert len(lab.finished) == 4
+    assert lab.values["tip-bias-voltage"] == "0.5"
+    assert "the parameters are set back" in caplog.text
 
 
 def test_the_settings_are_published_before_each_measurement_and_their_end_too() -> None:
