@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -15,8 +16,9 @@ from afspm.experiment.toml_lines import Table
 from afspm.model import ControlRequest, Parameter, ProbePosition, Region, Request, ScanParameters, names
 from afspm.model.geometry import XY
 from afspm.model.planned_work import PlannedWork, path_length_m
+from afspm.model.sweep_plan import SweepPlan
 from afspm.scheduler.safety.limit_checker import LimitChecker
-from afspm.scheduler.safety.limits import ExperimentLimits
+from afspm.scheduler.safety.limits import ExperimentLimits, Limit
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,7 @@ class PlannedMeasurements:
         scan_speed_m_s: speed of the first scan, if the component is a microscope that defines the speed.
         is_listed: whether the file lists each region, so that an error has a line.
         work: returns the work at a scan speed; see `Component.planned_work`.
+        sweep: the points of a sweep, whose values follow each other in a known order.
     """
 
     regions: tuple[Region, ...] = ()
@@ -43,6 +46,7 @@ class PlannedMeasurements:
     is_listed: bool = False
     drift_doubts: tuple[AfspmError, ...] = ()
     work: Callable[[float | None], PlannedWork | None] | None = None
+    sweep: SweepPlan | None = None
 
     def sets(self, name: str) -> bool:
         """Return whether the plan sets this parameter."""
@@ -104,6 +108,7 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
         isinstance(settings.get("regions"), list),
         tuple(getattr(made, "drift_doubts", ())),
         getattr(made, "planned_work", None),
+        sweep if isinstance(sweep := getattr(made, "sweep", None), SweepPlan) else None,
     )
 
 
@@ -132,6 +137,10 @@ def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) 
             guard = LimitChecker(replace(_for_all(_without_changes(limits)), region=None))
         for parameter in parameters:
             check(ControlRequest.PARAM, parameter, (setting, parameter.name))
+    for before, after in _sweep_steps(planned.sweep, limits) if planned.sweep else ():
+        guard = LimitChecker(_with_steps_alone(limits)).in_force(before, 0)
+        hint = 'list values between them, or leave `order` at "snake"'
+        check(ControlRequest.PARAM, after, ("parameters", after.name), hint)
     guard = LimitChecker(_without_changes(limits))
     cure = _remedy(planned, limits.region)
     for number, region in enumerate(planned.regions):
@@ -249,6 +258,24 @@ def refused_actions(limits: ExperimentLimits) -> list[tuple[str, str]]:
         if refused is not None:
             found.append((action, refused.reason))
     return found
+
+
+def _sweep_steps(sweep: SweepPlan, limits: ExperimentLimits) -> Iterator[tuple[Parameter, Parameter]]:
+    # the largest change between two points, of each parameter whose changes are limited
+    places = sweep.places()
+    for i, axis in enumerate(sweep.axes):
+        numbers = [value for value in axis.values if not isinstance(value, str | bool)]
+        changes = {(a[i], b[i]) for a, b in itertools.pairwise(places) if a[i] != b[i]}
+        if axis.name in limits.bounded and len(numbers) == len(axis.values) and changes:
+            before, after = max(sorted(changes), key=lambda pair: abs(numbers[pair[1]] - numbers[pair[0]]))
+            yield axis.parameter(before), axis.parameter(after)
+
+
+def _with_steps_alone(limits: ExperimentLimits) -> ExperimentLimits:
+    steps = {
+        name: Limit(step=limit.step, unit=limit.unit, source=limit.source) for name, limit in limits.parameters.items()
+    }
+    return ExperimentLimits(parameters=steps)
 
 
 def _for_all(limits: ExperimentLimits) -> ExperimentLimits:

@@ -84,3 +84,19 @@ def test_check_finds_swept_values_outside_the_limits() -> None:
     found = refusals("sweep", plan, limits)
     assert found
     assert {one.where for one in found} == {("parameters", "tip-bias-voltage")}
+
+
+@pytest.mark.parametrize(("order", "is_fine"), [("snake", True), ("listed", False)])
+def test_check_finds_steps_between_points_that_a_limit_refuses(order: str, is_fine: bool) -> None:
+    swept = {"zctrl-igain": [1, 2], "tip-bias-voltage": ["-0.4 V", "0.0 V", "0.4 V"]}
+    plan = plan_of(Sweep, {"parameters": swept, "order": order})
+    assert plan is not None
+    limits = ExperimentLimits(parameters={"tip-bias-voltage": Limit(step=0.5, unit="V", source="night.toml:9")})
+    found = refusals("sweep", plan, limits)
+    assert len(found) == (0 if is_fine else 1)
+    for one in found:
+        assert one.where == ("parameters", "tip-bias-voltage")
+        assert (
+            one.reason == "tip-bias-voltage = -400 mV is a step of 800 mV, the largest allowed is 500 mV (night.toml:9)"
+        )
+        assert "snake" in one.hint
