@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -73,8 +74,14 @@ class Notifier(Component):
         self.memory.setdefault("told", [])
         self.memory.setdefault("waiting", [])
         self._due_s: dict[str, float] = {}
-        if self.targets.webhook:
-            notifications.address(self.targets.webhook)  # a wrong address fails at the start, not in the night
+        try:
+            if self.targets.webhook:
+                notifications.address(self.targets.webhook)  # a wrong address fails at the start, not in the night
+        except ConfigError as error:
+            if not self.targets.command:
+                raise
+            self.log.error("only the command is called: %s", error)
+            self.targets = replace(self.targets, webhook="")
 
     def on_control(self, control_state: ControlState) -> None:
         since_ns = self.packet.time_ns if self.packet and self.packet.time_ns is not None else self.clock.now_ns()

@@ -223,6 +223,16 @@ def test_command_and_webhook_are_retried_separately(tmp_path: Path, hook: Hook) 
     assert len(recorded(tmp_path)) == 1
 
 
+def test_command_is_called_although_the_webhook_is_unknown(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    night = Night(tmp_path, webhook="$AFSPM_NO_SUCH_HOOK", program=recording(tmp_path))
+    assert "only the command is called" in caplog.text
+    night.given_up("judge")
+    night.passes(100)
+    assert len(recorded(tmp_path)) == 1
+    with pytest.raises(ConfigError, match="no environment variable"):
+        Night(tmp_path, webhook="$AFSPM_NO_SUCH_HOOK")
+
+
 def test_no_log_holds_the_secret(tmp_path: Path, hook: Hook, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("DEBUG")
     hook.codes = [404]
