@@ -174,3 +174,19 @@ def test_a_batch_is_suggested_once_and_a_failed_position_is_left_out() -> None:
     planned.register_failures(batch[-1:])
     later = [planned.suggest(1)[0]["_id"] for _ in range(5)]
     assert batch[-1]["_id"] not in later
+
+
+@pytest.mark.parametrize("size_m", [1e-6, 5e-9])
+def test_map_of_equal_values_goes_on_with_complete_lattices(size_m: float) -> None:
+    planned = AdaptiveMap(Region((0.0, 0.0), (size_m, size_m)), "peaks")
+    for second in range(60):
+        (point,) = planned.suggest()
+        planned.ingest([{**point, "peaks": 0.0, "time_s": float(second), "seconds": 1.0}])
+    assert len(planned.measurements) == 60
+
+
+def test_map_goes_on_when_the_whole_first_lattice_has_failed() -> None:
+    planned = AdaptiveMap(REGION, "height", coarsest=3)
+    for _ in range(9):
+        planned.register_failures(planned.suggest())
+    assert len(measure(planned, 20)) == 20

@@ -238,6 +238,13 @@ class LatticeMap:
     def _round(self) -> list[Cell]:
         raise NotImplementedError
 
+    def _rest_of_lattice(self) -> list[Cell]:
+        for level in range(self.lattice.levels + 1):
+            cells = [cell for cell in self.lattice.new(level) if cell not in self._done]
+            if cells:
+                return snake(cells)
+        return []
+
     def _reached(self, done: Set[Cell]) -> int:
         return max((self.lattice.level(cell) for cell in done), default=0)
 
@@ -284,11 +291,7 @@ class NestedGrid(LatticeMap):
     def _round(self) -> list[Cell]:
         if self._rows:
             self.fit()
-        for level in range(self.lattice.levels + 1):
-            cells = [cell for cell in self.lattice.new(level) if cell not in self._done]
-            if cells:
-                return snake(cells)
-        return []
+        return self._rest_of_lattice()
 
 
 class AdaptiveMap(LatticeMap):
@@ -298,10 +301,14 @@ class AdaptiveMap(LatticeMap):
         first = [cell for cell in self.lattice.cells(0) if cell not in self._done]
         if first:
             return snake(first)
+        if not self._rows:  # no position of the first lattice has a value
+            return self._rest_of_lattice()
         self.fit()
         cells, gains = self._candidates()
         if not cells:
             return []
+        if not gains.any():  # all values are the same: no position is better than another
+            gains = np.ones(len(cells))
         # the gain of a typical good position: the mean, weighted by the gain itself
         least = _WORTH * float((gains**2).sum() / gains.sum())
         good = [cell for cell, gain in zip(cells, gains, strict=True) if gain >= least]
