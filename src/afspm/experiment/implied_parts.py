@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 RECORDER, NOTIFIER = "recorder", "notifier"
 RECORDS, NOTIFIES = "records", "notifies"
 """Class attributes that mark a recorder or a notifier."""
+NO_PROGRAM = "give its path, or install it; a file of yours must be executable (chmod +x)"
 
 
 def recorder(resolved: ResolvedExperiment) -> ExperimentPart | None:
@@ -50,11 +51,8 @@ def _implied(resolved: ResolvedExperiment, name: str, settings: Settings, sectio
 
 
 def targets(section: NotifySection, folder: Path) -> Targets:
-    """Return the targets of notifications. "python" as the program means the running interpreter."""
-    command = section.command
-    if command[:1] == ("python",):
-        command = (sys.executable, *command[1:])
-    return Targets(command, section.webhook, str(folder))
+    """Return the targets of notifications."""
+    return Targets(runnable(section.command, folder), section.webhook, str(folder))
 
 
 def check_notify(resolved: ResolvedExperiment) -> None:
@@ -64,7 +62,7 @@ def check_notify(resolved: ResolvedExperiment) -> None:
         resolved.document.error("[notify] has no recipient", "notify", hint="give a `command` or a `webhook`")
     if section.command and not is_program(section.command[0], resolved.document.folders[0]):
         what = f"[notify] there is no program {section.command[0]!r}"
-        resolved.document.error(what, "notify", "command", hint="give its path, or install it")
+        resolved.document.error(what, "notify", "command", hint=NO_PROGRAM)
     if section.webhook:
         try:
             address(section.webhook)
@@ -74,6 +72,21 @@ def check_notify(resolved: ResolvedExperiment) -> None:
             report(f"[notify] webhook: {error.what}", "notify", "webhook", hint=error.hint)
 
 
+def runnable(command: tuple[str, ...], folder: Path) -> tuple[str, ...]:
+    """Return a command as the system runs it: "python" is the running interpreter, a file in `folder` has its path."""
+    if not command:
+        return ()
+    return (_program(command[0], folder) or command[0], *command[1:])
+
+
 def is_program(name: str, folder: Path) -> bool:
-    """Return whether a program exists: "python", an installed program, or a file in `folder`."""
-    return name == "python" or shutil.which(name) is not None or (folder / name).is_file()
+    """Return whether a program exists: "python", an installed program, or an executable file in `folder`."""
+    return _program(name, folder) is not None
+
+
+def _program(name: str, folder: Path) -> str | None:
+    if name == "python":
+        return sys.executable
+    # the system looks for a bare name in PATH alone, and for a path in the folder of `afspm run`
+    is_bare = Path(name).name == name
+    return name if is_bare and shutil.which(name) else shutil.which(str(folder / name))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from afspm.basics.errors import ConfigError
 from afspm.basics.launch import Launch, Sockets
 from afspm.basics.requirements import require
 from afspm.experiment.findings import Finding, Level, nearest
-from afspm.experiment.implied_parts import RECORDS
+from afspm.experiment.implied_parts import RECORDS, runnable
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.toml_writer import SECRET
 from afspm.experiment.wiring_classes import ProcessSockets
@@ -202,9 +201,8 @@ def _start(
         adjustable=control.adjustable if role is Role.TRANSLATOR else (),
         keeps_requests=resolved.sections.record.requests and role is not Role.TRANSLATOR,
     )
-    if command[:1] == ("python",):  # the running interpreter
-        command = (sys.executable, *command[1:])
     folders = resolved.document.folders
+    command = runnable(command, folders[0])
     beats = process.part.own.get("heartbeats") is not False
     hidden, is_last = _hidden_variables(resolved, process), process.declares(RECORDS)
     acts = role is Role.COMPONENT and process.acts

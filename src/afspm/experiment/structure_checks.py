@@ -15,7 +15,7 @@ from afspm.basics.errors import InvalidValue
 from afspm.client.component import Component
 from afspm.experiment import class_loader, settings
 from afspm.experiment.findings import Finding, Level, closest, nearest
-from afspm.experiment.implied_parts import RECORDS, check_notify, is_program
+from afspm.experiment.implied_parts import NO_PROGRAM, RECORDS, check_notify, is_program
 from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
 from afspm.experiment.wiring_classes import WIRE_SETTINGS, BoundSocket, wire_of
 from afspm.model import Role, component_of, is_process_name
@@ -103,7 +103,7 @@ def check_commands(resolved: ResolvedExperiment) -> None:
     for part in resolved.parts.components:
         if part.command and not is_program(part.command[0], resolved.document.folders[0]):
             what = f"[{part.name}] there is no program {part.command[0]!r}"
-            resolved.document.error(what, part.name, "command", hint="give its path, or install it")
+            resolved.document.error(what, part.name, "command", hint=NO_PROGRAM)
 
 
 def check_intermediaries(resolved: ResolvedExperiment) -> None:

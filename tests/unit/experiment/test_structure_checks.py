@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
 
 from afspm.experiment import Experiment, load, load_expanded
+from afspm.experiment.implied_parts import NO_PROGRAM
 
 from .conftest import FRAME, Write, errors, line_of, only_error
 
@@ -440,3 +442,18 @@ def test_paths_of_an_overlay_in_another_folder_are_the_same_in_the_expanded_file
     files = [lab / "tip.png", tmp_path / "first.txt", lab / "more.txt", lab / "own.proto", lab / "keys"]
     assert paths(begun) == list(map(str, files))
     assert paths(load_expanded(tmp_path / "run.toml", begun.folders)) == paths(begun)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="any file is executable there")
+@pytest.mark.parametrize("name", ["own.sh", "./own.sh"])
+def test_a_program_beside_the_file_is_run_from_there(write: Write, tmp_path: Path, name: str) -> None:
+    text = f'[a]\ncomponent = true\ncommand = ["{name}"]\n[notify]\ncommand = ["{name}", "ada"]\n'
+    program = tmp_path / "own.sh"
+    program.write_text("#!/bin/sh\n", encoding="utf-8")
+    assert {finding.hint for finding in errors(write(text))} == {NO_PROGRAM}
+    program.chmod(0o755)
+    experiment = write(text)
+    assert not errors(experiment)
+    starts = {start.launch.name: start for start in experiment.launches(take_address=lambda: "tcp://127.0.0.1:5555")}
+    assert starts["a"].command == (str(program),)
+    assert starts["notifier"].launch.settings["program"] == [str(program), "ada"]
