@@ -18,7 +18,7 @@ class FeedbackTuner(FeedbackObserver):
     """A solver of `feedback-non-optimal`: it scans the current region, and searches for a good integral gain.
 
     The component raises the gain while the feedback is too slow, and lowers the gain while the feedback oscillates. If
-    no gain is good, the component restores the original gain, logs an error, and clears the flag, so that the
+    no gain is good, the component restores the original gain, says so at CRITICAL, and clears the flag, so that the
     experiment continues as before. After a failed scan, a loss of control or a kill, it sets the last good gain of the
     search, or the original gain if none was good. If that gain is refused, the component flags `device-malfunction`, so
     that nothing is scanned until a person has set a gain.
@@ -125,7 +125,7 @@ class FeedbackTuner(FeedbackObserver):
         if not self._set_back():
             return
         if why:
-            self.log.error("the feedback can't be improved: %s. Its setting is as before; please check it", why)
+            self.log.critical("the feedback can't be improved: %s. Its setting is as before; please check it", why)
         self.scope.clear(Problem.FEEDBACK_NON_OPTIMAL)
 
     def on_end(self) -> None:
@@ -147,7 +147,7 @@ class FeedbackTuner(FeedbackObserver):
             self._go_back_to(gain, timeout_s)
         except Refused as refused:
             text = "integral gain %g can't be set again: %s. The feedback in force is %s; set a gain by hand"
-            self.log.error(text, gain, refused.reason, self.scope.feedback)
+            self.log.critical(text, gain, refused.reason, self.scope.feedback)
             self.scope.flag(Problem.DEVICE_MALFUNCTION)
             is_back = False
         else:
