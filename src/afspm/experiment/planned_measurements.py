@@ -18,7 +18,7 @@ from afspm.model.geometry import XY
 from afspm.model.planned_work import PlannedWork, path_length_m
 from afspm.model.sweep_plan import SweepPlan
 from afspm.scheduler.safety.limit_checker import LimitChecker
-from afspm.scheduler.safety.limits import ExperimentLimits, Limit
+from afspm.scheduler.safety.limits import ExperimentLimits, Limit, RoleLimits
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,30 @@ def _as_parameters(values: Mapping[str, object]) -> tuple[Parameter, ...]:
 
 
 def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[Refusal]:
-    """Return the reasons of the limits to refuse the plan, each once; of a grid of regions only the first."""
+    """Return the reasons of the limits to refuse the plan, each once; of a grid of regions only the first.
+
+    The limits of the component's role count, too.
+    """
+    found = _refusals_by(name, planned, limits)
+    if (role := limits.roles.get(name)) is not None:
+        known = {one.reason for one in found}
+        found += [one for one in _refusals_by_role(name, planned, role) if one.reason not in known]
+    return found
+
+
+def _refusals_by_role(name: str, planned: PlannedMeasurements, role: RoleLimits) -> Iterator[Refusal]:
+    yield from _refusals_by(name, planned, role.limits)
+    for action in planned.needs_actions if role.actions is not None else ():
+        if action not in (role.actions or ()):
+            yield Refusal(f"{action} is not among the actions of {name} ({role.source})")
+    for setting, parameters in planned.parameters.items() if role.parameters_only else ():
+        for one in parameters:
+            if one.name not in role.limits.parameters:
+                reason = f"{one.name} is not among the parameters of {name} ({role.source})"
+                yield Refusal(reason, (setting, one.name))
+
+
+def _refusals_by(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[Refusal]:
     # steps and rates depend on the value before, which is unknown here
     guard = LimitChecker(_without_changes(limits))
     found: dict[str, Refusal] = {}

@@ -211,3 +211,19 @@ def test_the_nearest_region_lies_within_the_region_allowed(
     assert nearest.size_m[0] / nearest.size_m[1] == pytest.approx(width / height, rel=1e-4)
     if all(allowed.contains((float(x), float(y))) for x, y in wanted.corners_m()):
         assert nearest.center_m == pytest.approx(wanted.center_m, abs=1e-3 * max(across, up))
+
+
+@pytest.mark.parametrize(
+    ("role", "what"),
+    [
+        ('region = { x = ["-1 um", "1 um"], y = ["-0.3 um", "1 um"] }', "lies outside the region allowed"),
+        ('actions = ["start-spec"]', "start-scan is not among the actions of series"),
+        ('parameters = { tip-bias-voltage = ["-1 V", "1 V"] }', "tip-bias-voltage = 2 V is above the highest allowed"),
+        ("parameters = { zctrl-setpoint = [0.1, 1.0] }", "tip-bias-voltage is not among the parameters of series"),
+    ],
+)
+def test_a_plan_that_the_role_of_its_component_refuses_is_an_error(write: Write, role: str, what: str) -> None:
+    series = SERIES + SIZE + 'parameters = { tip-bias-voltage = "2 V" }\n'
+    assert what in only_error(write(f"{series}[limits.roles.series]\n{role}\n", frame=SIMULATED)).what
+    other = GRID.replace("[grid]", "[series2]")
+    assert not errors(write(f"{other}{series}[limits.roles.series2]\nactions = ['start-scan']\n", frame=SIMULATED))
