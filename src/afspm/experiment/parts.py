@@ -165,6 +165,7 @@ def _misspelt(table: Table, wanted: tuple[str, ...]) -> str:
 
 
 def _report_unused(parts: ExperimentParts, used: set[str], document: Document) -> None:
+    components = [part.name for part in parts.components]
     for name, table in parts.intermediaries.items():
         if name in used:
             continue
@@ -181,9 +182,13 @@ def _report_unused(parts: ExperimentParts, used: set[str], document: Document) -
             parts.unused.append(name)
             hint = "does it lack `component = true`?" if wire_of(table) is None else ""
             document.warning(f"nothing refers to [{name}]", name, hint=hint)
+        elif meant := closest(name, components, 0.8):  # settings that would silently not be in force
+            what = f"[{name}] is neither a section nor a component"
+            document.error(what, name, hint=f"did you mean [{meant}]? a component of its own has `component = true`")
         else:
             parts.unused.append(name)
-            document.warning(f"[{name}] is neither a section nor a component", name, hint=nearest(name, SECTIONS))
+            hint = nearest(name, (*SECTIONS, *components))
+            document.warning(f"[{name}] is neither a section nor a component", name, hint=hint)
 
 
 class VariableReferences:

@@ -94,3 +94,10 @@ def test_error_in_an_overlay_has_its_file_and_line(write: Write) -> None:
     error = only_error(experiment)
     assert error.place.file.endswith("over1.toml")
     assert error.place.line == line_of(experiment, "every", "over1.toml")
+
+
+def test_settings_for_a_misspelt_component_are_an_error(write: Write) -> None:
+    error = only_error(write(SCANNER.replace("scan", "scanner") + 'size = ["1 um", "1 um"]\n', "[scaner]\ncount = 2\n"))
+    assert error.what == "[scaner] is neither a section nor a component"
+    assert "did you mean [scanner]?" in error.hint
+    assert error.place.file.endswith("over1.toml")
