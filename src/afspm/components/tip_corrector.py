@@ -71,7 +71,8 @@ class TipCorrector(Component):
         problem: the problem to solve.
         policy: "list" makes the treatments in the order of the lists; "learn" chooses among them, again and again.
         most_treatments: largest number of treatments of one repair, with policy = "learn".
-        experience: file of the learnt experience, relative to the folder of the runs, with policy = "learn".
+        experience: file of the learnt experience, relative to the folder of the runs, with policy = "learn"; of a
+            simulated microscope, `_simulated` is added to its name.
         night_pulses: most pulses of all repairs of a run, also over restarts; by default no bound.
         night_depth: largest sum of the depths of all crashes of a run.
         night_places: most places of treatments, each with an area of `place_spacing` squared.
@@ -293,7 +294,10 @@ class TipCorrector(Component):
         self.experience = TipExperience()
         if not self.learns:
             return
-        self._path: Path | None = Path(self.run_dir).parent / self.experience_file
+        file = Path(self.experience_file)
+        if self.simulated:  # what cures a simulated tip must not be tried first on a real one
+            file = file.with_name(f"{file.stem}_simulated{file.suffix}")
+        self._path: Path | None = Path(self.run_dir).parent / file
         try:
             before = read_experience(self._path)
         except FileError as error:  # a night without experience is better than none

@@ -500,10 +500,12 @@ def learner(**settings: Any) -> TipCorrector:
     return corrector(policy="learn", **settings)
 
 
-def life(lab: Repairs, folder: Path, until_s: float = 5000.0, **settings: Any) -> TipCorrector:
+def life(
+    lab: Repairs, folder: Path, until_s: float = 5000.0, *, simulated: bool = False, **settings: Any
+) -> TipCorrector:
     """Run a learning corrector in a run folder until a time."""
     folder.mkdir(parents=True)
-    context = context_of(lab, folder, run_dir=str(folder))
+    context = context_of(lab, folder, run_dir=str(folder), simulated=simulated)
     lab.at(until_s, lab.kill)
     repairing = learner(**settings)
     assert repairing.run_process(context) == ExitCode.ENDED
@@ -529,6 +531,16 @@ def test_what_was_learnt_is_kept_for_the_next_night(tmp_path: Path) -> None:
         assert repairing.experience.nights == number + 1
     assert (tmp_path / "runs" / "tip_experience.toml").exists()
     assert sum(repairing.experience.of("unknown", one).cured for one in repairing.allowed) == 2.0
+
+
+def test_experience_of_a_simulated_night_is_not_used_on_a_real_tip(tmp_path: Path) -> None:
+    for night, simulated in (("simulated", True), ("real", False), ("simulated again", True)):
+        lab = Repairs([GOOD])
+        lab.at(10.0, partial(lab.flag, TIP))
+        repairing = life(lab, tmp_path / "runs" / night, simulated=simulated)
+        assert repairing.experience.nights == (2 if night == "simulated again" else 1)
+    names = {file.name for file in (tmp_path / "runs").glob("*.toml")}
+    assert names == {"tip_experience.toml", "tip_experience_simulated.toml"}
 
 
 def test_unreadable_experience_is_left_as_it_is(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
