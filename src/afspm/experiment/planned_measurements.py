@@ -53,7 +53,7 @@ class PlannedMeasurements:
         return any(one.name == name for parameters in self.parameters.values() for one in parameters)
 
     def frame(self) -> Iterator[Parameter]:
-        """Yield the parameters that the planned scans set: sizes, positions and pixels."""
+        """Yield the parameters that the plan sets: sizes, positions and pixels of scans, outermost probe positions."""
         for region in self.regions:
             sides = zip((names.SCAN_SIZE_X, names.SCAN_SIZE_Y), region.size_m, strict=True)
             corner = zip((names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y), region.top_left_m, strict=True)
@@ -62,6 +62,10 @@ class PlannedMeasurements:
             rows, columns = self.shape
             yield Parameter(names.SCAN_RESOLUTION_X, str(columns))
             yield Parameter(names.SCAN_RESOLUTION_Y, str(rows))
+        for name, places_m in zip(
+            (names.PROBE_POS_X, names.PROBE_POS_Y), zip(*self.positions, strict=True), strict=False
+        ):
+            yield from (Parameter(name, repr(float(end_m)), "m") for end_m in (min(places_m), max(places_m)))
 
 
 @dataclass(frozen=True)

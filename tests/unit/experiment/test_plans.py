@@ -227,3 +227,10 @@ def test_a_plan_that_the_role_of_its_component_refuses_is_an_error(write: Write,
     assert what in only_error(write(f"{series}[limits.roles.series]\n{role}\n", frame=SIMULATED)).what
     other = GRID.replace("[grid]", "[series2]")
     assert not errors(write(f"{other}{series}[limits.roles.series2]\nactions = ['start-scan']\n", frame=SIMULATED))
+
+
+def test_spectra_outside_the_range_of_the_microscope_are_an_error(write: Write) -> None:
+    grid = '[spectra]\ncomponent = true\nclass = "SpectroscopyGrid"\ncounts = [4, 1]\nspacing = ["10 um", "1 um"]\n'
+    error = only_error(write(grid + 'center = ["40 um", "0 um"]\n', frame=SIMULATED))
+    assert "[spectra] plans what its microscope refuses: probe-pos-x: 55000 nm is outside" in error.what
+    assert not errors(write(grid, frame=SIMULATED))
