@@ -63,6 +63,7 @@ class Sweep(Component):
         end_when_done: bool = False,
     ) -> None:
         self.sweep, self.measure, self.end_when_done = _plan(parameters, order, seed), measure, end_when_done
+        self.kind = kind
         self._given: Plain = {"parameters": parameters, "order": order, "seed": seed}
         of_scans = {"size": size, "center": center, "angle": angle, "pixels": pixels}
         for name, value in ({"at": at, "kind": kind} if measure == "scan" else of_scans).items():

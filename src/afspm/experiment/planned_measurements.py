@@ -33,6 +33,7 @@ class PlannedMeasurements:
         is_listed: whether the file lists each region, so that an error has a line.
         work: returns the work at a scan speed; see `Component.planned_work`.
         sweep: the points of a sweep, whose values follow each other in a known order.
+        kind: kind of the spectra; None: the kind in force.
     """
 
     regions: tuple[Region, ...] = ()
@@ -47,13 +48,16 @@ class PlannedMeasurements:
     drift_doubts: tuple[AfspmError, ...] = ()
     work: Callable[[float | None], PlannedWork | None] | None = None
     sweep: SweepPlan | None = None
+    kind: str | None = None
 
     def sets(self, name: str) -> bool:
         """Return whether the plan sets this parameter."""
         return any(one.name == name for parameters in self.parameters.values() for one in parameters)
 
     def frame(self) -> Iterator[Parameter]:
-        """Yield the parameters that the plan sets: sizes, positions and pixels of scans, outermost probe positions."""
+        """Yield the parameters that the plan sets: regions and pixels, outermost probe positions, kind of spectra."""
+        if self.kind is not None:
+            yield Parameter(names.SPEC_KIND, self.kind)
         for region in self.regions:
             sides = zip((names.SCAN_SIZE_X, names.SCAN_SIZE_Y), region.size_m, strict=True)
             corner = zip((names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y), region.top_left_m, strict=True)
@@ -113,6 +117,7 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
         tuple(getattr(made, "drift_doubts", ())),
         getattr(made, "planned_work", None),
         sweep if isinstance(sweep := getattr(made, "sweep", None), SweepPlan) else None,
+        made.kind if names.SPEC_KIND in getattr(made, "needs_parameters", ()) and hasattr(made, "kind") else None,
     )
 
 

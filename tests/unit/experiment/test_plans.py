@@ -234,3 +234,17 @@ def test_spectra_outside_the_range_of_the_microscope_are_an_error(write: Write) 
     error = only_error(write(grid + 'center = ["40 um", "0 um"]\n', frame=SIMULATED))
     assert "[spectra] plans what its microscope refuses: probe-pos-x: 55000 nm is outside" in error.what
     assert not errors(write(grid, frame=SIMULATED))
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        '[plan]\ncomponent = true\nclass = "SpectroscopyGrid"\ncounts = [2, 2]\nspacing = ["1 um", "1 um"]\n',
+        '[plan]\ncomponent = true\nclass = "Survey"\nsize = "4 um"\nzoom = "1 um"\ncurves = { top = "0 nm" }\n',
+        '[plan]\ncomponent = true\nclass = "Sweep"\nmeasure = "spectrum"\nparameters = { zctrl-igain = [1, 2] }\n',
+    ],
+)
+def test_a_kind_of_spectra_that_the_microscope_lacks_is_an_error(write: Write, plan: str) -> None:
+    what = only_error(write(plan + 'kind = "Force"\n', frame=SIMULATED)).what
+    assert what == "[plan] plans what its microscope refuses: x-spec-kind: 'Force' is not one of IV, force"
+    assert not errors(write(plan + 'kind = "force"\n', frame=SIMULATED))

@@ -86,7 +86,8 @@ class Adaptive(Component):
         self._until = Until.of(until, self._evaluation.unit)
         own = {"coarsest": coarsest, "levels": levels} if optimizer in ("adaptive", "nested") else {}
         self._optimizer = optimizer_of(optimizer, self._region, self._evaluation.name, **own)
-        with_kind = (names.SPEC_KIND,) if self._evaluation.kind else ()
+        self.kind = self._evaluation.kind
+        with_kind = (names.SPEC_KIND,) if self.kind else ()
         self.needs_parameters = (names.PROBE_POS_X, names.PROBE_POS_Y, *with_kind)
         self.positions = tuple((float(x), float(y)) for x, y in self._region.corners_m())
         self.end_when_done, self.file = end_when_done, file
