@@ -20,7 +20,7 @@ from afspm.components.planned_scans import FRAME, Pixels, checked_parameters, pa
 from afspm.components.scan_plan import ScanPlan
 from afspm.components.surveying.record import Outcome, SurveyRecord, Visit
 from afspm.components.surveying.targets import Target, find_particles, lowest_beside, nearest
-from afspm.model import Region, RegistrationOutcome, Scan, ScanSet, names, registration_summary
+from afspm.model import Region, RegistrationOutcome, Scan, ScanParameters, ScanSet, names, registration_summary
 from afspm.model.geometry import XY
 from afspm.model.planned_work import PlannedWork, planned_rounds
 from afspm.record.drift_mapping import drift_knowledge
@@ -108,7 +108,8 @@ class Survey(Component):
         self._wide = _ScanSetup(wide, shape_of(chosen), self.parameters)
         self._closer = _ScanSetup(closer, shape_of(zoom_pixels, "zoom_pixels"), self.zoom_parameters)
         self.drift_doubts = tuple(_too_coarse(wide, chosen, closer, is_given=pixels is not None))
-        self.plan = ScanPlan((self._wide.region,), self._wide.shape)  # the part that `afspm check` can look at
+        self.plan = ScanPlan((self._wide.region,), self._wide.shape)  # the parts that `afspm check` can look at
+        self.placed_later = {"zoom": ScanParameters(closer.moved_to(wide.center_m), self._closer.shape)}
         half_m = min(self._closer.region.size_m) / 2
         self.curves = {name: _place(name, place, half_m) for name, place in (curves or {}).items()}
         self.kind, self.channel, self.end_when_done, self.file = kind, channel, end_when_done, file

@@ -34,6 +34,8 @@ class PlannedMeasurements:
         work: returns the work at a scan speed; see `Component.planned_work`.
         sweep: the points of a sweep, whose values follow each other in a known order.
         kind: kind of the spectra; None: the kind in force.
+        placed_later: scans at places that are found in the run, by the setting that gives their size; here anywhere in
+            the planned regions.
     """
 
     regions: tuple[Region, ...] = ()
@@ -49,6 +51,7 @@ class PlannedMeasurements:
     work: Callable[[float | None], PlannedWork | None] | None = None
     sweep: SweepPlan | None = None
     kind: str | None = None
+    placed_later: Mapping[str, ScanParameters] = field(default_factory=dict)
 
     def sets(self, name: str) -> bool:
         """Return whether the plan sets this parameter."""
@@ -62,10 +65,14 @@ class PlannedMeasurements:
             sides = zip((names.SCAN_SIZE_X, names.SCAN_SIZE_Y), region.size_m, strict=True)
             corner = zip((names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y), region.top_left_m, strict=True)
             yield from (Parameter(name, repr(float(value_m)), "m") for name, value_m in (*sides, *corner))
-        if self.shape is not None:
-            rows, columns = self.shape
-            yield Parameter(names.SCAN_RESOLUTION_X, str(columns))
-            yield Parameter(names.SCAN_RESOLUTION_Y, str(rows))
+        for shape in (self.shape, *(one.shape for one in self.placed_later.values())):
+            if isinstance(shape, tuple):
+                rows, columns = shape
+                yield Parameter(names.SCAN_RESOLUTION_X, str(columns))
+                yield Parameter(names.SCAN_RESOLUTION_Y, str(rows))
+        for region in (one.region for one in self.placed_later.values() if isinstance(one.region, Region)):
+            sides = zip((names.SCAN_SIZE_X, names.SCAN_SIZE_Y), region.size_m, strict=True)
+            yield from (Parameter(name, repr(float(value_m)), "m") for name, value_m in sides)
         for name, places_m in zip(
             (names.PROBE_POS_X, names.PROBE_POS_Y), zip(*self.positions, strict=True), strict=False
         ):
@@ -118,6 +125,7 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
         getattr(made, "planned_work", None),
         sweep if isinstance(sweep := getattr(made, "sweep", None), SweepPlan) else None,
         made.kind if names.SPEC_KIND in getattr(made, "needs_parameters", ()) and hasattr(made, "kind") else None,
+        getattr(made, "placed_later", {}),
     )
 
 
@@ -181,6 +189,8 @@ def _refusals_by(name: str, planned: PlannedMeasurements, limits: ExperimentLimi
             check(ControlRequest.SET_SCAN_PARAMS, wanted, where, _nearest_text(region, limits.region))
         elif not found:  # of a grid outside, one reason is enough
             check(ControlRequest.SET_SCAN_PARAMS, wanted, hint=cure)
+    for setting, scan in planned.placed_later.items():
+        check(ControlRequest.SET_SCAN_PARAMS, scan, (setting,))
     for xy in planned.positions:
         check(ControlRequest.SET_PROBE_POS, ProbePosition(xy), hint=cure)
     return list(found.values())

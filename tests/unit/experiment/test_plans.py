@@ -248,3 +248,18 @@ def test_a_kind_of_spectra_that_the_microscope_lacks_is_an_error(write: Write, p
     what = only_error(write(plan + 'kind = "Force"\n', frame=SIMULATED)).what
     assert what == "[plan] plans what its microscope refuses: x-spec-kind: 'Force' is not one of IV, force"
     assert not errors(write(plan + 'kind = "force"\n', frame=SIMULATED))
+
+
+@pytest.mark.parametrize(
+    ("limit", "what"),
+    [
+        ("[limits]\nmost_pixels = 40_000\n", "a scan of 256 x 256 pixels; the highest number allowed is 40000"),
+        ('[limits.scan-size-y]\nmin = "1.5 um"\n', "scan-size-y = 1 µm is below the lowest allowed, 1.5 µm"),
+    ],
+)
+def test_zooms_that_the_limits_refuse_are_an_error(write: Write, limit: str, what: str) -> None:
+    survey = SURVEY + 'zoom = "1 um"\nzoom_pixels = [256, 256]\n'
+    error = only_error(write(survey + limit, frame=SIMULATED))
+    assert what in error.what
+    assert error.place.line == 5
+    assert not errors(write(survey + REGION, frame=SIMULATED))
