@@ -148,16 +148,24 @@ def _post(url: str, notice: Notification) -> None:
     from http.client import HTTPException
     from urllib.error import HTTPError, URLError
     from urllib.parse import urlsplit
-    from urllib.request import Request, urlopen
+    from urllib.request import HTTPRedirectHandler, Request, build_opener
+
+    class NoRedirect(HTTPRedirectHandler):
+        """A redirect is an error: urllib would follow it by a GET, which leaves the message behind."""
+
+        def redirect_request(self, *_: object) -> None:
+            return None
 
     host = urlsplit(url).hostname
     headers = {"Content-Type": "application/json; charset=utf-8", "User-Agent": "afspm"}
     try:
-        with urlopen(Request(url, notice.body(), headers, method="POST"), timeout=TIMEOUT_S) as answer:
+        request = Request(url, notice.body(), headers, method="POST")
+        with build_opener(NoRedirect).open(request, timeout=TIMEOUT_S) as answer:
             answer.read(1000)
     except HTTPError as error:
         error.close()
-        raise NotDelivered(f"{host} answers {error.code}") from None
+        moved = ", and leads to another address: is it https instead of http?" if 300 <= error.code < 400 else ""
+        raise NotDelivered(f"{host} answers {error.code}{moved}") from None
     except URLError as error:
         raise NotDelivered(f"{host} can't be reached: {_reason_without_secret(error.reason)}") from None
     except (OSError, HTTPException, ValueError) as error:

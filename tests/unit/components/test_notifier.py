@@ -52,6 +52,13 @@ class _Handler(BaseHTTPRequestHandler):
         if code == 200:
             self.server.got.append(body)
         self.send_response(code)
+        if 300 <= code < 400:
+            self.send_header("Location", self.path)
+        self.send_header("Content-Length", "0")
+        self.end_headers()
+
+    def do_GET(self) -> None:
+        self.send_response(200)
         self.send_header("Content-Length", "0")
         self.end_headers()
 
@@ -221,6 +228,13 @@ def test_command_and_webhook_are_retried_separately(tmp_path: Path, hook: Hook) 
     night.passes(100)
     assert len(hook.got) == 1
     assert len(recorded(tmp_path)) == 1
+
+
+@pytest.mark.parametrize("code", [301, 302, 303, 307, 308])
+def test_a_redirected_webhook_has_not_taken_the_message(hook: Hook, code: int) -> None:
+    hook.codes = [code]
+    with pytest.raises(NotDelivered, match=f"answers {code}, and leads to another address"):
+        Targets(webhook=hook.url).deliver(NOTICE, "webhook")
 
 
 def test_command_is_called_although_the_webhook_is_unknown(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
