@@ -137,7 +137,7 @@ Length = Annotated[float, Unit("m")]
 Duration = Annotated[float, Unit("s", least=0.0)]
 PositiveDuration = Annotated[float, Unit("s", above=0.0)]
 Period = Annotated[float, Unit("s", is_written=True, least=0.0)]
-"""A duration that must be written with a unit, since 10 could mean seconds or minutes."""
+"""A duration that must be written with a unit, since 10 could mean milliseconds, seconds or minutes."""
 PollPeriod = Annotated[float, Unit("s", least=1e-3)]
 """Time between two polls of a controller, at least 1 ms, so that polls don't use up a processor."""
 Angle = Annotated[float, Unit("rad")]

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 
 from afspm.basics.errors import AfspmError, ConfigError, ControlLost, FileError, NoResponse, Refused
 from afspm.basics.formatting import position_text
-from afspm.basics.units import Duration, Length, Speed, Voltage
+from afspm.basics.units import Duration, Length, Period, Speed, Voltage
 from afspm.client.component import Component
 from afspm.client.events import Events
 from afspm.components import tip_verdict
@@ -91,7 +91,7 @@ class TipCorrector(Component):
         workshop_center: tuple[Length, Length],
         test_center: tuple[Length, Length] | None = None,
         pulse_voltages: tuple[Voltage, ...] = (3.0, -4.0, 5.0),
-        pulse_duration: Duration = 50e-3,
+        pulse_duration: Period = 50e-3,
         crash_depths: tuple[Length, ...] = (5e-9, 10e-9, 20e-9),
         crash_speed: Speed = 50e-9,
         place_spacing: Length = 300e-9,

@@ -271,6 +271,9 @@ class LimitsReader:
         if not math.isfinite(number):
             self.document.error(f"{where} is not a finite number", *path, key)
             return None
+        if unit == "s" and key != "rate" and number and not (isinstance(value, str) and parse_quantity(value)[1]):
+            what = f"{where} has no unit, and counts in s"  # milliseconds may be meant, as for a pulse
+            self.document.warning(what, *path, key, hint=f'write it as "{number:g} s", or "{number:g} ms"')
         return number
 
     def _region(self, box: RegionSection, owner: tuple[str, ...] = ("limits",)) -> Region | None:

@@ -104,6 +104,18 @@ def test_a_small_number_without_a_unit_is_in_si(write: Write) -> None:
     assert not errors(write("[limits]\nregion = { x = [-3e-6, 3e-6], y = [-3e-6, 3e-6] }\n" + BIAS + "max = 3\n"))
 
 
+@pytest.mark.parametrize(("value", "is_clear"), [("100", False), ('"100 ms"', True), ('"0.1"', False), ("0", True)])
+def test_a_time_without_a_unit_is_a_warning(write: Write, value: str, is_clear: bool) -> None:
+    findings = write(f"[limits.x-pulse-duration]\nmax = {value}\n").check()
+    assert not any(one.is_error for one in findings)
+    assert (not any("has no unit, and counts in s" in one.what for one in findings)) is is_clear
+
+
+def test_a_pulse_duration_needs_its_unit(write: Write) -> None:
+    corrector = '[repair]\ncomponent = true\nclass = "TipCorrector"\nworkshop_center = ["1 um", "1 um"]\n'
+    assert "5 has no unit" in only_error(write(f"{corrector}pulse_duration = 5\n")).what
+
+
 def test_action_among_the_parameters_is_an_error_with_its_place(write: Write) -> None:
     assert "[limits.actions.start-scan]" in only_error(write("[limits.start-scan]\nonly = []\n")).hint
 
