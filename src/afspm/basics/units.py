@@ -140,7 +140,8 @@ Period = Annotated[float, Unit("s", is_written=True, least=0.0)]
 """A duration that must be written with a unit, since 10 could mean milliseconds, seconds or minutes."""
 PollPeriod = Annotated[float, Unit("s", least=1e-3)]
 """Time between two polls of a controller, at least 1 ms, so that polls don't use up a processor."""
-Angle = Annotated[float, Unit("rad")]
+Angle = Annotated[float, Unit("rad", is_written=True)]
+"""An angle that must be written with a unit, since 5 could mean degrees or radians."""
 Voltage = Annotated[float, Unit("V")]
 Current = Annotated[float, Unit("A")]
 Speed = Annotated[float, Unit("m/s")]

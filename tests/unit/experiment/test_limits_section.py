@@ -50,6 +50,11 @@ def test_a_region_may_be_given_by_its_ends_or_its_centre(write: Write, region: s
     assert found.size_m == pytest.approx((10e-6, 2e-6))
 
 
+def test_a_turned_region_needs_the_unit_of_its_angle(write: Write) -> None:
+    region = 'region = { center = ["0 um", "0 um"], size = ["2 um", "2 um"], angle = 5 }'
+    assert "5 has no unit" in only_error(write(f"[limits]\n{region}\n")).what
+
+
 def test_a_region_may_be_turned(write: Write) -> None:
     text = '[limits]\nregion = { center = ["0 m", "0 m"], size = ["1 um", "1 um"], angle = "45 deg" }\n'
     found = write(text).resolved.limits.region

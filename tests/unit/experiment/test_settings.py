@@ -64,6 +64,7 @@ def test_a_relative_file_is_one_beside_the_experiment_file(write: Write) -> None
         ('style = "fast"', "'quick' or 'slow'"),
         ('names = "a"', "list of values in brackets"),
         ("angle = 45", "without a unit this means 45 rad"),
+        ("angle = 5", "5 has no unit"),
     ],
 )
 def test_a_wrong_value_is_an_error_on_its_line(write: Write, setting: str, said: str) -> None:
