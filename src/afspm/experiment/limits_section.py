@@ -251,6 +251,10 @@ class LimitsReader:
         except pydantic.ValidationError as error:
             report(error, plain, path, self.document)
             read = Limit()
+        if read.interval_s and not _has_unit(given["every"]):  # minutes may be meant
+            what = f"[{'.'.join(path)}] every = {given['every']!r} has no unit, and counts in s"
+            hint = f'write it as "{read.interval_s:g} s", or "{read.interval_s:g} min"'
+            self.document.warning(what, *path, "every", hint=hint)
         for i, who in enumerate(read.only or ()):
             if who not in self.components:
                 what = f"[{'.'.join(path)}] only: there is no component {who!r}"
@@ -271,8 +275,8 @@ class LimitsReader:
         if not math.isfinite(number):
             self.document.error(f"{where} is not a finite number", *path, key)
             return None
-        if unit == "s" and key != "rate" and number and not (isinstance(value, str) and parse_quantity(value)[1]):
-            what = f"{where} has no unit, and counts in s"  # milliseconds may be meant, as for a pulse
+        if unit == "s" and key != "rate" and number and not _has_unit(value):  # milliseconds may be meant
+            what = f"{where} has no unit, and counts in s"
             self.document.warning(what, *path, key, hint=f'write it as "{number:g} s", or "{number:g} ms"')
         return number
 
@@ -311,6 +315,10 @@ def _unit_given(given: Table, as_unit: Callable[[str], str]) -> str | None:
                 if unit := as_unit(over if key == "rate" and slash else written):
                     return unit
     return None
+
+
+def _has_unit(value: object) -> bool:
+    return isinstance(value, str) and bool(parse_quantity(value)[1])
 
 
 def _rate(value: Quantity, unit: str) -> float:

@@ -116,6 +116,13 @@ def test_a_time_without_a_unit_is_a_warning(write: Write, value: str, is_clear: 
     assert (not any("has no unit, and counts in s" in one.what for one in findings)) is is_clear
 
 
+def test_an_interval_without_a_unit_is_a_warning(write: Write) -> None:
+    (finding,) = write("[limits.actions.x-crash]\nevery = 10\n").check()
+    assert not finding.is_error
+    assert finding.what == "[limits.actions.x-crash] every = 10 has no unit, and counts in s"
+    assert '"10 min"' in finding.hint
+
+
 def test_a_pulse_duration_needs_its_unit(write: Write) -> None:
     corrector = '[repair]\ncomponent = true\nclass = "TipCorrector"\nworkshop_center = ["1 um", "1 um"]\n'
     assert "5 has no unit" in only_error(write(f"{corrector}pulse_duration = 5\n")).what
