@@ -1,8 +1,7 @@
-"""An urgent action of a person does not wait behind an action that waits for a free microscope."""
+"""An urgent action and a renewal do not wait behind an action that waits for a free microscope."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, cast
 
 import pytest
@@ -49,8 +48,8 @@ def persons(link: BusyMicroscope, monkeypatch: pytest.MonkeyPatch) -> Persons:
     watch.take("ScopeStateMsg", ScopeStatus(ScopeState.SCANNING), 1)
     made = Persons(Launch("dashboard"), link.clock, watch)
 
-    def connect(person: str, hurried: Callable[[], bool]) -> tuple[Any, PersonCommands]:
-        return None, PersonCommands(cast("ExperimentLink", link), watch, hurried)
+    def connect(person: str, one: Any) -> tuple[Any, PersonCommands]:
+        return None, PersonCommands(cast("ExperimentLink", link), watch, lambda: one.urgent > 0, one.meanwhile)
 
     monkeypatch.setattr(made, "_connect", connect)
     return made
@@ -79,3 +78,18 @@ def test_scan_after_an_urgent_action_waits_again(persons: Persons, link: BusyMic
     with pytest.raises(TimeoutError):
         waiting.result(0.2)
     persons.submit("Ada", lambda one: one.act(names.STOP_SCAN), urgent=True).result(SOON_S)
+
+
+def test_renewal_is_carried_out_while_a_scan_waits_which_then_waits_on(persons: Persons, link: BusyMicroscope) -> None:
+    waiting = persons.submit("Ada", lambda one: one.act_when_free(names.START_SCAN))
+    for lease_s in (60.0, 61.0):
+        assert persons.submit("Ada", lambda one, s=lease_s: one.renew(s), meanwhile=True).result(SOON_S).ok  # type: ignore[misc]
+    assert link.asked == [60.0, 61.0]
+    with pytest.raises(TimeoutError):
+        waiting.result(0.2)
+    assert persons.submit("Ada", lambda one: one.act(names.STOP_SCAN), urgent=True).result(SOON_S).ok
+
+
+def test_renewal_is_carried_out_where_nothing_waits(persons: Persons, link: BusyMicroscope) -> None:
+    assert persons.submit("Ada", lambda one: one.renew(60.0), meanwhile=True).result(SOON_S).ok
+    assert link.asked == [60.0]

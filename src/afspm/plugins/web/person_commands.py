@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 
 from afspm import wire
@@ -39,12 +40,20 @@ class PersonCommands:
 
     Args:
         hurried: whether an urgent action of this person waits for the end of the present one.
+        meanwhile: actions of this person to carry out while the present one waits for a free microscope.
     """
 
-    def __init__(self, link: ExperimentLink, watch: Watch, hurried: Callable[[], bool] = lambda: False) -> None:
+    def __init__(
+        self,
+        link: ExperimentLink,
+        watch: Watch,
+        hurried: Callable[[], bool] = lambda: False,
+        meanwhile: deque[Callable[[], None]] | None = None,
+    ) -> None:
         self._link = link
         self._watch = watch
         self._hurried = hurried
+        self._meanwhile = deque[Callable[[], None]]() if meanwhile is None else meanwhile
 
     # --- the experiment ---
 
@@ -129,14 +138,14 @@ class PersonCommands:
         """
         until_s = self._link.clock.monotonic_s() + FREE_S
         while True:
-            self._watch.wait_for(lambda o: is_free(o) or self._hurried(), until_s - self._link.clock.monotonic_s())
+            self._wait_for(is_free, until_s)
             with self._watch.reading():
                 seen = self._watch.changes
             response = self._ask(ControlRequest.ACTION, action, next_id())
             is_over = self._hurried() or self._link.clock.monotonic_s() >= until_s
             if response.code != ControlResponse.NOT_FREE or is_over:
                 return response
-            self._watch.wait_for(lambda _, n=seen: self._watch.changes != n or self._hurried(), 1.0)  # type: ignore[misc]
+            self._wait_for(lambda _, n=seen: self._watch.changes != n, self._link.clock.monotonic_s() + 1.0)  # type: ignore[misc]
 
     def stop(self) -> Response:
         """Stop the running scan or spectrum."""
@@ -156,6 +165,16 @@ class PersonCommands:
     def _ask(self, kind: int, subject: object = None, request_id: str = "") -> Response:
         self._link.pump(0.0)  # processes changes of the connection since the last request
         return self._link.request(kind, subject, request_id=request_id, until_s=self._link.until(ANSWER_S))
+
+    def _wait_for(self, done: Callable[[Overview], bool], until_s: float) -> None:
+        # a renewal of the lease must not wait for the microscope: the wait may outlast the lease
+        while True:
+            while self._meanwhile:
+                self._meanwhile.popleft()()
+            left_s = until_s - self._link.clock.monotonic_s()
+            self._watch.wait_for(lambda o: done(o) or self._hurried() or bool(self._meanwhile), left_s)
+            if not self._meanwhile:
+                return
 
     def _settle(self, done: Callable[[Overview], bool]) -> None:
         # an unchanged value is not published, so the wait is bounded

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 from afspm.basics.clock import Clock
@@ -30,10 +30,12 @@ class _Person:
 
     Attributes:
         urgent: number of submitted urgent actions that have not started yet.
+        meanwhile: submitted actions that the present action carries out while it waits for a free microscope.
     """
 
     thread: ThreadPoolExecutor
     urgent: int = 0
+    meanwhile: deque[Callable[[], None]] = field(default_factory=deque)
     commands: PersonCommands | None = None
     port: ZmqPort | None = None
 
@@ -59,11 +61,19 @@ class Persons:
         self._lock = threading.Lock()
         self._persons: OrderedDict[str, _Person] = OrderedDict()
 
-    def submit(self, person: str, action: Callable[[PersonCommands], T], *, urgent: bool = False) -> Future[T]:
+    def submit(
+        self,
+        person: str,
+        action: Callable[[PersonCommands], T],
+        *,
+        urgent: bool = False,
+        meanwhile: bool = False,
+    ) -> Future[T]:
         """Start an action in the person's thread and name, and return its future.
 
         Args:
             urgent: earlier actions of this person stop waiting for a free microscope, and are refused.
+            meanwhile: an earlier action that waits for a free microscope carries out this action, and waits on.
         """
         with self._lock:
             one = self._persons.get(person)
@@ -74,8 +84,11 @@ class Persons:
                 one = self._persons[person] = _Person(ThreadPoolExecutor(1, thread_name_prefix="person"))
             self._persons.move_to_end(person)
             one.urgent += urgent
-            future = one.thread.submit(self._carry_out, person, one, action, urgent)
-        if urgent:
+            if meanwhile:
+                future = self._put_meanwhile(person, one, action)
+            else:
+                future = one.thread.submit(self._carry_out, person, one, action, urgent)
+        if urgent or meanwhile:
             self._watch.wake()
         return future
 
@@ -90,16 +103,35 @@ class Persons:
         for one in persons:
             one.close()
 
+    def _put_meanwhile(self, person: str, one: _Person, action: Callable[[PersonCommands], T]) -> Future[T]:
+        future: Future[T] = Future()
+
+        def carry_out() -> None:
+            if not future.set_running_or_notify_cancel():
+                return
+            try:
+                future.set_result(self._carry_out(person, one, action, urgent=False))
+            except BaseException as error:  # any error is the result of this action, not of the action that waits
+                future.set_exception(error)
+
+        def carry_out_rest() -> None:
+            while one.meanwhile:
+                one.meanwhile.popleft()()
+
+        one.meanwhile.append(carry_out)
+        one.thread.submit(carry_out_rest)  # if no action waits, or the last one has just ended
+        return future
+
     def _carry_out(self, person: str, one: _Person, action: Callable[[PersonCommands], T], urgent: bool) -> T:
         with self._lock:
             one.urgent -= urgent
         if one.commands is None:
-            one.port, one.commands = self._connect(person, lambda: one.urgent > 0)
+            one.port, one.commands = self._connect(person, one)
         return action(one.commands)
 
-    def _connect(self, person: str, hurried: Callable[[], bool]) -> tuple[ZmqPort, PersonCommands]:
+    def _connect(self, person: str, one: _Person) -> tuple[ZmqPort, PersonCommands]:
         launch, name = self._launch, self.name_of(person)
         network = Network.from_launch(launch.name, launch.keys)
         port = ZmqPort(network, name, self._clock, control=launch.sockets.control)
         link = ExperimentLink.of_launch(launch, port, new_session(launch.run), name=name)
-        return port, PersonCommands(link, self._watch, hurried)
+        return port, PersonCommands(link, self._watch, lambda: one.urgent > 0, one.meanwhile)

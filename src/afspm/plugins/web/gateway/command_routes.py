@@ -98,7 +98,8 @@ class CommandRoutes:
 
     async def renew_control(self, asked: Request, lease: LeaseModel = _LEASE) -> ControlModel:
         """Renew the lease. The request fails with `not-in-control` once control is lost."""
-        await self._services.command(asked, lambda commands: commands.renew(lease.lease_s))
+        # the renewal must not wait behind a measurement that waits for a free microscope
+        await self._services.command(asked, lambda commands: commands.renew(lease.lease_s), meanwhile=True)
         return ControlModel(holder=self._services.who(asked), lease_s=lease.lease_s)
 
     async def release_control(self, asked: Request) -> DoneModel:

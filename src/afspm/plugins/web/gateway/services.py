@@ -56,35 +56,51 @@ class GatewayServices:
             raise RefusedRequest(RefusalCode.NAME_NEEDED, "the record keeps a name with each action")
         return self.persons.name_of(person)
 
-    async def do(self, asked: Request, action: Callable[[PersonCommands], T], *, urgent: bool = False) -> T:
+    async def do(
+        self,
+        asked: Request,
+        action: Callable[[PersonCommands], T],
+        *,
+        urgent: bool = False,
+        meanwhile: bool = False,
+    ) -> T:
         """Carry out an action under the client's name.
 
         Args:
             urgent: earlier requests of this client stop waiting for a free microscope.
+            meanwhile: the action is carried out even while an earlier request waits for a free microscope.
 
         Raises:
             RefusedRequest: the client gave no name, too many of its requests wait, or the action failed.
         """
         self.who(asked)
-        return await self._carry_out(self.person_of(asked), action, urgent=urgent)
+        return await self._carry_out(self.person_of(asked), action, urgent=urgent, meanwhile=meanwhile)
 
     async def command(
-        self, asked: Request, action: Callable[[PersonCommands], Response], *, urgent: bool = False
+        self,
+        asked: Request,
+        action: Callable[[PersonCommands], Response],
+        *,
+        urgent: bool = False,
+        meanwhile: bool = False,
     ) -> Response:
         """Send a request to the scheduler, and return the response. Raises RefusedRequest for a refusal."""
-        return _success(await self.do(asked, action, urgent=urgent))
+        return _success(await self.do(asked, action, urgent=urgent, meanwhile=meanwhile))
 
     async def read(self, action: Callable[[PersonCommands], T]) -> T:
         """Carry out an action that only reads, under the gateway's own name for readers."""
         return await self._carry_out(READER, action)
 
-    async def _carry_out(self, person: str, action: Callable[[PersonCommands], T], *, urgent: bool = False) -> T:
+    async def _carry_out(
+        self, person: str, action: Callable[[PersonCommands], T], *, urgent: bool = False, meanwhile: bool = False
+    ) -> T:
         if self.waiting[person] >= MOST_WAITING and person != READER:
             raise RefusedRequest(RefusalCode.TOO_MANY, f"{MOST_WAITING} requests of {person} wait already")
         self.waiting[person] += 1
         try:
             # shielded: a client that disconnects does not cancel its request to the scheduler
-            return await asyncio.shield(asyncio.wrap_future(self.persons.submit(person, action, urgent=urgent)))
+            submitted = self.persons.submit(person, action, urgent=urgent, meanwhile=meanwhile)
+            return await asyncio.shield(asyncio.wrap_future(submitted))
         except (
             Exception,
             StopRequested,
