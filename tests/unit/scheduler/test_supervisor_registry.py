@@ -31,8 +31,8 @@ from afspm.model import (
 from afspm.model.events import LONGEST_ANNOUNCEMENT
 from afspm.scheduler.control.arbitration import RoleTable, Rules
 from afspm.scheduler.control.supervisor_registry import SILENT_S
-from afspm.scheduler.events import SaveState
-from afspm.scheduler.settings import SchedulerSettings
+from afspm.scheduler.events import Log, SaveState
+from afspm.scheduler.settings import RunFacts, SchedulerSettings
 
 HOST = "supervisor:host"
 OK = ControlResponse.SUCCESS
@@ -239,3 +239,34 @@ def test_settings_of_a_measurement_are_published_only_for_the_component_that_set
     settings = MeasurementSettings(1, "sweep", (Parameter("zctrl-igain", "5"),), "sweep-1")
     assert tell(lab, settings, "sweep", user="sweep").code == OK
     assert tell(lab, settings, "other").code == ControlResponse.FAILURE
+
+
+def reports(lab: Lab, *leads_s: float) -> list[str]:
+    """Report every two seconds with these leads of the supervisor's clock; return the warnings."""
+    began = len(lab.effects)
+    for lead_s in leads_s:
+        lab.later(2.0, 2.0)
+        alive = ProcessState("microscope", "translator", ProcessCondition.ALIVE, 1)
+        tell(lab, ProcessStates(lab.now_ns + round(lead_s * 1e9), "host", (alive,)))
+    return [one.text for one in lab.effects[began:] if isinstance(one, Log) and one.level == "WARNING"]
+
+
+@pytest.mark.parametrize(("lead_s", "way"), [(1200.0, "20 min ahead of"), (-1200.0, "20 min behind")])
+def test_clock_of_another_computer_that_differs_is_logged_once(lab: Lab, lead_s: float, way: str) -> None:
+    (warning,) = reports(lab, lead_s, lead_s, lead_s + 0.1)
+    assert warning.startswith(f"the clock of host is {way} the scheduler's clock")
+    assert not reports(lab, lead_s, lead_s)
+
+
+def test_late_report_and_its_repetition_are_no_difference_of_clocks(lab: Lab) -> None:
+    assert not reports(lab, 0.0, -7200.0, 0.0, 0.0)
+    late = ProcessStates(lab.now_ns - 7200 * 10**9, "host", ())
+    tell(lab, late)
+    tell(lab, late)
+    assert not [one for one in lab.effects if isinstance(one, Log) and "clock" in one.text]
+
+
+def test_delay_of_a_report_in_fast_time_is_no_difference_of_clocks() -> None:
+    made = Lab(SchedulerSettings(run=RunFacts(clock={"speed": 480.0})))
+    made.translator()
+    assert not reports(made, -100.0, -100.0)

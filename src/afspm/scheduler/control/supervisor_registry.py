@@ -27,6 +27,9 @@ from afspm.scheduler.saved_state import SavedSupervisor
 
 SILENT_S = 10.0
 """A supervisor without a report for this time, real, gets no more orders: the orders would be lost."""
+CLOCKS_DIFFER_S = 5.0
+"""Difference between a supervisor's clock and the scheduler's, real, above which a warning is logged."""
+_STEADY_S = 1.0
 _MOST = 64  # supervisors: names come from peers, and memory must stay bounded
 OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
 """Conditions of a process that has ended for good."""
@@ -43,6 +46,9 @@ class KnownSupervisor:
         over: for each process that has ended for good, its number of starts and the real time at which its end was
             first reported.
         states: the states of its processes in its last report.
+        clock: the time of its last report by its own clock, and the lead of this time over the scheduler's clock at the
+            arrival, both ns of experiment time.
+        warned: whether a difference of the clocks was logged.
     """
 
     processes: tuple[str, ...] = ()
@@ -50,6 +56,8 @@ class KnownSupervisor:
     orders: tuple[str, ...] = ()
     over: Mapping[str, tuple[int, float]] = field(default_factory=dict)
     states: tuple[ProcessState, ...] = ()
+    clock: tuple[int, int] | None = None
+    warned: bool = False
 
 
 @dataclass(frozen=True)
@@ -138,9 +146,35 @@ class SupervisorRegistry:
             if state.condition in OVER:
                 starts, since_s = known.over.get(state.name, (-1, now_s))
                 over[state.name] = (state.starts, since_s if starts == state.starts else now_s)
-        newest = KnownSupervisor(tuple(state.name for state in states), now_s, known.orders, over, states)
+        processes = tuple(state.name for state in states)
+        newest = replace(known, processes=processes, reported_s=now_s, over=over, states=states)
         others = [(other, one) for other, one in self.supervisors.items() if other != name]
         return replace(self, supervisors=dict([*others, (name, newest)][-_MOST:]))
+
+    def clock_compared(self, name: str, time_ns: int, now_ns: int, speed: float) -> tuple[SupervisorRegistry, str]:
+        """Compare the time of a supervisor's newest report with the present time; also return a warning, or "".
+
+        The translator of a real microscope that is started alone has the clock of its computer, and so have its scans.
+        A single report may be late, e.g. repeated after a lost link; two reports with the same difference are not.
+
+        Args:
+            speed: experiment seconds per real second.
+        """
+        known = self.supervisors[name]
+        ahead_ns, real_ns = time_ns - now_ns, max(1.0, speed) * 1e9
+        before_ns, ahead_before_ns = known.clock or (time_ns, ahead_ns)
+        is_steady = time_ns != before_ns and abs(ahead_ns - ahead_before_ns) <= _STEADY_S * real_ns
+        differs = is_steady and abs(ahead_ns) > CLOCKS_DIFFER_S * real_ns
+        newest = replace(known, clock=(time_ns, ahead_ns), warned=known.warned or differs)
+        registry = replace(self, supervisors={**self.supervisors, name: newest})
+        if known.warned or not differs:
+            return registry, ""
+        way = "ahead of" if ahead_ns > 0 else "behind"
+        return registry, (
+            f"the clock of {name.partition(PERSON)[2] or name} is {duration_text(abs(ahead_ns) / 1e9)} {way} the "
+            "scheduler's clock, so the times of scans there are wrong by as much, and drift is followed late or early: "
+            "let both computers take their time from the network (NTP), then start that part again"
+        )
 
 
 @dataclass(frozen=True)
@@ -150,12 +184,12 @@ class Announcement:
     Attributes:
         envelope: the envelope of the packet; empty if the message is refused.
         why: the reason of the refusal.
-        states: the states of a supervisor's processes, if the message reports them.
+        reported: the states of a supervisor's processes, if the message reports them.
     """
 
     envelope: str
     why: str = ""
-    states: tuple[ProcessState, ...] | None = None
+    reported: ProcessStates | None = None
 
 
 def announcement(event: RequestIn, codec: Codec) -> Announcement:
@@ -192,7 +226,7 @@ def announcement(event: RequestIn, codec: Codec) -> Announcement:
     if isinstance(thing, LogLines):
         return Announcement(subject.message)
     named = _named(subject.message, thing.supervisor)
-    return named if named.why else replace(named, states=thing.processes)
+    return named if named.why else replace(named, reported=thing)
 
 
 def _named(message: str, whose: str) -> Announcement:

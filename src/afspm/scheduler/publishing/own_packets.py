@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from afspm import wire
 from afspm.basics.frozen import replace
-from afspm.model import HAS_ENDED, ControlResponse, ResponseDetail
+from afspm.model import HAS_ENDED, ControlResponse, ProcessStates, ResponseDetail
 from afspm.scheduler.control.arbitration import may
 from afspm.scheduler.control.supervisor_registry import SupervisorRegistry, announcement
 from afspm.scheduler.events import Publish, RequestIn
@@ -48,8 +48,8 @@ def publish_for_process(draft: StateDraft, event: RequestIn) -> None:
         ended = ResponseDetail.EXPERIMENT_ENDED
         answers.answer(draft, event, ControlResponse.FAILURE, HAS_ENDED, detail=ended)
         return
-    if announced.states is not None:
-        _replace_supervisors(draft, draft.peers.supervisors.reported(event.name, announced.states, draft.now_s))
+    if announced.reported is not None:
+        _take_report(draft, event.name, announced.reported)
     supervisors, orders = draft.peers.supervisors.orders_for(event.name)
     _replace_supervisors(draft, supervisors)
     payload = event.request.subject.payload
@@ -58,6 +58,15 @@ def publish_for_process(draft: StateDraft, event: RequestIn) -> None:
         publish(draft, announced.envelope, payload)
     answers.answer(draft, event, ControlResponse.SUCCESS, payload=wire.encode_orders(orders))
     draft.end = draft.end.processes_reported(draft.peers.supervisors.states_of(event.name), draft.now_s)
+
+
+def _take_report(draft: StateDraft, supervisor: str, report: ProcessStates) -> None:
+    reported = draft.peers.supervisors.reported(supervisor, report.processes, draft.now_s)
+    speed = float(draft.env.settings.run.clock.get("speed", 1.0))
+    compared, warning = reported.clock_compared(supervisor, report.time_ns, draft.now_ns, speed)
+    _replace_supervisors(draft, compared)
+    if warning:
+        draft.log("WARNING", warning)
 
 
 def order_restart(draft: StateDraft, event: RequestIn) -> None:
