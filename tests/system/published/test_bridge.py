@@ -165,6 +165,25 @@ def test_a_request_that_their_translator_may_have_carried_out_is_not_sent_again(
     assert asked.count(ControlRequest.ACTION) == 1
 
 
+def test_a_large_scan_of_their_translator_arrives(rig: BridgedRig, plain: Any) -> None:
+    assert rig.translator is not None
+    rig.translator.close()
+    rig.translator = None
+    server, publisher = plain(zmq.REP), plain(zmq.PUB)
+    server.bind(rig.source[1])
+    publisher.bind(rig.source[0])
+    rig.start()
+    ours = rig.component("Ours")
+    large = Scan(SCAN.region, "Height", "m", np.ones((512, 512)), 1)  # 2 MiB in one frame
+    ready = wire.encode(ScopeStatus(ScopeState.FREE))
+    # a subscriber that has just connected misses packets
+    rig.until(lambda: publisher.send_multipart([ready[0].encode(), ready[1]]) or ours.packets("ScopeStateMsg"))
+    publisher.send_multipart([b"Scan2d", wire.encode(large)[1]])
+    rig.until(lambda: ours.packets("Scan2d"))
+    ((_, payload),) = ours.packets("Scan2d")
+    assert wire.decode("Scan2d", payload).shape == (512, 512)
+
+
 @pytest.fixture
 def locked_rig(tmp_path: Path) -> Iterator[BridgedRig]:
     keys.generate(tmp_path / "keys", ["scheduler", "translator", "Experiment", "bridge"])

@@ -6,10 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import zmq
 
 from afspm import wire
-from afspm.model import ControlRequest, ControlResponse, ResponseDetail
+from afspm.model import ControlRequest, ControlResponse, Region, ResponseDetail, Scan
 
 GOLDEN = json.loads((Path(__file__).parents[3] / "proto" / "golden.json").read_text(encoding="utf-8"))
 REQUESTS = {entry["name"]: [bytes.fromhex(frame) for frame in entry["frames"]] for entry in GOLDEN["requests"]}
@@ -126,3 +127,7 @@ def test_a_plain_scheduler_serves_our_component(rig: Any, plain: Any) -> None:
     expected = [(packet[0].decode(), packet[1]) for _, packet in published("scheduler")]
     rig.until(lambda: len(component.packets()) == len(expected))
     assert component.packets() == expected
+    large = Scan(Region((0.0, 0.0), (1e-6, 1e-6)), "Height", "m", np.ones((512, 512)))  # 2 MiB in one frame
+    publisher.send_multipart([b"Scan2d_1000.0_Height", wire.encode(large)[1]])
+    rig.until(lambda: len(component.packets()) > len(expected))
+    assert wire.decode("Scan2d", component.packets()[-1][1]).shape == (512, 512)

@@ -16,7 +16,7 @@ from afspm.basics.exit_codes import ExitCode
 from afspm.model import ControlRequest, ControlResponse, Request, Response, ResponseDetail, Role, component_of
 from afspm.plugins.published import version_1
 from afspm.transport.frames import receive_frames, send_frames
-from afspm.transport.network import CONNECTED, DISCONNECTED, Monitor, Network
+from afspm.transport.network import CONNECTED, DISCONNECTED, MAX_PACKET_BYTES, Monitor, Network
 from afspm.transport.port import Incoming, ParentGone
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.router import PeerAsked, PeerConnected, PeerDisconnected, Router, RouterEvent
@@ -181,7 +181,7 @@ class _SchedulerPort(BasePort[Incoming]):
         self._unpublished: set[int] = set()  # flagged by clients here, and not published yet
         self._ends_s = math.inf
         self._outside = version_1.outside(launch)
-        self._sub = self._outside.socket(zmq.SUB)
+        self._sub = self._outside.socket(zmq.SUB, max_bytes=MAX_PACKET_BYTES)
         # a single subscription: the published scheduler processes one subscription per loop
         self._sub.setsockopt(zmq.SUBSCRIBE, b"")
         self._monitor = Monitor(self._outside, self._sub, CONNECTED)

@@ -39,7 +39,7 @@ from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.process import GUARD
 from afspm.translator.requests import RequestOutcomes
 from afspm.transport.frames import receive_frames, send_frames
-from afspm.transport.network import CONNECTED, DISCONNECTED, Monitor, Network
+from afspm.transport.network import CONNECTED, DISCONNECTED, MAX_PACKET_BYTES, Monitor, Network
 from afspm.transport.polling import Poller, WakeUp
 from afspm.transport.port import ParentGone, RequestReceived, Served
 from afspm.transport.rate_limited_log import RateLimitedLog
@@ -215,7 +215,7 @@ class _TranslatorPort(ZmqServerPort):
         self._dealer = self._outside.socket(zmq.DEALER)
         self._dealer.setsockopt(zmq.IMMEDIATE, 1)  # no request is queued for a translator that is gone
         self._dealer_monitor = Monitor(self._outside, self._dealer, DISCONNECTED)
-        self._sub = self._outside.socket(zmq.SUB)
+        self._sub = self._outside.socket(zmq.SUB, max_bytes=MAX_PACKET_BYTES)
         self._sub.setsockopt(zmq.SUBSCRIBE, b"")
         self._outside.connect(self._dealer, serve)
         self._outside.connect(self._sub, publish)
