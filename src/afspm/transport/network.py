@@ -158,6 +158,7 @@ class Network:
             socket.setsockopt(zmq.CURVE_SERVER, 1)
             socket.setsockopt(zmq.CURVE_SECRETKEY, self.keys.secret)
             socket.setsockopt(zmq.ZAP_DOMAIN, b"afspm")
+        _allow_ipv6(socket, address)
         try:
             socket.bind(_bindable(address))
         except zmq.ZMQError as error:
@@ -179,6 +180,7 @@ class Network:
             socket.setsockopt(zmq.CURVE_SERVERKEY, server_key)
             socket.setsockopt(zmq.CURVE_PUBLICKEY, self.keys.public)
             socket.setsockopt(zmq.CURVE_SECRETKEY, self.keys.secret)
+        _allow_ipv6(socket, address)
         try:
             socket.connect(address)
         except zmq.ZMQError as error:
@@ -221,6 +223,12 @@ def is_local(address: str) -> bool:
         except ValueError:
             return False
     return True
+
+
+def _allow_ipv6(socket: zmq.Socket[bytes], address: str) -> None:
+    # only where an address asks for it: with this option libzmq resolves names to addresses of IPv6 first
+    if "[" in address:
+        socket.setsockopt(zmq.IPV6, 1)
 
 
 def _bindable(address: str) -> str:

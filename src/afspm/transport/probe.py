@@ -68,9 +68,10 @@ def handshake(network: Network, address: str, within_s: float = WITHIN_S) -> Han
 def is_of_this_computer(address: str) -> bool:
     """Return whether an address belongs to this computer."""
     host = address.removeprefix("tcp://").rpartition(":")[0].strip("[]")
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        found = {entry[4][0] for entry in socket.getaddrinfo("0.0.0.0" if host == "*" else host, None, socket.AF_INET)}
-        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        found = {entry[4][0] for entry in socket.getaddrinfo("0.0.0.0" if host == "*" else host, None, family)}
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
             probe.bind((str(found.pop()), 0))
     except OSError:
         return False
