@@ -140,3 +140,14 @@ def test_a_key_belongs_to_one_measurement_of_one_client(file: Path) -> None:
         lab.kept.take("gateway:ada", "tile", other)(cast("PersonCommands", Commands()))
     assert refused.value.model.code is RefusalCode.KEY_USED
     assert lab.kept.find("gateway:max", "tile") is None
+
+
+def test_a_grid_of_several_thousand_keys_is_not_begun_again(file: Path) -> None:
+    lab = Lab(file)
+    lab.begin(Commands(OK))
+    lab.publish(ScopeState.SCANNING, scan(), ScopeState.FREE)
+    for number in range(5000):
+        lab.kept._kept["gateway:ada", str(number)] = Measurement("gateway:ada", str(number), {}, state="done")
+    lab.begin(Commands(OK), "another")
+    assert lab.begin(Commands()).state == "done"
+    assert Lab(file).begin(Commands()).state == "done"

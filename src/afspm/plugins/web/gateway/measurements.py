@@ -8,7 +8,7 @@ from __future__ import annotations
 import secrets
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -24,7 +24,8 @@ from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.watch import Watch
 from afspm.storage.memory import Memory
 
-MOST_KEPT = 1000
+MOST_KEPT = 10_000
+"""Measurements that are remembered, newest first: a client may begin an older key again."""
 _RUNNING, _DONE, _FAILED = (one.value for one in MeasurementState)
 _WHY = {
     CycleOutcome.INTERRUPTED: (RefusalCode.INTERRUPTED, "it was stopped before its end"),
@@ -217,5 +218,6 @@ class Measurements:
         while len(self._kept) > MOST_KEPT:
             oldest = next(key for key, one in self._kept.items() if key not in self._followed)
             del self._kept[oldest]
-        self._memory["measurements"] = [asdict(one) for one in self._kept.values()]
+        # no `asdict`: it copies each plan, which takes half a second for many measurements
+        self._memory["measurements"] = [dict(vars(one)) for one in self._kept.values()]
         self._memory.save()
