@@ -23,6 +23,7 @@ from afspm.plugins.replay import replay as replay_module
 from afspm.plugins.replay.replay import ReplayOptions, _addresses, replay
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.supervisor import resume
+from afspm.transport.network import is_local
 
 START_NS = 1_773_518_400_000_000_000
 STEP_NS = 60_000_000_000  # experiment time between two packets
@@ -166,4 +167,16 @@ def test_replay_uses_the_addresses_of_the_experiment_file(recorded: Path, tmp_pa
             "tcp://127.0.0.1:1",
             "tcp://127.0.0.1:2",
         )
+    file.unlink()
+
+
+def test_replay_of_a_run_on_several_computers_takes_addresses_of_this_computer(recorded: Path) -> None:
+    file = recorded / "experiment.toml"
+    file.write_text(
+        '[scheduler]\ncomponent = true\nclass = "Scheduler"\npubsubcache = "tcp://192.168.1.20:19471"\n'
+        'router = "tcp://microscope:19472"\n',
+        encoding="utf-8",
+    )
+    with afspm.open_run(recorded) as run:
+        assert all(map(is_local, _addresses(run, ReplayOptions())))
     file.unlink()

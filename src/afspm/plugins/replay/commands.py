@@ -23,7 +23,8 @@ def replay(
         list[str] | None, opt("Publish only these, e.g. Scan2d,ControlState.", "--only", metavar="MESSAGE[,…]")
     ] = None,
     publish: Annotated[
-        str | None, opt("Where. Default: as the experiment file says, else a free port.", metavar="ADDRESS")
+        str | None,
+        opt("Where. Default: the address in the experiment file if local, else a free port.", metavar="ADDRESS"),
     ] = None,
     serve: Annotated[str | None, opt("Where requests are answered.", metavar="ADDRESS")] = None,
     stay: Annotated[

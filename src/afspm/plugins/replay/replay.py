@@ -25,6 +25,7 @@ from afspm.record.run_lock import lock_run
 from afspm.supervisor import run_folder
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.run import now
+from afspm.transport.network import is_local
 from afspm.transport.process import signals
 from afspm.transport.rate_limited_log import RateLimitedLog
 
@@ -39,8 +40,8 @@ class ReplayOptions:
     Attributes:
         speed: experiment seconds per real second; None: as recorded.
         only: names of the messages to publish; empty: all.
-        publish, serve: addresses for packets and for requests; None: the addresses in the recorded experiment file,
-            else free addresses.
+        publish, serve: addresses for packets and for requests; None: the addresses in the recorded experiment file if
+            only this computer can use them, else free addresses.
         stay: whether to serve late joiners after the last packet.
         runs: parent folder of the replay's run folder.
     """
@@ -119,7 +120,8 @@ def _addresses_of_file(run: Run) -> tuple[str | None, str | None]:
     found: list[str | None] = []
     for key in ("pubsubcache", "router"):
         addresses = (table.get(key) for table in tables if table.get("component"))
-        found.append(next((a for a in addresses if isinstance(a, str) and is_address(a)), None))
+        # a replay has no keys; and the address may be of another computer, on which the run was recorded
+        found.append(next((a for a in addresses if isinstance(a, str) and is_address(a) and is_local(a)), None))
     return found[0], found[1]
 
 
