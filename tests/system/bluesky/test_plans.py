@@ -131,6 +131,8 @@ def test_the_plan_of_the_page_runs_and_the_documents_of_the_run_are_valid(runs: 
     for name, document in documents:
         schema_validators[DocumentNames[name]].validate(document)
     assert [name for name, _ in documents].count("event") == 4  # three scans, one spectrum
+    scans = next(document for name, document in documents if name == "descriptor" and document["name"] == "scans")
+    assert scans["data_keys"]["height"]["shape"] == [32, 32], "the topography, not the height of the frame"
 
 
 def _plain(document: dict[str, Any]) -> dict[str, Any]:

@@ -21,7 +21,9 @@ from afspm.record.tables import ScanRow, SpectrumRow
 Document = tuple[str, dict[str, object]]
 """A document: its name and content."""
 DOCUMENTS_FILE = "documents.jsonl"
-_PLACE = {"center_x": "m", "center_y": "m", "width": "m", "height": "m", "angle": "rad"}
+_REGION = {"center_x": "m", "center_y": "m", "size_x": "m", "size_y": "m", "angle": "rad"}
+_POSITION = {"x": "m", "y": "m"}
+_KEY = "key"
 
 
 def tables(run: Run, scans: Sequence[ScanRow], spectra: Sequence[SpectrumRow]) -> Iterator[tuple[str, bytes]]:
@@ -99,28 +101,33 @@ class _Stream:
     def uid(self) -> str:
         return _uid(self.run, self.name)
 
-    def _arrays(self) -> Iterator[tuple[str, str, str, list[int]]]:
-        # (field in the file, name, unit, shape)
+    def _arrays(self) -> Iterator[tuple[str, str, str, str, list[int]]]:
+        # (data key, field in the file, name, unit, shape)
         row = self.first
         if isinstance(row, ScanRow):
-            names = [name for name, _ in row.channels]
-            for one, (name, unit) in zip(field_names(names, ("x", "y")), row.channels, strict=True):
-                yield one, name, unit, list(row.shape or ())
+            names, units = [name for name, _ in row.channels], [unit for _, unit in row.channels]
+            fields, shape = field_names(names, ("x", "y")), list(row.shape or ())
         else:
-            for one, name, unit in zip(field_names(row.names), row.names, row.units, strict=True):
-                yield one, name, unit, [row.points]
+            names, units, fields, shape = list(row.names), list(row.units), field_names(row.names), [row.points]
+        # a channel may have the name of a number in the event, such as "Angle" or "X"
+        keys = field_names(fields, (*self._units(), _KEY))
+        for key, one, name, unit in zip(keys, fields, names, units, strict=True):
+            yield key, one, name, unit, shape
 
     def descriptor(self) -> dict[str, object]:
         source = f"afspm:{self.run.folder.name}"
         keys: dict[str, object] = {
-            one: {
+            key: {
                 "source": f"{source}/{name}", "dtype": "array", "dtype_numpy": "<f8", "shape": shape, "units": unit,
                 "external": "STREAM:",
             }
-            for one, name, unit, shape in self._arrays()
+            for key, _, name, unit, shape in self._arrays()
         }  # fmt: skip
-        keys |= {one: {"source": source, "dtype": "number", "shape": [], "units": unit} for one, unit in self._units()}
-        keys["key"] = {"source": source, "dtype": "string", "shape": []}
+        keys |= {
+            one: {"source": source, "dtype": "number", "shape": [], "units": unit}
+            for one, unit in self._units().items()
+        }
+        keys[_KEY] = {"source": source, "dtype": "string", "shape": []}
         return {
             "uid": self.uid,
             "time": (self.first.began_ns or self.first.time_ns) / NS_PER_S,
@@ -132,19 +139,19 @@ class _Stream:
             "hints": {"microscope": {"fields": [one for one, *_ in self._arrays()][:1]}},
         }
 
-    def _units(self) -> Iterator[tuple[str, str]]:
-        yield from _PLACE.items() if isinstance(self.first, ScanRow) else (("x", "m"), ("y", "m"))
+    def _units(self) -> dict[str, str]:
+        return _REGION if isinstance(self.first, ScanRow) else _POSITION
 
     def event(self, row: ScanRow | SpectrumRow) -> Iterator[Document]:
         number, self.count = self.count, self.count + 1
         file = measured_file(self.run.folder, row.file)
-        for one, *_ in self._arrays():
-            resource = _uid(self.run, self.name, str(number), one)
+        for key, one, *_ in self._arrays():
+            resource = _uid(self.run, self.name, str(number), key)
             yield (
                 "stream_resource",
                 {
                     "uid": resource,
-                    "data_key": one,
+                    "data_key": key,
                     "mimetype": "application/x-hdf5",
                     "uri": file.resolve().as_uri().replace("file:///", "file://localhost/"),
                     "parameters": {"dataset": f"/entry/data/{one}", "chunk_shape": []},
@@ -161,7 +168,7 @@ class _Stream:
                     "seq_nums": {"start": number + 1, "stop": number + 2},
                 },
             )
-        data = {**_place(row), "key": row.key}
+        data = {**_place(row), _KEY: row.key}
         time_s = row.time_ns / NS_PER_S
         yield (
             "event",
@@ -179,10 +186,10 @@ class _Stream:
 
 def _place(row: ScanRow | SpectrumRow) -> dict[str, float | None]:
     if isinstance(row, SpectrumRow):
-        return dict(zip("xy", row.position_m or (None, None), strict=True))
+        return dict(zip(_POSITION, row.position_m or (None, None), strict=True))
     if row.region is None:
-        return dict.fromkeys(_PLACE)
-    return dict(zip(_PLACE, (*row.region.center_m, *row.region.size_m, row.region.angle_rad), strict=True))
+        return dict.fromkeys(_REGION)
+    return dict(zip(_REGION, (*row.region.center_m, *row.region.size_m, row.region.angle_rad), strict=True))
 
 
 def _uid(run: Run, *of: str) -> str:

@@ -158,7 +158,7 @@ class _Measurement(StandardReadable, Triggerable):
     def _keep(
         self, channels: Sequence[str], units: Sequence[str], arrays: Sequence[NDArray[np.float64]], time_s: float
     ) -> None:
-        fields = field_names(channels)
+        fields = field_names(channels, (name for name, _ in self.children()))  # a channel may be named as a signal
         self._keys = {
             field: DataKey(
                 source=f"{self._session.source}/{channel}", dtype="array", dtype_numpy="<f8", units=unit,
