@@ -51,15 +51,14 @@ def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
     port = open_port(launch, wall)
     session, sent, asked, asked_s, again_s = os.urandom(4).hex(), 0, "", wall.now_s(), -math.inf
     connected = waiting = False
-    refused_s = math.inf
+    refused_s, began_s = math.inf, wall.monotonic_s()
     try:
         while True:
             if connected and wall.monotonic_s() >= again_s:
                 sent, asked_s, again_s = sent + 1, wall.now_s(), wall.monotonic_s() + AGAIN_S
                 asked = f"{launch.name}/{session}/{sent}"
                 port.send(wire.encode_request(Request(CLOCK_REQUEST, id=asked)))
-            found = port.poll(AGAIN_S)
-            for incoming in found:
+            for incoming in port.poll(AGAIN_S):
                 connected = connected or isinstance(incoming, ControlConnected)
                 if not isinstance(incoming, ReplyReceived) or incoming.response.id != asked:
                     continue
@@ -72,9 +71,13 @@ def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
                 if refused_s == math.inf:
                     refused_s = now_s
                     tell(f"the scheduler refuses: {response.reason}; asking again for {REFUSED_S:.0f} s")
-            if not found and not waiting:
+            # a time, not an empty poll: a refused key causes events without end
+            if not connected and not waiting and wall.monotonic_s() >= began_s + AGAIN_S:
                 waiting = True
-                tell(f"waiting for the scheduler at {launch.sockets.control}, whose run and clock this part joins")
+                where = f"the scheduler at {launch.sockets.control}, whose run and clock this part joins"
+                tell(
+                    f"waiting for {where}; if it runs already, `afspm doctor` with the experiment file finds the cause"
+                )
     finally:
         port.close()
 
