@@ -69,6 +69,8 @@ def test_a_night_by_http_alone_is_in_the_record_under_its_name(started: Started)
     assert np.array_equal(values, again)
     assert looker.get("/scans/newest/values?format=png").startswith(b"\x89PNG")
     assert looker.ask("GET", "/scans/newest/values?channel=None").code == "not-found"
+    kept = [looker.ask("GET", f"/scans/{one}/values").headers["cache-control"] for one in ("newest", scan["id"])]
+    assert kept == ["no-store", "private, max-age=3600"], "a browser must not show an earlier scan as the newest"
 
     ada.done("POST", "/spectra", {"position_m": [1e-7, 0], "key": "curve"})
     curve = ada.until_measured("curve")

@@ -202,7 +202,7 @@ class ReadingRoutes:
         if wanted is None:
             raise RefusedRequest(RefusalCode.NOT_FOUND, f"the scan has no channel {channel!r}")
         values = await asyncio.to_thread(self._values, wanted)
-        return await _values(values, [wanted.unit], format, lambda: views.as_png(values, levelling))
+        return await _values(which, values, [wanted.unit], format, lambda: views.as_png(values, levelling))
 
     async def spectrum_values(
         self,
@@ -211,7 +211,7 @@ class ReadingRoutes:
     ) -> Response:
         """Return the values of a spectrum, a column for each variable."""
         spectrum = await asyncio.to_thread(self._spectrum_values, self._spectrum(which).time_ns)
-        return await _values(spectrum.values, list(spectrum.units), ValueFormat(format.value), bytes)
+        return await _values(which, spectrum.values, list(spectrum.units), ValueFormat(format.value), bytes)
 
     async def events(
         self,
@@ -267,9 +267,11 @@ class ReadingRoutes:
 
 
 async def _values(
-    values: NDArray[np.float64], units: list[str], wanted: ValueFormat, draw: Callable[[], bytes]
+    which: str, values: NDArray[np.float64], units: list[str], wanted: ValueFormat, draw: Callable[[], bytes]
 ) -> Response:
-    headers = {"Cache-Control": "private, max-age=3600", "X-Shape": ",".join(map(str, values.shape))}
+    # the values of an id never change; a cache must not answer a request for the newest with an earlier scan
+    kept = "no-store" if which == NEWEST else "private, max-age=3600"
+    headers = {"Cache-Control": kept, "X-Shape": ",".join(map(str, values.shape))}
     match wanted:
         case ValueFormat.PNG:
             return Response(await asyncio.to_thread(draw), media_type="image/png", headers=headers)
