@@ -51,6 +51,8 @@ def test_no_channel_is_lost_to_a_number_of_the_event(tmp_path: Path) -> None:
         stream = "scans" if one["data_key"] in arrays["scans"] else "spectra"
         with h5py.File(path) as file:
             assert list(file[one["parameters"]["dataset"]].shape) == descriptors[stream][one["data_key"]]["shape"]
+    assert descriptors["scans"]["interrupted"]["dtype"] == "boolean"
     events = [one["data"] for name, one in found if name == "event"]
+    assert events[0]["interrupted"] is False
     assert [events[0][key] for key in ("size_x", "size_y", "angle")] == pytest.approx([3e-7, 4e-7, 0.1])
     assert (events[1]["x"], events[1]["y"]) == pytest.approx((1e-9, 2e-9))

@@ -23,7 +23,7 @@ Document = tuple[str, dict[str, object]]
 DOCUMENTS_FILE = "documents.jsonl"
 _REGION = {"center_x": "m", "center_y": "m", "size_x": "m", "size_y": "m", "angle": "rad"}
 _POSITION = {"x": "m", "y": "m"}
-_KEY = "key"
+_KEY, _INTERRUPTED = "key", "interrupted"
 
 
 def tables(run: Run, scans: Sequence[ScanRow], spectra: Sequence[SpectrumRow]) -> Iterator[tuple[str, bytes]]:
@@ -110,7 +110,7 @@ class _Stream:
         else:
             names, units, fields, shape = list(row.names), list(row.units), field_names(row.names), [row.points]
         # a channel may have the name of a number in the event, such as "Angle" or "X"
-        keys = field_names(fields, (*self._units(), _KEY))
+        keys = field_names(fields, (*self._units(), _KEY, _INTERRUPTED))
         for key, one, name, unit in zip(keys, fields, names, units, strict=True):
             yield key, one, name, unit, shape
 
@@ -128,6 +128,8 @@ class _Stream:
             for one, unit in self._units().items()
         }
         keys[_KEY] = {"source": source, "dtype": "string", "shape": []}
+        if isinstance(self.first, ScanRow):  # the lines after the interruption are NaN
+            keys[_INTERRUPTED] = {"source": source, "dtype": "boolean", "shape": []}
         return {
             "uid": self.uid,
             "time": (self.first.began_ns or self.first.time_ns) / NS_PER_S,
@@ -168,7 +170,9 @@ class _Stream:
                     "seq_nums": {"start": number + 1, "stop": number + 2},
                 },
             )
-        data = {**_place(row), _KEY: row.key}
+        data: dict[str, object] = {**_place(row), _KEY: row.key}
+        if isinstance(row, ScanRow):
+            data[_INTERRUPTED] = row.interrupted
         time_s = row.time_ns / NS_PER_S
         yield (
             "event",
