@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ import bluesky.plans as bp
 from bluesky import RunEngine
 from bluesky.utils import FailedStatus, RequestAbort, RunEngineInterrupted
 from event_model import DocumentNames, schema_validators
-from ophyd_async.core import init_devices
+from ophyd_async.core import DEFAULT_TIMEOUT, init_devices
 
 from afspm.plugins.bluesky.microscope import Microscope
 
@@ -93,6 +94,23 @@ def test_a_refusal_fails_the_plan_with_the_reason(scope: Any) -> None:
     with pytest.raises(FailedStatus) as failed:
         RunEngine()(bps.mv(scope.tip_bias_voltage, 4.0))
     assert "above the highest allowed" in str(failed.value.__cause__)
+
+
+def test_a_setting_waits_for_control_as_a_scan_does(scope: Any, runs: Path) -> None:
+    holding = threading.Event()
+
+    def hold() -> None:
+        with afspm.connect(runs, name="repair") as repair, repair.control():
+            holding.set()
+            time.sleep(DEFAULT_TIMEOUT + 2.0)  # a tip repair takes minutes
+
+    holder = threading.Thread(target=hold)
+    holder.start()
+    assert holding.wait(20.0)
+    RunEngine()(bps.mv(scope.tip_bias_voltage, 0.35))
+    holder.join()
+    with afspm.connect(runs, name="watcher") as watcher:
+        assert watcher.get("tip-bias-voltage") == pytest.approx(0.35)
 
 
 def test_a_plan_that_is_aborted_stops_its_scan_and_gives_control_back(scope: Any, runs: Path) -> None:

@@ -245,7 +245,9 @@ class Microscope(StandardReadable):
         self._held = ExitStack()
         with self.add_children_as_readables(StandardReadableFormat.CONFIG_SIGNAL):
             for parameter in parameters:
-                setattr(self, parameter.replace("-", "_"), SignalRW(_ParameterBackend(session, parameter)))
+                # without ophyd's timeout of 10 s: like a notebook, the plan waits for control while the tip is repaired
+                signal = SignalRW(_ParameterBackend(session, parameter), timeout=None)
+                setattr(self, parameter.replace("-", "_"), signal)
         self.scan = ScanDevice(session)
         self.spectrum = SpectrumDevice(session)
         super().__init__(name)
