@@ -22,6 +22,7 @@ from afspm.transport.process.parent import StopRequested
 from afspm.wire.messages import FEEDBACK
 
 ASK_AGAIN_S = 10.0  # in case a published control state was lost
+NAMED_WITHIN_S = 2.0  # for the control state that names this component, which is published before the answer
 
 
 class ControlHold:
@@ -82,6 +83,9 @@ class ControlHold:
         was_unbroken = self.is_unbroken
         try:
             with self._link.interrupts.heeded():
+                # Packets from a long computation of the caller may wait: a measurement of another component would look
+                # like the result of this block, and a moved probe as if it were still in its place.
+                self._link.take_in()
                 self.regain(until_s)
             if len(self._wanted) == 1:
                 self._was_off = self._is_off
@@ -126,8 +130,10 @@ class ControlHold:
             may_ask = link.or_reconnected(self._when_changed(solving))
             with link.clock.late():  # not in the wait below: another component may use that time
                 obstacle = self._ask(solving, until_s)
-            if obstacle is None:
-                break
+                if obstacle is None:
+                    # packets from before the grant may arrive after the answer: they show what others have changed
+                    link.wait(lambda: self._was_named or not self.held, link.earlier(NAMED_WITHIN_S, until_s))
+                    continue
             if obstacle != reported:
                 link.log.info("waiting for control: %s", obstacle)
             reported = obstacle

@@ -239,13 +239,20 @@ class ExperimentLink:
                 return False
         return True
 
-    def pump(self, timeout_s: float | None) -> None:
-        """Wait for events once, and pass them to their listeners. Raises as `wait`."""
+    def pump(self, timeout_s: float | None) -> int:
+        """Wait for events once, pass them to their listeners, and return their number. Raises as `wait`."""
         self.check()
-        for incoming in self.port.poll(timeout_s):
+        came = self.port.poll(timeout_s)
+        for incoming in came:
             self._take(incoming)
         self.interrupts.heed()
         self.check()
+        return len(came)
+
+    def take_in(self) -> None:
+        """Pass all events that have arrived to their listeners, without waiting for more. Raises as `wait`."""
+        while self.pump(0.0):  # one poll returns a few packets only
+            pass
 
     def check(self) -> None:
         """Raise an error if no more events can arrive.

@@ -133,4 +133,4 @@ class ExperimentView:
         # a long computation may lie between two calls: take in the packets that arrived since
         with self._link.interrupts.heeded():
             self._link.wait_caught_up()
-            self._link.pump(0.0)
+            self._link.take_in()

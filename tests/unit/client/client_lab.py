@@ -85,7 +85,12 @@ class Nothing(AssertionError):
 
 
 class Lab:
-    """A laboratory whose events are in the order of time; `poll` moves the clock to the next event."""
+    """A laboratory whose events are in the order of time; `poll` moves the clock to the next event.
+
+    Attributes:
+        most_at_once: number of events that a poll returns, with answers before packets, as from real sockets; None:
+            all, in their order.
+    """
 
     def __init__(self, name: str = "experiment") -> None:
         self.name = name
@@ -108,6 +113,7 @@ class Lab:
         self._numbers = itertools.count()
         self._inbox: list[Incoming] = []
         self._newest_ns = 0
+        self.most_at_once: int | None = None
         self.open = True
         self.connect()
         self.publish(ScopeStatus(self.state))
@@ -126,7 +132,10 @@ class Lab:
             answer = self._answer_once(request)
         if isinstance(answer, Response):
             answer.id = request.id
-            self.at(0.01, lambda: self._inbox.append(ReplyReceived(answer)))
+            if self.most_at_once is None:
+                self.at(0.01, lambda: self._inbox.append(ReplyReceived(answer)))
+            else:  # a socket of its own: the answer waits for no packet
+                self._inbox.insert(0, ReplyReceived(answer))
 
     def poll(self, timeout_s: float | None) -> list[Incoming]:
         until_s = None if timeout_s is None else self.clock.passed_s + timeout_s
@@ -143,7 +152,7 @@ class Lab:
             at_s, _, happen = heapq.heappop(self._happenings)
             self.clock.passed_s = max(at_s, self.clock.passed_s)
             happen()
-        found, self._inbox = self._inbox, []
+        found, self._inbox = self._inbox[: self.most_at_once], self._inbox[len(self._inbox[: self.most_at_once]) :]
         return found
 
     def publish_out(self, envelope: str, payload: bytes) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -27,13 +28,16 @@ from afspm.model import (
     ControlRequest,
     ControlResponse,
     Packet,
+    ProbePosition,
     Problem,
     Region,
+    Request,
     Response,
     Scan,
     ScopeState,
     ScopeStatus,
 )
+from afspm.scheduler.control.arbitration import ArbitrationEvent
 from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S, CaughtUp
 from afspm.transport.process.parent import StopRequested
 
@@ -855,6 +859,75 @@ def test_states_and_modes_are_shown_by_their_names(lab: Lab, scope: Scope) -> No
 def test_properties_of_a_scope_show_the_present_state(lab: Lab, scope: Scope) -> None:
     lab.flag(TIP)
     assert "tip-shape-changed is flagged" in repr(scope)
+
+
+def _others_work_while_this_one_computes(lab: Lab, work: Callable[[], object]) -> None:
+    # with more packets than one poll returns
+    lab.does(ArbitrationEvent.REQUEST_CONTROL, "other")
+    for _ in range(100):
+        lab.publish(ScopeStatus(ScopeState.FREE))
+    work()
+    lab.does(ArbitrationEvent.RELEASE_CONTROL, "other")
+
+
+def _put_probe(lab: Lab, xy_m: tuple[float, float]) -> None:
+    lab.position = ProbePosition(xy_m)
+    lab.publish(lab.position)
+
+
+def test_property_is_the_present_one_after_many_unread_packets(lab: Lab, scope: Scope) -> None:
+    assert scope.state is ScopeState.FREE
+    lab.most_at_once = 16
+    _others_work_while_this_one_computes(lab, lambda: _put_probe(lab, (5e-7, 0.0)))
+    assert scope.probe_position == ProbePosition((5e-7, 0.0))
+
+
+def test_probe_that_another_component_has_moved_unread_is_moved_back(lab: Lab, scope: Scope) -> None:
+    lab.most_at_once = 16
+    scope.move_probe((1e-7, 0.0))
+    _others_work_while_this_one_computes(lab, lambda: _put_probe(lab, (5e-7, 0.0)))
+    scope.move_probe((1e-7, 0.0))
+    assert lab.position.xy_m == (1e-7, 0.0)
+
+
+def test_probe_that_a_person_has_moved_unread_in_a_block_is_moved_back(lab: Lab, scope: Scope) -> None:
+    lab.most_at_once = 16
+    with scope.control():
+        scope.move_probe((1e-7, 0.0))
+        lab.set_mode(ControlMode.MANUAL)
+        _others_work_while_this_one_computes(lab, lambda: _put_probe(lab, (5e-7, 0.0)))
+        lab.set_mode(ControlMode.AUTOMATED)
+        scope.move_probe((1e-7, 0.0))
+    assert lab.position.xy_m == (1e-7, 0.0)
+
+
+def test_packets_that_arrive_after_the_answer_of_a_grant_are_awaited(lab: Lab, scope: Scope) -> None:
+    scope.move_probe((1e-7, 0.0))
+    lab.most_at_once = 1
+
+    def moved_before(request: Request) -> str:
+        if request.kind == ControlRequest.REQUEST_CTRL:
+            _put_probe(lab, (5e-7, 0.0))
+        return "go on"
+
+    lab.intercept = moved_before
+    scope.move_probe((1e-7, 0.0))
+    assert lab.position.xy_m == (1e-7, 0.0)
+
+
+def test_unread_scan_of_another_component_is_not_taken_for_the_result(lab: Lab, scope: Scope) -> None:
+    scope.scan(REGION)
+    lab.most_at_once = 16
+
+    def scanned() -> None:
+        lab.publish(ScopeStatus(ScopeState.SCANNING))
+        lab.publish_scan(REGION)
+        lab.publish(ScopeStatus(ScopeState.FREE))
+
+    _others_work_while_this_one_computes(lab, scanned)
+    begun_s = lab.clock.passed_s
+    scope.scan(REGION)
+    assert lab.clock.passed_s >= begun_s + SCAN_S
 
 
 def test_wait_accepts_a_target_that_the_instrument_has_rounded(lab: Lab, scope: Scope) -> None:
