@@ -35,7 +35,7 @@ class ControlHold:
         held: whether the component is in control.
         tenures: number of grants of control.
         why_lost: reason of the last loss, for people.
-        gives_back_inherited: whether to release control that the component held before its restart.
+        gives_back_inherited: whether to release control that no block of this life has requested, or still waits for.
         is_unbroken: whether a loss of control in the present block is an error: all requests belong to one grant.
         switched: the last switching of the feedback: number of its messages published before, and whether it is on.
     """
@@ -180,7 +180,14 @@ class ControlHold:
     def _ask(self, solving: int, until_s: float | None) -> str | None:
         # returns why control must be waited for; None once it is held
         link = self._link
-        response = link.request(ControlRequest.REQUEST_CTRL, int(solving), until_s=until_s)
+        try:
+            response = link.request(ControlRequest.REQUEST_CTRL, int(solving), until_s=until_s)
+        except (NoResponse, KeyboardInterrupt):
+            # it may be granted all the same: without a release no other component would get control any more
+            self.gives_back_inherited = True
+            if not link.ended:
+                link.send_only(ControlRequest.RELEASE_CTRL)
+            raise
         if response.ok:
             # the published state with this holder may arrive before the answer
             self.tenures += 1

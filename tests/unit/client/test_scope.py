@@ -118,9 +118,29 @@ def test_scan_during_a_problem_waits_without_repeated_requests(lab: Lab, scope: 
     assert lab.count(ControlRequest.REQUEST_CTRL) <= 2 + 3600.0 / 10.0
 
 
-def test_scan_waits_for_another_solver(lab: Lab, scope: Scope) -> None:
-    from afspm.scheduler.control.arbitration import ArbitrationEvent
+def _grants_without_answer(lab: Lab, request: Request) -> str | None:
+    if request.kind != ControlRequest.REQUEST_CTRL:
+        return "go on"
+    lab.does(ArbitrationEvent.REQUEST_CONTROL, lab.name)
+    return None
 
+
+def test_control_that_is_granted_after_the_timeout_is_released(lab: Lab, scope: Scope) -> None:
+    lab.intercept = lambda request: _grants_without_answer(lab, request)
+    with pytest.raises(NoResponse):
+        scope.scan(REGION, timeout_s=0.5)
+    assert lab.control.holder is None
+
+
+def test_control_that_is_granted_after_an_interrupt_is_released(lab: Lab, scope: Scope) -> None:
+    lab.intercept = lambda request: _grants_without_answer(lab, request)
+    lab.at(0.5, lab.ctrl_c)
+    with pytest.raises(KeyboardInterrupt):
+        scope.scan(REGION)
+    assert lab.control.holder is None
+
+
+def test_scan_waits_for_another_solver(lab: Lab, scope: Scope) -> None:
     lab.does(ArbitrationEvent.REQUEST_CONTROL, "other")
     lab.at(7.0, lambda: lab.does(ArbitrationEvent.RELEASE_CONTROL, "other"))
     scope.scan(REGION)
@@ -545,8 +565,6 @@ def test_solving_an_unflagged_problem_is_refused_at_once(lab: Lab, scope: Scope)
 
 
 def test_waiting_solver_gets_an_error_when_another_has_solved_the_problem(lab: Lab, scope: Scope) -> None:
-    from afspm.scheduler.control.arbitration import ArbitrationEvent
-
     lab.flag(TIP)
     lab.does(ArbitrationEvent.REQUEST_CONTROL, "other", TIP)
     lab.at(5.0, lambda: lab.clear(TIP))
