@@ -166,7 +166,9 @@ class KeyedResults:
         """Remove the saved result of a key; the next request with this key measures again."""
         path = self._path(key)
         if path is not None:
-            # without its file the saved intent would look unfulfilled after a restart, and get the old scan
+            # without its file the saved intent, even of an earlier life, would look unfulfilled and get the old scan
+            if self.pending is None:
+                self._memory.pop("pending", None)
             self._memory.save(synced=False)
             with suppress(OSError):  # a file that stays only takes space
                 path.unlink(missing_ok=True)

@@ -285,6 +285,27 @@ def test_forgotten_key_may_be_used_in_a_loop(tmp_path: Path) -> None:
     assert lab.clock.passed_s < 9 * SCAN_S + 20.0, "no request had an old id, which starts nothing"
 
 
+def test_key_forgotten_in_a_later_life_is_measured_again_after_a_kill(tmp_path: Path) -> None:
+    lab = Lab()
+    scope_of(lab, tmp_path, 0).scan(TILES[0], shape=(8, 8), key="reference")
+    lab.restart_component()
+    scope_of(lab, tmp_path, 1).forget("reference")  # killed before it has control for the next measurement
+    lab.restart_component()
+    scope_of(lab, tmp_path, 2).scan(TILES[0], shape=(8, 8), key="reference")
+    assert lab.begun_scans == 2
+
+
+def test_measurement_of_a_forgotten_key_has_no_interruptions_of_the_earlier_one(tmp_path: Path) -> None:
+    lab = Lab()
+    lab.at(30.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
+    lab.at(60.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    assert scope_of(lab, tmp_path, 0).scan(TILES[0], shape=(8, 8), key="reference").interruptions
+    lab.restart_component()
+    scope = scope_of(lab, tmp_path, 1)
+    scope.forget("reference")
+    assert scope.scan(TILES[0], shape=(8, 8), key="reference").interruptions == ()
+
+
 def test_measurement_given_up_for_another_is_taken_at_once_later(tmp_path: Path) -> None:
     lab = Lab()
     scope = scope_of(lab, tmp_path, 0)
