@@ -85,6 +85,7 @@ class Memory(MutableMapping[str, Any]):
 
     def _text(self) -> str:
         try:
+            _check_keys(self._values)
             return json.dumps(self._values, ensure_ascii=False, default=_number)
         except (TypeError, ValueError) as error:
             raise InvalidValue(
@@ -95,7 +96,7 @@ class Memory(MutableMapping[str, Any]):
         return self._values[key]
 
     def __setitem__(self, key: str, value: object) -> None:
-        if not isinstance(key, str):  # JSON turns keys into strings: after a restart the key would be another
+        if not isinstance(key, str):  # as `_check_keys`, but at once
             raise InvalidValue(f"a key must be a text, not {key!r}", where="memory")
         self._values[key] = value
 
@@ -110,6 +111,20 @@ class Memory(MutableMapping[str, Any]):
 
     def __repr__(self) -> str:
         return f"<Memory {self._values!r}>"
+
+
+def _check_keys(value: object) -> None:
+    # JSON turns keys into strings: after a restart the key would be another, and what was done would be done again
+    if isinstance(value, dict):
+        for key in value:
+            if not isinstance(key, str):
+                raise TypeError(f"a key must be a text, not {key!r}")
+        value = value.values()
+    elif not isinstance(value, list | tuple):
+        return
+    for one in value:
+        if isinstance(one, dict | list | tuple):
+            _check_keys(one)
 
 
 def _number(value: Any) -> object:

@@ -69,6 +69,14 @@ def test_key_that_is_not_a_string_is_refused(tmp_path: Path) -> None:
         Memory(None)[5] = "x"  # type: ignore[index]
 
 
+def test_key_that_is_not_a_string_is_refused_at_any_depth(tmp_path: Path) -> None:
+    memory = Memory(tmp_path / "x.json")
+    memory["done"] = [{"tiles": {3: True}}]  # read back, it would be {"3": True}, and `3 in …` False
+    for save in (memory.save, memory.save_changes):
+        with pytest.raises(InvalidValue, match="a key must be a text, not 3"):
+            save()
+
+
 @pytest.mark.parametrize("content", ["{", "[1]", "\0"])
 def test_memory_file_of_another_kind_is_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "x.json").write_text(content)
