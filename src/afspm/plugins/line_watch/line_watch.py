@@ -125,7 +125,9 @@ class LineWatch(Component):
 
     flags: ClassVar = ("tip-shape-changed",)
     publishes: ClassVar = (tip_verdict.OF_LINES,)
-    listens: ClassVar = ("ScanLines", "Scan2d", "ControlState", "ZCtrlParameters", tip_verdict.MESSAGE)
+    listens: ClassVar = (
+        "ScanLines", "Scan2d", "ScopeStateMsg", "ControlState", "ZCtrlParameters", tip_verdict.MESSAGE,
+    )  # fmt: skip
 
     def __init__(
         self,
