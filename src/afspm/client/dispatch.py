@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 from afspm import wire
 from afspm.basics.errors import WireError
 from afspm.model import ControlState, Packet
+from afspm.wire.messages import CONTROL_STATE
 
 if TYPE_CHECKING:
     from afspm.basics.clock import Clock
@@ -71,6 +72,21 @@ class MessageDispatcher:
             self._wanted[message] = self._wants_message(message)
         return self._wanted[message]
 
+    def never_called(self) -> dict[str, str]:
+        """Return the handlers for which no prefix selects a message, each with the name of its message."""
+        prefixes = self._prefixes
+        if prefixes is None:
+            return {}
+        unsubscribed = [
+            name
+            for name in wire.known_messages()
+            if not any(name.startswith(prefix) or prefix.startswith(name) for prefix in prefixes)
+        ]
+        handlers = [(wire.declaration(name).handler, name) for name in unsubscribed]
+        if CONTROL_STATE.name in unsubscribed:
+            handlers.append(("on_problem", CONTROL_STATE.name))
+        return {handler: name for handler, name in handlers if self._has(handler)}
+
     @property
     def wants_anything(self) -> bool:
         return any(map(self._wants_message, wire.known_messages()))
@@ -99,7 +115,7 @@ class MessageDispatcher:
                 self._component.on_problem(self._component.scope.problems.name(number), number in self._problems)
 
     def _wants_message(self, message: str) -> bool:
-        return self._handler(message) is not None or (message == "ControlState" and self._has("on_problem"))
+        return self._handler(message) is not None or (message == CONTROL_STATE.name and self._has("on_problem"))
 
     def _handler(self, message: str) -> Callable[[str, object], None] | None:
         name = wire.declaration(message).handler

@@ -49,6 +49,9 @@ class ComponentLoop:
         self._has_reacted = False  # a handler has returned after a tenure of control
         launch = context.launch
         self._dispatcher = MessageDispatcher(component, base, launch.envelopes, context.log)
+        for handler, message in self._dispatcher.never_called().items():
+            text = "%s is never called: the component does not subscribe to %s; add it to `listens` or `envelopes`"
+            context.log.warning(text, handler, message)
         port, self._clock = context.open_port(), context.clock
         if launch.keeps_requests:
             port = recorded(port, context, self._dispatcher.wants, lambda: component.packet)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from afspm.basics.exit_codes import ExitCode
 from afspm.basics.launch import Launch
 from afspm.basics.own_fault import OwnFault
 from afspm.client.component import Component
+from afspm.client.dispatch import MessageDispatcher
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -186,6 +189,22 @@ def test_unreadable_packet_is_dropped_and_logged(caplog: pytest.LogCaptureFixtur
     assert run(component, lab) == ExitCode.ENDED
     assert component.seen == ["Height", "Phase"]
     assert "can't be read" in caplog.text
+
+
+def test_handler_that_is_never_called_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab()
+    lab.at(1.0, lab.kill)
+    run(Diary(), lab, envelopes=("Scan2d_2000.0", "ScopeStateMsg"))
+    [text] = (one for one in caplog.messages if "never called" in one)
+    assert text.startswith("on_problem is never called: the component does not subscribe to ControlState")
+
+
+def test_handlers_of_all_installed_components_can_be_called() -> None:
+    for entry in entry_points(group="afspm.components"):
+        component = entry.load()
+        made, listens = component.__new__(component), getattr(component, "listens", None)
+        dispatcher = MessageDispatcher(made, Component, listens, logging.getLogger("afspm.test"))
+        assert not dispatcher.never_called(), entry.name
 
 
 def test_ticks_keep_the_beat_of_the_experiment() -> None:
