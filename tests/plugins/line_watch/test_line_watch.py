@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from functools import partial
 from pathlib import Path
 
@@ -80,6 +81,20 @@ def test_missing_lines_are_reported_after_three_scans(caplog: pytest.LogCaptureF
     run(LineWatch(), lab, envelopes=LineWatch.listens)
     [text] = caplog.messages
     assert "no lines came of the last 3 scans" in text
+
+
+def test_cached_scans_are_not_missed_lines(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab("line_watch")
+    for number, picture in enumerate(night()[:4]):
+        lab.publish(ScopeStatus(ScopeState.SCANNING))
+        publish_scan(lab, picture, number, 0.0)
+        while lab._happenings:
+            heapq.heappop(lab._happenings)[2]()
+        lab.publish(ScopeStatus(ScopeState.FREE))
+    lab.clock.passed_s = 800.0
+    lab.at(100.0, lab.kill)
+    run(LineWatch(), lab, envelopes=LineWatch.listens)
+    assert not caplog.messages
 
 
 def test_look_publishes_the_row_and_flags_nothing() -> None:

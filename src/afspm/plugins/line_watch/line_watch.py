@@ -82,7 +82,7 @@ class _MissingLines:
 
     def __init__(self, log: logging.Logger) -> None:
         self._log = log
-        self._has_begun = False  # not true of the cached scans at a start
+        self._has_begun = False
         self._count = 0
 
     def on_state(self, status: ScopeStatus) -> None:
@@ -151,6 +151,7 @@ class LineWatch(Component):
     def on_start(self) -> None:
         self.expected = MissingChannels(self.channels, self.log)
         self._missing_lines = _MissingLines(self.log)
+        self._started_ns = self.clock.now_ns()
         self._later_states = _LaterStates(self.scope.events("ScopeStateMsg"))
         if "judge" in self.memory:
             self.judge.restore(self.memory["judge"])
@@ -224,7 +225,8 @@ class LineWatch(Component):
         self._finished = _Finished(pair, self._kind(scan), downwards, is_whole, is_whole and self._problems == ())
 
     def on_state(self, status: ScopeStatus) -> None:
-        self._missing_lines.on_state(status)
+        if self.packet is not None and (self.packet.time_ns or 0) > self._started_ns:  # lines are not cached
+            self._missing_lines.on_state(status)
 
     def _forget(self) -> None:
         self.judge.forget_places()
