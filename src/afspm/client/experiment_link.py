@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from afspm import wire
 from afspm.basics.clock import Clock
-from afspm.basics.errors import ConfigError, ExperimentEnded, NoResponse, WireError
+from afspm.basics.errors import AfspmError, ConfigError, ExperimentEnded, NoResponse, WireError
 from afspm.basics.launch import Launch
 from afspm.client.interrupts import Interrupts
 from afspm.model import (
@@ -186,6 +188,7 @@ class ExperimentLink:
         self._retries = request_retries
         self._source = source
         self._over: BaseException | None = None
+        self._thread: int | None = None  # the thread that waits for events
         self._caught_up: set[str] = set()
         self._listeners: dict[object, Listener] = {}
 
@@ -218,7 +221,7 @@ class ExperimentLink:
             ConfigError: the scheduler belongs to another run.
             KeyboardInterrupt: the user interrupts.
         """
-        with self.activity.waiting(), self.interrupts.heeded():
+        with self._alone(), self.activity.waiting(), self.interrupts.heeded():
             while not done():
                 left_s = None if until_s is None else until_s - self.clock.monotonic_s()
                 if left_s is not None and left_s <= 0.0:
@@ -242,9 +245,10 @@ class ExperimentLink:
     def pump(self, timeout_s: float | None) -> int:
         """Wait for events once, pass them to their listeners, and return their number. Raises as `wait`."""
         self.check()
-        came = self.port.poll(timeout_s)
-        for incoming in came:
-            self._take(incoming)
+        with self._alone():
+            came = self.port.poll(timeout_s)
+            for incoming in came:
+                self._take(incoming)
         self.interrupts.heed()
         self.check()
         return len(came)
@@ -261,11 +265,27 @@ class ExperimentLink:
             ExperimentEnded, StopRequested: the experiment has ended, or the process is being stopped.
             NoResponse: this link was closed.
             ConfigError: the scheduler belongs to another run.
+            AfspmError: another thread waits in a call.
         """
+        if self._thread not in (None, threading.get_ident()):
+            raise AfspmError(
+                "another thread waits in a call of this scope",
+                where=self.name,
+                hint="connect again under another name, and use that scope in this thread",
+            )
         if self._over is not None:
             raise self._over
         if self.ended:
             raise ExperimentEnded(HAS_ENDED, where=self.name)
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        # the frames of a message would be divided between two threads: packets and answers would be lost
+        before, self._thread = self._thread, threading.get_ident()
+        try:
+            yield
+        finally:
+            self._thread = before
 
     def leave(self) -> None:
         """Close the port; all later calls raise NoResponse."""
@@ -346,6 +366,7 @@ class ExperimentLink:
         """
         request = Request(kind, subject, id=request_id or self.next_id())
         frames, requests, sent = wire.encode_request(request), self.requests, 0
+        self.check()
         requests.expect(request.id)
         try:
             while sent <= self._retries:

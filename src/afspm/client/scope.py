@@ -68,6 +68,8 @@ class Scope(ExperimentView):
     A call requests control and releases it afterwards; `with scope.control():` keeps control over several calls.
     Without control, calls wait until control is given. Timeouts are in real seconds; None waits for ever.
 
+    One thread at a time may use a scope; only `interrupt` may be called meanwhile. For two threads, connect twice.
+
     Every call may raise:
         Refused: the scheduler, a limit or the microscope refused; `reason` gives the reason.
         NoResponse: the time limit has passed, or there is no answer.

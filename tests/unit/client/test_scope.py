@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from tests.unit.client.client_lab import OTHER_REGION, REGION, SCAN_S, SOURCE, L
 
 from afspm import model, wire
 from afspm.basics.errors import (
+    AfspmError,
     ControlLost,
     ExperimentEnded,
     InvalidValue,
@@ -946,6 +948,25 @@ def test_unread_scan_of_another_component_is_not_taken_for_the_result(lab: Lab, 
     begun_s = lab.clock.passed_s
     scope.scan(REGION)
     assert lab.clock.passed_s >= begun_s + SCAN_S
+
+
+def test_second_thread_is_refused_while_one_waits_in_a_call(lab: Lab, scope: Scope) -> None:
+    refused: list[AfspmError] = []
+
+    def ask() -> None:
+        with pytest.raises(AfspmError, match="another thread") as caught:
+            scope.get("tip-bias-voltage")
+        refused.append(caught.value)
+
+    def meanwhile() -> None:
+        other = threading.Thread(target=ask)
+        other.start()
+        other.join()
+
+    lab.at(50.0, meanwhile)
+    assert scope.scan(REGION).interruptions == ()
+    assert refused
+    assert scope.get("tip-bias-voltage") == 0.5
 
 
 def test_wait_accepts_a_target_that_the_instrument_has_rounded(lab: Lab, scope: Scope) -> None:
