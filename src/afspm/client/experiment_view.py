@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from numbers import Real
 
-from afspm.basics.errors import AfspmError, InvalidValue
+from afspm.basics.errors import AfspmError, ExperimentEnded, InvalidValue
 from afspm.client.events import Events
 from afspm.client.experiment_link import ExperimentLink
 from afspm.model import (
@@ -85,6 +85,9 @@ class ExperimentView:
             envelopes: prefixes of the wanted envelopes; none: all.
             timeout_s: end the iteration after this real time without a message; None: only with the experiment.
         """
+        if self._link.is_caught_up():
+            with suppress(ExperimentEnded), self._link.interrupts.heeded():
+                self._link.take_in()  # else packets of long ago, which wait unread, would count as new
         return Events(self._link, envelopes, timeout_s, self._before_wait)
 
     def wait_until(self, condition: Callable[[], bool], *, timeout_s: float | None = None) -> bool:

@@ -774,6 +774,16 @@ def test_events_are_iterated_over_and_none_is_lost_in_the_body(lab: Lab, scope: 
     assert seen == [(region, channel) for region in (REGION, OTHER_REGION) for channel in ("Height", "Phase")]
 
 
+def test_events_that_wait_unread_are_not_new(lab: Lab, scope: Scope) -> None:
+    assert scope.state is ScopeState.FREE
+    lab.most_at_once = 16
+    for _ in range(40):
+        lab.publish_scan(OTHER_REGION)
+    events = scope.events("Scan2d", timeout_s=10.0)
+    lab.at(1.0, lambda: lab.publish_scan(REGION))
+    assert [event.message.region for event in events] == [REGION, REGION]
+
+
 def test_the_end_of_the_experiment_ends_an_iteration(lab: Lab, scope: Scope) -> None:
     lab.at(5.0, lab.kill)
     assert [event.envelope for event in scope.events("Scan2d")] == []
