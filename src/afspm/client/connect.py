@@ -15,7 +15,7 @@ from afspm.basics.launch import Launch, Sockets
 from afspm.basics.plain_data import Plain
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
-from afspm.model import Frame, ProblemNames
+from afspm.model import Frame, ProblemNames, is_process_name
 from afspm.record.run_json import RUN_FILE, STATE_DIR, latest_run, read_run_json, run_json_or_empty
 from afspm.record.run_lock import cut_off_message
 from afspm.transport.process.context import new_session
@@ -44,10 +44,13 @@ def connect(where: str | Path = "runs", name: str = "notebook", *, messages: Seq
 
     Raises:
         FileError: there is no such run.
-        ConfigError: the run has no scheduler to connect to, or `messages` can't be imported.
+        ConfigError: the run has no scheduler to connect to, `messages` can't be imported, or `name` can't be a name.
         NoResponse: the scheduler does not answer within 5 s, or its cached packets do not arrive within 30 s.
         ExperimentEnded: the experiment has just ended.
     """
+    if not is_process_name(name):
+        hint = "letters, digits, - and _, with spaces and dots between them"
+        raise ConfigError(f"{name!r} can't be the name of a program", where="connect", hint=hint)
     folder = find_run(Path(where))
     launch = guest_of(folder, name)
     log = _log_of(name)

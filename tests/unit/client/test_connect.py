@@ -10,7 +10,7 @@ import pytest
 
 import afspm
 from afspm.basics.clock import Clock, ExperimentClock
-from afspm.basics.errors import FileError
+from afspm.basics.errors import ConfigError, FileError
 from afspm.basics.launch import Launch, Sockets
 from afspm.client import connect
 from afspm.client.connect import GUEST, find_run, guest_facts
@@ -113,3 +113,9 @@ def test_module_that_a_run_folder_names_is_imported_only_if_the_caller_names_it(
     assert "messages of beside_the_run are not read" in caplog.text
     with pytest.raises(SystemExit, match="it was run"):
         afspm.connect(folder, messages=["beside_the_run"])
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "../x", "notebook:2", "two\nlines", "x" * 200])
+def test_name_that_no_file_can_have_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ConfigError, match="can't be the name of a program"):
+        afspm.connect(run_folder(tmp_path, "night"), name)
