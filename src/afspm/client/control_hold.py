@@ -22,7 +22,7 @@ from afspm.transport.process.parent import StopRequested
 from afspm.wire.messages import FEEDBACK
 
 ASK_AGAIN_S = 10.0  # in case a published control state was lost
-NAMED_WITHIN_S = 2.0  # for the control state that names this component, which is published before the answer
+NAMED_WITHIN_S = 10.0  # for the control state that names this component, which is published before the answer
 
 
 class ControlHold:
@@ -131,8 +131,7 @@ class ControlHold:
             with link.clock.late():  # not in the wait below: another component may use that time
                 obstacle = self._ask(solving, until_s)
                 if obstacle is None:
-                    # packets from before the grant may arrive after the answer: they show what others have changed
-                    link.wait(lambda: self._was_named or not self.held, link.earlier(NAMED_WITHIN_S, until_s))
+                    self._take_in_earlier_packets(until_s)
                     continue
             if obstacle != reported:
                 link.log.info("waiting for control: %s", obstacle)
@@ -142,6 +141,12 @@ class ControlHold:
                 raise ControlLost(f"control was not given in time: {obstacle}", where=link.name)
         if reported:
             link.log.info("in control")
+
+    def _take_in_earlier_packets(self, until_s: float | None) -> None:
+        # packets from before the grant may arrive after its answer: they show what others have changed
+        link = self._link
+        if not link.wait(lambda: self._was_named or not self.held, link.earlier(NAMED_WITHIN_S, until_s)):
+            link.log.warning("in control, but the scheduler's packets are late: settings of others may be unseen")
 
     def release_inherited(self) -> None:
         """Release control held since before a restart of the component, unless the component needs control now."""
