@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from numbers import Real
 
+from afspm import wire
 from afspm.basics.errors import AfspmError, ExperimentEnded, InvalidValue
 from afspm.client.events import Events
 from afspm.client.experiment_link import ExperimentLink
@@ -84,7 +85,12 @@ class ExperimentView:
         Args:
             envelopes: prefixes of the wanted envelopes; none: all.
             timeout_s: end the iteration after this real time without a message; None: only with the experiment.
+
+        Raises:
+            InvalidValue: an envelope is not a text, or begins with no known message's name.
         """
+        for envelope in envelopes:
+            _check_prefix(envelope)
         if self._link.is_caught_up():
             with suppress(ExperimentEnded), self._link.interrupts.heeded():
                 self._link.take_in()  # else packets of long ago, which wait unread, would count as new
@@ -137,3 +143,13 @@ class ExperimentView:
         with self._link.interrupts.heeded():
             self._link.wait_caught_up()
             self._link.take_in()
+
+
+def _check_prefix(envelope: object) -> None:
+    if not isinstance(envelope, str):
+        hint = 'give each as an argument: events("Scan2d", "Spec1d")'
+        raise InvalidValue(f"an envelope is a text, not {envelope!r}", where="events", hint=hint)
+    names = wire.known_messages()
+    if not any(name.startswith(envelope) or envelope.startswith(name) for name in names):
+        hint = "e.g. Scan2d, Spec1d or ScopeStateMsg; messages of your own need their module under `messages`"
+        raise InvalidValue(f"no envelope begins with {envelope!r}", where="events", hint=hint)

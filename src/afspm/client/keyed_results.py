@@ -192,7 +192,7 @@ def check_key(key: str) -> str:
     Raises:
         InvalidValue: the key is not valid.
     """
-    if not key or len(key.encode()) > LONGEST_KEY or "/" in key or not key.isprintable():
+    if not isinstance(key, str) or not key or len(key.encode()) > LONGEST_KEY or "/" in key or not key.isprintable():
         raise InvalidValue(f"{key!r} can't be a key", hint=f"1 to {LONGEST_KEY} printable characters without '/'")
     return key
 

@@ -188,6 +188,8 @@ class Scope(ExperimentView):
                 "<key>-2" …
             done: number of points to skip at the beginning.
         """
+        if measure not in ("scan", "spectrum"):
+            raise InvalidValue(f"a sweep can't measure {measure!r}", where="sweep", hint='"scan" or "spectrum"')
         plan = SweepPlan.of(parameters, order, seed)
         target = (
             ScanTarget.of(region, shape, self._frame) if measure == "scan" else SpectrumTarget.of(at, kind, self._frame)
@@ -430,7 +432,13 @@ class Scope(ExperimentView):
         return tuple(map(self.problems.name, flagged))
 
     def set_mode(self, mode: ControlMode) -> None:
-        """Set MANUAL (no component has control) or AUTOMATED."""
+        """Set MANUAL (no component has control) or AUTOMATED.
+
+        Raises:
+            InvalidValue: `mode` is text.
+        """
+        if isinstance(mode, str):
+            raise InvalidValue(f"{mode!r} is not a mode", hint="ControlMode.MANUAL or ControlMode.AUTOMATED")
         self._ask_scheduler(ControlRequest.SET_CONTROL_MODE, int(mode))
 
     def restart(self, process: str) -> None:

@@ -46,7 +46,13 @@ class ScanTarget:
     def of(cls, region: Region | None, shape: tuple[int, int] | None, frame: Frame) -> ScanTarget:
         if isinstance(region, Region) and frame is Frame.SAMPLE:
             region = replace(region, frame=Frame.SAMPLE)
-        return cls(region, None if shape is None else (int(shape[0]), int(shape[1])))
+        if shape is None:
+            return cls(region, None)
+        try:
+            rows, columns = shape
+            return cls(region, (int(rows), int(columns)))
+        except (TypeError, ValueError) as error:
+            raise InvalidValue(f"a shape is (rows, columns), not {shape!r}", hint="e.g. (256, 256)") from error
 
     @property
     def parameters(self) -> ScanParameters:

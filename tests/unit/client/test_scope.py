@@ -7,6 +7,7 @@ import math
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -782,6 +783,30 @@ def test_events_that_wait_unread_are_not_new(lab: Lab, scope: Scope) -> None:
     events = scope.events("Scan2d", timeout_s=10.0)
     lab.at(1.0, lambda: lab.publish_scan(REGION))
     assert [event.message.region for event in events] == [REGION, REGION]
+
+
+@pytest.mark.parametrize("envelope", [["Scan2d"], "scan", "Peaks", 5])
+def test_events_of_an_envelope_that_never_comes_are_refused(lab: Lab, scope: Scope, envelope: Any) -> None:
+    with pytest.raises(InvalidValue, match="envelope"):
+        scope.events(envelope)
+    assert scope.scan(REGION).region == REGION
+
+
+def test_prefix_of_an_envelope_in_either_length_is_accepted(scope: Scope) -> None:
+    scope.events("", "Scan", "Scan2d_2000.0_Height")
+
+
+def test_values_of_the_wrong_kind_are_refused_with_a_valid_example(lab: Lab, scope: Scope) -> None:
+    with pytest.raises(InvalidValue, match="rows, columns"):
+        scope.scan(REGION, shape=128)  # type: ignore[arg-type]
+    with pytest.raises(InvalidValue, match="key"):
+        scope.scan(REGION, key=5)  # type: ignore[arg-type]
+    with pytest.raises(InvalidValue, match="mode"):
+        scope.set_mode("MANUAL")  # type: ignore[arg-type]
+    sweep = scope.sweep({"scan-speed": [1e-6]}, measure="scans")  # type: ignore[arg-type]
+    with pytest.raises(InvalidValue, match="scans"), sweep:
+        pass
+    assert not lab.requests
 
 
 def test_the_end_of_the_experiment_ends_an_iteration(lab: Lab, scope: Scope) -> None:
