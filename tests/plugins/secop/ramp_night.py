@@ -29,7 +29,8 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
-from afspm.plugins.secop.secop_client import SecopClient, ServerUnfit
+from afspm.plugins.secop.channel import ServerUnfit
+from afspm.plugins.secop.secop_client import SecopClient
 from afspm.scheduler import events
 from afspm.scheduler.instruments.conditions import AllowedBand, InstrumentSettings, MeasuringCondition
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit

@@ -14,8 +14,9 @@ from afspm.basics.errors import ConfigError, TransportError
 from afspm.client.component import Component
 from afspm.model import InstrumentReadings
 from afspm.plugins.secop import lines
+from afspm.plugins.secop.channel import ServerUnfit
 from afspm.plugins.secop.lines import LONGEST
-from afspm.plugins.secop.secop_client import SecopClient, ServerUnfit
+from afspm.plugins.secop.secop_client import SecopClient
 
 PORT = 10767
 AGAIN_S = 2.0

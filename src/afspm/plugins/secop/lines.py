@@ -30,10 +30,19 @@ class SecopLine:
         return self.data[0] if isinstance(self.data, list) and self.data else None
 
     @property
+    def number(self) -> float | None:
+        """The value, if it is a number."""
+        return number_in(self.value)
+
+    @property
     def time(self) -> object:
         """The server's own time of the value; None if missing."""
         qualifiers = self.data[1] if isinstance(self.data, list) and len(self.data) > 1 else None
         return qualifiers.get("t") if isinstance(qualifiers, dict) else None
+
+    @property
+    def is_error(self) -> bool:
+        return self.action.startswith("error")
 
     @property
     def error(self) -> str:
@@ -53,6 +62,11 @@ def parse(line: str) -> SecopLine | None:
     except ValueError:
         return None
     return SecopLine(action, specifier, data)
+
+
+def number_in(value: object) -> float | None:
+    """Return a decoded JSON value as a number; None if it is of another type."""
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
 def change(specifier: str, value: float) -> str:
