@@ -182,7 +182,7 @@ class DriftNight(Night):
         self.published = 0
         self.worker = PlayedWorker(self)
         super().__init__(plan)
-        self.scheduler.writes_ahead = True  # where a scan lies is not found out twice
+        self.scheduler.journal.writes_ahead = True  # where a scan lies is not found out twice
         self._carried_out = self.invariants.carried_out
         self.invariants.carried_out = self.carried_out  # type: ignore[method-assign]
 

@@ -25,7 +25,7 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
-from afspm.testing.components.memory_network import ControlLine, Feed
+from afspm.testing.components.memory_network import ControlLine, Feed, Subscribers
 from afspm.testing.components.simulated_process import Process
 from afspm.testing.components.simulated_time import SimulatedTime, Timer
 from afspm.translator.requests import RequestOutcomes
@@ -124,7 +124,7 @@ class FakeMicroscope(Process):
         self._history = deque(maxlen=_HISTORY)
         self._newest_ns = 0
         self._lines: list[ControlLine] = []
-        self._feeds: list[Feed] = []
+        self._subscribers = Subscribers()
         self._queue: deque[tuple[ControlLine, Request, int]] = deque()
         self._serving = False
         self._scan: Timer | None = None
@@ -325,15 +325,12 @@ class FakeMicroscope(Process):
         self._newest_ns = max(time_ns, self._newest_ns + 1)
         packet = Packet(message, self._codec.encode(thing), self._newest_ns)
         self._history.append(packet)
-        for feed in list(self._feeds):
-            feed.publish(packet)
+        self._subscribers.publish(packet)
 
     def joined(self, feed: Feed, prefixes: Sequence[str], since_ns: int) -> Sequence[Packet]:
-        if feed not in self._feeds:
-            self._feeds.append(feed)
+        self._subscribers.join(feed)
         self.later(0.0, self._tell_what_is_in_force)
         return [packet for packet in self._history if packet.time_ns is not None and packet.time_ns > since_ns]
 
     def left(self, feed: Feed) -> None:
-        if feed in self._feeds:
-            self._feeds.remove(feed)
+        self._subscribers.leave(feed)

@@ -302,8 +302,8 @@ class Night:
         elif fault.what == "full disk":
             self._full_disk(fault.for_s)
         elif fault.what == "slow disk":
-            self.scheduler.journal_s = min(fault.for_s, _SLOWEST_S)
-            self.timeline.after(fault.for_s, setattr, self.scheduler, "journal_s", _JOURNAL_S)
+            self.scheduler.journal.delay_s = min(fault.for_s, _SLOWEST_S)
+            self.timeline.after(fault.for_s, setattr, self.scheduler.journal, "delay_s", _JOURNAL_S)
         elif fault.what == "clock":
             self.invariants.times_are_certain = False
             self.microscope.habits.clock_error_s = self.timeline.random.choice((-100.0, 0.0, 100.0, 10_000.0))

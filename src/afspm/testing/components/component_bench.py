@@ -167,7 +167,7 @@ class Bench:
             time, self._weather, cast.scheduler.settings(self._context(cast)), WireCodec(),
             lambda one: wire.header(one.envelope, one.payload), self, make_core=lambda: self._core(cast),
         )  # fmt: skip
-        self._scheduler.writes_ahead = True
+        self._scheduler.journal.writes_ahead = True
         self._simulators = type(f"Bench{cast.simulator.__name__}", (_DrawsInItsThread, cast.simulator), {})
         self._microscope = copy.deepcopy(dict(cast.microscope))
         self._translator = _BenchTranslator(time, self._make_simulator, self.folder)

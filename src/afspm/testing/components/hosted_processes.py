@@ -18,7 +18,7 @@ from afspm.client.component import Component
 from afspm.model import Packet, Request, Response
 from afspm.storage.memory import Memory
 from afspm.testing.components.baton import Baton
-from afspm.testing.components.memory_network import ControlLine, Feed, PacketSource, Weather
+from afspm.testing.components.memory_network import ControlLine, Feed, PacketSource, Subscribers, Weather
 from afspm.testing.components.scheduler_host import SchedulerHost
 from afspm.testing.components.simulated_process import Process
 from afspm.testing.components.simulated_time import SimulatedTime, Timer
@@ -164,7 +164,7 @@ class ComponentProcess(BlockingProcess):
         self._inbox = []
         self._newest = {}
         self._published = PublishedHistory(self.timeline)
-        self._subscribers: list[Feed] = []
+        self._subscribers = Subscribers()
         self._line = ControlLine(self.timeline, self._weather, self, self._scheduler, self.name)
         wanted = self._launch.envelopes
         envelopes = wire.messages_of_the_experiment() if wanted is None else wanted
@@ -245,21 +245,18 @@ class ComponentProcess(BlockingProcess):
     # --- as a publisher ---
 
     def joined(self, feed: Feed, prefixes: Sequence[str], since_ns: int) -> Sequence[Packet]:
-        if feed not in self._subscribers:
-            self._subscribers.append(feed)
+        self._subscribers.join(feed)
         return self._published(feed, tuple(prefixes), since_ns)
 
     def left(self, feed: Feed) -> None:
-        if feed in self._subscribers:
-            self._subscribers.remove(feed)
+        self._subscribers.leave(feed)
 
     # --- what its port does ---
 
     def publish(self, envelope: str, payload: bytes) -> None:
         self.may_die()
         packet = self._published.stamp(envelope, payload)
-        for feed in list(self._subscribers):
-            feed.publish(packet)
+        self._subscribers.publish(packet)
 
     def send(self, frames: Sequence[bytes]) -> None:
         self.may_die()
@@ -329,7 +326,7 @@ class TranslatorProcess(BlockingProcess):
 
     def connect(self) -> None:
         self._published = PublishedHistory(self.timeline)
-        self._feeds: list[Feed] = []
+        self._subscribers = Subscribers()
         self._inbox: deque[Served | tuple[ControlLine, Request, int]] = deque()
         self._answering: tuple[ControlLine, int] | None = None
 
@@ -351,15 +348,13 @@ class TranslatorProcess(BlockingProcess):
         self.arrived()
 
     def joined(self, feed: Feed, prefixes: Sequence[str], since_ns: int) -> Sequence[Packet]:
-        if feed not in self._feeds:
-            self._feeds.append(feed)
+        self._subscribers.join(feed)
         self._inbox.append(SubscriberJoined())
         self.later(0.0, self.arrived)
         return self._published(feed, tuple(prefixes), since_ns)
 
     def left(self, feed: Feed) -> None:
-        if feed in self._feeds:
-            self._feeds.remove(feed)
+        self._subscribers.leave(feed)
 
     # --- what its port does ---
 
@@ -387,8 +382,7 @@ class TranslatorProcess(BlockingProcess):
     def publish(self, envelope: str, payload: bytes, time_ns: int | None, *, keep: bool) -> None:
         self.may_die()
         packet = self._published.stamp(envelope, payload, time_ns, keep=keep)
-        for feed in list(self._feeds):
-            feed.publish(packet)
+        self._subscribers.publish(packet)
 
     def wake(self, incoming: Served | None) -> None:
         if incoming is not None:

@@ -257,6 +257,29 @@ class Feed:
         self._joined = True
 
 
+class Subscribers:
+    """The feeds that receive a publisher's packets in one of its lives."""
+
+    def __init__(self) -> None:
+        self._feeds: list[Feed] = []
+
+    def join(self, feed: Feed) -> None:
+        if feed not in self._feeds:
+            self._feeds.append(feed)
+
+    def leave(self, feed: Feed) -> None:
+        if feed in self._feeds:
+            self._feeds.remove(feed)
+
+    def publish(self, packet: Packet) -> None:
+        for feed in list(self._feeds):
+            feed.publish(packet)
+
+    def kill_signal(self) -> None:
+        for feed in self._feeds:
+            feed.kill_signal()
+
+
 def _fall_silent(timeline: SimulatedTime, pipes: Sequence[Pipe | None]) -> None:
     for pipe in timeline.random.choice((pipes, pipes[:1], pipes[1:])):
         if pipe is not None:

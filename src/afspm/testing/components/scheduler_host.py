@@ -48,7 +48,14 @@ from afspm.scheduler.saved_state import KIND, VERSION, SavedState
 from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.scheduler.settings import SchedulerSettings
 from afspm.scheduler.shell import FrameWorker
-from afspm.testing.components.memory_network import ControlLine, Feed, LineServer, PacketSource, Weather
+from afspm.testing.components.memory_network import (
+    ControlLine,
+    Feed,
+    LineServer,
+    PacketSource,
+    Subscribers,
+    Weather,
+)
 from afspm.testing.components.simulated_process import Process, ProcessTimer
 from afspm.testing.components.simulated_time import SimulatedTime
 
@@ -95,6 +102,104 @@ class StepObserver(Protocol):
     def carried_out(self, host: SchedulerHost, effect: Effect) -> None: ...
 
 
+class JournalWriter:
+    """The writes of published packets to the journal on disk.
+
+    Attributes:
+        delay_s: longest delay between a packet and its write to the journal.
+        writes_ahead: True if a packet is on disk before it is published, as in the shell. If False, a kill loses the
+            translator's newest packets, which is harder on the scheduler.
+    """
+
+    def __init__(self, host: SchedulerHost, delay_s: float) -> None:
+        self._host = host
+        self._is_due = False
+        self.delay_s = delay_s
+        self.writes_ahead = False
+
+    def begin(self) -> None:
+        """Begin a new life: the writes due in the one before are lost."""
+        self._is_due = False
+
+    def before(self, publish: Publish) -> None:
+        """Write a packet about to be published, if it has to be on disk first."""
+        if publish.history and (publish.source_ns is None or self.writes_ahead):
+            self._host.disk.keep(LoggedPacket(publish.packet, publish.source_ns, publish.history))
+
+    def after(self, publish: Publish) -> None:
+        """Plan a write of all cached packets soon after a packet was published."""
+        if publish.history and not self._is_due:
+            self._is_due = True
+            self._host.later(self.delay_s * self._host.timeline.random.random(), self._write)
+
+    def _write(self) -> None:
+        self._is_due = False
+        if not self._host.disk.full:
+            self._host.disk.journal = tuple(self._host.core.cached())
+
+
+class ClientLines:
+    """The lines of clients, numbered and named as connections of a ROUTER socket."""
+
+    def __init__(self) -> None:
+        self._opened = 0  # over all lives
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the lines of a life that has ended."""
+        self._numbers: dict[ControlLine, int] = {}
+        self._by_number: dict[int, ControlLine] = {}
+        self._by_name: dict[str, ControlLine] = {}
+
+    def open(self, line: ControlLine) -> int:
+        """Return the connection's number, which no other connection of any life has."""
+        self._opened += 1
+        self._numbers[line], self._by_number[self._opened] = self._opened, line
+        return self._opened
+
+    def hand_over_name(self, line: ControlLine) -> None:
+        """Cut an older line of the same name: ROUTER hands the name over to the newest connection."""
+        former = self._by_name.get(line.name)
+        self._by_name[line.name] = line
+        if former is not None and former is not line:
+            former.cut()
+
+    def close(self, line: ControlLine) -> int | None:
+        """Return the number of the closed connection; None if it is of an earlier life."""
+        connection = self._numbers.pop(line, None)
+        if connection is None:
+            return None
+        del self._by_number[connection]
+        if self._by_name.get(line.name) is line:
+            del self._by_name[line.name]
+        return connection
+
+    def number(self, line: ControlLine) -> int | None:
+        return self._numbers.get(line)
+
+    def line(self, number: int) -> ControlLine | None:
+        return self._by_number.get(number)
+
+
+class TranslatorConnections:
+    """The scheduler's two connections to the translator in one life: requests there, packets back."""
+
+    def __init__(self, host: SchedulerHost, weather: Weather, server: LineServer, publisher: PacketSource) -> None:
+        self._requests = ControlLine(host.timeline, weather, host, server, "scheduler", doubling=False)
+        self._packets = Feed(host.timeline, weather, host, publisher)
+
+    def ask(self, request: Request, number: int) -> None:
+        self._requests.ask(request, number)
+
+    def fall_silent(self, for_s: float) -> None:
+        self._requests.fall_silent(for_s)
+        self._packets.fall_silent(for_s)
+
+    def close(self) -> None:
+        self._requests.close()
+        self._packets.close()
+
+
 class SchedulerHost(Process):
     """The counterpart of `afspm.scheduler.shell`, without sockets.
 
@@ -104,8 +209,7 @@ class SchedulerHost(Process):
         make_core: creates the core of each life; by default a `SchedulerCore`.
 
     Attributes:
-        writes_ahead: True if a packet is on disk before it is published, as in the shell. If False, a kill loses the
-            translator's newest packets, which is harder on the scheduler.
+        translator: the translator as a server of requests, and as a publisher; set before the first life.
         worker: executes jobs of the coordinate frame in this life; None: only the observer receives the jobs.
     """
 
@@ -131,19 +235,16 @@ class SchedulerHost(Process):
         self._weather = weather
         self._header = header
         self._observer = observer
-        self.journal_s = journal_s
-        self.writes_ahead = False
+        self.journal = JournalWriter(self, journal_s)
         self.worker: FrameWorker | None = None
-        self._connections = 0
+        self._clients = ClientLines()
         self._forget()
 
     def _forget(self) -> None:
-        self._lines: dict[ControlLine, int] = {}
-        self._by_connection: dict[int, ControlLine] = {}
-        self._by_name: dict[str, ControlLine] = {}
-        self._feeds: list[Feed] = []
+        self._clients.forget()
+        self._subscribers = Subscribers()
+        self.journal.begin()
         self._ticking = ProcessTimer(self, self._tick)
-        self._journal_due = False
         self._replay: tuple[Packet, ...] = ()
 
     # --- lives ---
@@ -155,46 +256,33 @@ class SchedulerHost(Process):
             self.core.restore(saved)
         self.core.restore_cache(self.disk.journal)
         assert self.translator is not None
-        server, publisher = self.translator
-        self._link = ControlLine(self.timeline, self._weather, self, server, "scheduler", doubling=False)
-        self._from_translator = Feed(self.timeline, self._weather, self, publisher)
+        self._link = TranslatorConnections(self, self._weather, *self.translator)
         self._carry_out(None, self.core.start(self.timeline.monotonic_s(), self.timeline.now_ns()))
 
     def fall_silent(self, for_s: float) -> None:
         """Lose the translator's messages in one or both directions, and break its connections after `for_s`."""
         if self.alive:
             self._link.fall_silent(for_s)
-            self._from_translator.fall_silent(for_s)
 
     def ended(self) -> None:
         self._link.close()
-        self._from_translator.close()
         self._ticking.set(None)
 
     # --- as a server of requests ---
 
     def peer_connected(self, line: ControlLine) -> None:
-        self._connections += 1
-        connection = self._connections
-        self._lines[line], self._by_connection[connection] = connection, line
+        connection = self._clients.open(line)
         self._step(Connected(connection))
         self._step(Greeted(connection, line.name))
-        former = self._by_name.get(line.name)
-        self._by_name[line.name] = line
-        if former is not None and former is not line:
-            former.cut()  # ROUTER hands the name over to the newest connection
+        self._clients.hand_over_name(line)
 
     def peer_disconnected(self, line: ControlLine) -> None:
-        connection = self._lines.pop(line, None)
-        if connection is None:
-            return
-        del self._by_connection[connection]
-        if self._by_name.get(line.name) is line:
-            del self._by_name[line.name]
-        self._step(Disconnected(connection))
+        connection = self._clients.close(line)
+        if connection is not None:
+            self._step(Disconnected(connection))
 
     def peer_asked(self, line: ControlLine, request: Request, number: int) -> None:
-        connection = self._lines.get(line)
+        connection = self._clients.number(line)
         if self._has_ended and request.kind != RELAY_REQUEST:
             ended = ResponseDetail.EXPERIMENT_ENDED
             line.answer(Response(int(ControlResponse.FAILURE), b"", HAS_ENDED, request.id, ended))
@@ -231,15 +319,13 @@ class SchedulerHost(Process):
     def joined(self, feed: Feed, prefixes: Sequence[str], since_ns: int) -> Sequence[Packet]:
         self._replay = ()
         self._step(ReplayRequested(feed, tuple(prefixes), since_ns))
-        if feed not in self._feeds:
-            self._feeds.append(feed)
+        self._subscribers.join(feed)
         if self._has_ended:
             self.later(0.0, feed.kill_signal)  # after the replay: it is over
         return self._replay
 
     def left(self, feed: Feed) -> None:
-        if feed in self._feeds:
-            self._feeds.remove(feed)
+        self._subscribers.leave(feed)
 
     # --- steps ---
 
@@ -276,19 +362,15 @@ class SchedulerHost(Process):
 
     def _do(self, effect: Effect) -> None:
         if isinstance(effect, Reply):
-            line = self._by_connection.get(effect.connection)
+            line = self._clients.line(effect.connection)
             if line is not None:
                 line.answer(effect.response)
         elif isinstance(effect, Forward):
             self._link.ask(effect.request, effect.number)
         elif isinstance(effect, Publish):
-            if effect.history and (effect.source_ns is None or self.writes_ahead):
-                self.disk.keep(LoggedPacket(effect.packet, effect.source_ns, effect.history))
-            for feed in list(self._feeds):
-                feed.publish(effect.packet)
-            if effect.history and not self._journal_due:
-                self._journal_due = True
-                self.later(self.journal_s * self.timeline.random.random(), self._write_journal)
+            self.journal.before(effect)
+            self._subscribers.publish(effect.packet)
+            self.journal.after(effect)
         elif isinstance(effect, Delegate):
             if self.worker is not None:
                 self.worker.take(effect.job)
@@ -298,13 +380,7 @@ class SchedulerHost(Process):
         elif isinstance(effect, SaveState):
             self.disk.save(effect.state)
         elif isinstance(effect, Kill):
-            for feed in self._feeds:
-                feed.kill_signal()
-
-    def _write_journal(self) -> None:
-        self._journal_due = False
-        if not self.disk.full:
-            self.disk.journal = tuple(self.core.cached())
+            self._subscribers.kill_signal()
 
     def _plan_tick(self) -> None:
         self._ticking.set(self._wait_s())
