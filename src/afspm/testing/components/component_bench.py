@@ -159,18 +159,17 @@ class Bench:
         if taken := {"translator", "scheduler", "person"} & cast.components.keys():
             raise ConfigError(f"a component has the name {min(taken)!r}, which the bench uses", hint="rename it")
         self.packets: list[Packet] = []
-        self._times = {name: _Life() for name in cast.components}
+        self._lives = {name: _Life() for name in cast.components}
         self._problems = ProblemNames(cast.scheduler_launch.problems)
         self._time = time = SimulatedTime(seed)
-        self._weather = Weather()
+        weather = Weather()
         self._scheduler = SchedulerHost(
-            time, self._weather, cast.scheduler.settings(self._context(cast)), WireCodec(),
+            time, weather, cast.scheduler.settings(self._context(cast)), WireCodec(),
             lambda one: wire.header(one.envelope, one.payload), self, make_core=lambda: self._core(cast),
         )  # fmt: skip
         self._scheduler.journal.writes_ahead = True
-        self._simulators = type(f"Bench{cast.simulator.__name__}", (_DrawsInItsThread, cast.simulator), {})
-        self._microscope = copy.deepcopy(dict(cast.microscope))
-        self._translator = _BenchTranslator(time, self._make_simulator, self.folder)
+        self._microscope = _SimulatedMicroscope(cast.simulator, cast.microscope)
+        self._translator = _BenchTranslator(time, self._microscope.switched_on, self.folder)
         self._scheduler.translator = (self._translator, self._translator)
         self._components = {
             name: self._process(name, one, cast.launches[name], dies_in_call if name == self.name else 0.0)
@@ -179,7 +178,7 @@ class Bench:
         publishing = [self._components[name] for name, one in cast.components.items() if one.publishes]
         for hosted in self._components.values():
             hosted.publishers = [one for one in publishing if one is not hosted]
-        self._person = _Person(time, self._weather, self._scheduler)
+        self._person = _Person(time, weather, self._scheduler)
         self._processes: dict[str, Process] = {
             "translator": self._translator,
             "scheduler": self._scheduler,
@@ -206,13 +205,8 @@ class Bench:
             return SchedulerCore(*parts)
         return RecordedCore(*parts, keep=StepLog.of_run(context.launch, context.log).keep)
 
-    def _make_simulator(self) -> Simulator:
-        made: Simulator = self._simulators(**copy.deepcopy(self._microscope))
-        self._simulator = made
-        return made
-
     def _process(self, name: str, component: Component, launch: Launch, dies_in_call: float) -> ComponentProcess:
-        life = self._times[name]
+        life = self._lives[name]
 
         def make() -> Component:
             life.component = made = copy.deepcopy(component)
@@ -299,11 +293,7 @@ class Bench:
         """Change the tip now, also during a scan, to "sharp", "blunt", "double" or "contaminated"."""
         if not self.now_s:
             self._settle()  # the microscope is not switched on before the first step
-        self._simulator.change_tip(condition)
-        # a translator that is killed before it saves has the change in its next life, too
-        changes = dict(self._microscope.get("tip_changes") or {})
-        changes["schedule"] = [*changes.get("schedule", ()), [self.now_s, condition]]
-        self._microscope["tip_changes"] = changes
+        self._microscope.change_tip(condition, self.now_s)
         self._settle()
 
     def _ask(self, kind: ControlRequest, subject: object) -> None:
@@ -325,12 +315,12 @@ class Bench:
     @property
     def component(self) -> Any:
         """The component in its current or last life."""
-        return self._times[self.name].component
+        return self._lives[self.name].component
 
     @property
     def components(self) -> Plain:
         """All components by name, in their current or last life."""
-        return {name: life.component for name, life in self._times.items()}
+        return {name: life.component for name, life in self._lives.items()}
 
     @property
     def memory(self) -> Plain:
@@ -382,6 +372,26 @@ class _Life:
 class _RaisingLoop(ComponentLoop):
     def _fail(self, error: Exception, state_dir: Path) -> ExitCode:
         raise error
+
+
+class _SimulatedMicroscope:
+    """The simulated microscope over all lives of its translator, each with a new simulator."""
+
+    def __init__(self, simulator: type[Simulator], settings: PlainMapping) -> None:
+        self._class = type(f"Bench{simulator.__name__}", (_DrawsInItsThread, simulator), {})
+        self._settings = copy.deepcopy(dict(settings))
+
+    def switched_on(self) -> Simulator:
+        made: Simulator = self._class(**copy.deepcopy(self._settings))
+        self._simulator = made
+        return made
+
+    def change_tip(self, condition: str, now_s: float) -> None:
+        self._simulator.change_tip(condition)
+        # a translator that is killed before it saves has the change in its next life, too
+        changes = dict(self._settings.get("tip_changes") or {})
+        changes["schedule"] = [*changes.get("schedule", ()), [now_s, condition]]
+        self._settings["tip_changes"] = changes
 
 
 class _DrawsInItsThread:
