@@ -151,7 +151,7 @@ def _replay(
             with guard.active(), guard.watching() if watch else nullcontext():
                 port = ReplayPort(life, outputs, packet_of)
                 memories.begin(home.memory, port)
-                component = _run(launch, port, life, make, outputs)
+                component = _run(launch, port, life, make)
             with suppress(OSError):  # Windows removes no open file: let the syncer close the memory of this life
                 SYNCER.now(SYNCED_WITHIN_S)
             now += port.outputs
@@ -189,7 +189,7 @@ def _launch(life: Life, folder: Path, settings: Mapping[str, object] | None) -> 
     )
 
 
-def _run(launch: Launch, port: ReplayPort, life: Life, make: Make, outputs: OutputReader) -> ExperimentProcess:
+def _run(launch: Launch, port: ReplayPort, life: Life, make: Make) -> ExperimentProcess:
     log = logging.getLogger(f"afspm.what_if.{launch.name}")
     log.propagate, log.disabled = False, True
     register_all(launch.messages)
@@ -213,7 +213,7 @@ def _run(launch: Launch, port: ReplayPort, life: Life, make: Make, outputs: Outp
     if port.missing is not None:
         raise port.missing
     if ended is not None and (life.end is not None or not port.is_over):
-        port.outputs.append(outputs.end(ended, *port.place()))
+        port.ended(ended)
     return component
 
 

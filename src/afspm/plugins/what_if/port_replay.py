@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from base64 import b64decode
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -199,6 +199,102 @@ class ReplayClock:
         return self._shown[kind]
 
 
+class RecordedLines:
+    """The lines of a recorded life in order, with the clock that shows their readings.
+
+    Attributes:
+        line: the next line; None after the last.
+    """
+
+    def __init__(self, life: Life) -> None:
+        facts = life.facts
+        self._lines = iter(life.lines)
+        self.clock = ReplayClock(facts["monotonic_s"], facts["now_ns"], facts["speed"])
+        self.line: Line | None = None
+        self.advance()
+
+    def advance(self) -> None:
+        self.line = next(self._lines, None)
+        self.clock.expect([] if self.line is None else self.line.readings)
+
+
+class RecordedAnswers:
+    """The recorded answers to a component's requests, for requests that may have other ids or another order."""
+
+    def __init__(self, life: Life) -> None:
+        self._answers = _answers(life)
+        self._asked: Counter[bytes] = Counter()
+        self._ids: dict[str, str] = {}  # the id to answer with, by recorded id
+
+    def asked(self, frames: Sequence[bytes]) -> None:
+        self._asked[_content(frames)] += 1
+
+    def rename(self, recorded_id: str, request_id: str) -> None:
+        """Give the coming recorded answer to a request numbered in another way."""
+        if recorded_id != request_id:
+            self._ids[recorded_id] = request_id
+
+    def renamed(self, response: Response) -> Response:
+        """Return a recorded answer with the id that the component knows."""
+        response.id = self._ids.get(response.id, response.id)
+        return response
+
+    def to_latest(self, frames: Sequence[bytes], request_id: str) -> Response | None:
+        """Return the answer to the n-th recorded request of this content, if asked n times; None if not recorded."""
+        recorded, number = self._answers.get(_content(frames), []), self._asked[_content(frames)] - 1
+        if number >= len(recorded):
+            return None
+        recorded_id, response = recorded[number]
+        self._ids[recorded_id] = _DONE  # its recorded answer may still come
+        return Response(response.code, response.payload, response.reason, request_id, response.detail)
+
+    def last_value(self, name: str, request_id: str) -> Response:
+        """Return the last recorded value of a parameter as an answer; a failure if the record has none."""
+        for answers in self._answers.values():
+            for _, response in reversed(answers):
+                if response.ok and response.payload and _parameter_name(response.payload) == name:
+                    return Response(response.code, response.payload, "", request_id)
+        reason = f"the value of {name} is not in the record"
+        return Response(int(ControlResponse.FAILURE), b"", reason, request_id)
+
+
+class OutputTrace:
+    """The outputs of one life, recorded or replayed; repetitions of a request are left out.
+
+    Args:
+        now_ns: time of the start of the life.
+
+    Attributes:
+        newest: the newest received packet; None before any.
+        woken_ns: time of the last wake-up.
+    """
+
+    def __init__(self, reader: OutputReader, now_ns: int) -> None:
+        self._reader = reader
+        self._sent: set[str] = set()
+        self.outputs: list[Output] = []
+        self.newest: PacketName | None = None
+        self.woken_ns = now_ns
+
+    def request(self, frames: Sequence[bytes], handled: PacketName | None) -> None:
+        output, request_id = self._reader.request(frames, *self._place(handled)), wire.id_of(frames)
+        if output is not None and (not request_id or request_id not in self._sent):
+            self.outputs.append(output)
+        self._sent.add(request_id)
+
+    def message(self, envelope: str, payload: bytes, handled: PacketName | None) -> None:
+        self.outputs.append(self._reader.message(envelope, payload, *self._place(handled)))
+
+    def end(self, how: int | str, handled: PacketName | None) -> None:
+        self.outputs.append(self._reader.end(how, *self._place(handled)))
+
+    def _place(self, handled: PacketName | None) -> tuple[PacketName | None, int]:
+        # the handled packet and its time; between packets the newest packet and the time of the last wake-up
+        if handled is not None:
+            return handled, handled.time_ns or self.woken_ns
+        return self.newest, self.woken_ns
+
+
 class ReplayPort:
     """Port that offers a recorded life to a component. See `afspm.transport.port.Port`.
 
@@ -208,7 +304,6 @@ class ReplayPort:
     microscope ends the replay.
 
     Attributes:
-        outputs: all outputs of the component so far.
         differs: whether an output differs from the recorded life.
         unanswered: the command, or the endless polling, that ended the replay early; empty otherwise.
         missing: the error that ended the replay early, because the record lacks a packet; None otherwise.
@@ -216,35 +311,31 @@ class ReplayPort:
     """
 
     def __init__(self, life: Life, outputs: OutputReader, packet_of: PacketOf) -> None:
-        facts = life.facts
-        self._life = life
-        self._reader = outputs
+        self._was_killed = life.end is None
+        self._recorded = RecordedLines(life)
+        self._answers = RecordedAnswers(life)
+        self._trace = OutputTrace(outputs, life.facts["now_ns"])
         self._packet_of = packet_of
-        self._clock = ReplayClock(facts["monotonic_s"], facts["now_ns"], facts["speed"])
-        self._at = 0
-        self._newest: PacketName | None = None
         self._pending: list[Incoming] = []
-        self._sent: set[str] = set()
-        self._asked: Counter[bytes] = Counter()
-        self._answers = _answers(life)
-        self._ids: dict[str, str] = {}
         self._polls = 0
-        self._woken_ns: int = facts["now_ns"]
-        self.outputs: list[Output] = []
         self.differs = False
         self.unanswered = ""
         self.missing: FileError | None = None
         self.handled: Callable[[], Packet | None] = lambda: None
-        self._expect_readings()
 
     @property
     def clock(self) -> ReplayClock:
-        return self._clock
+        return self._recorded.clock
+
+    @property
+    def outputs(self) -> Sequence[Output]:
+        """All outputs of the component so far."""
+        return self._trace.outputs
 
     @property
     def is_over(self) -> bool:
         """Whether all recorded events are delivered and all recorded outputs are passed."""
-        return self._at >= len(self._life.lines) and not self._pending
+        return self._recorded.line is None and not self._pending
 
     def wake_up(self, incoming: Incoming | None = None) -> None:
         if incoming is not None:
@@ -261,71 +352,48 @@ class ReplayPort:
     def send(self, frames: Sequence[bytes]) -> None:
         self._end_if_killed()
         there = tuple(map(bytes, frames))
-        output = self._reader.request(there, *self.place())
-        request_id = wire.id_of(frames)
-        if output is not None and (not request_id or request_id not in self._sent):
-            self.outputs.append(output)
-        self._sent.add(request_id)
-        content = b"\0".join(there[:2])
-        self._asked[content] += 1
-        if self._follows(there, is_request=True):
-            return
-        self._answer(frames, content, request_id)
+        self._trace.request(there, self._handled())
+        self._answers.asked(there)
+        if not self._follows(there, is_request=True):
+            self._pending.append(ReplyReceived(self._answer(there)))
 
     def publish(self, envelope: str, payload: bytes) -> None:
         self._end_if_killed()
-        self.outputs.append(self._reader.message(envelope, bytes(payload), *self.place()))
+        self._trace.message(envelope, bytes(payload), self._handled())
         self._follows((envelope.encode(), bytes(payload)), is_request=False)
 
+    def ended(self, how: int | str) -> None:
+        """Note the end of the component as its last output."""
+        self._trace.end(how, self._handled())
+
     def _follows(self, frames: tuple[bytes, ...], *, is_request: bool) -> bool:
-        line = self._line()
+        line = self._recorded.line
         if self.differs or not isinstance(line, Sent) or (line.frames[:2], line.is_request) != (frames[:2], is_request):
             self.differs = True
             return False
-        if is_request and (recorded_id := wire.id_of(line.frames)) != (request_id := wire.id_of(frames)):
-            self._ids[recorded_id] = request_id  # another version numbers its requests in another way
-        self._advance()
+        if is_request:
+            self._answers.rename(wire.id_of(line.frames), wire.id_of(frames))
+        self._recorded.advance()
         return True
 
-    def _answer(self, frames: Sequence[bytes], content: bytes, request_id: str) -> None:
-        recorded = self._answers.get(content, [])
-        number = self._asked[content] - 1
-        if number < len(recorded):
-            recorded_id, response = recorded[number]
-            self._ids[recorded_id] = _DONE  # its recorded answer may still come
-            response = Response(response.code, response.payload, response.reason, request_id, response.detail)
-        else:
-            response = self._made_up(frames, request_id)
-        self._pending.append(ReplyReceived(response))
-
-    def _made_up(self, frames: Sequence[bytes], request_id: str) -> Response:
+    def _answer(self, frames: tuple[bytes, ...]) -> Response:
+        request_id = wire.id_of(frames)
+        if (recorded := self._answers.to_latest(frames, request_id)) is not None:
+            return recorded
         try:
             request = wire.decode_request(frames)
         except WireError as error:
             return Response(int(error.response), reason=str(error), id=request_id)
         if request.kind == ControlRequest.PARAM and request.subject.value is None:
-            return self._last_value(request.subject.name, request_id)
+            return self._answers.last_value(request.subject.name, request_id)
         if request.kind not in _ANSWERABLE:
             self.unanswered = self.outputs[-1].text
             raise LifeOver
         return Response(int(ControlResponse.SUCCESS), b"", "", request_id)
 
-    def _last_value(self, name: str, request_id: str) -> Response:
-        for answers in self._answers.values():
-            for _, response in reversed(answers):
-                if response.ok and response.payload and _parameter_name(response.payload) == name:
-                    return Response(response.code, response.payload, "", request_id)
-        reason = f"the value of {name} is not in the record"
-        return Response(int(ControlResponse.FAILURE), b"", reason, request_id)
-
-    def place(self) -> tuple[PacketName | None, int]:
-        """Return the packet that the component is handling, and its time.
-
-        Between packets: the newest received packet (None before any), and the time of the last wake-up.
-        """
+    def _handled(self) -> PacketName | None:
         packet = self.handled()
-        handled = None if packet is None else PacketName(packet.time_ns or 0, packet.envelope)
-        return _place(handled, self._newest, self._woken_ns)
+        return None if packet is None else PacketName(packet.time_ns or 0, packet.envelope)
 
     # --- inputs of the component ---
 
@@ -339,27 +407,27 @@ class ReplayPort:
         if self._polls > _MOST_POLLS:
             self.unanswered = "it polls without end, and no time passes"
             raise LifeOver
-        until_s = None if timeout_s is None else self._clock.shown_s + timeout_s
-        while isinstance(line := self._line(), Poll):
+        until_s = None if timeout_s is None else self.clock.shown_s + timeout_s
+        while isinstance(line := self._recorded.line, Poll):
             is_due = until_s is None or line.monotonic_s <= until_s
             if line.timeout_s != timeout_s and not is_due:
                 break
             self._polls = 0
-            self._clock.move(line.monotonic_s, line.now_ns)
-            self._woken_ns = line.now_ns
-            self._advance()
+            self.clock.move(line.monotonic_s, line.now_ns)
+            self._trace.woken_ns = line.now_ns
+            self._recorded.advance()
             if line.events or line.timeout_s == timeout_s:
                 return self._incoming(line.events)
             self._skip_sent()
         self._end_if_over()
-        self._clock.pass_by(timeout_s or 0.0)
-        self._woken_ns = self._clock.shown_ns
+        self.clock.pass_by(timeout_s or 0.0)
+        self._trace.woken_ns = self.clock.shown_ns
         return []
 
     def _skip_sent(self) -> None:
-        while isinstance(self._line(), Sent):
+        while isinstance(self._recorded.line, Sent):
             self.differs = True
-            self._advance()
+            self._recorded.advance()
 
     def _incoming(self, written: PlainList) -> list[Incoming]:
         came: list[Incoming] = []
@@ -367,11 +435,10 @@ class ReplayPort:
             if kind == "packet":
                 envelope, time_ns, source, payload = rest
                 came.append(PacketReceived(self._packet(envelope, time_ns, payload), source))
-                self._newest = PacketName(time_ns or 0, envelope)
+                self._trace.newest = PacketName(time_ns or 0, envelope)
             elif kind == "reply":
                 response = wire.decode_response([*map(b64decode, rest)])
-                response.id = self._ids.get(response.id, response.id)
-                came.append(ReplyReceived(response))
+                came.append(ReplyReceived(self._answers.renamed(response)))
             else:
                 came.append(CaughtUp(rest[0]) if kind == "caught up" else _SIGNALS[kind]())
         return came
@@ -385,58 +452,32 @@ class ReplayPort:
             self.missing = error
             raise LifeOver from error
 
-    # --- the recorded lines ---
-
-    def _line(self) -> Line | None:
-        return self._life.lines[self._at] if self._at < len(self._life.lines) else None
-
-    def _advance(self) -> None:
-        self._at += 1
-        self._expect_readings()
-
-    def _expect_readings(self) -> None:
-        line = self._line()
-        self._clock.expect([] if line is None else line.readings)
-
     def _end_if_over(self) -> None:
         if self.is_over:
             raise LifeOver
 
     def _end_if_killed(self) -> None:
         # the next output of a killed process is unknown; a process that ended by itself had no further output
-        if self._life.end is None:
+        if self._was_killed:
             self._end_if_over()
 
 
-def _place(handled: PacketName | None, newest: PacketName | None, now_ns: int) -> tuple[PacketName | None, int]:
-    if handled is not None:
-        return handled, handled.time_ns or now_ns
-    return newest, now_ns
-
-
-def recorded_outputs(life: Life, outputs: OutputReader) -> Iterator[Output]:
-    """Yield all outputs of a recorded life, and its end if recorded; repetitions of a request are left out."""
-    sent: set[str] = set()
-    newest: PacketName | None = None
-    now_ns = life.facts["now_ns"]
+def recorded_outputs(life: Life, outputs: OutputReader) -> list[Output]:
+    """Return all outputs of a recorded life, and its end if recorded."""
+    trace = OutputTrace(outputs, life.facts["now_ns"])
     for line in life.lines:
         if isinstance(line, Poll):
-            now_ns = line.now_ns
+            trace.woken_ns = line.now_ns
             for kind, *rest in line.events:
                 if kind == "packet":
-                    newest = PacketName(rest[1] or 0, rest[0])
-            continue
-        place, at_ns = _place(line.handled, newest, now_ns)
-        if not line.is_request:
-            yield outputs.message(line.frames[0].decode(), line.frames[1], place, at_ns)
-            continue
-        request_id = wire.id_of(line.frames)
-        output = outputs.request(line.frames, place, at_ns)
-        if output is not None and (not request_id or request_id not in sent):
-            yield output
-        sent.add(request_id)
+                    trace.newest = PacketName(rest[1] or 0, rest[0])
+        elif line.is_request:
+            trace.request(line.frames, line.handled)
+        else:
+            trace.message(line.frames[0].decode(), line.frames[1], line.handled)
     if life.end is not None:
-        yield outputs.end(life.end, newest, now_ns)
+        trace.end(life.end, None)
+    return trace.outputs
 
 
 def _answers(life: Life) -> dict[bytes, list[tuple[str, Response]]]:
@@ -450,8 +491,13 @@ def _answers(life: Life) -> dict[bytes, list[tuple[str, Response]]]:
     found: dict[bytes, list[tuple[str, Response]]] = defaultdict(list)
     for line in life.lines:
         if isinstance(line, Sent) and line.is_request and (request_id := wire.id_of(line.frames)) in answered:
-            found[b"\0".join(line.frames[:2])].append((request_id, answered[request_id]))
+            found[_content(line.frames)].append((request_id, answered[request_id]))
     return found
+
+
+def _content(frames: Sequence[bytes]) -> bytes:
+    # without the id of the request
+    return b"\0".join(frames[:2])
 
 
 def _parameter_name(payload: bytes) -> str | None:
