@@ -1,4 +1,4 @@
-"""The budget of a night for tip repairs: bounds on the treatments of all repairs together. Pure."""
+"""The budget of a night for tip repairs: bounds on the treatments of all repairs together, and their account."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields, replace
 
 from afspm.basics.errors import ConfigError
 from afspm.components.tip_treatments import Crash, Treatment
+from afspm.model.snapshot import from_plain, to_plain
+from afspm.storage.memory import Memory
 
 _ROUNDING = 1e-9  # relative: five crashes of 4 nm fit into 20 nm
 
@@ -69,3 +71,77 @@ class RepairBudget:
         return tuple(
             one for one in treatments if not self.exceeded_by(spent.plus(cost_of(one, spacing_m)).after(step_s))
         )
+
+
+class RepairAccount:
+    """The cost of all repairs of a night, in the memory of a component, so that the budget holds over restarts.
+
+    The caller saves the memory. A step is a treatment with its test scans.
+
+    Args:
+        spacing_m: the distance between the places of two treatments.
+    """
+
+    def __init__(self, budget: RepairBudget, spacing_m: float, memory: Memory) -> None:
+        self._budget, self._spacing_m, self._memory = budget, spacing_m, memory
+        self._step_tenure = -1
+
+    @property
+    def spent(self) -> RepairCost:
+        return from_plain(RepairCost, self._memory["spent"]) if "spent" in self._memory else RepairCost()
+
+    @property
+    def step_s(self) -> float:
+        """The longest time of a step, expected or measured."""
+        return float(self._memory.get("longest_step_s", 0.0))
+
+    def expect_step(self, lasts_s: float) -> None:
+        self._memory["longest_step_s"] = max(self.step_s, lasts_s)
+
+    def affordable(self, treatments: Sequence[Treatment]) -> tuple[Treatment, ...]:
+        """Return the treatments that fit into the rest of the budget."""
+        return self._budget.affordable(treatments, self.spent, self._spacing_m, self.step_s)
+
+    def why_over(self, treatment: Treatment) -> str:
+        cost = self.spent.plus(cost_of(treatment, self._spacing_m)).after(self.step_s)
+        over = self._budget.exceeded_by(cost)
+        return f"the budget of the night is spent: no {treatment} is left in {', '.join(over)}"
+
+    def charge(self, treatment: Treatment, tenure: int) -> None:
+        """Charge a treatment before it is attempted; after a kill it counts as done.
+
+        Args:
+            tenure: number of the present tenure of control.
+        """
+        self._keep(self.spent.plus(cost_of(treatment, self._spacing_m)))
+        self._step_tenure = tenure
+
+    def refund(self, before: RepairCost) -> None:
+        """Charge the time only for a treatment that could not be done.
+
+        Args:
+            before: the cost before the charge.
+        """
+        self._keep(replace(before, time_s=self.spent.time_s))
+
+    def spend_time(self, now_s: float, *, ends: bool = False) -> None:
+        """Charge the time since the last call; a repair goes on until a call with `ends`.
+
+        A repair that a kill interrupts goes on in the memory, so the time until the restart counts, too.
+        """
+        since_s = self._memory.get("repairing_since_s")
+        if since_s is not None:
+            self._keep(self.spent.after(now_s - since_s))
+        if ends:
+            self._memory.pop("repairing_since_s", None)
+        else:
+            self._memory["repairing_since_s"] = now_s
+
+    def end_step(self, now_s: float, tenure: int) -> None:
+        """Charge the time of a step, and measure it, unless a person had control meanwhile."""
+        if self._step_tenure == tenure:
+            self.expect_step(now_s - float(self._memory["repairing_since_s"]))
+        self.spend_time(now_s)
+
+    def _keep(self, cost: RepairCost) -> None:
+        self._memory["spent"] = to_plain(cost)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -15,15 +14,14 @@ from afspm.client.events import Events
 from afspm.components import tip_verdict
 from afspm.components.channel_pairs import ChannelPairing
 from afspm.components.planned_scans import pair
-from afspm.components.tip_budget import RepairBudget, RepairCost, cost_of
-from afspm.components.tip_experience import CURED, UNCHANGED, UNKNOWN_FLAW, WORSENED, TipExperience
-from afspm.components.tip_experience_file import read_experience, write_experience
+from afspm.components.tip_budget import RepairAccount, RepairBudget
+from afspm.components.tip_experience import UNKNOWN_FLAW
+from afspm.components.tip_experience_file import NightsExperience
 from afspm.components.tip_judge import Opinion, TipJudge, Verdict
-from afspm.components.tip_treatments import Treatment, treatments
+from afspm.components.tip_treatments import Treatment, TreatmentPlaces, treatments
 from afspm.components.tip_verdict import read_verdict
 from afspm.components.tip_workshop import DONE_ACTION, TipWorkshop
 from afspm.model import Problem, Region, Scan, ScanSet, names
-from afspm.model.snapshot import from_plain, to_plain
 
 Frame = list[list[float]]
 """Region and pixels in JSON's types: centre, size and angle; rows and columns."""
@@ -109,36 +107,35 @@ class TipCorrector(Component):
         night_places: int | None = None,
         night_time: Duration | None = None,
     ) -> None:
-        self.workshop_center = pair(workshop_center)
         self.test_center = None if test_center is None else pair(test_center)
         # `afspm check` compares them with the limits
-        self.positions = tuple(place for place in (self.workshop_center, self.test_center) if place is not None)
+        self.positions = tuple(place for place in (pair(workshop_center), self.test_center) if place is not None)
         self.allowed = treatments(pulse_voltages, pulse_duration, crash_depths, crash_speed)
         pulses = (names.PULSE,) if pulse_voltages else ()
         crashes = (names.CRASH,) if crash_depths else ()
         self.needs_actions = (names.START_SCAN, *pulses, *crashes)
-        self.place_spacing, self.keep_away = place_spacing, keep_away
         self.problem = problem
-        if place_spacing <= 0.0 or keep_away < 0.0:
-            raise ConfigError("`place_spacing` must be above zero, `keep_away` not below")
+        self.places = TreatmentPlaces(pair(workshop_center), place_spacing, keep_away)
         self.pairing = ChannelPairing(channel, retrace_channel)
         self.judge = TipJudge(reference_scans) if judge == "self" or policy == "learn" else None
         self.clears = judge == "self"
-        self.learns = policy == "learn"
         if most_treatments < 1:
             raise ConfigError("must be at least 1", where="most_treatments")
-        self.most_treatments = most_treatments if self.learns else len(self.allowed)
-        self.experience_file = experience
+        self.most_treatments = most_treatments if policy == "learn" else len(self.allowed)
+        self.experience_file = experience if policy == "learn" else None
         area_m2 = None if night_places is None else night_places * place_spacing**2
         self.budget = RepairBudget(night_pulses, night_depth, area_m2, night_time)
 
     def run(self) -> None:
-        self._workshop = TipWorkshop(
-            self, self.problem, self.workshop_center, self.place_spacing, self.keep_away, self._charge
-        )
-        self._refused: set[Treatment] = set()
-        self._step_tenure = -1
-        self._restore_experience()
+        self._workshop = TipWorkshop(self, self.problem, self.places, self._charge)
+        self._account = RepairAccount(self.budget, self.places.spacing_m, self.memory)
+        self._experience: NightsExperience | None = None
+        if self.experience_file is not None:
+            file = Path(self.experience_file)
+            if self.simulated:  # what cures a simulated tip must not be tried first on a real one
+                file = file.with_name(f"{file.stem}_simulated{file.suffix}")
+            path = Path(self.run_dir).parent / file
+            self._experience = NightsExperience(path, self.allowed, self.memory, self.log)
         if self.judge is not None and "judge" in self.memory:
             self.judge.restore(self.memory["judge"])
         frames: dict[int | None, Frame] = {}
@@ -177,12 +174,14 @@ class TipCorrector(Component):
             return
         try:
             with self.scope.control(solving=self.problem):
-                self._spend_time()
+                self._account.spend_time(self.clock.now_s())
+                self.memory.save()
                 self._repair()
         except ControlLost as lost:
             self.log.info("the repair is over: %s", lost.what)
         finally:
-            self._spend_time(ends=True)
+            self._account.spend_time(self.clock.now_s(), ends=True)
+            self.memory.save()
 
     def _repair(self) -> None:
         region, shape = self._of_experiment()
@@ -195,7 +194,7 @@ class TipCorrector(Component):
         looks = (test, seen, seen) if self.test_center else (seen,) * 3
         tried = int(self.memory.get("tried", 0))
         self.log.info("repairing the tip%s", f" ({tried} treatments were tried already)" if tried else "")
-        self._refused.clear()
+        self._workshop.refused.clear()
         self._expect_step(looks, shape)
         with self.scope.events("ControlState", tip_verdict.MESSAGE, timeout_s=VERDICT_WITHIN_S) as answers:
             try:
@@ -216,49 +215,32 @@ class TipCorrector(Component):
     def _is_treated(self, number: int, safe: tuple[Region, ...]) -> bool:
         # False: the treatment could not be done
         treatment = self._next(number)
-        before = self._spent
+        before = self._account.spent
         if self._workshop.treat(number, treatment, safe):
             return True
-        self._refused.add(treatment)
         self.memory.pop("pending", None)
-        self._keep_spent(replace(before, time_s=self._spent.time_s))  # it cost time only
+        self._account.refund(before)
         self.memory.save()
         return False
 
     def _next(self, number: int) -> Treatment:
-        choice = self.allowed if self.learns else self.allowed[number - 1 : number]
-        possible = tuple(one for one in choice if one not in self._refused)
+        choice = self.allowed[number - 1 : number] if self._experience is None else self.allowed
+        possible = tuple(one for one in choice if one not in self._workshop.refused)
         if not possible:
             raise _Blind("no treatment of the list can be done")
-        affordable = self.budget.affordable(possible, self._spent, self.place_spacing, self._step_s)
+        affordable = self._account.affordable(possible)
         if not affordable:
-            raise _OverBudget(self._why_over(possible[0]))
-        return self.experience.choose(self._flaw, affordable) if self.learns else affordable[0]
+            raise _OverBudget(self._account.why_over(possible[0]))
+        return affordable[0] if self._experience is None else self._experience.choose(self._flaw, affordable)
 
     def _charge(self, treatment: Treatment) -> None:
         # before each attempt: after a kill it counts as done, so that the budget holds
-        self._spend_time(saves=False)
-        if not self.budget.affordable((treatment,), self._spent, self.place_spacing, self._step_s):
-            raise _OverBudget(self._why_over(treatment))
-        self._keep_spent(self._spent.plus(cost_of(treatment, self.place_spacing)))
-        self._step_tenure = self.scope.tenures
-        if self.learns:
-            self.memory["pending"] = [self._flaw, self.allowed.index(treatment)]
-
-    def _why_over(self, treatment: Treatment) -> str:
-        over = self.budget.exceeded_by(self._spent.plus(cost_of(treatment, self.place_spacing)).after(self._step_s))
-        return f"the budget of the night is spent: no {treatment} is left in {', '.join(over)}"
-
-    @property
-    def _spent(self) -> RepairCost:
-        return from_plain(RepairCost, self.memory["spent"]) if "spent" in self.memory else RepairCost()
-
-    def _keep_spent(self, cost: RepairCost) -> None:
-        self.memory["spent"] = to_plain(cost)
-
-    @property
-    def _step_s(self) -> float:
-        return float(self.memory.get("longest_step_s", 0.0))
+        self._account.spend_time(self.clock.now_s())
+        if not self._account.affordable((treatment,)):
+            raise _OverBudget(self._account.why_over(treatment))
+        self._account.charge(treatment, self.scope.tenures)
+        if self._experience is not None:
+            self._experience.begin(self._flaw, treatment)
 
     def _expect_step(self, looks: tuple[Region, ...], shape: tuple[int, int] | None) -> None:
         # the longest that a treatment and its test scans may take, for the budget of time
@@ -270,19 +252,7 @@ class TipCorrector(Component):
             self.log.warning("the first repair may exceed night_time by a test scan: %s", error.what)
             return
         scans_s = sum(2.0 * look.size_m[0] * shape[0] / speed_m_s for look in looks)
-        self.memory["longest_step_s"] = max(self._step_s, MOVES_SHARE * scans_s)
-
-    def _spend_time(self, *, saves: bool = True, ends: bool = False) -> None:
-        # a repair that a kill interrupts goes on in the memory, so the time until the restart counts, too
-        now_s, since_s = self.clock.now_s(), self.memory.get("repairing_since_s")
-        if since_s is not None:
-            self._keep_spent(self._spent.after(now_s - since_s))
-        if ends:
-            self.memory.pop("repairing_since_s", None)
-        else:
-            self.memory["repairing_since_s"] = now_s
-        if saves:
-            self.memory.save()
+        self._account.expect_step(MOVES_SHARE * scans_s)
 
     # --- what it learns
 
@@ -290,48 +260,12 @@ class TipCorrector(Component):
     def _flaw(self) -> str:
         return str(self.memory.get("flaw", UNKNOWN_FLAW))
 
-    def _restore_experience(self) -> None:
-        self.experience = TipExperience()
-        if not self.learns:
-            return
-        file = Path(self.experience_file)
-        if self.simulated:  # what cures a simulated tip must not be tried first on a real one
-            file = file.with_name(f"{file.stem}_simulated{file.suffix}")
-        self._path: Path | None = Path(self.run_dir).parent / file
-        try:
-            before = read_experience(self._path)
-        except FileError as error:  # a night without experience is better than none
-            self.log.error("%s; this night begins without experience, and leaves the file as it is", error)
-            self._path, before = None, TipExperience()
-        if "experience" in self.memory:
-            self.experience = from_plain(TipExperience, self.memory["experience"])
-            return
-        self.experience = before.for_next_night()
-        self.memory["experience"] = to_plain(self.experience)
-        self.memory.save()
-
     def _see(self, verdict: Verdict) -> None:
         if verdict.opinion is Opinion.GOOD:
             self.memory.pop("flaw", None)
         elif verdict.opinion is Opinion.BAD and verdict.flaws:
             self.memory["flaw"] = verdict.flaws[0]
             self.memory.save()
-
-    def _count_outcome(self, *, cured: bool) -> None:
-        if not self.learns or "pending" not in self.memory:
-            return
-        flaw, number = self.memory.pop("pending")
-        outcome = CURED if cured else UNCHANGED if self._flaw in (flaw, UNKNOWN_FLAW) else WORSENED
-        if self.experience.learn(flaw, self.allowed[number], outcome):
-            self.log.info("the %s tip answers otherwise than before: its experience counts less from now on", flaw)
-        self.memory["experience"] = to_plain(self.experience)
-        self.memory.save()
-        if self._path is None:
-            return
-        try:
-            write_experience(self._path, self.experience)
-        except FileError as error:  # the memory has it, and the next outcome writes it again
-            self.log.warning("what was learnt is not in its file: %s", error)
 
     # --- test scans
 
@@ -347,11 +281,9 @@ class TipCorrector(Component):
 
     def _is_cured(self, looks: tuple[Region, ...], shape: tuple[int, int] | None, answers: Events) -> bool:
         cured = self._looks_cured(looks, shape, answers)
-        if self._step_tenure == self.scope.tenures:  # otherwise a person had control meanwhile
-            lasted_s = self.clock.now_s() - float(self.memory["repairing_since_s"])
-            self.memory["longest_step_s"] = max(self._step_s, lasted_s)
-        self._spend_time(saves=False)
-        self._count_outcome(cured=cured)
+        self._account.end_step(self.clock.now_s(), self.scope.tenures)
+        if self._experience is not None:
+            self._experience.end(self._flaw, cured=cured)
         self.memory.save()
         return cured
 
@@ -410,7 +342,7 @@ class TipCorrector(Component):
         return tip_verdict.BAD
 
     def _learn(self, scan: Scan, problems: tuple[int, ...]) -> None:
-        if self.judge is None or problems or (self.judge.knows(scan.region, scan.shape) and not self.learns):
+        if self.judge is None or problems or (self._experience is None and self.judge.knows(scan.region, scan.shape)):
             return
         pair = self.pairing.add(scan)
         if pair is None:

@@ -1,19 +1,80 @@
-"""The experience of past nights in a TOML file that a person can read, edit or delete."""
+"""The experience of the nights: in a memory during a night, in a TOML file that a person can read, edit or delete."""
 
 from __future__ import annotations
 
+import logging
 import math
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 
 from afspm.basics.errors import FileError
-from afspm.components.tip_experience import OUTCOMES, OutcomeCounts, TipExperience
+from afspm.components.tip_experience import (
+    CURED,
+    OUTCOMES,
+    UNCHANGED,
+    UNKNOWN_FLAW,
+    WORSENED,
+    OutcomeCounts,
+    TipExperience,
+)
+from afspm.components.tip_treatments import Treatment
+from afspm.model.snapshot import from_plain, to_plain
 from afspm.storage.atomic import write_atomic
+from afspm.storage.memory import Memory
 
 _HEAD = """\
 # What a TipCorrector has learnt: how often each treatment cured a tip with each flaw, worsened it, or did nothing.
 # Older outcomes count less than one. You may edit or delete this file while no experiment runs.
 """
+
+
+class NightsExperience:
+    """The experience of this night, from the file of past nights, in the memory of a component and in the file again.
+
+    Args:
+        allowed: all treatments of the experiment; their order must not change in a run.
+    """
+
+    def __init__(self, path: Path, allowed: Sequence[Treatment], memory: Memory, log: logging.Logger) -> None:
+        self._path: Path | None = path
+        self._allowed, self._memory, self._log = allowed, memory, log
+        try:
+            before = read_experience(path)
+        except FileError as error:  # a night without experience is better than none
+            log.error("%s; this night begins without experience, and leaves the file as it is", error)
+            self._path, before = None, TipExperience()
+        if "experience" in memory:
+            self._experience: TipExperience = from_plain(TipExperience, memory["experience"])
+            return
+        self._experience = before.for_next_night()
+        memory["experience"] = to_plain(self._experience)
+        memory.save()
+
+    def choose(self, flaw: str, affordable: Sequence[Treatment]) -> Treatment:
+        """Return the treatment to try next on a flaw."""
+        return self._experience.choose(flaw, affordable)
+
+    def begin(self, flaw: str, treatment: Treatment) -> None:
+        """Note a treatment about to be attempted; the caller saves the memory."""
+        self._memory["pending"] = [flaw, self._allowed.index(treatment)]
+
+    def end(self, flaw: str, *, cured: bool) -> None:
+        """Count the outcome of the pending treatment, if any, from the flaw after it."""
+        if "pending" not in self._memory:
+            return
+        before, number = self._memory.pop("pending")
+        outcome = CURED if cured else UNCHANGED if flaw in (before, UNKNOWN_FLAW) else WORSENED
+        if self._experience.learn(before, self._allowed[number], outcome):
+            self._log.info("the %s tip answers otherwise than before: its experience counts less from now on", before)
+        self._memory["experience"] = to_plain(self._experience)
+        self._memory.save()
+        if self._path is None:
+            return
+        try:
+            write_experience(self._path, self._experience)
+        except FileError as error:  # the memory has it, and the next outcome writes it again
+            self._log.warning("what was learnt is not in its file: %s", error)
 
 
 def experience_text(experience: TipExperience) -> str:

@@ -67,6 +67,28 @@ def fresh_place(center_m: XY, spacing_m: float, number: int) -> XY:
     return center_m[0] + radius * math.cos(angle), center_m[1] + radius * math.sin(angle)
 
 
+@dataclass(frozen=True)
+class TreatmentPlaces:
+    """The places of treatments on the sample, each used once.
+
+    Attributes:
+        center_m: the centre of the places.
+        spacing_m: the distance between the places of two treatments.
+        keep_away_m: least distance of a place from scanned regions.
+    """
+
+    center_m: XY
+    spacing_m: float
+    keep_away_m: float
+
+    def __post_init__(self) -> None:
+        if self.spacing_m <= 0.0 or self.keep_away_m < 0.0:
+            raise ConfigError("`place_spacing` must be above zero, `keep_away` not below")
+
+    def fresh(self, number: int) -> XY:
+        return fresh_place(self.center_m, self.spacing_m, number)
+
+
 def clearance_m(place_m: XY, region: Region) -> float:
     """Return the distance of a place from a region; 0 within."""
     cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)

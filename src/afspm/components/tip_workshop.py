@@ -10,7 +10,7 @@ from afspm import wire
 from afspm.basics.errors import ControlLost, FileError, NoResponse, Refused
 from afspm.basics.formatting import position_text
 from afspm.client.component import Component
-from afspm.components.tip_treatments import XY, Pulse, Treatment, clearance_m, fresh_place
+from afspm.components.tip_treatments import XY, Pulse, Treatment, TreatmentPlaces, clearance_m
 from afspm.model import Region, ScopeState, names
 
 SETTLED_WITHIN_S = 2.0  # real time: a microscope that has not reported to be busy by then counts as ready
@@ -21,28 +21,26 @@ class TipWorkshop:
     """Treatments of the tip for a component, which must hold control around every call.
 
     Args:
-        center: the centre of the places.
-        spacing: the distance between the places of two treatments, in m.
-        keep_away: least distance of a treatment from scanned regions, in m.
         charge: called with the treatment before each attempt. Its changes of the memory are saved before the attempt;
             an error that it raises prevents the attempt.
+
+    Attributes:
+        refused: treatments of the present repair that could not be done.
     """
 
     def __init__(
         self,
         component: Component,
         problem: str,
-        center: XY,
-        spacing: float,
-        keep_away: float,
+        places: TreatmentPlaces,
         charge: Callable[[Treatment], None],
     ) -> None:
         self._component = component
         self._scope, self._log, self._memory = component.scope, component.log, component.memory
         self._problem = problem
-        self._center = center
-        self._spacing, self._keep_away = spacing, keep_away
+        self._places = places
         self._charge = charge
+        self.refused: set[Treatment] = set()
         self._frame: Region | None = None  # the frame set about a place
 
     def treat(self, number: int, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
@@ -57,6 +55,12 @@ class TipWorkshop:
             FileError: the state can't be saved; the treatment is not attempted.
             ControlLost: control was lost, and the problem is no longer flagged.
         """
+        is_done = self._attempt(number, treatment, safe)
+        if not is_done:
+            self.refused.add(treatment)
+        return is_done
+
+    def _attempt(self, number: int, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
         while True:
             self._charge(treatment)
             place = self._fresh_place(number)
@@ -77,13 +81,13 @@ class TipWorkshop:
         self._memory["tried"], self._memory["places"] = number, places + 1
         if not self._memory.save():
             raise FileError("the disk is full: after a restart the treatment would be repeated")
-        return fresh_place(self._center, self._spacing, places)
+        return self._places.fresh(places)
 
     def _treat_at(self, place: XY, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
         parameters = self._scope.scan_parameters  # a person may have chosen another region meanwhile
         if parameters is not None and isinstance(parameters.region, Region) and parameters.region != self._frame:
             safe = (*safe, parameters.region)
-        if (away := min(clearance_m(place, region) for region in safe)) < self._keep_away:
+        if (away := min(clearance_m(place, region) for region in safe)) < self._places.keep_away_m:
             self._log.error(
                 "%s was not done: its place is only %.0f nm away from a scanned region", treatment, away * 1e9
             )
@@ -116,14 +120,14 @@ class TipWorkshop:
             if parameters is None or not isinstance(parameters.region, Region):
                 raise
             self._log.debug("moving the scan frame along to %s: %s", position_text(place), refused.reason)
-            size_m = (self._spacing, self._spacing)
+            size_m = (self._places.spacing_m, self._places.spacing_m)
             self._frame = replace(parameters.region, center_m=place, size_m=size_m)
             self._scope.set_scan_region(self._frame)
             self._scope.move_probe(place)
 
     def _stands_at(self, place: XY) -> bool:
         position = self._scope.probe_position
-        return position is not None and math.dist(position.xy_m, place) <= self._spacing / 2
+        return position is not None and math.dist(position.xy_m, place) <= self._places.spacing_m / 2
 
     def _where(self) -> str:
         position = self._scope.probe_position

@@ -20,6 +20,7 @@ from afspm.basics.errors import ConfigError
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.formatting import position_text
 from afspm.components.tip_corrector import TipCorrector
+from afspm.components.tip_experience import TipExperience
 from afspm.components.tip_verdict import BAD, GOOD, MESSAGE, UNCLEAR, verdict_message
 from afspm.model import (
     ControlMode,
@@ -34,6 +35,7 @@ from afspm.model import (
     Scan,
     ScanParameters,
 )
+from afspm.model.snapshot import from_plain
 
 TIP, MALFUNCTION = Problem.TIP_SHAPE_CHANGED, Problem.DEVICE_MALFUNCTION
 
@@ -496,6 +498,11 @@ def test_tip_is_repaired_once_the_disk_has_room_and_a_person_cleared_the_flag(
     assert lab.problems == ()
 
 
+def _experience(repairing: TipCorrector) -> TipExperience:
+    found: TipExperience = from_plain(TipExperience, repairing.memory["experience"])
+    return found
+
+
 def learner(**settings: Any) -> TipCorrector:
     return corrector(policy="learn", **settings)
 
@@ -518,7 +525,7 @@ def test_learning_repair_tries_again_beyond_the_list_until_the_tip_is_good(tmp_p
     repairing = life(lab, tmp_path / "runs" / "night")
     assert len(lab.actions) == 6
     assert lab.problems == ()
-    outcomes = [repairing.experience.of("unknown", one) for one in repairing.allowed]
+    outcomes = [_experience(repairing).of("unknown", one) for one in repairing.allowed]
     assert sum(one.cured for one in outcomes) == 1.0
     assert sum(one.unchanged for one in outcomes) == 5.0
 
@@ -528,9 +535,9 @@ def test_what_was_learnt_is_kept_for_the_next_night(tmp_path: Path) -> None:
         lab = Repairs([GOOD])
         lab.at(10.0, partial(lab.flag, TIP))
         repairing = life(lab, tmp_path / "runs" / night)
-        assert repairing.experience.nights == number + 1
+        assert _experience(repairing).nights == number + 1
     assert (tmp_path / "runs" / "tip_experience.toml").exists()
-    assert sum(repairing.experience.of("unknown", one).cured for one in repairing.allowed) == 2.0
+    assert sum(_experience(repairing).of("unknown", one).cured for one in repairing.allowed) == 2.0
 
 
 def test_experience_of_a_simulated_night_is_not_used_on_a_real_tip(tmp_path: Path) -> None:
@@ -635,5 +642,5 @@ def test_time_of_repairs_counts_until_the_budget_is_spent(tmp_path: Path) -> Non
     )
     repairing = life(lab, tmp_path / "runs" / "night", 30_000.0, night_time=1000.0)
     assert 0 < len(lab.actions) < 12
-    assert 0.0 < repairing._spent.time_s <= 1000.0
+    assert 0.0 < repairing._account.spent.time_s <= 1000.0
     assert lab.problems == (TIP, MALFUNCTION)
