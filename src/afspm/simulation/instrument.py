@@ -20,7 +20,7 @@ Lengths in m in tip coordinates, angles in rad counter-clockwise, times in exper
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -32,14 +32,12 @@ from afspm.model import Feedback, Region
 from afspm.model.snapshot import restored, snapshot
 from afspm.simulation.activities import RETRACE, Move, Occupied, ScanActivity, SpectrumActivity, noise_in_air
 from afspm.simulation.feedback import FeedbackSettings
-from afspm.simulation.ledger import LEDGER_EVENT, DamageLedger, ScannedPlace, distance_m, with_place
+from afspm.simulation.ledger import DamageCounter, DamageLedger, Note, ScannedPlace
 from afspm.simulation.measuring import Adjustment
 from afspm.simulation.scan_drawing import RunWork, ScanDrawing, run_at_once
 from afspm.simulation.world import World
 
 Doing = ScanActivity | SpectrumActivity | Occupied
-Note = Callable[[float, str, Mapping[str, object]], None]
-"""Called with the time of an event, its name, and its facts."""
 _MOST_AVERAGED = 32  # more sweeps reduce the noise no further
 _FASTEST_DRIFT_M_S = 1e-6
 _FEW = (2, 2)  # pixels: enough to find the channels
@@ -111,7 +109,7 @@ class SimulatedInstrument:
         scan, spectrum: the last started scan and spectrum, also after their end; None before the first, and for a
             stopped spectrum.
         world: the physics, with its ground truth (`world.truth`).
-        ledger: the damage so far, counted up to the last call.
+        damage: the count of the damage so far.
     """
 
     def __init__(
@@ -134,13 +132,10 @@ class SimulatedInstrument:
         self._doing: Doing | None = None
         self._probe_m = (0.0, 0.0)
         self._counts = {"scan": 0, "spectrum": 0}
-        self._before: Plain = {}  # the world before the running scan
         self._noise = np.random.default_rng((seed, 3))
         self._signals: Mapping[str, float] = {}
         self._note = note
-        self.ledger = DamageLedger(start_s)
-        self._uncounted: ScanActivity | SpectrumActivity | None = None
-        self._scanned: list[ScannedPlace] = []
+        self.damage = DamageCounter(self.world, start_s, note)
 
     # -- what goes on
 
@@ -244,13 +239,12 @@ class SimulatedInstrument:
             setup.slope,
         )
         draw = self.drawing.prepared(scan, engaged=self.engaged)
-        self._before, self._counts["scan"] = self.world.state(), number
+        self.drawing.keep_world()
+        self._counts["scan"] = number
         self.note(now_s, "scan starts", {"number": number})
         self.scan = self._doing = scan
         if self.engaged:
-            self._uncounted = scan
-            place = ScannedPlace(scan.region, self.world.sample.under(scan.region.center_m, now_s))
-            self._scanned = with_place(self._scanned, place)
+            self.damage.scan_starts(scan, now_s)
         self.drawing.start(scan, draw)
         return scan
 
@@ -265,7 +259,7 @@ class SimulatedInstrument:
         """Apply the present feedback settings and bias to the running scan."""
         if self._scans and self.scan is not None and self.scan.running(now_s):
             self.drawing.wait()
-            self.world.restore(self._before)
+            self.drawing.rewind()
             self._redraw((*self.scan.adjusted, Adjustment(now_s, self.setup.feedback, self.setup.bias_v)))
 
     def change_tip(self, condition: str, now_s: float) -> None:
@@ -274,7 +268,7 @@ class SimulatedInstrument:
         self.world.change_tip(condition, now_s)
         self.note(now_s, "tip changed on demand", {"condition": condition})
         if self._scans and self.scan is not None and self.scan.running(now_s):
-            self.world.restore(self._before)
+            self.drawing.rewind()
             self._redraw(self.scan.adjusted)
 
     @property
@@ -283,7 +277,7 @@ class SimulatedInstrument:
 
     def _redraw(self, adjusted: tuple[Adjustment, ...]) -> None:
         assert self.scan is not None
-        self._before = self.world.state()
+        self.drawing.keep_world()
         self.scan.redrawn(adjusted)
         self.drawing.start(self.scan, self.drawing.prepared(self.scan, engaged=self.engaged))
 
@@ -310,7 +304,7 @@ class SimulatedInstrument:
         end_s = now_s + sweeps * self.world.spectrum_s(kind)
         self.spectrum = SpectrumActivity(number, kind, self._probe_m, now_s, end_s, names, units, values)
         self._doing = self.spectrum
-        self._uncounted = self.spectrum if self.engaged else None
+        self.damage.spectrum_starts(self.spectrum if self.engaged else None)
         truth = self.world.property_truth(self._probe_m, now_s)
         self.note(now_s, "spectrum starts", {"number": number, "kind": kind, **truth})
         return self.spectrum
@@ -318,7 +312,8 @@ class SimulatedInstrument:
     def stop_spectrum(self, now_s: float) -> None:
         """Interrupt and discard a running spectrum."""
         if isinstance(self._doing, SpectrumActivity) and self._doing.running(now_s):
-            self._doing = self.spectrum = self._uncounted = None
+            self._doing = self.spectrum = None
+            self.damage.spectrum_starts(None)
             self.note(now_s, "spectrum stopped", {})
 
     # -- moves
@@ -353,7 +348,7 @@ class SimulatedInstrument:
         _finite("the way of the stage", *by_m)
         self.occupy("stage", lasts_s, now_s)
         if self.engaged:
-            self._count(now_s, "stage", replace(self.ledger, stage_moves=self.ledger.stage_moves + 1))
+            self._add_damage(now_s, "stage", replace(self.ledger, stage_moves=self.ledger.stage_moves + 1))
         if lasts_s > 0.0:
             self.world.compensate((by_m[0] / lasts_s, by_m[1] / lasts_s), now_s)
             self.world.compensate((0.0, 0.0), now_s + lasts_s)
@@ -368,7 +363,7 @@ class SimulatedInstrument:
             raise InvalidValue(f"a drift of {velocity_m_per_s} m/s", hint=f"at most {_FASTEST_DRIFT_M_S} m/s")
         self.drawing.wait()
         if self._scans and self.scan is not None and self.scan.running(now_s):
-            self.world.restore(self._before)
+            self.drawing.rewind()
             self.world.compensate(velocity_m_per_s, now_s)
             self._redraw(self.scan.adjusted)
         else:
@@ -401,10 +396,11 @@ class SimulatedInstrument:
         position_m, marks = self._probe_m, len(self.world.sample.marks)
         outcome = self.world.pulse(voltage_v, duration_s, now_s, position_m)
         facts = {"voltage_v": voltage_v, "duration_s": duration_s, "position_m": position_m, "outcome": outcome}
-        near, clearance_m = self._clearance(position_m, now_s)
+        clearance_m = self.damage.clearance_m(position_m, now_s)
         self.note(now_s, "pulse", {**facts, "clearance_m": clearance_m})
-        ledger = self.ledger.pulsed(voltage_v, duration_s, outcome, self._mark_radius_m(marks), near=near)
-        self._count(now_s, "pulse", ledger)
+        near, radius_m = self.damage.is_near(clearance_m), self._mark_radius_m(marks)
+        ledger = self.ledger.pulsed(voltage_v, duration_s, outcome, radius_m, near=near)
+        self._add_damage(now_s, "pulse", ledger)
         return outcome
 
     def crash(self, depth_m: float, speed_m_s: float, now_s: float) -> str:
@@ -421,10 +417,11 @@ class SimulatedInstrument:
             marks = len(self.world.sample.marks)
             outcome = self.world.crash(position_m, depth_m, speed_m_s, now_s)
             facts = {"position_m": position_m, "speed_m_per_s": speed_m_s, "depth_m": depth_m, "outcome": outcome}
-            near, clearance_m = self._clearance(position_m, now_s)
+            clearance_m = self.damage.clearance_m(position_m, now_s)
             self.note(now_s, "crash", {**facts, "clearance_m": clearance_m})
-            ledger = self.ledger.crashed(depth_m, outcome, self._mark_radius_m(marks), near=near)
-            self._count(now_s, "crash", ledger)
+            near, radius_m = self.damage.is_near(clearance_m), self._mark_radius_m(marks)
+            ledger = self.ledger.crashed(depth_m, outcome, radius_m, near=near)
+            self._add_damage(now_s, "crash", ledger)
         self.occupy("crash", 2.0 * depth_m / speed_m_s, now_s)
         return outcome
 
@@ -460,47 +457,26 @@ class SimulatedInstrument:
         self.stop_scan(now_s)
         self._doing = None
 
-    # -- the damage ledger
+    # -- the damage
 
     def account(self, now_s: float) -> None:
         """Add to the ledger the time since the last call, and the measurement if it has ended.
 
         Call this method before a change of `setup.feedback` or `engaged`: the elapsed time counts with the old values.
         """
-        self._count(now_s, "feedback", self.ledger)
-        measured = self._uncounted
-        if measured is None or measured.running(now_s):
-            return
-        if isinstance(measured, ScanActivity):
-            if measured.drawing:  # a stopped one
-                return
-            self._uncounted = None
-            share = min(1.0, measured.lines_done(now_s) / measured.shape[0])
-            truth: Mapping[str, float] = {k: v for k, v in measured.truth.items() if isinstance(v, float)}
-            saturated_s = truth.get("saturated", 0.0) * share * measured.shape[0] * measured.line_s
-            pressed_m = truth.get("pressed_m", 0.0) if share else 0.0
-            self._count(measured.end_s, "scan", self.ledger.scanned(pressed_m, saturated_s))
-            return
-        self._uncounted = None
-        currents = [i for i, unit in enumerate(measured.units) if unit == "A"]
-        if currents:
-            share = self.world.saturated(measured.values[:, currents], measured.kind)
-            self._count(now_s, "spectrum", self.ledger.scanned(0.0, share * (measured.end_s - measured.start_s)))
+        self.damage.account(now_s, feedback_off=self._is_feedback_off)
 
-    def _count(self, now_s: float, cause: str, ledger: DamageLedger) -> None:
-        feedback_off = self.engaged and self.setup.feedback.on is False
-        before, self.ledger = self.ledger, ledger.at(now_s, feedback_off=feedback_off)
-        if self._note is not None and not self.ledger.same_totals(before):
-            self._note(now_s, LEDGER_EVENT, {"cause": cause, **self.ledger.line()})
+    @property
+    def ledger(self) -> DamageLedger:
+        """The damage so far, counted up to the last call."""
+        return self.damage.ledger
 
-    def _clearance(self, position_m: tuple[float, float], now_s: float) -> tuple[bool, float | None]:
-        # whether it is too near to a scanned place, and the distance of the nearest one
-        sample, distances = self.world.sample, list[float]()
-        for place in self._scanned:
-            x, y = sample.to_tip(place.sample_xy_m, now_s) - sample.compensation.at(now_s)[:2]
-            distances.append(distance_m(position_m, place.region.moved_to((float(x), float(y)))))
-        clearance_m = min(distances, default=None)
-        return clearance_m is not None and clearance_m < self.world.settings.tip_changes.keep_away_m, clearance_m
+    @property
+    def _is_feedback_off(self) -> bool:
+        return self.engaged and self.setup.feedback.on is False
+
+    def _add_damage(self, now_s: float, cause: str, ledger: DamageLedger) -> None:
+        self.damage.add(now_s, cause, ledger, feedback_off=self._is_feedback_off)
 
     def _mark_radius_m(self, marks_before: int) -> float:
         marks = self.world.sample.marks
@@ -511,7 +487,7 @@ class SimulatedInstrument:
     def state(self) -> Plain:
         """Return the state for `restore`, JSON-able; during a scan with the state of the world at its start."""
         doing = self._doing
-        world = self._before if self._scans or self.drawing.goes_on else self.world.state()
+        world = self.drawing.world_before if self._scans or self.drawing.goes_on else self.world.state()
         state = InstrumentState(
             engaged=self.engaged,
             probe_m=self._probe_m,
@@ -522,7 +498,7 @@ class SimulatedInstrument:
             move=doing if isinstance(doing, Move) else None,
             occupied=doing if isinstance(doing, Occupied) and not isinstance(doing, Move) else None,
             ledger=self.ledger,
-            scanned=self._scanned,
+            scanned=self.damage.scanned,
         )
         return {"world": world, "instrument": snapshot(state, "instrument", _STATE_VERSION, lists=True)}
 
@@ -538,8 +514,7 @@ class SimulatedInstrument:
         self._counts = {"scan": found.last_scan, "spectrum": found.spectra}
         self.scan, self.spectrum = found.scan, found.spectrum
         self._doing = found.scan or found.spectrum or found.move or found.occupied
-        self.ledger, self._scanned = found.ledger, found.scanned
-        self._uncounted = (found.scan or found.spectrum) if found.engaged else None
+        self.damage.restore(found.ledger, found.scanned, (found.scan or found.spectrum) if found.engaged else None)
         # the values are not saved: the world at the start of the scan gives the same values again
         if self.scan is not None:
             self._redraw(self.scan.adjusted)

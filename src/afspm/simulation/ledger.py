@@ -1,17 +1,22 @@
 """The damage ledger: totals of all actions that can damage tip or sample, as part of the ground truth.
 
-**Theory of operation.** The instrument adds each treatment, scan and interval of time. Whenever the totals have grown,
-they are appended to `truth.jsonl` as a separate line. The totals are no verdict: compare them with a budget.
+**Theory of operation.** The instrument reports each treatment, scan and interval of time to its `DamageCounter`.
+Whenever the totals have grown, they are appended to `truth.jsonl` as a separate line. The totals are no verdict:
+compare them with a budget.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 
 from afspm.model import Region
+from afspm.simulation.activities import ScanActivity, SpectrumActivity
+from afspm.simulation.world import World
 
+Note = Callable[[float, str, Mapping[str, object]], None]
+"""Called with the time of an event, its name, and its facts."""
 LEDGER_EVENT = "ledger"
 PRESSED_FROM_M = 0.2e-9
 """Smallest mean indentation, by errors of the feedback, of a scan that counts: five times the usual indentation."""
@@ -119,3 +124,77 @@ def with_place(places: Iterable[ScannedPlace], place: ScannedPlace) -> list[Scan
         return apart_m < 0.05 * size_m and one.region.moved_to(place.region.center_m) == place.region
 
     return [*(one for one in places if not same(one)), place]
+
+
+class DamageCounter:
+    """The count of the damage by one instrument: its ledger, the places scanned, and the measurement to count.
+
+    `feedback_off` of all methods: whether the tip has been engaged with the feedback off since the last call.
+
+    Args:
+        note: called with the totals whenever they have grown.
+    """
+
+    def __init__(self, world: World, start_s: float, note: Note | None) -> None:
+        self._world, self._note = world, note
+        self._measuring: ScanActivity | SpectrumActivity | None = None
+        self.ledger = DamageLedger(start_s)
+        self.scanned: list[ScannedPlace] = []
+
+    def restore(
+        self, ledger: DamageLedger, scanned: list[ScannedPlace], measuring: ScanActivity | SpectrumActivity | None
+    ) -> None:
+        self.ledger, self.scanned, self._measuring = ledger, scanned, measuring
+
+    def scan_starts(self, scan: ScanActivity, now_s: float) -> None:
+        """Count a scan of the engaged tip at its end, and its place from now on."""
+        self._measuring = scan
+        place = ScannedPlace(scan.region, self._world.sample.under(scan.region.center_m, now_s))
+        self.scanned = with_place(self.scanned, place)
+
+    def spectrum_starts(self, spectrum: SpectrumActivity | None) -> None:
+        """Count a spectrum of the engaged tip at its end; None: count none, nor the measurement before."""
+        self._measuring = spectrum
+
+    def clearance_m(self, position_m: tuple[float, float], now_s: float) -> float | None:
+        """Return the distance of a tip position from the nearest scanned place; None before the first scan."""
+        sample, distances = self._world.sample, list[float]()
+        for place in self.scanned:
+            x, y = sample.to_tip(place.sample_xy_m, now_s) - sample.compensation.at(now_s)[:2]
+            distances.append(distance_m(position_m, place.region.moved_to((float(x), float(y)))))
+        return min(distances, default=None)
+
+    def is_near(self, clearance_m: float | None) -> bool:
+        """Return whether a treatment with this clearance is too near to a scanned place."""
+        return clearance_m is not None and clearance_m < self._world.settings.tip_changes.keep_away_m
+
+    def add(self, now_s: float, cause: str, ledger: DamageLedger, *, feedback_off: bool) -> None:
+        """Replace the ledger by one with more damage, and count the time up to now."""
+        before, self.ledger = self.ledger, ledger.at(now_s, feedback_off=feedback_off)
+        if self._note is not None and not self.ledger.same_totals(before):
+            self._note(now_s, LEDGER_EVENT, {"cause": cause, **self.ledger.line()})
+
+    def account(self, now_s: float, *, feedback_off: bool) -> None:
+        """Count the time since the last call, and the measurement if it has ended."""
+        self.add(now_s, "feedback", self.ledger, feedback_off=feedback_off)
+        measured = self._measuring
+        if measured is None or measured.running(now_s):
+            return
+        if isinstance(measured, ScanActivity):
+            if measured.drawing:  # a stopped one
+                return
+            self._measuring = None
+            self.add(measured.end_s, "scan", self._with_scan(measured, now_s), feedback_off=feedback_off)
+            return
+        self._measuring = None
+        currents = [i for i, unit in enumerate(measured.units) if unit == "A"]
+        if currents:
+            share = self._world.saturated(measured.values[:, currents], measured.kind)
+            saturated_s = share * (measured.end_s - measured.start_s)
+            self.add(now_s, "spectrum", self.ledger.scanned(0.0, saturated_s), feedback_off=feedback_off)
+
+    def _with_scan(self, scan: ScanActivity, now_s: float) -> DamageLedger:
+        share = min(1.0, scan.lines_done(now_s) / scan.shape[0])
+        truth: Mapping[str, float] = {k: v for k, v in scan.truth.items() if isinstance(v, float)}
+        saturated_s = truth.get("saturated", 0.0) * share * scan.shape[0] * scan.line_s
+        return self.ledger.scanned(truth.get("pressed_m", 0.0) if share else 0.0, saturated_s)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 
 from afspm.basics.errors import InvalidValue
+from afspm.basics.plain_data import Plain
 from afspm.simulation.activities import NoValues, ScanActivity, ScanValues, ValuesInAir
 from afspm.simulation.feedback import Loop
 from afspm.simulation.world import World
@@ -37,6 +38,7 @@ class ScanDrawing:
     def __init__(self, world: World, units: Callable[[], Mapping[str, str]], seed: int, run: RunWork) -> None:
         self._world, self._units, self._seed, self._run = world, units, seed, run
         self._newest: ScanActivity | None = None
+        self._before: Plain = {}
         self.wake: Callable[[], None] = lambda: None
         self.log = logging.getLogger(__name__)
 
@@ -54,6 +56,19 @@ class ScanDrawing:
 
         self._newest = scan
         self._run(work)
+
+    @property
+    def world_before(self) -> Plain:
+        """The state of the world before the newest scan, from which the scan can be computed again."""
+        return self._before
+
+    def keep_world(self) -> None:
+        """Keep the state of the world before the computation of a scan."""
+        self._before = self._world.state()
+
+    def rewind(self) -> None:
+        """Restore the world as it was before the newest scan."""
+        self._world.restore(self._before)
 
     @property
     def goes_on(self) -> bool:
