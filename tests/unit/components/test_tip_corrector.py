@@ -545,7 +545,7 @@ def test_experience_of_a_simulated_night_is_not_used_on_a_real_tip(tmp_path: Pat
         lab = Repairs([GOOD])
         lab.at(10.0, partial(lab.flag, TIP))
         repairing = life(lab, tmp_path / "runs" / night, simulated=simulated)
-        assert repairing.experience.nights == (2 if night == "simulated again" else 1)
+        assert _experience(repairing).nights == (2 if night == "simulated again" else 1)
     names = {file.name for file in (tmp_path / "runs").glob("*.toml")}
     assert names == {"tip_experience.toml", "tip_experience_simulated.toml"}
 
