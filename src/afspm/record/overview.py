@@ -161,7 +161,7 @@ class ProcessHistory:
 
 
 @dataclass(slots=True)
-class Alarm:
+class CriticalMessage:
     """A CRITICAL line of the log, and the time of the line that ended it; None while it is not known to be over."""
 
     line: LogLine
@@ -203,7 +203,7 @@ class Overview:
         self.of_conditions: set[int] = set()
         self.set_ns: dict[str, int] = {}
         self.log: deque[LogLine] = deque(maxlen=MOST_LINES)
-        self.alarms: deque[Alarm] = deque(maxlen=MOST_ALARMS)
+        self.alarms: deque[CriticalMessage] = deque(maxlen=MOST_ALARMS)
         self.notes: deque[Note] = deque(maxlen=most_entries)
         self.entries: deque[JournalEntry] = deque(maxlen=most_entries)
         self.refusals: deque[JournalEntry] = deque(maxlen=most_entries)
@@ -458,7 +458,7 @@ class Overview:
         for line in lines.lines:
             if line.is_alarm:
                 if not any((one.name, one.text) == (line.name, line.text) for one in self.open_alarms):
-                    self.alarms.append(Alarm(line))
+                    self.alarms.append(CriticalMessage(line))
                 continue
             for alarm in self.alarms:
                 if alarm.ended_ns is None and line.ends(alarm.line):

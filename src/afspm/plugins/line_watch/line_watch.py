@@ -78,15 +78,20 @@ class _LaterStates:
 
 
 class _MissingLines:
-    """A reporter of successive scans without any lines."""
+    """A reporter of successive scans without any lines.
 
-    def __init__(self, log: logging.Logger) -> None:
-        self._log = log
+    Args:
+        started_ns: the start of this component: the lines of earlier scans are not cached.
+    """
+
+    def __init__(self, log: logging.Logger, started_ns: int) -> None:
+        self._log, self._started_ns = log, started_ns
         self._has_begun = False
         self._count = 0
 
-    def on_state(self, status: ScopeStatus) -> None:
-        self._has_begun |= status.state is ScopeState.SCANNING
+    def on_state(self, status: ScopeStatus, time_ns: int) -> None:
+        if time_ns > self._started_ns:
+            self._has_begun |= status.state is ScopeState.SCANNING
 
     def on_scan(self, *, has_lines: bool) -> None:
         if has_lines:
@@ -150,8 +155,7 @@ class LineWatch(Component):
 
     def on_start(self) -> None:
         self.expected = MissingChannels(self.channels, self.log)
-        self._missing_lines = _MissingLines(self.log)
-        self._started_ns = self.clock.now_ns()
+        self._missing_lines = _MissingLines(self.log, self.clock.now_ns())
         self._later_states = _LaterStates(self.scope.events("ScopeStateMsg"))
         if "judge" in self.memory:
             self.judge.restore(self.memory["judge"])
@@ -225,8 +229,7 @@ class LineWatch(Component):
         self._finished = _Finished(pair, self._kind(scan), downwards, is_whole, is_whole and self._problems == ())
 
     def on_state(self, status: ScopeStatus) -> None:
-        if self.packet is not None and (self.packet.time_ns or 0) > self._started_ns:  # lines are not cached
-            self._missing_lines.on_state(status)
+        self._missing_lines.on_state(status, (self.packet and self.packet.time_ns) or 0)
 
     def _forget(self) -> None:
         self.judge.forget_places()
