@@ -141,6 +141,33 @@ def test_steps_go_on_at_a_server_that_rounds_a_target_after_its_answer(bench: Be
     assert (reading.target, bench.client.log) == (4.41, [])
 
 
+def test_order_has_no_outcome_if_the_server_describes_itself_again_before_the_target_was_sent() -> None:
+    bench = Bench(Cryostat(has_ramp=True, chance=random.Random(1)))
+    bench.connect()
+    order = InstrumentOrder(1, "series/1", Parameter("cryo.t", "20", "K"), RATE_K_S, "K")
+    (change,) = bench.client.order(order, bench.now_s)
+    (answer,) = bench.cryostat.answer(change)
+    (without_ramp,) = Cryostat(has_ramp=False, chance=random.Random(1)).answer("describe")
+    bench.client.take(without_ramp, bench.now_s)
+    assert bench.client.take(answer, bench.now_s) == []
+    assert bench.client.outcomes() == ()
+    bench.exchange(bench.client.order(order, bench.now_s))
+    assert bench.changes
+
+
+def test_error_of_the_server_that_names_no_parameter_ends_no_order(bench: Bench) -> None:
+    order = InstrumentOrder(1, "series/1", Parameter("cryo.t", "5", "K"), RATE_K_S, "K")
+    bench.client.order(order, bench.now_s)
+    bench.client.take('error_change  ["ProtocolError", "what?", {}]', bench.now_s)
+    assert bench.client.outcomes() == ()
+
+
+def test_number_beyond_floats_is_no_number(bench: Bench) -> None:
+    bench.exchange(bench.client.take(f"update tt:value [1{'0' * 400}, {{}}]", bench.now_s))
+    (reading,) = bench.client.readings(bench.now_s)
+    assert reading.value is None
+
+
 @pytest.mark.parametrize("switch", ["ramp_enable", "use_ramp"])
 def test_ramp_of_the_server_is_switched_on_before_the_target_is_set(switch: str) -> None:
     bench = Bench(Cryostat(has_ramp=True, chance=random.Random(1), ramp_switch=switch))

@@ -80,10 +80,10 @@ class ChannelDescription:
     ramp: ServerRamp | None = None
 
     @property
-    def set_by_orders(self) -> tuple[str, str, str]:
+    def set_by_orders(self) -> tuple[str, ...]:
         """The accessibles that an order may set."""
         rate, switch = ("", "") if self.ramp is None else (self.ramp.rate, self.ramp.switch)
-        return rate, switch, self.target
+        return tuple(filter(None, (rate, switch, self.target)))
 
 
 def described(modules: Mapping[str, object], module: str, accessible: str) -> ChannelDescription:

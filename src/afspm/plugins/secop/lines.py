@@ -65,8 +65,13 @@ def parse(line: str) -> SecopLine | None:
 
 
 def number_in(value: object) -> float | None:
-    """Return a decoded JSON value as a number; None if it is of another type."""
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+    """Return a decoded JSON value as a number; None if it is of another type, or too large."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        return float(value)
+    except OverflowError:  # an integer of JSON may have any length
+        return None
 
 
 def change(specifier: str, value: float) -> str:

@@ -148,6 +148,7 @@ class SecopClient:
             raise ServerUnfit(f"this is no SECoP server: it answers {text[:80]!r}")
         if line.action == "describing":
             self._describe(line.data)
+            self._progress = None  # it follows the description before; the order comes again, as it has no outcome
             return [lines.ACTIVATE, *self.tick(now_s)]
         if not self.is_described:
             return []
