@@ -21,6 +21,7 @@ from afspm.components.scan_plan import (
     XY,
     PlanRest,
     PlanStep,
+    RefusedPlaces,
     Retakes,
     RoundSchedule,
     ScanPlan,
@@ -52,7 +53,8 @@ class PlannedScans(Component):
 
     Each scan has a key, so a restart after a kill neither repeats nor omits a scan. While control is lost (to the
     repair of a tip, to a person) the scan waits; an interruption is logged. Scans are left out only as `missed` and
-    `ends_on_time` define.
+    `ends_on_time` define, and where one of several regions is refused: an error in the log and a note say so. If all
+    regions are refused, or ten in a row, the component ends with the reason.
 
     Args:
         keep_control: whether to keep control between scans; by default others may measure meanwhile.
@@ -111,6 +113,7 @@ class PlannedScans(Component):
         if done and done != self._total:
             self.log.info("going on with scan %d%s", done + 1, self._of_total())
         self._retakes = Retakes(self.retakes, self.memory)
+        self._refused = RefusedPlaces(len(self.plan.regions), self.memory)
         self._verdicts = self.scope.events(tip_verdict.MESSAGE) if self.retakes else None
         with self.scope.control() if self.keep_control else nullcontext():
             for step in self.plan.steps(done):
@@ -123,8 +126,10 @@ class PlannedScans(Component):
             self._retake()
             while self._is_last_bad():
                 self._retake()
-        left_out = (self.plan.total or 0) - (self._total or 0)
+        left_out, refused = (self.plan.total or 0) - (self._total or 0), self._refused.number
         taken = "the scan is" if self._total == 1 else f"all {self._total} scans are"
+        if refused:
+            taken = f"{(self._total or 0) - refused} of {self._total} scans are"
         self.log.info("%s taken%s", taken, f", {left_out} left out" if left_out else "")
         if self.end_when_done:
             self.scope.end_experiment()
@@ -174,8 +179,7 @@ class PlannedScans(Component):
         count = rounds * len(self.plan.regions)
         message = f"missed {count} scan{'s' if count > 1 else ''} while it could not scan; {_MISSED[self.missed]}"
         self.log.warning("%s", message)
-        with suppress(RequestError):  # a scheduler of another make may have no notes
-            self.scope.note(message)
+        self._note(message)
 
     def _add(self, counter: str, rounds: int) -> None:
         self.memory[counter] = int(self.memory.get(counter, 0)) + rounds
@@ -183,7 +187,17 @@ class PlannedScans(Component):
     def _take(self, step: PlanStep) -> None:
         if step.starts_round:
             self._round_began_s = self.clock.now_s()
-        scans = self._measured(step)
+        try:
+            scans = self._measured(step)
+        except Refused as refused:
+            self._refused.add(refused)
+            self._leave_out(step, refused)
+            self._round_began_s = None
+            self.memory["done"], self.memory["done_s"] = step.index + 1, self.clock.now_s()
+            self.memory.save(synced=False)
+            self._tell_progress(step.index + 1)
+            return
+        self._refused.accepted()
         if scans.interruptions:
             self._round_began_s = None
         if self._round_began_s is not None and (step.index + 1) % len(self.plan.regions) == 0:
@@ -192,9 +206,21 @@ class PlannedScans(Component):
             self.memory["pace_s"] = min(round_s, float(self.memory.get("pace_s", round_s)))
         self.memory["done"], self.memory["done_s"] = step.index + 1, self.clock.now_s()
         self._save_taken(step, 0, scans)
-        if (total := self._total) is not None:
-            self.scope.progress(step.index + 1, total, left_s=self._left_s(step.index + 1, total))
+        self._tell_progress(step.index + 1)
         self._log_taken(step, scans)
+
+    def _tell_progress(self, done: int) -> None:
+        if (total := self._total) is not None:
+            self.scope.progress(done, total, left_s=self._left_s(done, total))
+
+    def _leave_out(self, step: PlanStep, refused: Refused) -> None:
+        message = f"scan {step.index + 1} is left out: {refused.reason}"
+        self.log.error("%s", message)
+        self._note(message)
+
+    def _note(self, message: str) -> None:
+        with suppress(RequestError):  # a scheduler of another make may have no notes
+            self.scope.note(message)
 
     def _retake(self) -> None:
         self._judge()
@@ -204,9 +230,14 @@ class PlannedScans(Component):
             self._round_began_s = None  # a repetition would count as the pace of a round
             self.log.warning("scan %d showed a bad tip, and is taken again", index + 1)
             self.memory.save()  # before the request: a restart requests the same scan first
-            scans = self._measured(step)
-            self._save_taken(step, again, scans)
-            self._log_taken(step, scans, " again")
+            try:
+                scans = self._measured(step)
+            except Refused as refused:
+                self._retakes.add(index, again, ())
+                self._leave_out(step, refused)
+            else:
+                self._save_taken(step, again, scans)
+                self._log_taken(step, scans, " again")
             self._judge()
 
     def _judge(self) -> None:
@@ -361,7 +392,7 @@ class ListedRegion:
 
 
 class ScanList(PlannedScans):
-    """Regions of a list, in order, in one or more rounds.
+    """Regions of a list, in order, in one or more rounds. Refused regions are left out; the log and a note say so.
 
     Args:
         regions: list of regions, each with center, size and angle.
@@ -386,6 +417,8 @@ class ScanList(PlannedScans):
 
 class RegionGrid(PlannedScans):
     """A region at each point of a grid, back and forth row by row, for a map larger than a scan.
+
+    Refused regions are left out; the log and a note say so.
 
     Args:
         size: (width, height) of each region.

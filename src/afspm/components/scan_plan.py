@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, MutableMapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from afspm.basics.errors import InvalidValue
+from afspm.basics.errors import InvalidValue, Refused
 from afspm.basics.formatting import lengths_text
 from afspm.model import Region
 from afspm.record.bad_scans import BAD
@@ -15,6 +15,7 @@ from afspm.record.bad_scans import BAD
 XY = tuple[float, float]
 REST_OVERLAP = 2  # rows before the estimated change that are taken again
 MOST_UNJUDGED = 16  # scans of a classifier's reference never get a verdict
+MOST_REFUSED = 10  # places in a row: after that, the reason is another
 FEWEST_ROWS = 8  # of the rest of a scan: fewer rows show too little to be judged or registered
 
 
@@ -150,6 +151,41 @@ class PlanRest:
         region = replace(step.region, center_m=center_m, size_m=size_m)
         shape = (self.last - self.first + 1, columns)
         return replace(step, key=f"{step.key}-rows-{self.first}-{self.last}", region=region, shape=shape)
+
+
+class RefusedPlaces:
+    """The places of a plan that a limit or the microscope refuses: they are left out, and the others are measured.
+
+    Args:
+        places: number of places. If all are refused, or `MOST_REFUSED` in a row, the refusal is an error.
+        memory: memory of the component, for the state.
+    """
+
+    def __init__(self, places: int, memory: MutableMapping[str, Any]) -> None:
+        self._most_in_a_row, self._memory = min(places, MOST_REFUSED), memory
+
+    @property
+    def number(self) -> int:
+        """Return the number of refused measurements."""
+        number, _ = self._memory.get("refused", (0, 0))
+        return int(number)
+
+    def add(self, refused: Refused, measurements: int = 1) -> None:
+        """Count the measurements of a refused place.
+
+        Raises:
+            Refused: too many places in a row are refused.
+        """
+        number, in_a_row = self._memory.get("refused", (0, 0))
+        if in_a_row + 1 >= self._most_in_a_row:
+            raise refused
+        self._memory["refused"] = [number + measurements, in_a_row + 1]
+
+    def accepted(self) -> None:
+        """Begin the count of places in a row again."""
+        number, in_a_row = self._memory.get("refused", (0, 0))
+        if in_a_row:
+            self._memory["refused"] = [number, 0]
 
 
 class Retakes:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+from contextlib import suppress
 
-from afspm.basics.errors import ConfigError
+from afspm.basics.errors import ConfigError, Refused, RequestError
+from afspm.basics.formatting import position_text
 from afspm.basics.units import Angle, Length
 from afspm.client.component import Component
 from afspm.components.planned_scans import pair
-from afspm.components.scan_plan import grid_centers
+from afspm.components.scan_plan import XY, RefusedPlaces, grid_centers
 from afspm.model import names
 from afspm.model.planned_work import PlannedWork
 
@@ -19,7 +21,9 @@ MOST_LINES = 20
 class SpectroscopyGrid(Component):
     """A spectrum at each point of a grid, back and forth by rows, or at each position of a list.
 
-    A restart after a kill neither repeats nor omits a spectrum.
+    A restart after a kill neither repeats nor omits a spectrum. A position that a limit or the microscope refuses is
+    left out; an error in the log and a note say so. If all positions are refused, or ten in a row, the component ends
+    with the reason.
 
     Args:
         counts: (columns, rows) of the grid.
@@ -77,16 +81,32 @@ class SpectroscopyGrid(Component):
     def run(self) -> None:
         total = len(self.positions) * self.repeats
         start_s = float(self.memory.setdefault("start_s", self.clock.now_s()))
-        for index in range(int(self.memory.get("done", 0)), total):
+        refusals = RefusedPlaces(len(self.positions), self.memory)
+        while (index := int(self.memory.get("done", 0))) < total:
             place, repeat = divmod(index, self.repeats)
-            key = f"spectrum-{place}-{repeat}"
-            self.scope.spectrum(self.positions[place], kind=self.kind, key=key)
-            self.memory["done"] = index + 1
+            done, key = index + 1, f"spectrum-{place}-{repeat}"
+            try:
+                self.scope.spectrum(self.positions[place], kind=self.kind, key=key)
+            except Refused as refused:
+                done = (place + 1) * self.repeats
+                refusals.add(refused, done - index)
+                self._leave_out(self.positions[place], refused)
+            else:
+                refusals.accepted()
+                is_told = total <= MOST_LINES or done * MOST_LINES // total > index * MOST_LINES // total
+                self.log.log(logging.INFO if is_told else logging.DEBUG, "spectrum %d of %d", done, total)
+            self.memory["done"] = done
             if self.memory.save(synced=False):  # if not saved, a restart requests the same spectrum
                 self.scope.forget(key)
-            per_spectrum_s = (self.clock.now_s() - start_s) / (index + 1)
-            self.scope.progress(index + 1, total, left_s=per_spectrum_s * (total - index - 1))
-            is_told = total <= MOST_LINES or (index + 1) * MOST_LINES // total > index * MOST_LINES // total
-            self.log.log(logging.INFO if is_told else logging.DEBUG, "spectrum %d of %d", index + 1, total)
+            per_spectrum_s = (self.clock.now_s() - start_s) / done
+            self.scope.progress(done, total, left_s=per_spectrum_s * (total - done))
+        if refusals.number:
+            self.log.error("%d of %d spectra were refused", refusals.number, total)
         if self.end_when_done:
             self.scope.end_experiment()
+
+    def _leave_out(self, at_m: XY, refused: Refused) -> None:
+        message = f"the position {position_text(at_m)} is left out: {refused.reason}"
+        self.log.error("%s", message)
+        with suppress(RequestError):  # a scheduler of another make may have no notes
+            self.scope.note(message)

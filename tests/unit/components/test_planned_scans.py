@@ -11,7 +11,7 @@ import pytest
 from tests.unit.client.client_lab import EPOCH_S, SCAN_S, Kill9, Lab, LabPort, context_of, run
 
 from afspm import wire
-from afspm.basics.errors import ConfigError
+from afspm.basics.errors import ConfigError, Refused
 from afspm.basics.exit_codes import ExitCode
 from afspm.client.component import Component
 from afspm.components.planned_scans import ScanList, ScanSeries
@@ -502,6 +502,71 @@ def test_rest_of_an_interrupted_scan_is_kept_while_another_is_taken_again(tmp_pa
     series = ScanSeries(size=(1e-6, 1e-6), pixels=(8, 32), scans=2, end_when_done=True, missed="rest", retakes=1)
     assert run(series, lab, tmp_path) == ExitCode.ENDED
     assert [round(region.size_m[1] * 1e9) for region in lab.finished] == [1000, 419, 1000]
+
+
+def refuse(lab: Lab, *x_m: float) -> None:
+    """Refuse scans and positions at these x, as a limit does."""
+
+    def intercepted(request: Request) -> Response | str:
+        asked = lab.parameters if request.subject == "start-scan" else request.subject
+        place = asked.region if isinstance(asked, ScanParameters) else asked
+        x = place.center_m[0] if isinstance(place, Region) else getattr(place, "xy_m", (None,))[0]
+        return Response(ControlResponse.PARAM_ERROR, reason="outside of [limits] region") if x in x_m else "go on"
+
+    lab.intercept = intercepted
+
+
+def test_refused_place_is_left_out_and_the_others_are_scanned(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab("list")
+    refuse(lab, PLACES_M[1])
+    with caplog.at_level("INFO"):
+        assert run(places(rounds=2), lab) == ExitCode.ENDED
+    assert taken(lab) == [1, 3, 1, 3]
+    assert "scan 2 is left out: the region or shape of the scan was refused: outside of [limits] region" in caplog.text
+    assert "4 of 6 scans are taken" in caplog.text
+    assert [note.text.split(":")[0] for note in notes_of(lab)] == ["scan 2 is left out", "scan 5 is left out"]
+
+
+def test_plan_ends_if_all_its_places_are_refused() -> None:
+    lab = Lab("list")
+    refuse(lab, *PLACES_M)
+    with pytest.raises(Refused, match="limits"):
+        places().run_process(context_of(lab))
+    assert not lab.begun_scans
+
+
+def test_refused_retake_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
+    lab = judged(Lab("list"), 1, in_s=0.0)
+    lab.at(50.0, lambda: refuse(lab, PLACES_M[0]))
+    assert run(places(retakes=2), lab) == ExitCode.ENDED
+    assert taken(lab) == [1, 2, 3]
+    assert "scan 1 is left out" in caplog.text
+
+
+@pytest.mark.parametrize("call", range(1, 60, 9))
+def test_refused_place_is_left_out_once_over_a_kill(tmp_path: Path, call: int) -> None:
+    lab = Lab("list")
+    refuse(lab, PLACES_M[1])
+    _killed_at(call, places, tmp_path, is_late=True, lab=lab)
+    assert taken(lab) == [1, 3]
+
+
+def test_refused_position_of_a_grid_is_left_out_with_its_repeats(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab("grid")
+    refuse(lab, 2e-7)
+    positions = [(x, 0.0) for x in (1e-7, 2e-7, 3e-7)]
+    run(SpectroscopyGrid(positions=positions, repeats=2, end_when_done=True), lab)
+    assert lab.begun_scans == 4
+    assert lab.control.ended
+    assert "the position (200, 0) nm is left out: the position of the probe was refused: outside" in caplog.text
+    assert "2 of 6 spectra were refused" in caplog.text
+
+
+def test_grid_ends_if_its_only_position_is_refused() -> None:
+    lab = Lab("grid")
+    refuse(lab, 5e-7)
+    with pytest.raises(Refused, match="limits"):
+        SpectroscopyGrid(positions=[(5e-7, 0.0)]).run_process(context_of(lab))
 
 
 def test_number_of_retakes_below_zero_is_refused() -> None:
