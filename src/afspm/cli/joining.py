@@ -60,11 +60,11 @@ def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
 @contextmanager
 def acting(where: Path) -> Iterator[Scope]:
     """Connect to the run at `where`, as for `looking`, in the user's name; end the command if no run goes on there."""
-    from afspm.client.connect import connect
+    from afspm.client.connect import join
 
     folder = _running(where)
     with _only_if_running(folder):
-        scope = connect(folder, person())
+        scope = join(folder, person())
     with scope:
         yield scope
 

@@ -51,7 +51,14 @@ def connect(where: str | Path = "runs", name: str = "notebook", *, messages: Seq
     if not is_process_name(name):
         hint = "letters, digits, - and _, with spaces and dots between them"
         raise ConfigError(f"{name!r} can't be the name of a program", where="connect", hint=hint)
-    folder = find_run(Path(where))
+    return join(find_run(Path(where)), name, messages)
+
+
+def join(folder: Path, name: str, messages: Sequence[str] = ()) -> Scope:
+    """Join the run in a folder. Arguments and errors as of `connect`.
+
+    The name may also name a person, such as "terminal:ada", who takes no keyed measurements.
+    """
     launch = guest_of(folder, name)
     log = _log_of(name)
     register_all(messages)

@@ -50,12 +50,15 @@ def test_recorded_run_with_kills_repeats_its_record(run: Run, tmp_path: Path, mo
     with pytest.raises(ConfigError, match="series"):
         afspm.what_if(folder, {"series": {"size": ["2 um", "2 V"]}})
     untried = tmp_path / "untried.toml"
-    for text in ("[microscope]\nseed = 12\n", "[serie]\nscans = 2\n"):  # nothing of it is in a replay
+    for text in ("[microscope]\nseed = 12\n", "[elsewhere]\nscans = 2\n"):  # nothing of it is in a replay
         untried.write_text(text, encoding="utf-8")
         with pytest.raises(ConfigError, match="nothing that this file changes can be tried"):
             afspm.what_if(folder, untried)
-    untried.write_text("[series]\nscans = 2\n[serie]\nscans = 2\n", encoding="utf-8")
-    assert afspm.what_if(folder, untried).untried == {"serie": "is no process of the experiment"}
+    untried.write_text("[series]\nscans = 2\n[elsewhere]\nscans = 2\n", encoding="utf-8")
+    assert afspm.what_if(folder, untried).untried == {"elsewhere": "is no process of the experiment"}
+    untried.write_text("[serie]\nscans = 2\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"did you mean \[series\]"):
+        afspm.what_if(folder, untried)
     outcomes = rerun(folder, changed, runs=tmp_path / "again", terminal=sys.stderr)
     assert outcomes.rows["whole scans"] == ("3", "2")
     assert afspm.open_run(outcomes.folder).simulated

@@ -32,7 +32,7 @@ def test_message_on_a_run_that_was_cut_off_names_resume_and_on_a_running_one_the
     (tmp_path / "night-1" / "run.json").write_text(
         f'{{"name": "night", "guest": {{"keys": {keys}}}}}', encoding="utf-8"
     )
-    monkeypatch.setattr("afspm.client.connect.connect", nobody)
+    monkeypatch.setattr("afspm.client.connect.join", nobody)
     monkeypatch.setattr("afspm.cli.follower.Follower.__init__", lambda *_: None)
     monkeypatch.setattr("afspm.cli.follower.Follower.close", lambda *_: None)
     monkeypatch.setattr("afspm.cli.follower.Follower.catch_up", nobody)
@@ -57,7 +57,7 @@ def test_run_of_another_computer_is_not_called_cut_off(
     folder = tmp_path / "night-1"
     (folder / "state").mkdir(parents=True)
     (folder / "run.json").write_text('{"name": "night", "computer": "lab-7", "guest": {}}', encoding="utf-8")
-    monkeypatch.setattr("afspm.client.connect.connect", nobody)
+    monkeypatch.setattr("afspm.client.connect.join", nobody)
     with lock_run(folder):
         pass
     assert cut_off_message(folder) == ""
