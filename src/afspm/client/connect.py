@@ -57,7 +57,7 @@ def connect(where: str | Path = "runs", name: str = "notebook", *, messages: Seq
 def join(folder: Path, name: str, messages: Sequence[str] = ()) -> Scope:
     """Join the run in a folder. Arguments and errors as of `connect`.
 
-    The name may also name a person, such as "terminal:ada", who takes no keyed measurements.
+    The name may also be "terminal:ada", for a person, who takes no keyed measurements.
     """
     launch = guest_of(folder, name)
     log = _log_of(name)
