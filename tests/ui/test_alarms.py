@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -74,12 +75,11 @@ def small(tmp_path: Path) -> Iterator[Path]:
 
 
 def fill(file: Path) -> None:
-    try:
-        with file.open("wb", buffering=0) as stream:
-            while stream.write(bytes(1 << 16)):
-                pass
-    except OSError:
-        return
+    with file.open("wb", buffering=0) as stream:
+        for size in (1 << 16, 1 << 12):  # the last page, too: a small record would still find room in it
+            with suppress(OSError):
+                while stream.write(bytes(size)):
+                    pass
 
 
 def test_full_disk_is_a_banner_until_there_is_room_and_stands_in_the_report(
@@ -91,10 +91,10 @@ def test_full_disk_is_a_banner_until_there_is_room_and_stands_in_the_report(
         page.wait_for_selector(".alarms", state="hidden")
         fill(filler)
         banner = ".alarms .flag:has-text('nothing can be recorded')"
-        page.wait_for_selector(banner, timeout=40_000)
+        page.wait_for_selector(banner, timeout=80_000)
         keep(page, "full-disk")
         filler.unlink()
-        page.wait_for_selector(banner, state="detached", timeout=40_000)
+        page.wait_for_selector(banner, state="detached", timeout=80_000)
     finally:
         night.close()
     report = (night.folder / REPORT_FILE).read_text(encoding="utf-8")
