@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+from small_disk import fill, small_disk
 from tests.ui.ui_lab import Night, Opened
 
 from afspm.record.report import REPORT_FILE
@@ -62,24 +59,9 @@ def test_message_is_a_banner_until_it_is_over_and_a_viewer_may_hide_it(
 
 @pytest.fixture
 def small(tmp_path: Path) -> Iterator[Path]:
-    """A small file system of its own for the run folders."""
-    if not sys.platform.startswith("linux") or os.geteuid() != 0:
-        pytest.skip("only root may mount a file system")
-    runs = tmp_path / "runs"
-    runs.mkdir()
-    mounted = subprocess.run(("mount", "-t", "tmpfs", "-o", "size=64m", "none", str(runs)), check=False)
-    if mounted.returncode:
-        pytest.skip("no file system can be mounted here")
-    yield tmp_path
-    subprocess.run(("umount", "-l", str(runs)), check=True)
-
-
-def fill(file: Path) -> None:
-    with file.open("wb", buffering=0) as stream:
-        for size in (1 << 16, 1 << 12):  # the last page, too: a small record would still find room in it
-            with suppress(OSError):
-                while stream.write(bytes(size)):
-                    pass
+    """A folder whose run folders have a small disk of their own."""
+    with small_disk(tmp_path / "runs"):
+        yield tmp_path
 
 
 def test_full_disk_is_a_banner_until_there_is_room_and_stands_in_the_report(

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -15,6 +13,7 @@ from typing import Any
 import psutil
 import pytest
 from afspm_process import DEADLINE_S
+from small_disk import fill, small_disk
 from tests.system.agent.agent_lab import GRANT, PLAN, SCAN, AgentClient
 from tests.system.agent.conftest import Started
 
@@ -48,25 +47,9 @@ def is_scanning(state: Any) -> bool:
 
 @pytest.fixture
 def full_disk(tmp_path: Path) -> Iterator[Path]:
-    """A small file system of its own for all runs."""
-    if not sys.platform.startswith("linux") or os.geteuid() != 0:
-        pytest.skip("only root may mount a file system")
-    runs = tmp_path / "runs"
-    runs.mkdir()
-    mounted = subprocess.run(("mount", "-t", "tmpfs", "-o", "size=64m", "none", str(runs)), check=False)
-    if mounted.returncode:
-        pytest.skip("no file system can be mounted here")
-    yield runs
-    subprocess.run(("umount", "-l", str(runs)), check=True)
-
-
-def fill(folder: Path) -> None:
-    try:
-        with (folder / "filler").open("wb", buffering=0) as file:
-            while file.write(bytes(1 << 16)):
-                pass
-    except OSError:
-        return
+    """A small disk for all runs."""
+    with small_disk(tmp_path / "runs") as runs:
+        yield runs
 
 
 def test_stop_does_not_wait_for_a_preflight(started: Started) -> None:
@@ -132,7 +115,7 @@ def test_stop_takes_effect_with_a_full_disk(started: Started, full_disk: Path) -
     async def stop(agent: AgentClient) -> None:
         await agent.call("measure", step=LONG)
         await until(agent, is_scanning)
-        fill(full_disk)
+        fill(full_disk / "filler")
         await stopped(agent)
         await until(agent, is_flagged)
         await until(agent, lambda state: not is_scanning(state))

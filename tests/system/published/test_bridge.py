@@ -37,6 +37,18 @@ def client(rig: BridgedRig, plain: Any, name: str, address: str = "") -> Any:
     return ask
 
 
+def bare_translator(rig: BridgedRig, plain: Any) -> tuple[Any, Any]:
+    """Start the rig with sockets in place of its translator; return those for requests and for packets."""
+    assert rig.translator is not None
+    rig.translator.close()
+    rig.translator = None
+    server, publisher = plain(zmq.REP), plain(zmq.PUB)
+    server.bind(rig.source[1])
+    publisher.bind(rig.source[0])
+    rig.start()
+    return server, publisher
+
+
 def test_channels_of_a_scan_arrive_a_poll_apart_and_a_move_lasts_one(rig: BridgedRig, plain: Any) -> None:
     rig.start()
     ours = rig.component("Ours")
@@ -130,13 +142,7 @@ def test_their_scheduler_finds_our_microscope_where_a_translator_of_theirs_would
 
 
 def test_a_request_that_their_translator_may_have_carried_out_is_not_sent_again(rig: BridgedRig, plain: Any) -> None:
-    assert rig.translator is not None
-    rig.translator.close()
-    rig.translator = None
-    server, publisher = plain(zmq.REP), plain(zmq.PUB)
-    server.bind(rig.source[1])
-    publisher.bind(rig.source[0])
-    rig.start()
+    server, _ = bare_translator(rig, plain)
     ours = rig.component("Ours")
     answers = {12: b"\0"}  # it answers whether it has an action, and is silent where it is to do it
     asked: list[int] = []
@@ -166,13 +172,7 @@ def test_a_request_that_their_translator_may_have_carried_out_is_not_sent_again(
 
 
 def test_a_large_scan_of_their_translator_arrives(rig: BridgedRig, plain: Any) -> None:
-    assert rig.translator is not None
-    rig.translator.close()
-    rig.translator = None
-    server, publisher = plain(zmq.REP), plain(zmq.PUB)
-    server.bind(rig.source[1])
-    publisher.bind(rig.source[0])
-    rig.start()
+    _, publisher = bare_translator(rig, plain)
     ours = rig.component("Ours")
     large = Scan(SCAN.region, "Height", "m", np.ones((512, 512)), 1)  # 2 MiB in one frame
     ready = wire.encode(ScopeStatus(ScopeState.FREE))

@@ -154,13 +154,17 @@ def test_replay_imports_no_module_that_the_recorded_run_names(
     assert replay(recorded, options, lambda _: None) == 1
 
 
-def test_replay_uses_the_addresses_of_the_experiment_file(recorded: Path, tmp_path: Path) -> None:
+def experiment_at(recorded: Path, publish: str, serve: str) -> Path:
     file = recorded / "experiment.toml"
     file.write_text(
-        '[scheduler]\ncomponent = true\nclass = "Scheduler"\npubsubcache = "tcp://127.0.0.1:19471"\n'
-        'router = "tcp://127.0.0.1:19472"\n',
+        f'[scheduler]\ncomponent = true\nclass = "Scheduler"\npubsubcache = "{publish}"\nrouter = "{serve}"\n',
         encoding="utf-8",
     )
+    return file
+
+
+def test_replay_uses_the_addresses_of_the_experiment_file(recorded: Path, tmp_path: Path) -> None:
+    file = experiment_at(recorded, "tcp://127.0.0.1:19471", "tcp://127.0.0.1:19472")
     with afspm.open_run(recorded) as run:
         assert _addresses(run, ReplayOptions()) == ("tcp://127.0.0.1:19471", "tcp://127.0.0.1:19472")
         assert _addresses(run, ReplayOptions(publish="tcp://127.0.0.1:1", serve="tcp://127.0.0.1:2")) == (
@@ -171,12 +175,7 @@ def test_replay_uses_the_addresses_of_the_experiment_file(recorded: Path, tmp_pa
 
 
 def test_replay_of_a_run_on_several_computers_takes_addresses_of_this_computer(recorded: Path) -> None:
-    file = recorded / "experiment.toml"
-    file.write_text(
-        '[scheduler]\ncomponent = true\nclass = "Scheduler"\npubsubcache = "tcp://192.168.1.20:19471"\n'
-        'router = "tcp://microscope:19472"\n',
-        encoding="utf-8",
-    )
+    file = experiment_at(recorded, "tcp://192.168.1.20:19471", "tcp://microscope:19472")
     with afspm.open_run(recorded) as run:
         assert all(map(is_local, _addresses(run, ReplayOptions())))
     file.unlink()
