@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+WANDERS = ("steady", "smooth", "swinging")
+"""Spectra of lines that wander: of a first-order process, of one smoothed once more, and with a period."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,10 @@ class Condition:
         overlap: least and most.
         calibration: standard deviation of the stretch of each axis of the second scan.
         creep_px: displacement at the start of lines; decays to 1/e within `creep_length_px`.
+        wander_px: standard deviation, in each direction, of a displacement of the lines: vibration, hysteresis, creep.
+        wander_rows: rows within which it decays to 1/e.
+        wander: its spectrum, one of `WANDERS`.
+        slow_creep_px: displacement of the first row; decays to 1/e within `slow_creep_rows`.
         aspect: height of a pixel over its width.
         blunt: radius of the tip, over the usual one.
         double_px: distance of a second apex that the tip has in both scans.
@@ -66,6 +72,11 @@ class Condition:
     calibration: float = 0.0
     creep_px: float = 0.0
     creep_length_px: float = 8.0
+    wander_px: float = 0.0
+    wander_rows: float = 10.0
+    wander: str = "steady"
+    slow_creep_px: tuple[float, float] = (0.0, 0.0)
+    slow_creep_rows: float = 12.0
     aspect: float = 1.0
     blunt: float = 1.0
     double_px: float = 0.0
@@ -93,7 +104,25 @@ CONDITIONS: dict[str, Condition] = {
     "hard": Condition(**_HARD),  # type: ignore[arg-type]
     "dtip": Condition(**_REAL, second_tip_px=2.5),  # type: ignore[arg-type]
     "null": Condition(**_REAL, elsewhere=True),  # type: ignore[arg-type]
+    "real-wander": Condition(**_REAL, wander_px=0.1),  # type: ignore[arg-type]
+    "hard-wander": Condition(**_HARD, wander_px=0.1),  # type: ignore[arg-type]
 }
+
+
+def wandered(rows: int, condition: Condition, random: np.random.Generator) -> Array:
+    """Return the displacement of each row, px, shape (2, rows): zero mean, and creep at the first rows."""
+    keep = np.exp(-1.0 / condition.wander_rows)
+    made = _remembered(random.standard_normal((4 * rows, 2)), keep)
+    if condition.wander == "smooth":
+        made = _remembered(made, keep)
+    elif condition.wander == "swinging":
+        phase = 2.0 * np.pi * np.arange(4 * rows) / (4.0 * condition.wander_rows)
+        other = _remembered(random.standard_normal((4 * rows, 2)), keep)
+        made = made * np.cos(phase)[:, None] + other * np.sin(phase)[:, None]
+    made = made / np.sqrt(np.mean(made**2, axis=0))
+    taken = made[3 * rows :] * condition.wander_px
+    crept = np.exp(-np.arange(rows) / condition.slow_creep_rows)[:, None] * np.array(condition.slow_creep_px)
+    return np.asarray((taken - taken.mean(axis=0) + crept).T)
 
 
 def measured(image: Array, condition: Condition, random: np.random.Generator, gain: float = 1.0) -> Array:

@@ -1,6 +1,6 @@
 """Pairs cut out of images of real microscopes, through a known warp and with the noise of another real image.
 
-The images are in `FOLDER`; the two halves share no sample. A pair is resampled from one image of 256 px by two frames,
+The images are in `DATA`; the two halves share no sample. A pair is resampled from one image of 256 px by two frames,
 so its surface, its tip and its artefacts are real, and its displacement is known.
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
@@ -17,11 +16,11 @@ from scipy import ndimage
 from afspm.model import Region
 from afspm.plugins.drift.registration import DriftScan, Prior
 from afspm.storage.formats import read
+from benchmarks.data_folder import DATA
 from benchmarks.drift.conditions import Array, flattened, measured
 from benchmarks.drift.families import Half, drawn_condition, source
 from benchmarks.drift.pairs import HEIGHT_M, PIXEL_M, ROW_S, Frame, Sampling, Truth, framed, prior_of, truth_of
 
-FOLDER = Path(__file__).parents[3] / "shared" / "data"
 SURFACE = "images"
 PIXELS = 96
 IMAGES: dict[Half, tuple[tuple[str, str], ...]] = {
@@ -57,7 +56,7 @@ class Cut:
 
 def there_are_images() -> bool:
     """Return whether the data of real microscopes are there."""
-    return FOLDER.is_dir()
+    return DATA.is_dir()
 
 
 def cut(condition: str, seed: int, half: Half, prior_sd_px: float | None = None) -> Cut:
@@ -111,7 +110,7 @@ def _image(name: str, channel: str) -> Array:
 
 @cache
 def _channel(name: str, channel: str) -> Array:
-    (found,) = (one.values for one in read(FOLDER / name).scans if one.channel == channel)
+    (found,) = (one.values for one in read(DATA / name).scans if one.channel == channel)
     return np.asarray(found, dtype=np.float64)
 
 

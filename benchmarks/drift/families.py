@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from benchmarks.drift.conditions import CONDITIONS, Array, Condition
+from benchmarks.drift.conditions import CONDITIONS, WANDERS, Array, Condition
 from benchmarks.drift.surfaces import SURFACES, Grid, Random, contaminated
 
 Half = Literal["fitted", "unseen"]
@@ -62,6 +62,8 @@ def drawn_condition(name: str, random: Random) -> Condition:
     if not usual.drift_px:
         return replace(usual, white=usual.white * log(0.5, 2.0), overlap=(0.6, 1.0), aspect=log(0.8, 1.25))
     hard = usual.rotation_deg > 0.0
+    if usual.wander_px:
+        usual = _wandering(usual, random)
     return replace(
         usual,
         white=usual.white * log(0.5, 2.0),
@@ -86,6 +88,20 @@ def drawn_condition(name: str, random: Random) -> Condition:
         blunt=log(0.4, 4.0),
         double_px=likely(0.15) * u(1.5, 5.0),
         turned_round=bool(likely(0.1)),
+    )
+
+
+def _wandering(usual: Condition, random: Random) -> Condition:
+    u, log, likely = random.uniform, partial(_log_uniform, random), partial(_likely, random)
+    turn = u(0.0, 2.0 * math.pi)
+    slow_px = likely(0.4) * log(0.1, 1.0)
+    return replace(
+        usual,
+        wander_px=likely(0.7) * log(0.02, 0.3),
+        wander_rows=log(4.0, 40.0),
+        wander=str(random.choice(WANDERS)),
+        slow_creep_px=(slow_px * math.cos(turn), slow_px * math.sin(turn)),
+        slow_creep_rows=log(4.0, 20.0),
     )
 
 

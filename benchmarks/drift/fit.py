@@ -1,9 +1,9 @@
 """`python -m benchmarks.drift.fit`: fit the probabilities and the ellipses of the default estimator.
 
-Uses the fitted half of the families alone. Writes plugins/drift/estimators/coefficients.py, or with `--figure` a
-reliability diagram of the present coefficients, on both halves. The outcomes of all pairs are kept in build/ as they
-come: an interrupted run continues, and a run with more rounds adds to them. After a change of the estimator delete this
-file.
+Uses the fitted half of the families alone. Writes plugins/drift/estimators/coefficients.py (with `--doubt` the doubt in
+it alone), or with `--figure` a reliability diagram of the present coefficients, on both halves. The outcomes of all
+pairs are kept in build/ as they come: an interrupted run continues, and a run with more rounds adds to them. After a
+change of the estimator delete this file.
 """
 
 from __future__ import annotations
@@ -29,12 +29,15 @@ from afspm.plugins.drift.estimators.acceptance import MatchEvidence
 from afspm.plugins.drift.estimators.coefficients import SPREAD
 from benchmarks.drift.conditions import Array
 from benchmarks.drift.families import HALVES, Half
+from benchmarks.drift.surfaces import SURFACES
 from benchmarks.drift.trials import ELLIPSE_95, Outcome, Trial
 from benchmarks.drift.unseen import trials
 from benchmarks.drift.workers import done
 
 HARD = ("hard", "hard+prior")
 CELLS = ("real", *HARD, "null", "null+prior", "zoom+prior", "null-zoom+prior")
+WANDERING = ("real-wander", "hard-wander", "hard-wander+prior", "zoom-wander+prior")
+"""Cells of the doubt alone: pairs whose lines wander are no more often wrong, and the acceptance needs none of them."""
 AT_ONCE = 200  # jobs, before their outcomes are kept
 SEED = 20_000
 MORE_SEEDS = (30_000, 40_000)  # of stampers alone: how well they are known is the hardest to tell
@@ -43,6 +46,7 @@ KEPT = Path("build")
 COEFFICIENTS = Path(acceptance.__file__).with_name("coefficients.py")
 DOUBTS = ("varied", "shared", "unclear", "leverage")
 COVERED = 0.96  # of right matches, by the ellipses of 95 %: on others it will be less
+COVERED_BY_DOUBT = 0.94  # of pairs whose lines wander: of clean pairs it is 98 %, and their ellipses stay as small
 DOMAIN = 0.99  # of accepted right matches are within the largest spread
 TURNS = 3  # who is accepted depends on the spread, and that is fitted to those who are
 
@@ -50,12 +54,17 @@ TURNS = 3  # who is accepted depends on the spread, and that is fitted to those 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.drift.fit", description=__doc__)
     parser.add_argument("--rounds", type=int, default=100, help="of one pair for each surface and condition")
+    parser.add_argument("--doubt", action="store_true", help="fit the doubt alone, and leave the acceptance as it is")
     parser.add_argument("--figure", type=Path, help="draw how far the probabilities are right")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     asked = parser.parse_args(arguments)
     halves: tuple[Half, ...] = HALVES[:1] if asked.figure is None else HALVES
-    outcomes = {half: gathered(half, asked.rounds, asked.processes) for half in halves}
-    if asked.figure is None:
+    # the diagram is of the acceptance alone
+    cells = WANDERING if asked.doubt else CELLS if asked.figure else (*CELLS, *WANDERING)
+    outcomes = {half: gathered(half, asked.rounds, asked.processes, cells) for half in halves}
+    if asked.doubt:
+        COEFFICIENTS.write_text(with_doubt(outcomes["fitted"]), encoding="utf-8")
+    elif asked.figure is None:
         COEFFICIENTS.write_text(fitted(outcomes["fitted"]), encoding="utf-8")
     else:
         drawn(outcomes, asked.figure)
@@ -63,13 +72,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def gathered(half: Half, rounds: int, processes: int) -> list[Outcome]:
+def gathered(half: Half, rounds: int, processes: int, cells: Sequence[str]) -> list[Outcome]:
     """Return the outcomes of `rounds` rounds: the kept ones, and the missing ones, which are computed and kept."""
     file = KEPT / f"drift-{half}.pickles"
     file.parent.mkdir(exist_ok=True)
     kept = list(_kept(file))
     known = {(one.cell, one.surface, one.seed) for one in kept}
-    wanted = [job for number in range(rounds) for job in _round(half, number)]
+    wanted = [job for number in range(rounds) for job in _round(half, number, cells)]
     for first in range(0, len(wanted), AT_ONCE):
         some = wanted[first : first + AT_ONCE]
         missing = [job for job in some if (job.cell, job.surface, job.seed) not in known]
@@ -81,11 +90,13 @@ def gathered(half: Half, rounds: int, processes: int) -> list[Outcome]:
     return [one for one in kept if (one.cell, one.surface, one.seed) in chosen]
 
 
-def _round(half: Half, number: int) -> list[Trial]:
+def _round(half: Half, number: int, cells: Sequence[str]) -> list[Trial]:
     # a pair of each surface in each cell, and more of stampers in cells where they are hard
-    more = trials(half, {cell: [seed + number for seed in MORE_SEEDS] for cell in HARD}, (DEFAULT,))
+    hard = [cell for cell in cells if cell in HARD]
+    more = trials(half, {cell: [seed + number for seed in MORE_SEEDS] for cell in hard}, (DEFAULT,))
+    plain = trials(half, {cell: [SEED + number] for cell in cells}, (DEFAULT,))
     return [
-        *trials(half, {cell: [SEED + number] for cell in CELLS}, (DEFAULT,)),
+        *(job for job in plain if job.surface in SURFACES or job.cell not in WANDERING),  # an image has its own wander
         *(job for job in more if job.surface == "stamper"),
     ]
 
@@ -119,11 +130,15 @@ def fitted(outcomes: Sequence[Outcome]) -> str:
 
     The regression uses features of unit variance.
     """
+    doubt = _doubt(outcomes)
+    outcomes = [one for one in outcomes if one.cell not in WANDERING]
     found = [(one, each) for one in outcomes if (each := evidence(one)) is not None]
     wrong = np.array([one.failed for one, _ in found], dtype=np.float64)
     accepted = np.array([one.accepted for one, _ in found])
     for _ in range(TURNS):
-        spread = _spread([one for (one, _), sure in zip(found, accepted, strict=True) if sure and not one.failed])
+        spread = _spread(
+            [one for (one, _), sure in zip(found, accepted, strict=True) if sure and not one.failed], COVERED
+        )
         features = [_with_spread(each, one, spread).features() for one, each in found]
         x = np.array([list(one.values()) for one in features])
         right = np.median(x[wrong == 0.0], axis=0)
@@ -148,9 +163,28 @@ def fitted(outcomes: Sequence[Outcome]) -> str:
         '"""The median of right matches."""',
         "",
         *_table("SPREAD", list(spread), list(spread.values())),
-        '"""By which covariances are larger than their model says, see `Doubt`."""',
+        '"""Ratio of true covariances to those of the model, in the evidence for a match, see `Doubt`."""',
         "",
+        *_doubt_table(doubt),
     ])  # fmt: skip
+
+
+def with_doubt(outcomes: Sequence[Outcome]) -> str:
+    """Return the module of coefficients with a new doubt."""
+    rest, found, _ = COEFFICIENTS.read_text(encoding="utf-8").partition("DOUBT = {")
+    assert found
+    return rest + "\n".join(_doubt_table(_doubt(outcomes)))
+
+
+def _doubt_table(doubt: Mapping[str, float]) -> list[str]:
+    table = _table("DOUBT", list(doubt), list(doubt.values()))
+    return [*table, '"""Ratio of true covariances to those of the model, see `Doubt`."""', ""]
+
+
+def _doubt(outcomes: Sequence[Outcome]) -> dict[str, float]:
+    right = [one for one in outcomes if one.cell in WANDERING and one.accepted and not one.failed]
+    found = _spread(right, COVERED_BY_DOUBT)
+    return {name: value for name, value in found.items() if name != "most"}
 
 
 def _table(title: str, names: Sequence[str], values: Sequence[float] | Array) -> list[str]:
@@ -159,7 +193,7 @@ def _table(title: str, names: Sequence[str], values: Sequence[float] | Array) ->
 
 def _with_spread(found: MatchEvidence, outcome: Outcome, spread: Mapping[str, float]) -> MatchEvidence:
     # the evidence was computed with another spread
-    changed = math.exp(_log_spread(outcome, spread)) / outcome.quality["spread"]
+    changed = math.exp(_log_spread(outcome, spread)) / outcome.quality["spread_of_evidence"]
     return replace(found, sd_px=found.sd_px * math.sqrt(changed))
 
 
@@ -168,13 +202,13 @@ def _log_spread(outcome: Outcome, spread: Mapping[str, float]) -> float:
     return min(found, math.log(spread["most"]))
 
 
-def _spread(right: Sequence[Outcome]) -> dict[str, float]:
-    # Factor on the model of accepted right matches, so that ellipses of 95 % contain `COVERED` of them at any doubt:
+def _spread(right: Sequence[Outcome], covered: float) -> dict[str, float]:
+    # Factor on the model of accepted right matches, so that ellipses of 95 % contain `covered` of them at any doubt:
     # linear quantile regression (Koenker and Bassett, Econometrica 46, 33, 1978).
     log_chi2 = np.log([max(one.chi2 * one.quality["spread"], 1e-6) / ELLIPSE_95 for one in right])
     columns = np.array([[1.0, *(one.quality[name] for name in DOUBTS)] for one in right])
     count, free = columns.shape
-    cost = np.concatenate([np.zeros(2 * free), np.full(count, COVERED), np.full(count, 1.0 - COVERED)])
+    cost = np.concatenate([np.zeros(2 * free), np.full(count, covered), np.full(count, 1.0 - covered)])
     parts: list[Any] = [columns, -columns, sparse.eye(count), -sparse.eye(count)]
     equal: Any = sparse.hstack(parts)
     # a sign of doubt never makes an ellipse smaller, as chance would have it in few pairs

@@ -52,6 +52,8 @@ class Circumstances:
         drift_px: standard deviation of the drift during each scan.
         turn_rad, stretch: of the sample between the scans, standard deviations; unknown to the estimator.
         creep_px, creep_length_px: of the lines' starts.
+        wander_px, wander_rows: of lines, in each direction: standard deviation, and the longest period of its spectrum.
+        slow_creep_px, slow_creep_rows: of the slow axis after the start of a frame.
         tip: fall of the tip's flanks for each pixel.
         overlap: least and greatest share of the area.
         frame_turn_rad: rotation of the second frame; known.
@@ -84,10 +86,17 @@ class Circumstances:
     zoom_px: float = 0.0
     prior_px: float | None = None
     elsewhere: bool = False
+    wander_px: float = 0.0
+    wander_rows: float = 40.0
+    slow_creep_px: float = 0.0
+    slow_creep_rows: float = 10.0
 
 
 ZOOMS = (13, 16, 20, 24)
-CELLS = ("real", "hard", "hard+prior", *(f"zoom{px}" for px in ZOOMS), "turned", "null", "null+prior")
+WANDER_PX = (0.0, 0.05, 0.2)
+WANDERING = ("wander", "hard-wander", *(f"wander{px}" for px in WANDER_PX), "turned-wander")
+"""Cells of pairs whose lines wander: drawn, as in "hard", of a given size, and with turned frames."""
+CELLS = ("real", "hard", "hard+prior", *(f"zoom{px}" for px in ZOOMS), "turned", "null", "null+prior", *WANDERING)
 
 
 def circumstances(cell: str, random: Random) -> Circumstances:
@@ -100,7 +109,7 @@ def circumstances(cell: str, random: Random) -> Circumstances:
         return log(low, high) * (random.random() < share)
 
     name, _, prior = cell.partition("+")
-    hard = name == "hard"
+    hard = name.startswith("hard")
     worse = 2.0 if hard else 1.0
     shares = random.dirichlet(np.ones(len(RELAXATIONS_PX)))
     relaxing = worse * log(0.05, 0.2) * np.sqrt(shares)
@@ -128,10 +137,19 @@ def circumstances(cell: str, random: Random) -> Circumstances:
         overlap=(0.4, 0.7) if hard else (0.7, 1.0),
         prior_px=1.5 if prior else None,
     )
+    if name in WANDERING:
+        given_px = {f"wander{px}": px for px in WANDER_PX}.get(name)
+        made = replace(
+            made,
+            wander_px=sometimes(0.7, 0.02, 0.3) if given_px is None else given_px,
+            wander_rows=log(8.0, 80.0),
+            slow_creep_px=sometimes(0.3, 0.1, 1.0) if given_px is None else 0.0,
+            slow_creep_rows=random.uniform(5.0, 15.0),
+        )
     if name.startswith("zoom"):
         zoom_px = float(name.removeprefix("zoom"))
         return replace(made, zoom_px=zoom_px, prior_px=1.5, drift_px=made.drift_px * zoom_px / PIXELS)
-    if name == "turned":
+    if name.startswith("turned"):
         return replace(made, frame_turn_rad=math.radians(30.0 * random.choice((-1.0, 1.0))))
     return replace(made, elsewhere=name == "null")
 
@@ -364,6 +382,11 @@ def foreign_pair(cell: str, surface: str, seed: int) -> ForeignPair:
     if how.zoom_px:
         second = _onto_something(samples[0], second, first.width_px, random)
         clear[1] = second.sample(second.positions(how.creep_px, how.creep_length_px))
+    if how.wander_px or how.slow_creep_px:
+        clear = [
+            frame.sample(frame.positions(how.creep_px, how.creep_length_px) + wander(frame, how, random))
+            for frame in (first, second)
+        ]
     heights = [samples[0].at(clear[0]), samples[-1].at(clear[1])]
     level, unit = heights[0].mean(), heights[0].std()
     gain = float(np.exp(how.gain * random.uniform(-1.0, 1.0)))
@@ -393,6 +416,22 @@ def foreign_pair(cell: str, surface: str, seed: int) -> ForeignPair:
     if not how.elsewhere:
         bound = _bound(samples[0], first, second, shown, center, unit, gain, how)
     return ForeignPair(scans[0], scans[1], prior, displacement, linear, center, bound, how.elsewhere)
+
+
+def wander(frame: Frame, how: Circumstances, random: Random) -> Array:
+    """Return the displacement (2, y, 1) of each line: waves of random periods, and slow creep at the first lines."""
+    rows = np.arange(frame.pixels)
+    moved = np.zeros((2, frame.pixels))
+    for axis in range(2):
+        for _ in range(24):
+            period = how.wander_rows * random.uniform(0.1, 1.0)
+            size, start = period * math.sqrt(random.exponential()), random.random()
+            moved[axis] += size * np.sin(2 * np.pi * (rows / period + start))
+    moved -= moved.mean(axis=1, keepdims=True)
+    moved *= how.wander_px * frame.step_px / np.sqrt(np.mean(moved**2, axis=1, keepdims=True))
+    crept = how.slow_creep_px * frame.step_px * random.choice((-1.0, 1.0)) * np.exp(-rows / how.slow_creep_rows)
+    own = moved + np.outer((0.0, 1.0), crept)
+    return np.asarray((frame.axes @ own)[:, :, None])
 
 
 def _frames(how: Circumstances, random: Random) -> tuple[Frame, Frame]:

@@ -10,14 +10,16 @@ import numpy as np
 from rich.table import Table
 
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
-from benchmarks.drift.foreign_pairs import CELLS, PIXEL_M, SURFACES, ZOOMS, foreign_pair
+from benchmarks.drift.foreign_pairs import CELLS, PIXEL_M, SURFACES, WANDERING, ZOOMS, foreign_pair
 from benchmarks.drift.parts import Plan, Report
 from benchmarks.drift.trials import Cell, Outcome, geometric_mean
 from benchmarks.rows import Row
 
-PAIRS = {"real": 80, "hard": 40, "hard+prior": 40, "turned": 30, "null": 40, "null+prior": 40} | {
-    f"zoom{px}": 30 for px in ZOOMS
-}
+PAIRS = (
+    {"real": 80, "hard": 40, "hard+prior": 40, "turned": 30, "null": 40, "null+prior": 40}
+    | {f"zoom{px}": 30 for px in ZOOMS}
+    | dict.fromkeys(WANDERING, 24)
+)
 RIGHT_ZOOMS = {13: 65, 16: 88, 20: 90, 24: 92}  # %, accepted
 
 

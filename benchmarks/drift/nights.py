@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from afspm.model import Region
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 from afspm.plugins.drift.shear import row_delay_s
 from afspm.plugins.drift.tracking import Tracker, Update
-from benchmarks.drift.conditions import CONDITIONS, Array, Condition, measured
+from benchmarks.drift.conditions import CONDITIONS, Array, Condition, measured, wandered
 from benchmarks.drift.families import Half, drawn_condition, drawn_surface, source
 from benchmarks.drift.pairs import HEIGHT_M, PIXEL_M, ROW_S, View
 from benchmarks.drift.surfaces import SURFACES, Grid, imaged
@@ -69,12 +69,17 @@ class Drift:
 
 @dataclass
 class Night:
-    """A sample of one kind, and its drift; of a half of the families if one is named."""
+    """A sample of one kind, and its drift; of a half of the families if one is named.
+
+    Attributes:
+        wander_px: standard deviation, in each direction, of the wander of the lines.
+    """
 
     surface: str
     seed: int
     scans: int
     half: Half | None = None
+    wander_px: float = 0.0
     drift: Drift = field(init=False)
     _view: View = field(init=False)
     _how: Condition = field(init=False)
@@ -101,6 +106,9 @@ class Night:
         sample_m = np.asarray(center_m - self.drift.at(np.asarray(start_s + order * ROW_S, dtype=np.float64)))
         along = np.arange(PIXELS) / self._how.creep_length_px
         q[0] += self._how.creep_px * np.exp(-along)
+        if self.wander_px:
+            lines = np.random.default_rng([self.seed, 5, number])
+            q = q + wandered(PIXELS, replace(self._how, wander_px=self.wander_px), lines)[:, order][:, :, None]
         heights = self._view.at(q + (sample_m / PIXEL_M).T[:, :, None])
         noise = np.random.default_rng([self.seed, 4, number])
         values = HEIGHT_M * measured(heights, self._how, noise)

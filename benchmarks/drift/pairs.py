@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from afspm.model import Region
 from afspm.plugins.drift.registration import DriftScan, Prior
-from benchmarks.drift.conditions import CONDITIONS, Array, Condition, measured
+from benchmarks.drift.conditions import CONDITIONS, Array, Condition, measured, wandered
 from benchmarks.drift.families import HALVES, Half, Relief, drawn_condition, drawn_surface, source
 from benchmarks.drift.surfaces import SURFACES, Grid, imaged
 
@@ -55,6 +55,13 @@ class Frame:
         middle: Array = self.origin_px.reshape(2, *[1] * (q_px.ndim - 1))
         moved: Array = middle + np.einsum("ij,j...->i...", self.matrix, q_px + self._crept_px(q_px))
         return moved
+
+    def imaged_px(self, how: Condition, random: np.random.Generator) -> Array:
+        """Return the places in the sample of all pixels, shape (2, ny, nx), with the wander of the lines."""
+        q = self.offsets_px()
+        if how.wander_px or any(how.slow_creep_px):
+            q += wandered(self.shape[0], how, random)[:, :, None]
+        return self.sample_px(q)
 
     def seen_px(self, sample_px: Array) -> Array:
         """Return the offset (2,) at which a place (2,) of the sample appears."""
@@ -189,7 +196,7 @@ def pair(
     centers_m = [random.uniform(-20.0, 20.0, 2) * PIXEL_M for _ in frames]
     scans = [
         DriftScan(
-            values=HEIGHT_M * measured(scale * view.at(f.sample_px(f.offsets_px())), how, random, k_gain),
+            values=HEIGHT_M * measured(scale * view.at(f.imaged_px(how, random)), how, random, k_gain),
             region=Region(tuple(center_m), tuple(f.width_px * PIXEL_M)),
             start_s=k * 900.0,
             end_s=k * 900.0 + ROW_S * f.shape[0],

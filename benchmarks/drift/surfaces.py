@@ -75,7 +75,7 @@ def stamper(
         edges = np.cumsum(runs)
         edges -= edges[len(edges) // 2] + (0.0 if number == 0 else place.uniform(0.0, 8 * bit))
         here = track == number
-        run = np.searchsorted(edges, along[here])
+        run = np.clip(np.searchsorted(edges, along[here]), 1, len(edges) - 1)
         to_end = np.minimum(along[here] - edges[run - 1], edges[run] - along[here]) * np.where(run % 2, 1.0, -1.0)
         past = np.maximum(half_width - to_end, 0.0)
         inside = half_width - np.hypot(past, across[here] - number * pitch)

@@ -33,6 +33,8 @@ LONG_REFERENCES = 2
 STARTS = {"rough": 6, "stamper": 4}
 # Of the unseen half of the families: nights of each surface, and scans of a night.
 UNSEEN, UNSEEN_SCANS = 4, 24
+# Nights whose lines wander, by as much as in a slow series of a real AFM, correlated over ten lines.
+WANDERING, WANDER_PX = {"rough": 2, "particles": 2, "steps": 2}, 0.2
 
 OURS, ORACLE, PAPER, FEATURES = "bank", "oracle, bank", "paper's scheme", "paper's scheme, brief"
 FIRST_ORDER, ONE_WAY, LONG = "oracle, paper's scheme", "bank, upwards only", "bank, long"
@@ -48,6 +50,8 @@ class Followed:
         unmatched, lost: number of such scans.
         half: of the families; None: a standard sample and microscope.
         lost_at_end: the sample was never found again.
+        wander_px: standard deviation of the wander of the lines.
+        chi2: of the known drift about its mean error, which is the first scan's own: mean per degree of freedom.
     """
 
     scheme: str
@@ -58,6 +62,8 @@ class Followed:
     lost: int
     half: Half | None = None
     lost_at_end: bool = False
+    wander_px: float = 0.0
+    chi2: float = math.nan
 
     @property
     def misplaced_m(self) -> NDArray[np.float64]:
@@ -78,18 +84,21 @@ class Track:
     scans: int
     estimator: str
     half: Half | None = None
+    wander_px: float = 0.0
 
     def run(self) -> list[Followed]:
-        night = Night(self.surface, self.seed, self.scans, self.half)
-        misplaced, mistaken, unmatched, lost, last = [], [], 0, 0, False
+        night = Night(self.surface, self.seed, self.scans, self.half, self.wander_px)
+        misplaced, mistaken, covariances, unmatched, lost, last = [], [], [], 0, 0, False
         for drift_m, update in night.followed(self._tracker(night), up_and_down=self.scheme == OURS):
             misplaced += list(-update.before.mapping.translation_m - drift_m)
             mistaken += list(-update.after.mapping.translation_m - drift_m)
+            covariances.append(update.after.covariance_m2)
             unmatched += not update.matched
             lost += update.lost
             last = update.lost
         found = tuple(misplaced), tuple(mistaken)
-        return [Followed(self.scheme, self.surface, *found, unmatched, lost, self.half, last)]
+        chi2 = _chi2(np.reshape(mistaken, (-1, 2))[1:], covariances[1:]) if self.wander_px else math.nan
+        return [Followed(self.scheme, self.surface, *found, unmatched, lost, self.half, last, self.wander_px, chi2)]
 
     def _tracker(self, night: Night) -> Tracker:
         kind = "paper" if self.scheme in (PAPER, FEATURES, FIRST_ORDER) else "bank"
@@ -111,6 +120,9 @@ def jobs(plan: Plan) -> list[Track]:
     for surface in SURFACES:
         for seed in range(plan.seed, plan.seed + (1 if plan.quick else UNSEEN)):
             found += [Track(scheme, surface, seed, UNSEEN_SCANS, name, "unseen") for scheme, name in schemes[:2]]
+    for surface, count in WANDERING.items():
+        for seed in range(plan.seed, plan.seed + (1 if plan.quick else count)):
+            found.append(Track(OURS, surface, seed, UNSEEN_SCANS, plan.ours, wander_px=WANDER_PX))
     for surface, count in STARTS.items():
         for seed in plan.seeds(count):
             found += [Track(scheme, surface, seed + 500, 2, plan.ours) for scheme in (OURS, ONE_WAY)]
@@ -119,7 +131,8 @@ def jobs(plan: Plan) -> list[Track]:
 
 def report(plan: Plan, results: Sequence[Followed]) -> Report:
     unseen = [one for one in results if one.half is not None]
-    results = [one for one in results if one.half is None]
+    wandering = [one for one in results if one.wander_px]
+    results = [one for one in results if one.half is None and not one.wander_px]
     nights = [one for one in results if one.scheme != LONG and len(one.misplaced) > 4]
     starts = [one for one in results if one.scheme != LONG and len(one.misplaced) == 4]
     long = next(one for one in results if one.scheme == LONG)
@@ -134,7 +147,8 @@ def report(plan: Plan, results: Sequence[Followed]) -> Report:
     for scheme in (OURS, ONE_WAY):
         first = [one for one in starts if one.scheme == scheme]
         table.add_row(f"{scheme}: first jump", "rough, stamper", str(len(first)), f"{_jump_m(first) * 1e9:.1f}")
-    return Report([table, _unseen_table(unseen)], [*_rows(nights, starts, long), *_unseen_rows(unseen)])
+    rows = [*_rows(nights, starts, long), *_unseen_rows(unseen), *_wandering_rows(wandering)]
+    return Report([table, _unseen_table(unseen)], rows)
 
 
 def _unseen_table(nights: Sequence[Followed]) -> Table:
@@ -161,6 +175,17 @@ def _unseen_rows(nights: Sequence[Followed]) -> Iterator[Row]:
     yield Row("unseen nights: the same, worst surface", "1", max(ratios), None, 1.4)
     lost = sum(one.lost_at_end for one in nights if one.scheme == OURS)
     yield Row("unseen nights: lost for good", "nights", lost, None, 0)
+
+
+def _wandering_rows(nights: Sequence[Followed]) -> Iterator[Row]:
+    name = f"nights whose lines wander by {WANDER_PX} px"
+    yield Row(f"{name}: chi² of the known drift, worst", "1", max(one.chi2 for one in nights), None, 2.0)
+    yield Row(f"{name}: late misplacement", "nm", 1e9 * _late_m(nights), None, 4.0)
+
+
+def _chi2(mistaken_m: NDArray[np.float64], covariances_m2: Sequence[NDArray[np.float64]]) -> float:
+    apart = mistaken_m - mistaken_m.mean(axis=0)
+    return float(np.mean([off @ np.linalg.solve(c, off) for off, c in zip(apart, covariances_m2, strict=True)])) / 2
 
 
 def _figures(here: Sequence[Followed]) -> list[str]:

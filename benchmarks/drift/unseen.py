@@ -20,7 +20,8 @@ PAIRS = {
     "white30": 24, "real": 96, "real+prior": 48, "hard": 48, "hard+prior": 48, "null": 48, "null+prior": 48,
     "zoom+prior": 48, "null-zoom+prior": 48,
 }  # fmt: skip
-ZOOMS = {"zoom": "real", "null-zoom": "null"}  # by the conditions under which they are taken
+# by the conditions under which they are taken
+ZOOMS = {"zoom": "real", "null-zoom": "null", "zoom-wander": "real-wander"}
 ZOOM_PX = (10.0, 30.0)  # of the overview
 PRIOR_SD_PX = 1.5
 GAP = 1.25  # of the unseen half over the fitted one, beyond which something was learnt by heart

@@ -53,6 +53,7 @@ def test_the_fit_gives_calibrated_probabilities() -> None:
         probability = 1.0 / (1.0 + math.exp(10.0 * (found.agreement - 0.5)))
         outcomes.append(_outcome(seed, found, wrong=bool(random.random() < probability)))
         told.append(probability)
+    outcomes += [_outcome(seed, GOOD, wrong=False, cell=fit.WANDERING[0]) for seed in range(100)]
     module: dict[str, Any] = {}
     exec(fit.fitted(outcomes), module)
     assert module["WEIGHTS"]["agreement"] == pytest.approx(-10.0, rel=0.1)
@@ -65,9 +66,8 @@ def test_ellipses_match_the_errors_and_grow_with_a_significant_doubt() -> None:
     for seed in range(8000):
         shared, varied = random.uniform(0.0, 1.0, 2)
         chi2 = 2.0 * math.exp(1.5 * shared) * random.exponential(2.0)
-        doubts = {"varied": varied, "shared": shared, "unclear": 0.0, "leverage": 0.0, "spread": 1.0}
-        outcomes.append(_outcome(seed, GOOD, wrong=False, chi2=chi2, **doubts))
-    spread = fit._spread(outcomes)
+        outcomes.append(_outcome(seed, GOOD, wrong=False, chi2=chi2, varied=varied, shared=shared))
+    spread = fit._spread(outcomes, fit.COVERED)
     assert spread["shared"] == pytest.approx(1.5, abs=0.2)
     assert abs(spread["varied"]) < 0.2
     assert spread["all"] == pytest.approx(2.0 * math.log(1.0 - fit.COVERED) / math.log(0.05), rel=0.15)
@@ -79,9 +79,8 @@ def test_no_doubt_makes_an_ellipse_smaller() -> None:
     for seed in range(400):
         shared, varied = random.uniform(0.0, 1.0, 2)
         chi2 = 2.0 * math.exp(-1.5 * shared) * random.exponential(2.0)
-        doubts = {"varied": varied, "shared": shared, "unclear": 0.0, "leverage": 0.0, "spread": 1.0}
-        outcomes.append(_outcome(seed, GOOD, wrong=False, chi2=chi2, **doubts))
-    spread = fit._spread(outcomes)
+        outcomes.append(_outcome(seed, GOOD, wrong=False, chi2=chi2, varied=varied, shared=shared))
+    spread = fit._spread(outcomes, fit.COVERED)
     assert all(spread[name] >= 0.0 for name in fit.DOUBTS)
 
 
@@ -89,8 +88,8 @@ def test_an_interrupted_fit_continues(tmp_path: Path, monkeypatch: pytest.Monkey
     ran: list[int] = []
     monkeypatch.setattr(fit, "KEPT", tmp_path)
     monkeypatch.setattr(fit, "trials", lambda half, seeds, names: [_Job(seed, ran) for seed in seeds.get("real", [])])
-    assert len(fit.gathered("fitted", 2, 1)) == 2
-    assert len(fit.gathered("fitted", 3, 1)) == 3
+    assert len(fit.gathered("fitted", 2, 1, fit.CELLS)) == 2
+    assert len(fit.gathered("fitted", 3, 1, fit.CELLS)) == 3
     assert ran == [fit.SEED, fit.SEED + 1, fit.SEED + 2]
 
 
@@ -106,10 +105,13 @@ class _Job:
         return [_outcome(self.seed, GOOD, wrong=False)]
 
 
-def _outcome(seed: int, found: MatchEvidence, *, wrong: bool, chi2: float = 3.0, **doubts: float) -> Outcome:
-    quality = {**asdict(found), "varied": 0.0, "shared": 0.0, "unclear": 0.0, "leverage": 0.0, "spread": 1.0, **doubts}
+def _outcome(
+    seed: int, found: MatchEvidence, *, wrong: bool, chi2: float = 3.0, cell: str = "real", **doubts: float
+) -> Outcome:
+    usual = {**dict.fromkeys(fit.DOUBTS, 0.0), "spread": 1.0, "spread_of_evidence": 1.0}
+    quality = {**asdict(found), **usual, **doubts}
     error = (5.0, 0.0) if wrong else (0.01, 0.0)
     return Outcome(
-        cell="real", surface="rough", estimator="", seed=seed, accepted=True, reason="", error_px=error, chi2=chi2,
+        cell=cell, surface="rough", estimator="", seed=seed, accepted=True, reason="", error_px=error, chi2=chi2,
         bound_px=0.01, white_bound_px=0.01, cpu_s=0.1, half="fitted", quality=quality,
     )  # fmt: skip

@@ -3,45 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from benchmarks.drift import cuts, families, pairs
 from benchmarks.drift.bounds import bounds, row_precision, unknown_rough
-from benchmarks.drift.conditions import CONDITIONS, Array, flattened, measured
+from benchmarks.drift.conditions import CONDITIONS, flattened, measured
 from benchmarks.drift.pairs import HEIGHT_M, PIXEL_M, Sampling, pair
 from benchmarks.drift.published import PublishedBrief
 from benchmarks.drift.surfaces import OVERSAMPLING, SURFACES, Grid, rough_power
 from benchmarks.drift.trials import PUBLISHED, Cell, Trial
 from scipy import ndimage
-
-from afspm.plugins.drift.registration import DriftScan
-
-QUIET: dict[str, Any] = {
-    "white": 0.0,
-    "row_offset": 0.0,
-    "one_over_f": 0.0,
-    "scars": 0.0,
-    "tilt": 0.0,
-    "flatten": None,
-    "row_tilt": 0.0,
-    "spikes": 0.0,
-    "lost": 0.0,
-    "bow": 0.0,
-    "creep_px": 0.0,
-    "gain": 1.0,
-    "bend": 0.0,
-}
-
-
-def found_at(scan: DriftScan, xy_m: Array) -> Array:
-    """Return heights at positions (2, …) in tip coordinates, interpolated from the scan's pixels."""
-    ny, nx = scan.values.shape
-    x_m, y_m = scan.region.pixels_m((ny, nx))
-    column = (xy_m[0] - x_m[0, 0]) / scan.pixel_m[0]
-    row = (xy_m[1] - y_m[0, 0]) / scan.pixel_m[1]
-    return np.asarray(ndimage.map_coordinates(scan.values, [row, column], order=5, mode="constant", cval=np.nan))
+from tests.plugins.drift.quiet_pairs import QUIET, found_at, require_match_at_truth
 
 
 @pytest.mark.parametrize("surface", SURFACES)
@@ -212,19 +185,15 @@ def test_creep_displaces_the_start_of_a_line_and_not_its_end() -> None:
     assert frame.seen_px(np.array([-50.0, 3.0])) == pytest.approx([-50.0 - np.exp(-13.4 / 6.0), 3.0], abs=0.01)
 
 
-@pytest.mark.skipif(not cuts.there_are_images(), reason="the data of real microscopes are not here")
-def test_a_pair_cut_from_a_real_image_matches_itself_at_its_truth(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn = families.drawn_condition
-    quiet = {**QUIET, "scars": 0.0}
-    monkeypatch.setattr(cuts, "drawn_condition", lambda name, random: replace(drawn(name, random), **quiet))
-    monkeypatch.setattr(cuts, "_noise", lambda half, random: np.zeros((cuts.PIXELS, cuts.PIXELS)))
-    made = cuts.cut("real", 2, "unseen")
-    assert made.truth is not None
-    x_m, y_m = made.reference.region.pixels_m(made.reference.values.shape)
-    there_m = np.stack([x_m, y_m]) + np.apply_along_axis(made.truth.at, 0, np.stack([x_m, y_m]))
-    moved = found_at(made.scan, there_m)
-    seen = np.isfinite(moved)
-    assert np.corrcoef(moved[seen], made.reference.values[seen])[0, 1] > 0.999
+def generated(name: str, channel: str) -> np.ndarray:
+    """Stand in for an image of a real microscope."""
+    random = np.random.default_rng(len(name) + len(channel))
+    return np.asarray(ndimage.gaussian_filter(random.standard_normal((256, 256)), 3.0))
+
+
+def test_pair_cut_from_an_image_matches_itself_at_its_truth(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cuts, "_image", generated)
+    require_match_at_truth(monkeypatch)
 
 
 def test_trial_shows_the_error_of_a_compared_method(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from benchmarks.drift.foreign_pairs import PIXEL_M, foreign_pair
 from numpy.typing import NDArray
 
 from afspm.plugins.drift.estimators.alignment import Doubt
-from afspm.plugins.drift.estimators.coefficients import SPREAD
+from afspm.plugins.drift.estimators.coefficients import DOUBT, SPREAD
 from afspm.plugins.drift.estimators.images import Image, without_scars
+from afspm.plugins.drift.estimators.least_squares import LeastSquares
 from afspm.plugins.drift.estimators.noise import CrossingLines
 from afspm.plugins.drift.estimators.spikes import without_scars_of_one, without_spikes
 from afspm.plugins.drift.estimators.warp import COUNT, OverlapBox, Scene, Spline, WarpedPair
@@ -110,10 +112,27 @@ def test_crossing_lines_are_removed_with_the_rows() -> None:
     assert lines.seen(features[:, None], everything).std() > 0.4 * features.std()
 
 
-def test_doubt_is_limited_to_the_range_of_the_fit() -> None:
+def test_doubt_of_a_match_is_limited_to_the_range_of_the_fit() -> None:
     certain, small = Doubt(1.0, 1.0, 0.01, 0.1), Doubt(1e4, 1e3, 3.0, 1.0)
-    assert certain.spread == pytest.approx(SPREAD["all"])
-    assert small.spread == pytest.approx(SPREAD["most"])
+    assert certain.spread_of_evidence == pytest.approx(SPREAD["all"])
+    assert small.spread_of_evidence == pytest.approx(SPREAD["most"])
+    assert certain.spread == pytest.approx(DOUBT["all"])
+
+
+@pytest.mark.parametrize("surface", ["rough", "particles", "steps"])
+def test_ellipses_hold_the_errors_of_wandering_lines(surface: str) -> None:
+    """The standard deviation given grows with the wander, and without wander it stays small."""
+    sd_px = {}
+    for cell in ("wander0.0", "wander0.2"):
+        pairs = [foreign_pair(cell, surface, seed) for seed in range(50, 54)]
+        found = [LeastSquares().register(one.reference, one.scan) for one in pairs]
+        assert all(one.accepted for one in found)
+        off_m = [one.displacement_m - pair.displacement_m(one.center_m) for one, pair in zip(found, pairs, strict=True)]
+        chi2 = [off @ np.linalg.solve(one.covariance_m2, off) for one, off in zip(found, off_m, strict=True)]
+        assert np.mean(chi2) / 2 < 3.0, "about one, of four pairs"
+        sd_px[cell] = np.median([np.sqrt(np.trace(one.covariance_m2)) / PIXEL_M for one in found])
+    assert sd_px["wander0.0"] < 0.04
+    assert sd_px["wander0.2"] > 2.0 * sd_px["wander0.0"]
 
 
 def test_lines_of_a_zoom_creep_for_their_own_pixels() -> None:

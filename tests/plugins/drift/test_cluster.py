@@ -13,7 +13,8 @@ from tests.plugins.drift.test_workers import by_index, doubled, doubled_by_the_n
 from afspm.basics.errors import ConfigError
 from afspm.plugins.drift.study.workers import TaskOutcome, on_cluster
 
-pytestmark = pytest.mark.timeout(60)
+pytestmark = pytest.mark.slow  # each worker imports Dask; `test_workers.py` has those without
+
 NEEDED: dict[str, Any] = {"modname": "distributed", "reason": "needs Dask, the extra `study`"}
 
 

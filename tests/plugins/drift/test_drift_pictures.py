@@ -98,7 +98,6 @@ def night(folder: Path) -> Lab:
     return lab
 
 
-@pytest.mark.timeout(60)
 def test_the_table_and_all_figures_are_there_when_the_experiment_has_ended(tmp_path: Path) -> None:
     lab = night(tmp_path)
     lab.at(1500.0, lab.kill)
@@ -112,7 +111,6 @@ def test_the_table_and_all_figures_are_there_when_the_experiment_has_ended(tmp_p
     }  # fmt: skip
 
 
-@pytest.mark.timeout(60)
 def test_a_restart_loses_nothing(tmp_path: Path) -> None:
     lab = night(tmp_path)
     lab.at(450.0, lab.parent_goes)
@@ -127,7 +125,6 @@ def test_a_restart_loses_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "drift_errors.png").exists(), "the truth is for simulated microscopes"
 
 
-@pytest.mark.timeout(60)
 def test_comparisons_before_a_restart_are_repeated_before_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -145,7 +142,6 @@ def test_comparisons_before_a_restart_are_repeated_before_the_end(
     assert left == [0]
 
 
-@pytest.mark.timeout(60)
 def test_figures_without_comparisons_are_drawn_when_time_is_short(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -167,7 +163,6 @@ def test_figures_without_comparisons_are_drawn_when_time_is_short(
     assert "3 of 3 comparisons" in line.message
 
 
-@pytest.mark.timeout(60)
 def test_scans_of_a_night_are_never_all_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = night(tmp_path)
     drawn = []
@@ -180,7 +175,6 @@ def test_scans_of_a_night_are_never_all_in_memory(tmp_path: Path, monkeypatch: p
     assert [scan.key for scan in album.scans[2:4]] == [scan.key for scan in album.scans][2:4]
 
 
-@pytest.mark.timeout(60)
 def test_unreadable_scans_are_left_out_and_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     lab = night(tmp_path)
     for gone in (2, 7):
@@ -192,7 +186,6 @@ def test_unreadable_scans_are_left_out_and_logged(tmp_path: Path, caplog: pytest
     assert len([text for text in caplog.messages if "left out" in text]) == 1
 
 
-@pytest.mark.timeout(60)
 def test_a_table_that_can_not_be_written_for_a_while_ends_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

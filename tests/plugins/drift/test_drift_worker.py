@@ -12,9 +12,11 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import deadlines
 import numpy as np
 import psutil
 import pytest
+from deadlines import DEADLINE_S
 from tests.plugins.drift.drift_parts import Brightest
 
 from afspm.basics.errors import ConfigError, FileError
@@ -36,7 +38,6 @@ from afspm.plugins.drift.scheduler.worker_process import DriftWorkerProcess
 from afspm.plugins.drift.scheduler.worker_state import WorkerStateFile
 from afspm.plugins.drift.trackers import tracker
 
-DEADLINE_S = 30.0
 HERE = Region((0.0, 0.0), (63e-9, 63e-9))
 
 
@@ -300,7 +301,8 @@ def test_worker_ends_with_a_killed_scheduler_even_while_it_registers(tmp_path: P
         threading.Event().wait()
     """
     command = [sys.executable, "-c", textwrap.dedent(program)]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    support = Path(deadlines.__file__).parent
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (Path(__file__).parent, support)))}
     with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True) as scheduler:
         assert scheduler.stdout is not None
         worker = psutil.Process(int(scheduler.stdout.readline()))

@@ -90,7 +90,6 @@ def run_folder(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.timeout(60)
 def test_a_run_folder_is_followed_printed_and_drawn(run_folder: Path, tmp_path: Path) -> None:
     output = tmp_path / "out"
     line = ["drift", str(run_folder), "-o", str(output), "-j", "2", "--estimator", "correlation", "--tracker", "paper"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,18 +16,25 @@ from afspm.plugins.drift.shear import row_delay_s
 from afspm.plugins.drift.tracking import Tracker, Update
 
 Array = NDArray[np.float64]
+Drift = Callable[[Any], Array]
+"""Returns the displacement (x, y) at a time, or at an array of times: shape of the times + (2,)."""
 
 SIZE_M = 2e-6
 INTERVAL_S = 900.0
 FRAME_S = 256.0
 
 
-def still(time_s: float) -> Array:
-    return np.zeros(2)
+def still(times_s: Any) -> Array:
+    return np.zeros((*np.shape(times_s), 2))
 
 
-def steady(velocity_m_s: tuple[float, float]) -> Callable[[float], Array]:
-    return lambda time_s: np.array(velocity_m_s) * time_s
+def steady(velocity_m_s: tuple[float, float]) -> Drift:
+    return lambda times_s: np.multiply.outer(times_s, np.array(velocity_m_s))
+
+
+def walked(times_s: Any, known_s: Array, walk_m: Array) -> Array:
+    """Return positions (x, y) of a walk with known positions [time, 2] at some times."""
+    return np.stack([np.interp(times_s, known_s, walk_m[:, axis]) for axis in range(2)], axis=-1)
 
 
 @dataclass
@@ -40,7 +48,7 @@ class World:
         asked: (key of the reference, key of the scan, prior) of every registration.
     """
 
-    drift_m: Callable[[float], Array] = still
+    drift_m: Drift = still
     noise_m: float = 0.2e-9
     seed: int = 0
     blind: set[str] = field(default_factory=set)

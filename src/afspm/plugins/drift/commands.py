@@ -67,7 +67,9 @@ def files(
     from afspm.experiment.class_loader import importing_from
     from afspm.plugins.drift import file_commands as drift_files
 
-    with importing_from([Path.cwd()]):
+    # only for a class of one's own: the current folder may be a download, with a module named like a library's
+    folders = [Path.cwd()] if "." in estimator + tracker else []
+    with importing_from(folders):
         drift_files.run(paths, channel, estimator, tracker, output, jobs)
 
 

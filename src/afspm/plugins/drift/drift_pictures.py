@@ -36,9 +36,10 @@ _COMPARED_WITHIN_S = (
 
 
 class DriftTable(Component):
-    """The writer of `drift_correction.csv`: for each scan the offset of tip and sample coordinates, and its rate.
+    """The writer of `drift_correction.csv`: for each scan the offset of the coordinates, and the sample's velocity.
 
-    The offset is x_sample - x_tip. The columns from `scan` to `failures` are those of `drift.record`, which reads the
+    The offset is x_sample - x_tip. `rate_x` is the velocity of the sample, so it is the negative of the offset's rate;
+    `rate_x_m_s` is the same in m/s. The columns from `scan` to `failures` are those of `drift.record`, which reads the
     table. `outcome` is the way in which the position of a scan was determined: registered, coarse, or by dead reckoning
     (refused, failed, new); the variances belong to this position. After a kill and restart, header and rows are still
     written only once.

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import difflib
-import importlib
 import inspect
 from collections.abc import Iterable
 
-from afspm.basics import entry_points
+from afspm.basics import entry_points, named_imports
 from afspm.basics.errors import AfspmError, ConfigError
 from afspm.basics.plain_data import PlainMapping
 from afspm.basics.requirements import require
@@ -45,13 +44,14 @@ def named(what: str, spec: str | PlainMapping, default: str, *arguments: object)
 def _imported(what: str, name: str) -> type[object]:
     module_name, _, class_name = name.rpartition(".")
     try:
-        module = importlib.import_module(module_name)
+        module = named_imports.import_named(module_name)
     except ImportError as error:
         hint = "is it installed, or on the path?"
         raise ConfigError(f"the {what} {name} can't be imported: {error}", hint=hint) from error
     found = getattr(module, class_name, None)
     if not isinstance(found, type):
         raise ConfigError(f"the module {module_name} has no class {class_name}", hint=_near(class_name, vars(module)))
+    named_imports.require_trusted(found, name)
     return found
 
 

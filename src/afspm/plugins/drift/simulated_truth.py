@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.basics.errors import AfspmError, FileError
-from afspm.basics.plain_data import Plain
+from afspm.basics.plain_data import Plain, from_json
 from afspm.plugins.drift.registration import DriftScan
 from afspm.simulation import World
 
@@ -52,7 +51,7 @@ def _read(path: Path) -> tuple[Plain, Array]:
     with path.open(encoding="utf-8") as file:
         for line in file:
             try:
-                entry: Plain = json.loads(line)
+                entry: Plain = from_json(line)
             except ValueError:
                 continue  # a line cut off by a kill
             if entry["event"] == "start" and start is None:

@@ -38,4 +38,13 @@ SPREAD = {
     "leverage": 1.1494,
     "most": 39.4562,
 }
+"""Ratio of true covariances to those of the model, in the evidence for a match, see `Doubt`."""
+
+DOUBT = {
+    "all": 2.0592,
+    "varied": 0.8585,
+    "shared": 0.0183,
+    "unclear": 0.0000,
+    "leverage": 0.9153,
+}
 """Ratio of true covariances to those of the model, see `Doubt`."""

@@ -12,11 +12,11 @@ from afspm.basics.errors import ConfigError
 from afspm.plugins.drift.estimators.acceptance import WRONG_AT_MOST, MatchEvidence, above_repeats, agreement
 from afspm.plugins.drift.estimators.alignment import (
     COARSE,
-    FLOOR_PX,
     SHIFT,
     Believed,
     Doubt,
     covariance,
+    enlarged,
     generalised_least_squares,
     least_squares,
 )
@@ -85,15 +85,16 @@ class LeastSquares:
         try:
             shear = _expected_shear(prior, reference, scan, grid)
             lines = _Lines.of(reference, scan, grid)
-            theta, total, seen, doubt = _fine(scene, box, start[0], lines, expected, shear)
+            theta, model, seen, doubt = _fine(scene, box, start[0], lines, expected, shear)
         except Unusable as reason:
             rows, columns = box.shape
             return Registration.refused(f"the overlap of {columns} x {rows} pixels is {reason}")
-        if not (np.isfinite(total).all() and np.hypot(*(theta - start[0])[:2]) < FARTHEST_PX):
+        if not (np.isfinite(model).all() and np.hypot(*(theta - start[0])[:2]) < FARTHEST_PX):
             return Registration.refused("no displacement fits: the scans have no features in common")
-        found = _evidence(scene, box, theta, total, start[1:], expected)
-        registration = self._registration(theta, total, box, grid, found)
-        quality = {**registration.quality, **doubt.features(), "spread": doubt.spread}
+        found = _evidence(scene, box, theta, enlarged(model, doubt.spread_of_evidence), start[1:], expected)
+        registration = self._registration(theta, enlarged(model, doubt.spread), box, grid, found)
+        spreads = {"spread": doubt.spread, "spread_of_evidence": doubt.spread_of_evidence}
+        quality = {**registration.quality, **doubt.features(), **spreads}
         return replace(registration, linear_seen=_in_m(seen, grid), quality=quality)
 
     def _registration(
@@ -149,9 +150,7 @@ def _fine(
     free = believed.precision.copy()
     free[2:SLOPES] = 0.0
     theta, total = averaged(information, pull + free @ believed.mean, free, shear)
-    total *= doubt.spread / DISTRUST
-    total[:2, :2] += FLOOR_PX**2 * np.eye(2)
-    return theta, total, seen, doubt
+    return theta, total / DISTRUST, seen, doubt
 
 
 def _in_m(seen: LinearSeen, grid: CommonGrid) -> LinearSeen:
