@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import sys
 from collections.abc import Callable
@@ -11,7 +12,8 @@ from threading import Event
 from typing import Any
 
 import pytest
-from tests.plugins.vendor_bench import DEADLINE_S, PATIENT, AtPanel, VendorBench
+from deadlines import DEADLINE_S
+from tests.plugins.vendor_bench import PATIENT, AtPanel, VendorBench
 
 from afspm.plugins.gxsm.emulator import GxsmEmulator
 
@@ -40,3 +42,32 @@ def until(made: Bench, what: Callable[[], bool]) -> None:
     while not what():
         assert made.clock.monotonic_s() < until_s
         pace.wait(0.005)
+
+
+HELD_S = 1e6
+"""Delay of a held scan's first line: the scan outlasts the test on however busy a computer."""
+
+
+def hold_scan(program: Any, *numbers: int) -> None:
+    """Hold scans, counted from now, before their first line until `scan_until_line`."""
+    start, begun = program.start_scan, itertools.count(1)
+
+    def start_scan() -> None:
+        before = program.scan.activity
+        start()
+        if program.scan.activity is not before and next(begun) in numbers:
+            program.scan.activity.paused_s = HELD_S
+
+    program.start_scan = start_scan
+
+
+def scan_until_line(program: Any, line: int) -> None:
+    """Complete these lines of a held scan."""
+    scan = program.scan.activity
+    scan.paused_s = program.clock.now_s() - scan.start_s - (line + 0.5) * scan.line_s
+
+
+def scan_to_line(program: Any, line: int) -> None:
+    """Complete these lines of a held scan, and no more, however long it takes to stop it."""
+    scan_until_line(program, line)
+    program.scan.activity.pause(program.clock.now_s())

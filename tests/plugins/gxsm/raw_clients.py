@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from deadlines import DEADLINE_S
 
 
 class SocketClient:
@@ -25,7 +26,7 @@ class SocketClient:
 
     def __init__(self, address: str) -> None:
         host, _, port = address.rpartition(":")
-        self._socket = socket.create_connection((host, int(port)), 10.0)
+        self._socket = socket.create_connection((host, int(port)), DEADLINE_S)
         self._lines = self._socket.makefile("rb")
         secret = Path("~/.afspm/gxsm-bridge-secret").expanduser().read_bytes().strip()
         mine = secrets.token_hex(32)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.plugins.gxsm.gxsm_bench import Bench
+from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan
 from tests.plugins.vendor_bench import Peer, TranslatorProcess, scans, states
 
 from afspm.basics.clock import ExperimentClock
@@ -33,11 +33,18 @@ SHAPE = (24, 32)
 
 
 @pytest.fixture(params=[*EMULATED, "real"])
-def peer(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Peer]:
+def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench | None]:
+    """A bench with an emulated GXSM; None for the real one."""
+    with ExitStack() as stack:
+        yield Bench(tmp_path, stack, 5.0, EMULATED[request.param]) if request.param != "real" else None
+
+
+@pytest.fixture
+def peer(bench: Bench | None, tmp_path: Path) -> Iterator[Peer]:
     """A peer of a translator with a small frame; the previous settings are restored."""
     with ExitStack() as stack:
-        if request.param != "real":
-            found = Bench(tmp_path, stack, 5.0, EMULATED[request.param]).start()
+        if bench is not None:
+            found = bench.start()
         else:
             address = os.environ.get(REAL)
             if not address:
@@ -79,7 +86,9 @@ def test_scan_of_a_rotated_oblong_frame(peer: Peer) -> None:
     assert 0.0 < np.ptp(topography.values) < 1e-6
 
 
-def test_stopped_scan(peer: Peer) -> None:
+def test_stopped_scan(peer: Peer, bench: Bench | None) -> None:
+    if bench is not None:
+        bench.at_panel(lambda emulator: hold_scan(emulator.program, 1))
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     assert peer.set(names.SCAN_SIZE_X, 60e-9).code == ControlResponse.NOT_FREE

@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from tests.plugins.gxsm.gxsm_bench import Bench, until
-from tests.plugins.vendor_bench import SHAPE, SOON, Peer, ready, scans, states
+from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_until_line, until
+from tests.plugins.vendor_bench import FLAT, SHAPE, SOON, Peer, ready, scans, states
 
 from afspm.model import (
     ControlRequest,
@@ -224,6 +225,178 @@ def test_scan_without_channels_is_reported(bench: Make) -> None:
     assert made.emulator.program.dialogs == ["no channel is set"]
 
 
+def test_dialog_about_channels_takes_all_starts_until_it_is_closed(bench: Make) -> None:
+    made = bench(speed=20.0, channels_set=False)
+    peer = small(made)
+    assert peer.act(names.START_SCAN).ok
+    assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
+    made.at_panel(lambda emulator: emulator.program.set_channels())
+    assert peer.act(names.START_SCAN).ok
+    assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
+    made.at_panel(lambda emulator: emulator.program.close_dialogs())
+    assert scanned(peer)
+
+
+@pytest.mark.parametrize("settings", [BRIDGE, SHM], ids=["bridge", "shm"])
+def test_nothing_is_begun_after_a_restart_until_channels_are_set(bench: Make, settings: dict[str, Any]) -> None:
+    process = f"c{os.getpid()}"
+    made = bench(speed=20.0, **({"process": process, **settings} if settings else {}))
+    address = f"{made.address.partition('@')[0]}@{process}" if settings else made.address
+    peer = small(made, address=address)
+    assert scanned(peer)
+    made.strike("crash")
+    peer.until(UNDEFINED)
+    made.start_controller_again(channels_set=False)
+    made.until_logged("GXSM reports no channel, as after a restart; nothing is begun (set the channels at its panel")
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.NO_RESPONSE
+    assert "close its dialog" in response.reason
+    made.at_panel(lambda emulator: emulator.program.set_channels())
+    assert made.emulator.program.dialogs == []
+    made.at_panel(lambda emulator: emulator.program.start_scan())
+    peer.until(FREE)
+    assert peer.act_once_free(names.START_SCAN).ok
+    while not scans(peer.until(FREE)):
+        pass
+
+
+def test_nothing_is_begun_once_the_channels_are_switched_off(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    assert scanned(peer)
+    made.at_panel(lambda emulator: emulator.program.channels.clear())
+    assert "GXSM reports no channel" in peer.act(names.START_SCAN).reason
+    peer.until(UNDEFINED)
+    assert made.emulator.program.dialogs == []
+
+
+# --- scans that are not of the frame alone ---
+
+
+@pytest.mark.parametrize(("ref", "value"), [("OffsetX", "-300"), ("OffsetY", "250"), ("Rotation", "40")])
+@pytest.mark.parametrize("at_panel", [False, True], ids=["own", "panel"])
+def test_scan_whose_frame_was_moved_meanwhile_is_interrupted(bench: Make, ref: str, value: str, at_panel: bool) -> None:
+    made = bench(speed=5.0)
+    peer = small(made)
+    scanned(peer)
+    made.at_panel(lambda emulator: hold_scan(emulator.program, 1))
+    if at_panel:
+        made.at_panel(lambda emulator: emulator.program.start_scan())
+    else:
+        assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.at_panel(lambda emulator: emulator.program.entries.set(ref, value))
+    assert len(made.emulator.program.scan.elsewhere) == 1
+    made.until_logged("this scan will not be published")
+    made.at_panel(lambda emulator: scan_until_line(emulator.program, 1))
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"], made.log_text()
+    assert not scans(received)
+    made.until_logged("the scan has no result: the frame was moved or turned during the scan")
+    assert scanned(peer)
+
+
+def test_scan_before_a_repetition_is_interrupted_by_a_move_of_its_frame(bench: Make) -> None:
+    made = bench(speed=5.0)
+    peer = small(made)
+    scanned(peer)
+    program = made.emulator.program
+
+    def begin(emulator: Any) -> None:
+        emulator.program.panel.repeats = True
+        hold_scan(emulator.program, 1, 2)
+        emulator.program.start_scan()
+
+    def move(emulator: Any) -> None:
+        emulator.program.entries.set("OffsetX", "-300")
+        scan_until_line(emulator.program, 8)
+
+    made.at_panel(begin)
+    peer.until(ScopeState.SCANNING)
+    number = program.scan.number
+    made.at_panel(move)
+    until(made, lambda: program.scan.number > number)
+    received = peer.until(ScopeState.INTERRUPTED)
+    assert not scans(received)
+    made.until_logged("the scan has no result: the frame was moved or turned during the scan")
+
+
+def test_moved_scan_goes_on_in_the_new_frame(bench: Make) -> None:
+    made = bench(speed=5.0, **FLAT)
+    peer = small(made)
+    scanned(peer)
+    program = made.emulator.program
+    (channel, *_) = program.channels
+    still = program.image(channel)
+
+    def move(emulator: Any) -> None:
+        scan_until_line(emulator.program, 3)
+        emulator.program.entries.set("OffsetX", "5000")
+
+    made.at_panel(lambda emulator: hold_scan(emulator.program, 1))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.at_panel(move)
+    ((line, _),) = program.scan.elsewhere
+    assert line == 3
+    peer.until(FREE)
+    apart = np.abs(program.image(channel) - still).max(axis=1)
+    assert apart[:line].max() < 0.1 * apart[line:].max()
+
+
+PART: list[dict[str, Any]] = [{"version": 3}, {}, SHM]
+
+
+@pytest.mark.parametrize("part", [[0, 12, 0, 8], [20, 12, 0, 8], [8, 16, 0, 8]], ids=["left", "right", "middle"])
+@pytest.mark.parametrize("kind", PART, ids=["gxsm3", "gxsm4", "shm"])
+def test_scan_of_some_columns_is_not_published(bench: Make, kind: dict[str, Any], part: list[int]) -> None:
+    made = bench(speed=20.0, **kind)
+    peer = made.start()
+    ready(peer, Region((0.0, 0.0), (100e-9, 1e-6)), (8, 32))
+    scanned(peer)
+    subscan(made, part)
+
+    def begin(emulator: Any) -> None:
+        hold_scan(emulator.program, 1)
+        emulator.program.start_scan()
+
+    made.at_panel(begin)
+    peer.until(ScopeState.SCANNING)
+    made.at_panel(lambda emulator: scan_until_line(emulator.program, 1))
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"], made.log_text()
+    assert not scans(received)
+    response = peer.act(names.START_SCAN)
+    if kind.get("version") == 3:  # it has no parameters for it, and its rows show it at the end
+        assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
+        made.until_logged("its first or last columns still hold the previous scan: is SubScan on")
+    else:
+        assert response.code == ControlResponse.ACTION_ERROR
+        assert "SubScan is on at GXSM's panel" in response.reason
+        assert f"{part[1]} of 32 columns from {part[0]}, 8 of 8 rows from 0" in response.reason
+        made.until_logged("the scan has no result: SubScan is on")
+    subscan(made, [0, 0, 0, 0])
+    assert scanned(peer)
+
+
+def test_subscan_of_the_whole_frame_is_published(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    subscan(made, [0, 16, 0, 8])
+    assert scanned(peer)
+
+
+def subscan(made: Bench, part: list[int]) -> None:
+    """Set the part of the frame that is scanned: first column, columns, first row, rows."""
+
+    def set_it(emulator: Any) -> None:
+        emulator.program.panel.subscan[:] = part
+        for ref, value in zip(("xs", "xn", "ys", "yn"), part, strict=True):
+            emulator.program.entries.set(f"SPMC-sls-{ref}", str(value))  # Gxsm3 has no such entries
+
+    made.at_panel(set_it)
+
+
 def stopped_at_panel(made: Bench, peer: Peer) -> None:
     """Start a scan and stop it at the panel after a few lines; check that it is not published."""
     assert peer.act(names.START_SCAN).ok
@@ -399,12 +572,9 @@ def test_scan_without_files_is_interrupted(bench: Make) -> None:
 
 
 def test_channels_named_only_during_a_scan_are_found(bench: Make) -> None:
-    # Old files in the folder are not taken for the new ones.
     made = bench(speed=20.0)
-    peer = small(made)
-    assert scanned(peer)
     made.at_panel(lambda emulator: setattr(emulator.program, "names", _named_late(emulator.program)))
-    assert {name[:7] for name in scanned(peer)} == {"scan002"}
+    assert {name[:7] for name in scanned(small(made))} == {"scan001"}
 
 
 def _named_late(program: GxsmProgram) -> Callable[[float], list[Path]]:

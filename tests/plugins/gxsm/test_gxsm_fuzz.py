@@ -9,10 +9,11 @@ from typing import Any
 import pytest
 from benchmarks.fuzz import fuzz
 from benchmarks.fuzz.gxsm import GxsmFuzzer
+from rotation import ALL
 
 from afspm.plugins.gxsm.emulator import GxsmEmulator
 
-CALLS = 1000
+CALLS = 1000 if ALL else 300
 KINDS: list[dict[str, Any]] = [{"version": 3}, {"version": 4, "transport": "shm"}]
 
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deadlines import DEADLINE_S
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.plugins.vendor_bench import answering
@@ -172,7 +173,7 @@ def _answer(listener: socket.socket, known: bytes, replies: tuple[bytes, ...], s
         for reply in replies:
             lines.readline()
             client.sendall(reply)
-        client.settimeout(10.0)
+        client.settimeout(DEADLINE_S)
         while silent and client.recv(1000):
             pass
 

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.plugins.gxsm.gxsm_bench import Bench, until
+from deadlines import DEADLINE_S
+from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_to_line, until
 from tests.plugins.gxsm.raw_clients import MemoryClient, SocketClient, client
-from tests.plugins.vendor_bench import DEADLINE_S
 
 from afspm.plugins.gxsm.emulator.block import FAULT_KINDS, SharedMemoryBlock
 from afspm.plugins.gxsm.emulator.file_writer import GxsmFileWriter
@@ -177,8 +177,11 @@ def test_stopped_scan_is_saved_with_rows_of_the_previous_one(bench: Make) -> Non
     with calling(made) as gxsm:
         small(gxsm)
         assert gxsm.call("chfname", 0) == "EE: invalid channel"
+        made.at_panel(lambda emulator: hold_scan(emulator.program, 1, 3))
         gxsm.call("startscan")
-        until(made, lambda: gxsm.call("y_current") >= 3)
+        until(made, lambda: bool(bits(gxsm) & 2))
+        made.at_panel(lambda emulator: scan_to_line(emulator.program, 4))
+        assert gxsm.call("y_current") == 3
         gxsm.call("stopscan")
         assert not bits(gxsm) & 2, "free at once"
         assert gxsm.call("y_current") == 7, "where it did not come to"
@@ -198,7 +201,9 @@ def test_stopped_scan_is_saved_with_rows_of_the_previous_one(bench: Make) -> Non
         gxsm.call("set", "PointsX", "12")
         gxsm.call("set", "PointsY", "10")
         gxsm.call("startscan")
-        until(made, lambda: gxsm.call("y_current") == 3)
+        until(made, lambda: bool(bits(gxsm) & 2))
+        made.at_panel(lambda emulator: scan_to_line(emulator.program, 4))
+        assert gxsm.call("y_current") == 3
         gxsm.call("stopscan")
         now = gxsm.call("get_slice", 0, 0, 0, 0, 10)
         assert not np.array_equal(now[0], before[0, :12])

@@ -10,8 +10,8 @@ values are read back, and states are derived from polls of status bits, line num
                   position of the tip: all persistent
     outputs       calls; scans and spectra from files; lines of the running scan from memory
     invariants    one call at a time; no call that waits for the end of a scan, as such a call blocks GXSM forever; a
-                  scan whose first or last row still holds the previous scan is not published; a file is read only once
-                  two polls have found the same size
+                  scan is not published if its first or last row or its first or last columns still hold the previous
+                  scan, or if its frame was moved meanwhile; a file is read only once two polls have found the same size
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ from afspm.plugins.gxsm.result_files import LATE_S, SOON_S, GxsmFiles
 from afspm.plugins.gxsm.scan_memory import new_lines
 from afspm.plugins.gxsm.settings import (
     REFNAMES,
+    SUBSCAN,
     FeedbackSwitch,
     FrameSettings,
     ScanFrame,
@@ -143,21 +144,23 @@ class Gxsm(Driver):
         found = recognised(refnames, actions)
         hardware = Hardware(self._given_hardware) if self._given_hardware else found
         self._offered = Offered(refnames, actions, hardware)
-        self._find_parameters()
+        lacking = self._find_parameters()
         self.lacking = self._missing_actions()
         scan_frame = ScanFrame(ask, user_unit_m(ask))
         can_switch = self._offered.actions.issuperset(AUTOSAVE.values())
         saving = replace(self._saving, switches_autosave=self._saving.by_us and can_switch)
         self._kept.kept_in(self.memory)
+        gxsm = ConnectedGxsm(ask, hardware, scan_frame, refnames.issuperset(SUBSCAN))
         self._files = GxsmFiles(
             self.memory,
             self.log,
             patience_s=self.patience_s(self.common.result_timeout_s / 2),
             soon_s=self.patience_s(SOON_S),
             late_s=self.patience_s(LATE_S),
+            ends_early=gxsm.ends_early,
         )
         self._activity = GxsmActivity(
-            ConnectedGxsm(ask, hardware, scan_frame),
+            gxsm,
             self._files,
             self.memory,
             self.clock,
@@ -166,13 +169,15 @@ class Gxsm(Driver):
             shows_s=self.patience_s(SHOWS_S),
             saving=saving,
         )
+        self._activity.require_channels()
         self._activity.look()
         self._tip = TipPlace(scan_frame, self.memory, self._sets_out)
         own = FrameSettings(scan_frame, self._tip, is_led=self._offered.hardware is Hardware.RPSPMC)
         feedback = FeedbackSwitch(ask, self._activity.gxsm.doing, self._feedback_actions)
         self.groups = (own, self._tip, self._kept, feedback)
+        self.log.info("GXSM with the hardware %s; unsupported: %s", self._offered.kind, ", ".join(lacking) or "none")
 
-    def _find_parameters(self) -> None:
+    def _find_parameters(self) -> list[str]:
         table = self._whole_table
         vendors = {name: spec.vendor for name, spec in table.items() if name not in self.translated}
         there = available(vendors, self._offered.refnames)
@@ -180,7 +185,7 @@ class Gxsm(Driver):
         if self._feedback_actions and self._offered.actions.issuperset(self._feedback_actions):
             table = table.extended({FEEDBACK_ON: {"read_only": False}}, where="feedback_actions")
         self.table = table.without(lacking)
-        self.log.info("GXSM with the hardware %s; unsupported: %s", self._offered.kind, ", ".join(lacking) or "none")
+        return lacking
 
     def _missing_actions(self) -> dict[str, str]:
         # GXSM returns 0 also for unknown actions and does nothing, so the actions are checked against its list at the
@@ -249,13 +254,16 @@ class Gxsm(Driver):
     def followed(self) -> bool | None:
         return self._files.followed()
 
+    def stopped_by_hand(self) -> str:
+        return self._files.stopped_by_hand()
+
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         return self._files.load(result)
 
     def lines(self, start: int) -> Sequence[ScanLines]:
         """Return new lines from GXSM's memory, for channels that were in the files of an earlier scan."""
         endings = self._activity.endings()
-        if not endings:
+        if not endings or self._files.spoiled:
             return ()
         done = self._activity.lines_done()
         found = new_lines(self._ask, endings, self._files.channels, self._files.scanning, start, done)

@@ -9,14 +9,16 @@ from pathlib import Path
 from typing import ClassVar, Final
 
 from afspm.basics.clock import Clock
-from afspm.model import Region, ScopeState, ScopeStatus
+from afspm.basics.errors import Refused
+from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.plugins.gxsm.errors import GxsmError
 from afspm.plugins.gxsm.hardware import ABORT, AUTOSAVE, STATUS, Doing, Hardware, decoded, execute
 from afspm.plugins.gxsm.link import Asking
-from afspm.plugins.gxsm.result_files import GxsmFiles, endings
-from afspm.plugins.gxsm.scan_memory import Rows, is_unfinished, looked_at, only
-from afspm.plugins.gxsm.settings import ScanFrame
+from afspm.plugins.gxsm.result_files import OLD_COLUMNS, GxsmFiles, endings
+from afspm.plugins.gxsm.scan_memory import Rows, has_new_row, has_old_columns, is_unfinished, looked_at, only
+from afspm.plugins.gxsm.settings import ScanFrame, subscan
 from afspm.translator.activity import Activity, TipWay
+from afspm.translator.driver_base import ControllerLost
 from afspm.translator.result_files import SCAN, as_list
 from afspm.translator.state import Kept
 
@@ -26,6 +28,10 @@ SHOWS_S: Final = 1.0
 """Longest delay until a started measurement shows in the status bits; measured: up to 0.3 s."""
 _CHANNELS: Final = 40
 _NO_CHANNEL: Final = "EE:"
+_MOVED: Final = (
+    "the frame was moved or turned during the scan, at GXSM's panel (opening a file sets it, too) or by another program"
+)
+_ONLY_A_PART: Final = "SubScan is on at GXSM's panel and scans a part of the frame ({}): switch it off"
 
 
 @dataclass(frozen=True)
@@ -55,6 +61,11 @@ class LineWatch:
     line: int
     has_moved: bool = False
     step: int = 0
+    stride: int = 0
+
+    def is_near(self, last_row: int) -> bool:
+        """Return whether the next look would have come after the last row."""
+        return abs(last_row - self.line) <= self.stride + 1
 
     def turned(self, line: int, rows: int) -> bool:
         """Register a reported line; return True if this line reverses the direction."""
@@ -62,7 +73,8 @@ class LineWatch:
         if line == self.line or not 0 <= line < rows:
             return False
         step = 1 if line > self.line else -1
-        self.line, turned = line, self.step not in (0, step)
+        turned = self.step not in (0, step)
+        self.line, self.stride = line, 0 if turned else abs(line - self.line)
         if self.has_moved:
             self.step = 0 if turned else step
         self.has_moved = True
@@ -81,6 +93,7 @@ class ScanProgress:
         settles_until_s, ended_ns: end of GXSM's own work after the scan, and end of the scan.
         lines: direction of the lines, counted from the last line of the previous scan; None before the first count.
         follows: True if the scan started before a poll showed the end of the previous scan.
+        was_near_end: True if the last poll before the next scan showed this one at its end.
     """
 
     endings: list[str] = field(default_factory=list)
@@ -91,6 +104,7 @@ class ScanProgress:
     ended_ns: int = 0
     lines: LineWatch | None = None
     follows: bool = False
+    was_near_end: bool = False
 
 
 @dataclass(frozen=True)
@@ -101,11 +115,18 @@ class ConnectedGxsm:
         ask: link with type-checked answers.
         hardware: kind of hardware driver, which defines the meaning of the status bits.
         frame: frame of the next scan.
+        reports_subscan: True if GXSM has parameters for the part of the frame that *SubScan* scans.
     """
 
     ask: Asking
     hardware: Hardware
     frame: ScanFrame
+    reports_subscan: bool = False
+
+    @property
+    def ends_early(self) -> bool:
+        """True if the hardware may end a scan after its first line by itself."""
+        return self.hardware is Hardware.SIMULATOR
 
     def doing(self) -> Doing:
         """Return the state that GXSM reports.
@@ -174,19 +195,42 @@ class GxsmActivity(Activity):
 
     # --- start and stop ---
 
+    def require_channels(self) -> None:
+        """Raise ControllerLost if GXSM reports no channel, although it reported channels earlier in this run.
+
+        After a restart Gxsm4 has no channels. A scan would only open a dialog, which takes all later starts, too.
+        """
+        if self._files.channels and all(self._reported(channel) is None for channel in range(_CHANNELS)):
+            hint = (
+                "set the channels at its panel, close its dialog about them, and start a scan there:"
+                " GXSM reports a channel only from its first scan on"
+            )
+            raise ControllerLost("GXSM reports no channel, as after a restart; nothing is begun", hint=hint)
+
     def look(self) -> None:
         """Register the files that are there before a measurement: they are not its results."""
         folder = self._folder()
         self._files.look(folder, self._saving.probe_dir or folder)
 
     def start_scan(self) -> None:
+        """Start a scan.
+
+        Raises:
+            Refused: *SubScan* restricts the scan to a part of the frame.
+            ControllerLost: see `require_channels`.
+        """
+        self.require_channels()
+        part = self._part(self._set_frame()[1])
+        if part:
+            raise Refused(ControlResponse.ACTION_ERROR, _ONLY_A_PART.format(part))
         self._autosave.on = None  # unknown: a person may have switched Auto Save at the panel
         self._autosave.switch(on=False)
         self._begin_scan(self._clock.now_ns(), own=True)
         self._scan.lines = LineWatch(int(self.gxsm.ask.number("y_current")))
         rows, columns = self._set_frame()[1]
         # a scan that is stopped or does not start is recognised by rows that still hold the previous scan
-        self._files.looked(looked_at(self.gxsm.ask, len(self._channels()), (0, rows - 1), columns), None)
+        looked = {0, rows - 1, *self._second_rows(rows)}
+        self._files.looked(looked_at(self.gxsm.ask, len(self._channels()), looked, columns), None)
         self._shows_until_s = self._clock.now_s() + self._shows_s
         # returns 0 at once, even if no scan starts (no channel is set, or a scan is running)
         self.gxsm.ask.call("startscan")
@@ -289,16 +333,33 @@ class GxsmActivity(Activity):
         return ScopeStatus(ScopeState.MOVING) if moving else self.at_rest()
 
     def _measuring(self, doing: Doing) -> ScopeStatus:
+        is_moved = self._watch_place()
         if self._files.what == SCAN and doing.scanning and self._is_another():
             self._follow()
+            if is_moved:  # in either of the two
+                self._files.spoil(_MOVED)
         self._shows_until_s = self._scan.settles_until_s = 0.0
         if not self._files.what and not self._stopping:  # started at the panel
             self.begin(SCAN if doing.scanning else "VP")
+        if self._files.what:
+            self._files.ran()
         if self._files.what == SCAN and self._files.before is None:
             self._look_at_memory()
         self._looked_ns = self._clock.now_ns()
         curve = doing.probing and (self._files.what not in ("", SCAN) or not doing.scanning)
         return ScopeStatus(ScopeState.SPEC if curve else ScopeState.SCANNING, doing.paused or None)
+
+    def _watch_place(self) -> bool:
+        # GXSM moves the tip with the frame at once, and its files have the frame of the scan's start alone.
+        if self._files.what != SCAN or self.gxsm.frame.place() == self._files.place:
+            return False
+        if not self._files.spoiled:
+            self._log.warning("%s: this scan will not be published", _MOVED)
+        self._files.spoil(_MOVED)
+        return True
+
+    def _part(self, shape: tuple[int, int]) -> str:
+        return subscan(self.gxsm.ask, shape) if self.gxsm.reports_subscan else ""
 
     def _is_another(self) -> bool:
         # A repeated scan starts sooner than the next poll, so no poll shows the end of its predecessor. Two facts
@@ -315,6 +376,7 @@ class GxsmActivity(Activity):
             return is_another
         if watch.step:
             self._scan.goes_up = watch.step < 0
+        self._scan.was_near_end = watch.is_near(self._last_row())
         return watch.turned(line, self._files.scanning[1][0]) or is_another
 
     def _follow(self) -> None:
@@ -323,7 +385,8 @@ class GxsmActivity(Activity):
         self._log.warning("another scan was begun at GXSM's panel before the last one was seen to end")
         channels, folder, before = self._channels(), self._folder(), self._before()
         name, ended_ns, now_ns = self._scan.name, self._scan.ended_ns, self._clock.now_ns()
-        self._files.end(ended_ns or now_ns, now_ns, channels, folder, is_whole=None, before=before)
+        near_end = self._scan.was_near_end
+        self._files.end(ended_ns or now_ns, now_ns, channels, folder, is_whole=None, before=before, near_end=near_end)
         self._begin_scan(self._looked_ns, own=False)
         self._autosave.switch(on=True)
         self._scan.name, self._scan.follows = name, True
@@ -341,19 +404,25 @@ class GxsmActivity(Activity):
         goes_up = self._files.upwards if self._scan.goes_up is None else self._scan.goes_up
         return 0 if goes_up else self._files.scanning[1][0] - 1
 
+    def _second_rows(self, rows: int) -> set[int]:
+        # The row after the first, in either direction. GXSM's simulator ends a scan after its first line by itself if
+        # that line takes long: only a scan of more lines was ended by a person.
+        return {1, rows - 2} - {0, rows - 1} if self.gxsm.ends_early else set()
+
     def _before(self) -> Rows | None:
         # Rows of the previous scan that must have changed when this scan is complete.
         if self._files.before is None:
             return None
         rows, line = self._files.before
         if line is None:
-            return rows
+            return only(rows, 0, self._files.scanning[1][0] - 1)
         last = self._last_row()
         return only(rows, last) if abs(line - last) > 1 else None
 
     def _is_settled(self, now_s: float) -> bool:
         if not self._scan.settles_until_s:
             self._scan.settles_until_s, self._scan.ended_ns = now_s + SETTLES_S, self._clock.now_ns()
+            self._watch_place()
         return now_s >= self._scan.settles_until_s
 
     def _forestalled(self) -> ScopeStatus:
@@ -380,9 +449,11 @@ class GxsmActivity(Activity):
     def _begin_scan(self, begun_ns: int, *, own: bool) -> None:
         self._stopping, self._scan = False, ScanProgress()
         region, shape = self._set_frame()
-        taken = {"frame": as_list(region), "shape": list(shape)}
+        taken = {"frame": as_list(region), "shape": list(shape), "place": self.gxsm.frame.place()}
         by_gxsm = not (own and self._saving.by_us)
         self._files.begin(SCAN, self._folder(), begun_ns, taken, own=own, by_gxsm=by_gxsm)
+        if not own and (part := self._part(shape)):  # an own scan of a part was refused
+            self._files.spoil(_ONLY_A_PART.format(part))
 
     def _begin_curve(self, kind: str, position_m: tuple[float, float]) -> None:
         self._stopping = False
@@ -399,7 +470,8 @@ class GxsmActivity(Activity):
             self._files.end(now_ns, now_ns)
             return
         is_whole = self._is_whole()
-        if is_whole and not self._files.is_saved_by_gxsm:
+        has_second_row = is_whole is False and self._has_second_row()
+        if is_whole and not self._files.spoiled and not self._files.is_saved_by_gxsm:
             try:
                 # `autosave` returns the line, not a path; a second call would save the scan again
                 self.gxsm.ask.call("autosave")
@@ -407,7 +479,8 @@ class GxsmActivity(Activity):
                 self._log.error("the scan can't be saved: %s", error)
         # not earlier: up to 40 ms after a start GXSM still reports the paths of the previous scan
         channels, folder = self._channels(), self._folder()
-        self._files.end(self._scan.ended_ns, self._clock.now_ns(), channels, folder, is_whole=is_whole)
+        now_ns, ended_ns = self._clock.now_ns(), self._scan.ended_ns
+        self._files.end(ended_ns, now_ns, channels, folder, is_whole=is_whole, has_second_row=has_second_row)
 
     def _is_whole(self) -> bool | None:
         # None: the scan followed another scan at once, and no poll came early enough to read the previous rows.
@@ -419,7 +492,17 @@ class GxsmActivity(Activity):
         self._seen_last = shape, after
         if before is None:
             return None if self._scan.follows else True
+        if has_old_columns(before, after):
+            self._files.spoil(OLD_COLUMNS)
         return not is_unfinished(before, after)
+
+    def _has_second_row(self) -> bool:
+        if self._files.before is None:
+            return False
+        rows = self._files.scanning[1][0]
+        before = only(self._files.before[0], *self._second_rows(rows))
+        after = looked_at(self.gxsm.ask, len(self._channels()), self._second_rows(rows), before["columns"])
+        return has_new_row(before, after)
 
     def _folder(self) -> Path | None:
         # Before the first scan GXSM reports no folder, and saves to the folder in which it was started.
@@ -431,12 +514,16 @@ class GxsmActivity(Activity):
     def _channels(self, most: int = _CHANNELS) -> list[str]:
         found: list[str] = []
         for channel in range(most):
-            # GXSM has no list of channels: the first unused number is answered with "EE: invalid channel"
-            path = self.gxsm.ask.text("chfname", channel)
-            if path.startswith(_NO_CHANNEL):
+            # GXSM has no list of channels: the first unused number ends it
+            path = self._reported(channel)
+            if path is None:
                 break
             found.append(self._absolute(path))
         return found
+
+    def _reported(self, channel: int) -> str | None:
+        path = self.gxsm.ask.text("chfname", channel)  # "EE: invalid channel" for an unused number
+        return None if path.startswith(_NO_CHANNEL) else path
 
     def _absolute(self, path: str) -> str:
         # "./name" is relative to the folder in which GXSM was started.

@@ -25,6 +25,10 @@ _TYPES: Final = {f"<{kind}" for kind in ("f8", "f4", "i8", "i4", "u8", "u4", "i2
 _HINT: Final = "is bridge.py running in GXSM's console? Nothing is answered while a call of it blocks"
 
 
+class _NoRoom(ControllerLost):
+    """The error that the bridge serves as many clients as it can; its message says what to do."""
+
+
 class BridgeLink:
     """A connection to the bridge; the first call performs the handshake. For other arguments, see `TcpConnection`.
 
@@ -77,13 +81,16 @@ class BridgeLink:
                 f"run the bridge.py of this version, and use its {SECRET} (secret_file); a tunnel needs the bridge's "
                 "port number at both ends"
             )
+            if isinstance(error, _NoRoom):
+                hint = ""
             raise ControllerLost(f"no connection to the bridge: {error}", where=self._tcp.where, hint=hint) from error
         self._is_welcome = True
 
     def _step(self, step: str, text: str) -> object:
         reply = self._tcp.ask(f"the {step}", json.dumps([step, text]).encode() + b"\n", _read, is_secret=True)
         if "error" in reply:
-            raise ControllerLost(str(reply["error"]))
+            # to a wrong response the bridge disconnects: an error means that secret and version are right
+            raise (_NoRoom if step == "response" else ControllerLost)(str(reply["error"]))
         return reply["value"]
 
     def _secret(self) -> bytes:

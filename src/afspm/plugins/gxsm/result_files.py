@@ -11,7 +11,7 @@ from typing import Final
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import AfspmError
 from afspm.model import Region
-from afspm.plugins.gxsm.scan_memory import Rows, in_files, is_unfinished
+from afspm.plugins.gxsm.scan_memory import Rows, has_old_columns, in_files, is_unfinished
 from afspm.storage.formats.content import FileContent
 from afspm.translator.result_files import (
     SCAN,
@@ -34,6 +34,11 @@ LATE_S: Final = 20.0
 SOON_S: Final = 1.0
 """Longest wait for the file of a channel that the previous scan did not save either; measured: up to 0.3 s."""
 
+_STOPPED: Final = "GXSM ended the scan before its last row, and no request had stopped it"
+OLD_COLUMNS: Final = (
+    "its first or last columns still hold the previous scan: is SubScan on at GXSM's panel? Then switch it off"
+)
+
 
 class GxsmFiles(ResultFiles):
     """The running or just ended measurement, and the results.
@@ -42,6 +47,7 @@ class GxsmFiles(ResultFiles):
         patience_s: longest wait for all files, experiment time.
         soon_s: longest wait for files of channels that the previous scan did not save, experiment time.
         late_s: longest difference between the start delays of two scans (`LATE_S`), experiment time.
+        ends_early: True if GXSM's hardware may end a scan after its first line by itself.
     """
 
     def __init__(
@@ -52,11 +58,14 @@ class GxsmFiles(ResultFiles):
         patience_s: float,
         soon_s: float,
         late_s: float,
+        ends_early: bool = False,
     ) -> None:
         super().__init__(kept, log)
         self._patience_s = patience_s
         self._soon_s = soon_s
         self._late_ns = round(late_s * NS_PER_S)
+        self._ends_early = ends_early
+        self._by_hand = ""
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._before: set[int] = set()
         self._whole: dict[Path, FileContent] = {}
@@ -95,6 +104,30 @@ class GxsmFiles(ResultFiles):
         """Store rows and line for `before`."""
         self._kept["running"]["before"] = {"rows": rows, "line": line}
 
+    @property
+    def place(self) -> list[float]:
+        """Centre and angle of the frame at the start of the running scan, see `ScanFrame.place`."""
+        found: list[float] = self._kept["running"]["place"]
+        return found
+
+    @property
+    def spoiled(self) -> str:
+        """The reason why the running measurement must not be published; empty: there is none."""
+        return str(self._kept["running"]["spoiled"])
+
+    def spoil(self, why: str) -> None:
+        """Register a reason not to publish the running measurement; the first reason stays."""
+        self._kept["running"]["spoiled"] = self.spoiled or why
+
+    def ran(self) -> None:
+        """Register that GXSM has shown the running measurement in its state."""
+        self._kept["running"]["ran"] = True
+
+    def stopped_by_hand(self) -> str:
+        """Return once the evidence that a person stopped the last scan of the translator; empty: there is none."""
+        found, self._by_hand = self._by_hand, ""
+        return found
+
     def is_written(self, file: Path) -> bool:
         """Return True if the file is newer than all files in the folder at the start of the running measurement."""
         return modified_ns(file) > int(self._kept["running"]["newest_ns"])
@@ -119,7 +152,7 @@ class GxsmFiles(ResultFiles):
         Args:
             folder: folder of the measurement's files; None: unknown yet.
             begun_ns: earliest start; 0: not known, or a spectrum, whose file has no start time.
-            taken: settings of the measurement: "frame" and "shape" of a scan, "position" of a spectrum.
+            taken: settings of the measurement: "frame", "shape" and "place" of a scan, "position" of a spectrum.
             own: True if the translator started the measurement.
             by_gxsm: True if GXSM saves by itself: files may appear before the end, and be written again.
         """
@@ -127,8 +160,9 @@ class GxsmFiles(ResultFiles):
         followed = self._kept["ended"]
         newest = self.newest_ns(folder, _files(folder, what), what)
         place = None if folder is None else str(folder)
-        facts = {"folder": place, "newest_ns": newest, "begun_ns": begun_ns, "before": None}
-        self._begins(what, {**facts, "own": own, "by_gxsm": by_gxsm, **taken})
+        facts = {"folder": place, "newest_ns": newest, "begun_ns": begun_ns, "before": None, "spoiled": ""}
+        self._begins(what, {**facts, "own": own, "by_gxsm": by_gxsm, "ran": False, **taken})
+        self._by_hand = ""
         if followed is not None:
             # GXSM saves a scan before it starts the next: all new files belong to the ended scan
             there = _files(_folder(followed), followed["what"])
@@ -148,7 +182,9 @@ class GxsmFiles(ResultFiles):
         folder: Path | None = None,
         *,
         is_whole: bool | None = True,
+        has_second_row: bool = False,
         before: Rows | None = None,
+        near_end: bool = False,
     ) -> None:
         """Register the end of the measurement; its files are awaited from now on.
 
@@ -157,20 +193,24 @@ class GxsmFiles(ResultFiles):
             folder: folder of the files, which may have changed since the start.
             is_whole: True if a scan reached its last row; False: the scan has no result; None: unknown until its files
                 are compared with `before`.
+            has_second_row: True if an interrupted scan has scanned a second row.
             before: rows of the previous scan, for `is_whole` None; without rows the scan has no result.
+            near_end: True if a scan that is followed by the next at once was last seen in its last rows.
         """
         order = [next(iter(endings([Path(path)])), "") for path in channels]
         now_s = now_ns / NS_PER_S
         self._hurry(now_s)
         awaited = {"soon_s": now_s + self._soon_s, "until_s": now_s + self._patience_s}
-        self._ends({"end_ns": end_ns, **awaited, "channels": order, "before": before, "is_whole": is_whole})
+        facts = {"channels": order, "before": before, "is_whole": is_whole, "near_end": near_end}
+        self._ends({"end_ns": end_ns, **awaited, **facts})
         ended = self._kept["ended"]
         if folder is not None and str(folder) != ended["folder"]:  # old scans there are recognised by their start
             ended["folder"] = str(folder)
             ended["begun_ns"] = ended["begun_ns"] or end_ns
         self._sizes, self._whole, self._before = {}, {}, set()
         if is_whole is False:
-            self._give_up("it was stopped or never began: GXSM's first or last row still holds the previous scan")
+            why = "it was stopped or never began: GXSM's first or last row still holds the previous scan"
+            self._give_up(why, has_second_row=has_second_row)
 
     def _hurry(self, now_s: float) -> None:
         # The next measurement overwrites GXSM's memory and may overwrite files: read them now, or never.
@@ -205,15 +245,21 @@ class GxsmFiles(ResultFiles):
         """Look for awaited files; return the last results, oldest first, named by one file and the end time in ns."""
         self.broken_off = False
         ended = self._kept["ended"]
-        if ended is not None:
+        if ended is not None and ended["spoiled"]:
+            self._give_up(ended["spoiled"])
+        elif ended is not None:
             files = self._new(ended)
             is_followed = "names" in ended
             over = now_s >= ended["until_s"] or (is_followed and not ended["names"])
             gaps = [file for file, content in files.items() if lines_missing(content)]
+            has_second_row = any(
+                lines_missing(content) < len(scan.values) - 1 for content in files.values() for scan in content.scans
+            )
             if not any(scan.values.any() for content in files.values() for scan in content.scans):
                 gaps = [file for file in files if ended["what"] == SCAN]  # stopped in its first line
+                has_second_row = False
             if gaps and (over or is_followed or not ended["by_gxsm"]):
-                self._give_up(f"it was stopped: {gaps[0]} lacks lines")
+                self._give_up(f"it was stopped: {gaps[0]} lacks lines", has_second_row=has_second_row)
             elif files and not gaps and (over or self._all(ended, files, now_s)):
                 why = self._why_unfinished(ended, files) if ended["is_whole"] is None else ""
                 if why:
@@ -229,8 +275,11 @@ class GxsmFiles(ResultFiles):
         if before is None:
             return "one scan followed the other at once, and whether this one came to its end is unknown"
         numbered = {k: files[named[ending]] for k, ending in enumerate(ended["channels"]) if ending in named}
-        if is_unfinished(before, in_files(numbered, before)):
+        saved = in_files(numbered, before)
+        if is_unfinished(before, saved):
             return "it was stopped: its last row still holds the previous scan"
+        if has_old_columns(before, saved):
+            return OLD_COLUMNS
         return ""
 
     def read(self, entry: Entry) -> Content:
@@ -291,8 +340,10 @@ class GxsmFiles(ResultFiles):
         return not missing or (missing <= set(self._kept["absent"]) and now_s >= ended["soon_s"])
 
     def _missing(self, ended: Entry) -> str:
+        if "names" in ended and ended.get("near_end"):
+            return "it came to its end, but the next one began and GXSM had saved no file: is it a frame of a Movie?"
         if "names" in ended:
-            return "another one began before it was saved"
+            return "another one began before it was saved: it was stopped, or GXSM saved no file of it"
         folder = _folder(ended)
         if folder is None:
             return "GXSM does not say where it saves: check that it began and that a channel is set"
@@ -308,8 +359,12 @@ class GxsmFiles(ResultFiles):
             )
         return f"no new .vpdata in {folder}: switch on Auto Save of probes in GXSM, and set probe_dir to its folder"
 
-    def _give_up(self, why: str) -> None:
+    def _give_up(self, why: str, *, has_second_row: bool | None = None) -> None:
+        # `has_second_row`: None if the scan does not lack rows
         ended, self._kept["ended"] = self._kept["ended"], None
+        is_by_hand = has_second_row or (has_second_row is False and not self._ends_early)
+        if is_by_hand and ended["what"] == SCAN and ended["own"] and ended["ran"]:
+            self._by_hand = _STOPPED
         self._log.error("the %s has no result: %s", ended["what"], why)
         if self._before:
             self._saw(ended, self._before)

@@ -1,7 +1,8 @@
 """NetCDF files (.nc) of GXSM's scans: NetCDF-3 of Gxsm3, NetCDF-4 (HDF5) of Gxsm4, one channel each.
 
-Values are FloatField * dz; rows come from the top; lengths are in ångström even if their attributes name another unit;
-rangex is from the first pixel to the last; offsetx is the centre; alpha is clockwise in degrees.
+Values are FloatField * dz, in GXSM's base unit (Å, V, nA, Hz …): the unit named in the file is the one in which GXSM's
+windows show them. Rows come from the top; lengths of the frame are in ångström; rangex is from the first pixel to the
+last; offsetx is the centre; alpha is clockwise in degrees.
 """
 
 from __future__ import annotations
@@ -23,10 +24,28 @@ from afspm.storage.formats import hdf5, netcdf
 from afspm.storage.formats.content import FileContent, OtherFormat
 
 CONTROLLER = "GXSM"
-_ANGSTROM = ("AA", "Å", "Ang")
+# GXSM's table of units (`XsmUnitsTable`) has a name, a symbol and a factor for each: a window shows the stored number
+# divided by the factor. Here are the entries whose factor is not 1, or whose name is no unit, with the unit of the
+# stored number. The name "A" is ångström, the symbol "A" ampere; the second millivolt, "mV1", is stored in millivolt.
+_STORED_BY_NAME = dict.fromkeys(("AA", "A", "nm", "um", "mm"), "Å") | {
+    "mV": "V",
+    "mV1": "mV",
+    "pA": "nA",
+    "Amp": "nA",
+    "mHz": "Hz",
+    "0": "1",
+}
+_STORED_BY_SYMBOL = dict.fromkeys(("Å", "Ang", "nm", "um", "µm", "mm"), "Å") | {
+    "mV": "V",
+    "pA": "nA",
+    "A": "nA",
+    "mHz": "Hz",
+}
 _TEXT_MAX = 1 << 16
 _FILE_NAME = re.compile(r"-X([pm])-(.+)\.nc$")
 _WAS_DASH = re.compile(r"(?<=[A-Z0-9])m(?=[A-Z])")
+_SHORT = {"Z": "Topo"}
+"""Name of a channel in the file's name by the label of Gxsm3, where the label is another name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +107,8 @@ def _content(raw: _Raw, path: Path) -> FileContent:
     region = _region(raw.numbers)
     start, end = (_ns(raw.numbers, key) for key in ("t_start", "t_end"))
     upwards = {"TopDown": False, "BottomUp": True}.get(raw.texts.get("spm_scancontrol", "").strip())
-    unit, scale = _unit(raw)
+    stored, dz = _unit(raw), raw.numbers["dz"]
+    unit = "m" if stored == "Å" else stored
     layers = raw.values.reshape(-1, *raw.values.shape[2:])
     name = _channel(raw, path)
     scans = tuple(
@@ -96,7 +116,7 @@ def _content(raw: _Raw, path: Path) -> FileContent:
             region,
             name if k == 0 else f"{name} #{k + 1}",
             unit,
-            convert(_measured(layer, upwards) * scale, "Å", "m") if unit == "m" else _measured(layer, upwards) * scale,
+            convert(_measured(layer, upwards) * dz, "Å", "m") if unit == "m" else _measured(layer, upwards) * dz,
             end,
             str(path),
         )
@@ -117,22 +137,37 @@ def _ns(numbers: dict[str, float], key: str) -> int | None:
     return round(seconds) * NS_PER_S if seconds > 0.0 else None
 
 
-def _unit(raw: _Raw) -> tuple[str, float]:
-    # ZSrcUnit is the unit's name in GXSM's own list, where a second millivolt is "mV1". The unit is in `var_unit` in
-    # Gxsm4, whose `unit` has that name, too, and in `unit` in Gxsm3. A length by either name is in ångström.
+def stored_unit(name: str, symbol: str) -> str:
+    """Return the unit of GXSM's stored numbers.
+
+    Args:
+        name: name of the display unit in GXSM's table; empty if unknown.
+        symbol: text in GXSM's windows for this unit; empty if unknown.
+    """
+    return _STORED_BY_NAME.get(name) or _STORED_BY_SYMBOL.get(symbol) or symbol or name
+
+
+def _unit(raw: _Raw) -> str:
+    # ZSrcUnit is the name of the unit. Gxsm4 has the symbol in `var_unit` and the name again in `unit`; Gxsm3 has the
+    # symbol in `unit`.
     given = raw.attributes
-    named = given.get("ZSrcUnit", "")
-    unit = given.get("var_unit") or given.get("unit", "") or named
-    return ("m" if {unit, named} & set(_ANGSTROM) else unit), raw.numbers["dz"]
+    symbol = given.get("var_unit", given.get("unit", ""))
+    name = given.get("ZSrcUnit") or (given.get("unit", "") if "var_unit" in given else "")
+    return stored_unit(name, symbol)
 
 
 def _channel(raw: _Raw, path: Path) -> str:
+    # The file's own name counts first: `basename` is the path of the file that a person opened last, until GXSM is
+    # restarted. So it counts for a renamed file alone, and only if ZLabel confirms its channel.
     # "ZS-Topo" is ZSmTopo in the file's name. Gxsm3 has the full name nowhere else: "ADC0-ITunnel" has the label "I".
     # There, an "m" between a capital or digit and a capital is taken for the original dash.
     label = raw.attributes.get("ZLabel", "")
-    match = _FILE_NAME.search(raw.texts.get("basename", "")) or _FILE_NAME.search(path.name)
+    short = _SHORT.get(label, label.replace("-", "m"))
+    match = _FILE_NAME.search(path.name)
     if match is None:
-        return label
+        match = _FILE_NAME.search(raw.texts.get("basename", ""))
+        if match is None or match[2] != short:
+            return label
     name = label if label.replace("-", "m") == match[2] else _WAS_DASH.sub("-", match[2])
     return f"{name} Backward" if match[1] == "m" else name
 

@@ -1,7 +1,8 @@
 """GXSM's memory of a scan: lines of the running scan, and the check for completeness.
 
 GXSM keeps the values of the previous scan in rows not yet scanned, and does not mark new rows. A complete scan has
-rewritten the first and the last row of each channel; a stopped scan has left at least one of both bit-identical.
+rewritten the first and the last row of each channel; a stopped scan has left at least one of both bit-identical. A scan
+of a part of the columns (*SubScan*) has left the first or the last columns of these rows bit-identical.
 """
 
 from __future__ import annotations
@@ -18,6 +19,12 @@ from afspm.plugins.gxsm.settings import ANGSTROM_M
 from afspm.storage.formats.content import FileContent
 
 _CONSTANT = "="
+_FIRST_LAYER, _NO_TIME = 0, -1
+"""Arguments of `get_slice`. With a time of 0 or more, Gxsm4 copies that picture of a *Movie* over its memory, with its
+size and in the caller's thread, and ends with a segmentation fault if a scan of another size runs. Gxsm3 ignores both
+arguments."""
+_EDGE = 8
+"""Compared columns at either end of a row: fewer agree by chance if a signal flickers between two values."""
 _MOST = 1 << 20
 
 
@@ -26,11 +33,12 @@ class Rows(TypedDict):
 
     Attributes:
         columns: number of compared columns.
-        digests: digest by channel and row. The digest of a constant row, which proves nothing, starts with "=".
+        digests: by channel and row, the digests of the whole row, of its first and of its last columns. The digest of
+            constant values, which proves nothing, starts with "=".
     """
 
     columns: int
-    digests: dict[str, dict[str, str]]
+    digests: dict[str, dict[str, list[str]]]
 
 
 def looked_at(ask: Asking, channels: int, rows: Collection[int], columns: int) -> Rows:
@@ -47,11 +55,9 @@ def looked_at(ask: Asking, channels: int, rows: Collection[int], columns: int) -
         columns=columns,
         digests={
             str(channel): {
-                str(row): _digest(values.ravel()[:columns] / dz)
+                str(row): _digests(values.ravel()[:columns] / dz)
                 for row in rows
-                if row < shape[1]
-                and isinstance(values := ask.call("get_slice", channel, 0, 0, row, 1), np.ndarray)
-                and values.size
+                if row < shape[1] and isinstance(values := _slice(ask, channel, row, 1), np.ndarray) and values.size
             }
             for channel, (shape, dz) in there.items()
         },
@@ -64,7 +70,7 @@ def in_files(files: Mapping[int, FileContent], like: Rows) -> Rows:
         columns=like["columns"],
         digests={
             channel: {
-                row: _digest(_stored(files[int(channel)])[int(row)][: like["columns"]])
+                row: _digests(_stored(files[int(channel)])[int(row)][: like["columns"]])
                 for row in rows
                 if int(row) < len(files[int(channel)].scans[0].values)
             }
@@ -79,10 +85,22 @@ def _stored(file: FileContent) -> np.ndarray:
     return scan.values[::-1] / (ANGSTROM_M if scan.unit == "m" else 1.0) / dz
 
 
-def only(rows: Rows, row: int) -> Rows:
-    """Return the digests of a single row."""
-    digests = {channel: {str(row): there[str(row)]} for channel, there in rows["digests"].items() if str(row) in there}
+def only(rows: Rows, *numbers: int) -> Rows:
+    """Return the digests of some rows, by their numbers."""
+    digests = {
+        channel: {str(row): there[str(row)] for row in numbers if str(row) in there}
+        for channel, there in rows["digests"].items()
+    }
     return Rows(columns=rows["columns"], digests=digests)
+
+
+def has_new_row(before: Rows, after: Rows) -> bool:
+    """Return True if any of these rows was scanned, in any channel."""
+    return any(
+        row in (now := after["digests"].get(channel, {})) and now[row][0] != digests[0]
+        for channel, rows in before["digests"].items()
+        for row, digests in rows.items()
+    )
 
 
 def is_unfinished(before: Rows, after: Rows) -> bool:
@@ -93,17 +111,43 @@ def is_unfinished(before: Rows, after: Rows) -> bool:
     changed = unchanged = False
     for channel, rows in before["digests"].items():
         now = after["digests"].get(channel, {})
-        is_new = any(now.get(row) != digest for row, digest in rows.items())
-        is_old = any(now.get(row) == digest for row, digest in rows.items() if not digest.startswith(_CONSTANT))
+        is_new = any(now.get(row, [""])[0] != digests[0] for row, digests in rows.items())
+        is_old = any(
+            now.get(row, [""])[0] == digests[0] for row, digests in rows.items() if not digests[0].startswith(_CONSTANT)
+        )
         if is_new and is_old:
             return True
         changed, unchanged = changed or is_new, unchanged or is_old
     return unchanged and not changed
 
 
-def _digest(stored: np.ndarray) -> str:
+def has_old_columns(before: Rows, after: Rows) -> bool:
+    """Return True if the first or the last columns of all changed rows hold the previous scan, in each channel."""
+    changed = [
+        (digests, now[row])
+        for channel, rows in before["digests"].items()
+        for row, digests in rows.items()
+        if row in (now := after["digests"].get(channel, {})) and now[row][0] != digests[0]
+    ]
+    for edge in (1, 2):
+        proofs = [(then[edge], now[edge]) for then, now in changed if not then[edge].startswith(_CONSTANT)]
+        if proofs and all(then == now for then, now in proofs):
+            return True
+    return False
+
+
+def _slice(ask: Asking, channel: int, row: int, count: int) -> object:
+    return ask.call("get_slice", channel, _FIRST_LAYER, _NO_TIME, row, count)
+
+
+def _digests(stored: np.ndarray) -> list[str]:
     # Of stored values, without dz: GXSM may change dz between two scans.
     values = stored.astype(np.float32)
+    edge = min(_EDGE, len(values))
+    return [_digest(part) for part in (values, values[:edge], values[-edge:])]
+
+
+def _digest(values: np.ndarray) -> str:
     kind = _CONSTANT if (values == values[0]).all() else ""
     return kind + hashlib.blake2b(values.tobytes(), digest_size=12).hexdigest()
 
@@ -143,7 +187,7 @@ def new_lines(
     images: dict[str, np.ndarray] = {}
     for channel, ending in enumerate(endings):
         if ending in known:
-            found = ask.call("get_slice", channel, 0, 0, start, count)
+            found = _slice(ask, channel, start, count)
             # another shape: the frame was changed at the panel, and the recorded shape is not this scan's
             if isinstance(found, np.ndarray) and found.shape == (count, shape[1]):
                 images[ending] = found.astype(np.float64)

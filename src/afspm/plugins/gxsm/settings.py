@@ -26,6 +26,9 @@ ANGSTROM_M: Final = 1e-10
 _UNITS: Final = {"AA": "Å", "Ang": "Å", "\u00c5": "Å", "\u212b": "Å", "\u03bcm": "um", "\u00b5m": "um"}
 _ROUNDED: Final = 0.06  # rounding of the panel's digits
 REFNAMES: Final = ("PointsX", "PointsY", "RangeX", "RangeY", "OffsetX", "OffsetY", "Rotation")
+SUBSCAN: Final = ("SPMC-sls-xs", "SPMC-sls-xn", "SPMC-sls-ys", "SPMC-sls-yn")
+"""First column, columns, first row and rows of a *SubScan*; zeros without it. Gxsm3 has no such names."""
+_PLACE: Final = ("OffsetX", "OffsetY", "Rotation")
 _SIZE: Final = {names.SCAN_SIZE_X, names.SCAN_SIZE_Y}
 PIXELS: Final = {names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y}
 _CORNER: Final = {names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y}
@@ -90,6 +93,10 @@ class ScanFrame:
     def region(self) -> Region:
         return frame(self.read())[0]
 
+    def place(self) -> list[float]:
+        """Return centre and angle as GXSM shows them: a change moves the tip at once, even during a scan."""
+        return [number(self._ask, ref) for ref in _PLACE]
+
     def move_tip(self, xy_m: tuple[float, float]) -> None:
         """Move the tip to (x, y) in m. Raises Refused with PARAM_ERROR: the position is outside the frame."""
         region = self.region()
@@ -109,6 +116,19 @@ class ScanFrame:
 
     def _send(self, ref: str, value: float) -> None:
         send(self._ask, ref, value)
+
+
+def subscan(ask: Asking, shape: tuple[int, int]) -> str:
+    """Return a description of the part of the frame that *SubScan* scans; empty: the whole frame is scanned.
+
+    Args:
+        shape: (rows, columns) of the frame.
+    """
+    left, width, top, height = (round(number(ask, ref)) for ref in SUBSCAN)
+    rows, columns = shape
+    if not (width or height) or (left, width, top, height) == (0, columns, 0, rows):
+        return ""
+    return f"{width} of {columns} columns from {left}, {height} of {rows} rows from {top}"
 
 
 class FrameSettings(SettingsGroup):

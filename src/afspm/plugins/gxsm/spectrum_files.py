@@ -12,9 +12,15 @@ from afspm.basics.errors import FileError
 from afspm.basics.units import convert
 from afspm.model import Spectrum
 from afspm.plugins.gxsm.scan_files import CONTROLLER
-from afspm.storage.formats.content import FileContent, local_ns, name_and_unit
-from afspm.storage.formats.igor import decoded
+from afspm.storage.formats.content import FileContent, local_ns, name_and_unit, text_of
 
+_MISLABELLED = {"LockIn-Mag": "V", "McBSP Ampl": "V", "McBSP Exec": "V", "In 0": "nA"}
+"""Unit of the values of signals that GXSM labels with another unit, in which it shows their scans (mV, pA).
+
+All other columns have values in the unit of their label, among them "ADC0-I (pA)" of an SRanger and "Amplitude (mV)" of
+a RedPitaya. The rule of scans does not hold here: a label has only the symbol of a unit, and "mV" stands for two units.
+"""
+_NUMBERED = re.compile(r"^\d\d-")
 _BEGIN, _END = "#C Data Table", "#C END."
 
 
@@ -27,7 +33,7 @@ def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
     Raises:
         FileError, ValueError: another format, or damaged.
     """
-    lines = decoded(path.read_bytes()).splitlines()
+    lines = text_of(path.read_bytes()).splitlines()
     starts = [k for k, line in enumerate(lines) if line.startswith(_BEGIN)]
     ends = [k for k, line in enumerate(lines) if line.startswith(_END)]
     if len(starts) != 1 or not ends or ends[0] < starts[0] + 3:
@@ -61,6 +67,8 @@ def _spectrum(columns: list[str], table: np.ndarray, kind: str, end: int | None,
     values: list[np.ndarray] = []
     for column, numbers in zip(columns, table.T, strict=True):
         name, unit = name_and_unit(column.strip().strip('"'))
+        if unit in ("mV", "pA"):
+            unit = _MISLABELLED.get(_NUMBERED.sub("", name), unit)
         if not unit or name in names:
             continue
         length = unit == "Å"

@@ -7,6 +7,7 @@ import select
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
 from afspm.basics.errors import ConfigError
@@ -38,6 +39,10 @@ class GxsmEmulator(Emulator):
         decimal_comma: True for a locale with decimal commas, 12,5.
         auto_save, probe_auto_save: Auto Save of scans and of spectra at the start.
         feedback_actions: names of the actions that switch the feedback on and off. Default: none.
+        display_units: display units by the name of a channel, e.g. "pA" for "I-Tunnel"; GXSM stores values in its base
+            unit (Å, V, nA, Hz) in any case.
+        channels_set: True if a person has set the channels at the panel, and begun a scan with them if the folder has
+            scans from before. False: no channel is set, as after each start of a real Gxsm4.
         reach_m: reach of the scanner in x and y, from the centre.
         seed, faults, and the simulated world: settings of every emulator.
 
@@ -72,6 +77,8 @@ class GxsmEmulator(Emulator):
         auto_save: bool = True,
         probe_auto_save: bool = True,
         feedback_actions: Sequence[str] = (),
+        display_units: Mapping[str, str] = MappingProxyType({}),
+        channels_set: bool = True,
         reach_m: Length = 2e-6,
         **settings: Any,
     ) -> None:
@@ -84,8 +91,13 @@ class GxsmEmulator(Emulator):
         ):
             if value not in known:
                 raise ConfigError(f"unknown value {value!r}", where=name, hint=f"one of {', '.join(map(str, known))}")
+        for unit in display_units.values():
+            if unit not in files.UNITS:
+                raise ConfigError(
+                    f"unknown unit {unit!r}", where="display_units", hint=f"one of {', '.join(files.UNITS)}"
+                )
         self._settings = program.GxsmSettings(
-            version, card, user_unit, decimal_comma, auto_save, probe_auto_save, reach_m
+            version, card, user_unit, decimal_comma, auto_save, probe_auto_save, reach_m, display_units, channels_set
         )
         self._transport = transport
         self._script = Path(script) if script else SCRIPT
@@ -137,7 +149,7 @@ class GxsmEmulator(Emulator):
 
     def tick(self, now_s: float) -> float | None:
         """Advance scans and files, and answer waiting calls."""
-        if self.faults.strikes("crash", now_s):
+        if self.faults.strikes("crash", now_s) or self.program.has_crashed:
             if self._block is not None:
                 self._block.end(remains=True)
                 self._block = None

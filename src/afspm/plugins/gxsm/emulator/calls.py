@@ -304,6 +304,8 @@ class GxsmFunctions:
         if program.scan.activity is None or not self._has(channel):
             return -1
         one = program.channels[channel]
+        if time >= 0 and program.version == 4:
+            program.retrieve()
         image = program.image(one)
         if first < 0 or count < 0 or first + count > len(image):
             return -1

@@ -158,8 +158,21 @@ def lengths(reach: float, on_change: Callable[[str], Callable[[float], None]]) -
         "OffsetY": length("OffsetY", 0.0, -reach, reach),
         "ScanX": length("ScanX", 0.0, -reach, reach),
         "ScanY": length("ScanY", 0.0, -reach, reach),
-        "Rotation": GxsmEntry(0.0, -360.0, 360.0, "°", "{:6.0f}"),
+        "Rotation": GxsmEntry(0.0, -360.0, 360.0, "°", "{:6.0f}", on_change=on_change("Rotation")),
         "script-control": GxsmEntry(50.0, 0.0, 100.0),
+    }
+
+
+def subscan(on_change: Callable[[int], Callable[[float], None]]) -> dict[str, GxsmEntry]:
+    """Return the entries of *SubScan*, which only Gxsm4 lists: first column, columns, first row, rows.
+
+    Args:
+        on_change: returns the callback of an entry, by its place in this list.
+    """
+    refs = ("SPMC-sls-xs", "SPMC-sls-xn", "SPMC-sls-ys", "SPMC-sls-yn")
+    return {
+        ref: GxsmEntry(0.0, 0.0, 99_999.0, shown="{:.0f}", whole=True, on_change=on_change(place))
+        for place, ref in enumerate(refs)
     }
 
 

@@ -16,7 +16,23 @@ if TYPE_CHECKING:
 
 _USER: Final = "user"
 _VERSIONS: Final = {3: ("gxsm3", "3.54.0"), 4: ("gxsm4", "4.4.1")}
-_ANGSTROM: Final = {"label": "L", "var_unit": "Ang", "unit": "AA"}
+_ANGSTROM: Final = {"label": "L", "var_unit": "Å", "unit": "AA"}
+UNITS: Final[Mapping[str, tuple[str, float]]] = {
+    "AA": ("Å", 1.0),
+    "nm": ("nm", 10.0),
+    "um": ("µm", 1e4),
+    "mm": ("mm", 1e7),
+    "V": ("V", 1.0),
+    "mV": ("mV", 1e-3),
+    "mV1": ("mV", 1.0),
+    "nA": ("nA", 1.0),
+    "pA": ("pA", 1e-3),
+    "Amp": ("A", 1e9),
+    "Hz": ("Hz", 1.0),
+    "mHz": ("mHz", 1e-3),
+    "deg": ("°", 1.0),
+}
+"""Symbol and factor of units in GXSM's table: a window shows the stored number divided by the factor."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +43,9 @@ class GxsmChannel:
         source: name of the channel in the simulated instrument.
         label: name of the channel in GXSM.
         direction: "Xp" forward, "Xm" backward.
-        unit: unit in the file ("AA" for lengths), and unit on the panel.
-        scale: factor from the instrument's values to this unit.
-        dz: factor from stored values to this unit.
+        unit: name of the display unit (see `UNITS`), and its symbol.
+        scale: factor from the instrument's values to GXSM's base unit (Å, V, nA, Hz), not to the display unit.
+        dz: factor from stored values to the base unit.
     """
 
     source: str
@@ -76,9 +92,10 @@ class GxsmScanFile:
     """The content of the file of one channel of a scan.
 
     Attributes:
-        raw: stored values, rows from the top; multiplied by `dz`, they are in `unit`.
-        unit: unit in the file ("AA" for lengths), and unit on the panel.
+        raw: stored values, rows from the top; multiplied by `dz`, they are in GXSM's base unit.
+        unit: name of the display unit, and its symbol.
         frame: x, y, width, height in ångström, angle clockwise in degrees.
+        original: path in the variable "basename"; empty: the path of this file.
     """
 
     path: str
@@ -91,6 +108,7 @@ class GxsmScanFile:
     end_s: float
     card: str
     bias_v: float
+    original: str = ""
 
     def numbers(self) -> dict[str, float]:
         """Return the variables with one floating-point number."""
@@ -129,10 +147,15 @@ class GxsmScanFile:
             "type": "not set",
             "username": _USER,
             "dateofscan": f"{begun} ",
-            "basename": self.path,
+            "basename": self.original or self.path,
             "spm_scancontrol": "TopDown ",
             "extra_scan_info": "Extra Scan Info: N/A",
         }
+
+    def info(self) -> str:
+        """Return the sentence in which Gxsm4 names the first value in the display unit."""
+        shown = float(self.raw[0, 0]) * self.dz / UNITS[self.unit[0]][1]
+        return f"The value for {self.label} is {shown:g} {self.unit[1]}."
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
         """Return x ascending and y descending, relative to the centre, in ångström."""
@@ -204,7 +227,7 @@ def netcdf4(scan: GxsmScanFile) -> bytes:
             file.attrs[name] = np.bytes_(value)
         field = file.create_dataset("FloatField", data=scan.raw[None, None].astype("<f4"))
         _describe(field, label=scan.label, var_unit=scan.unit[1], unit=scan.unit[0])
-        _describe(field, ZLabel=scan.label, unit_x_dz=scan.unit[1], ZSrcUnit=scan.unit[0])
+        _describe(field, Info=scan.info(), ZLabel=scan.label, unit_x_dz=scan.unit[1], ZSrcUnit=scan.unit[0])
         x, y = scan.axes()
         for name, values, unit in (
             ("time", [scan.end_s - scan.start_s], "s"),

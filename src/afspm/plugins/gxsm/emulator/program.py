@@ -15,12 +15,13 @@ from afspm.basics.errors import InvalidValue
 from afspm.basics.plain_data import Plain
 from afspm.model import Region
 from afspm.plugins.gxsm.emulator import files
-from afspm.plugins.gxsm.emulator.entries import GxsmEntries, GxsmEntry, lengths, simulated_3
+from afspm.plugins.gxsm.emulator.entries import GxsmEntries, GxsmEntry, lengths, simulated_3, subscan
 from afspm.plugins.gxsm.emulator.file_writer import GxsmFileWriter
-from afspm.plugins.gxsm.emulator.files import CHANNELS, SIMULATED_3, GxsmChannel
+from afspm.plugins.gxsm.emulator.files import CHANNELS, SIMULATED_3, UNITS, GxsmChannel
 from afspm.simulation.activities import ScanActivity, SpectrumActivity
 from afspm.simulation.faults import Faults
 from afspm.simulation.instrument import SimulatedInstrument
+from afspm.storage.formats import read
 
 CARDS: Final = {"SRanger": "SRangerMK2:SPM", "RPSPMC": "RPSPMC:SPM", "simulator": "SPM-SIM:SPM"}
 FAULT_KINDS: Final[Mapping[str, str]] = {
@@ -41,6 +42,8 @@ _PIXELS_S: Final = 0.045
 """Duration of a line in GXSM's own simulator, in addition to the duration of the line's pixels."""
 _NEVER_WRITTEN: Final = -296
 """The line that Gxsm4's simulator reports at the start of its first scan."""
+NO_CHANNEL: Final = "no channel is set"
+"""The dialog that takes all later starts, even with channels, until a person closes it."""
 _PULSE_S: Final = 1.0
 _MIXER: Final = ("dsp-fbs-mx0-current-set", "nA", 1.0)
 _MIXERS: Final = {
@@ -62,6 +65,8 @@ class GxsmSettings:
     auto_save: bool
     probe_auto_save: bool
     reach_m: float
+    display_units: Mapping[str, str]
+    channels_set: bool
 
 
 @dataclass
@@ -72,12 +77,18 @@ class GxsmPanel:
         auto_save, probe_auto_save: automatic saving of scans, of spectra.
         repeats: True if each complete scan is followed by another scan.
         behind_s: lag of the clock of GXSM's computer, whose times are in files; that clock may be set at any time.
+        original: path of the file that was opened last; empty: none since the start of GXSM.
+        subscan: first column, columns, first row and rows of *SubScan*; zeros: off.
+        movie: number of columns and rows of the pictures of the last *Movie*; None: there was none.
     """
 
     auto_save: bool
     probe_auto_save: bool
     repeats: bool = False
     behind_s: float = 0.0
+    original: str = ""
+    subscan: list[int] = field(default_factory=lambda: [0, 0, 0, 0])
+    movie: tuple[int, int] | None = None
 
 
 @dataclass
@@ -96,6 +107,8 @@ class GxsmScan:
         before: file names of the previous scan, reported at first; None: own file names from the start.
         y_before: line reported until the first line of the scan is complete.
         memory: image of stored values before the scan, by channel.
+        elsewhere: line from which the scan goes on in a frame that was moved meanwhile, and this scan; in order.
+        subscan: part of the frame at the start of the scan, see `GxsmPanel`.
     """
 
     activity: ScanActivity | None = None
@@ -110,6 +123,8 @@ class GxsmScan:
     y_before: int = 0
     memory: dict[GxsmChannel, np.ndarray] = field(default_factory=dict)
     own: list[Path] = field(default_factory=list)
+    elsewhere: list[tuple[int, ScanActivity]] = field(default_factory=list)
+    subscan: list[int] = field(default_factory=lambda: [0, 0, 0, 0])
 
 
 class GxsmProgram:
@@ -120,6 +135,7 @@ class GxsmProgram:
         channels: channels that a scan records.
         dialogs: texts of dialogs on the screen.
         scan: the last started scan.
+        has_crashed: True once a call has ended the program.
     """
 
     def __init__(
@@ -133,7 +149,16 @@ class GxsmProgram:
             version, settings.user_unit, decimal_comma=settings.decimal_comma, dialogs=self.dialogs.append
         )
         known = SIMULATED_3 if (version, card) == (3, "simulator") else CHANNELS[version]
-        self.channels: list[GxsmChannel] = [one for one in known if one.source in rig.channels]
+        shown = settings.display_units
+        self._known_channels = [
+            replace(one, unit=(shown[one.label], UNITS[shown[one.label]][0])) if one.label in shown else one
+            for one in known
+            if one.source in rig.channels
+        ]
+        self.channels: list[GxsmChannel] = list(self._known_channels) if settings.channels_set else []
+        # Unattended nights go on after a crash: with scans from before it, a person has also begun a scan since then.
+        self._is_named = settings.channels_set and any(folder.glob("*.nc"))
+        self.has_crashed = False
         self.saving = GxsmFileWriter(folder, faults)
         self.scan = GxsmScan()
         self.curve: SpectrumActivity | None = None
@@ -141,13 +166,33 @@ class GxsmProgram:
         self._curves = 0
         for ref, entry in lengths(settings.reach_m / ANGSTROM_M, self._on_change).items():
             self.entries.add(ref, entry)
-        for ref, entry in self._of_hardware().items():
+        for ref, entry in {**self._of_hardware(), **(subscan(self._on_subscan) if version == 4 else {})}.items():
             self.entries.add(ref, entry)
 
     def _on_change(self, ref: str) -> Callable[[float], None]:
-        if ref in ("ScanX", "ScanY", "OffsetX", "OffsetY"):
+        if ref in ("OffsetX", "OffsetY"):
+            return lambda _: self._go_elsewhere() if self.scan.runs else self._move()
+        if ref in ("ScanX", "ScanY"):
             return lambda _: self._move()
-        return lambda _: None
+        return lambda _: self._go_elsewhere()
+
+    def _on_subscan(self, place: int) -> Callable[[float], None]:
+        return lambda value: self.panel.subscan.__setitem__(place, int(value))
+
+    def _go_elsewhere(self) -> None:
+        # The hardware moves at once: the lines that follow are scanned in the new frame.
+        now_s, rig, scan = self.clock.now_s(), self.rig, self.scan.activity
+        if scan is None or not self.scan.runs or not scan.running(now_s):
+            return
+        moved = replace(scan, region=self._scanned(self.frame()))
+        rig.drawing.wait()
+        rig.drawing.rewind()
+        rig.drawing.start(moved, rig.drawing.prepared(moved, engaged=rig.engaged))
+        self.scan.elsewhere.append((scan.lines_done(now_s), moved))
+
+    def _scanned(self, region: Region) -> Region:
+        # the real simulator turns its picture against the direction of the frame
+        return replace(region, angle_rad=-region.angle_rad) if self.card == "simulator" else region
 
     def _of_hardware(self) -> dict[str, GxsmEntry]:
         rig, loop = self.rig, self.rig.setup.feedback
@@ -243,17 +288,15 @@ class GxsmProgram:
             return
         follows, self.scan.follows = self.scan.follows, False
         self.rig.stop_move(now_s)
-        if self.rig.busy(now_s) or self.faults.strikes("no-start", now_s):
+        if self.rig.busy(now_s) or self.faults.strikes("no-start", now_s) or NO_CHANNEL in self.dialogs:
             return
         if not self.channels:
-            self.dialogs.append("no channel is set")
+            self.dialogs.append(NO_CHANNEL)
             return
         entries, columns, rows = self.entries, int(self.entries["PointsX"]), int(self.entries["PointsY"])
-        region = self.frame()
+        region = self._scanned(self.frame())
         self.rig.setup.region, self.rig.setup.shape, self.rig.setup.upwards = region, (rows, columns), False
         if self.card == "simulator":
-            # the real simulator turns its picture against the direction of the frame
-            self.rig.setup.region = replace(region, angle_rad=-region.angle_rad)
             self.rig.setup.line_s = _PIXELS_S + len(self.channels) * columns / entries["sim-stm-speed"]
         else:
             self.rig.setup.line_s = 2.0 * entries["RangeX"] / entries["dsp-fbs-scan-speed-scan"]
@@ -266,6 +309,7 @@ class GxsmProgram:
         is_first = self.scan.activity is None and self.card == "simulator" and self.version == 4
         self.scan.y_before = _NEVER_WRITTEN if is_first else self.y_current(now_s)
         self.scan.before, self.scan.own = None if follows else self.names(now_s), []
+        self.scan.elsewhere, self.scan.subscan = [], list(self.panel.subscan)
         self.scan.number = self.saving.next_number()
         self.scan.shows_s = 0.0 if follows else SHOWS_S
         self.scan.activity = started
@@ -293,8 +337,10 @@ class GxsmProgram:
 
     def names(self, now_s: float) -> list[Path]:
         """Return the reported paths of the channels' files, existing or not; empty before the first scan."""
-        if self.scan.activity is None:
+        if not self.channels:
             return []
+        if self.scan.activity is None:
+            return [self.saving.named(one, self.saving.counter) for one in self._endings()] if self._is_named else []
         if self.scan.before is not None and now_s < self.scan.activity.start_s + NAMED_S:
             return self.scan.before
         if self.scan.own:
@@ -311,9 +357,60 @@ class GxsmProgram:
             return np.zeros((0, 0), np.float32)
         now_s = self.clock.now_s()
         until_s = now_s if self.scan.runs else self.scan.activity.stopped_s
-        drawn = self.scan.activity.channels(until_s)
-        scanned = channel.raw(drawn[channel.source][1])
+        scanned = channel.raw(self.scan.activity.channels(until_s)[channel.source][1])
+        for line, moved in self.scan.elsewhere:
+            scanned[line:] = channel.raw(moved.channels(until_s)[channel.source][1])[line:]
+        left, width, top, height = self.scan.subscan
+        if width:
+            inside = np.zeros(scanned.shape, bool)
+            inside[top : top + height, left : left + width] = True
+            scanned[~inside] = np.nan
         return np.where(np.isnan(scanned), self.scan.memory[channel], scanned)
+
+    # --- a person ---
+
+    def set_channels(self) -> None:
+        """Set the channels at the panel; GXSM reports them from their first scan on."""
+        self.channels = list(self._known_channels)
+
+    def close_dialogs(self) -> None:
+        self.dialogs.clear()
+
+    def pause_scan(self) -> None:
+        """Pause the scan; GXSM's own simulator has no status bit for it."""
+        if self.scan.activity is not None:
+            self.scan.activity.pause(self.clock.now_s())
+
+    def resume_scan(self) -> None:
+        if self.scan.activity is not None:
+            self.scan.activity.resume(self.clock.now_s())
+
+    def switch_feedback(self, *, on: bool) -> None:
+        self.rig.switch_feedback(self.clock.now_s(), on=on)
+        self.rig.adjust(self.clock.now_s())
+
+    def open_file(self, path: Path) -> None:
+        """Open a file: its path becomes the "basename" of all later scans, and its frame the next scan's."""
+        self.panel.original = str(path)
+        scan = read(path).scans[0]
+        (x, y), (width, height) = scan.region.center_m, scan.region.size_m
+        for ref, length_m in (("OffsetX", x), ("OffsetY", y), ("RangeX", width), ("RangeY", height)):
+            self.entries.put(ref, length_m / ANGSTROM_M)
+        self.entries.put("Rotation", -math.degrees(scan.region.angle_rad))
+        self.entries.put("PointsX", scan.shape[1])
+        self.entries.put("PointsY", scan.shape[0])
+
+    def keep_movie(self) -> None:
+        """Keep the last scan as the picture of a *Movie*."""
+        assert self.scan.activity is not None
+        rows, columns = self.scan.activity.shape
+        self.panel.movie = columns, rows
+
+    def retrieve(self) -> None:
+        """Copy the picture of the last *Movie* over the memory; with another size, that ends GXSM during a scan."""
+        scan = self.scan.activity
+        if self.panel.movie is not None and scan is not None and self.scan.runs:
+            self.has_crashed = self.has_crashed or self.panel.movie != scan.shape[::-1]
 
     def save(self, now_s: float, *, finished: bool = False) -> None:
         """Save the last scan, if any; a saved scan is saved again under the next number.
@@ -349,6 +446,7 @@ class GxsmProgram:
             scan.end_s - self.panel.behind_s if finished else 0.0,
             CARDS[self.card],
             scan.bias_v,
+            self.panel.original,
         )
         return files.netcdf3(saved) if self.version == 3 else files.netcdf4(saved)
 
