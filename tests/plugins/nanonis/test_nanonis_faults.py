@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deadlines import DEADLINE_S
 from tests.plugins.nanonis.nanonis_bench import Bench
 from tests.plugins.vendor_bench import SOON, scans, small, states
 
@@ -350,7 +351,7 @@ def test_restarted_translator_publishes_scans_that_ended_meanwhile(bench: Make) 
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     made.kill()
-    assert made.emulator.scan_ended.wait(30)
+    assert made.emulator.scan_ended.wait(DEADLINE_S)
     again = made.start()
     found = scans(again.until(FREE))
     assert found[0].filename.endswith("unnamed001.sxm")

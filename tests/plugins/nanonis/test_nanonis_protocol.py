@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deadlines import DEADLINE_S
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -352,7 +353,7 @@ def _texts(reply: bytes) -> list[str]:
 
 def _asked(address: str, name: str, body: bytes = b"") -> bytes:
     host, port = address.split(":")
-    with socket.create_connection((host, int(port)), timeout=20.0) as connection:
+    with socket.create_connection((host, int(port)), timeout=DEADLINE_S) as connection:
         connection.sendall(name.encode().ljust(32, b"\0") + struct.pack(">iHH", len(body), 1, 0) + body)
         reader = connection.makefile("rb")
         header = reader.read(40)

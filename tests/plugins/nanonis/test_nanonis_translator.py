@@ -27,6 +27,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
+from afspm.plugins.nanonis.z_controller import unit_of
 from afspm.storage.formats import read
 
 Make = Callable[..., Bench]
@@ -121,6 +122,67 @@ def test_pixels_that_nanonis_would_round_are_refused(bench: Make) -> None:
     assert response.code == ControlResponse.PARAM_ERROR
     assert "96 or 112, not 100" in response.reason
     assert peer.get(names.SCAN_RESOLUTION_X) == "32"
+
+
+def test_missing_module_piezo_is_named_at_the_start_and_refuses_positions(bench: Make) -> None:
+    made = bench()
+    made.at_panel(lambda emulator: emulator.software.functions.remove("Piezo."))
+    peer = made.start()
+    ready(peer)
+    made.until_logged("Nanonis has no module Piezo, so positions of the probe will be refused")
+    response = peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((1e-9, 0.0)))
+    assert response.code == ControlResponse.PARAM_ERROR
+    assert "does not report the scanner's range" in response.reason
+    made.kill()
+    assert "Traceback" not in made.log_text()
+
+
+SIGNALS = ["Current (A)", "Bias (V)", "Z (m)", "OC M1 Freq. Shift (Hz)", "Amplitude (V)", "OC M1 Amplitude (m)", "X"]
+
+
+@pytest.mark.parametrize(
+    ("controller", "unit"),
+    [
+        ("log Current", "A"),
+        ("Current", "A"),
+        ("neg. Freq. Shift", "Hz"),
+        ("OC M1 Freq. Shift", "Hz"),
+        ("Amplitude", "V"),
+        ("OC M1 Amplitude", "m"),
+        ("Force", ""),
+        ("OC M1", ""),
+        ("log", ""),
+        ("X", ""),
+    ],
+)
+def test_z_controller_has_the_unit_of_the_signal_in_its_name(controller: str, unit: str) -> None:
+    assert unit_of(controller, SIGNALS) == unit
+
+
+@pytest.mark.parametrize(
+    ("mode", "setpoint", "rows", "logged"),
+    [
+        ("current", 1e-10, {}, "the active z controller is 'log Current', in A"),
+        ("frequency-shift", -20.0, {}, "'OC M1 Freq. Shift' holds a value in Hz, but zctrl-setpoint is in A"),
+        ("frequency-shift", -20.0, {"unit": "Hz"}, "the active z controller is 'OC M1 Freq. Shift', in Hz"),
+        ("current", 1e-10, {"unit": "pA"}, "'log Current' holds a value in A, but zctrl-setpoint is in pA"),
+    ],
+)
+def test_active_z_controller_is_compared_with_the_unit_of_the_setpoint(
+    bench: Make, mode: str, setpoint: float, rows: dict[str, str], logged: str
+) -> None:
+    made = bench(feedback={"mode": mode, "setpoint": setpoint})
+    peer = made.start(parameters={names.ZCTRL_SETPOINT: rows} if rows else {})
+    peer.until(FREE)
+    made.until_logged(logged)
+
+
+def test_z_controller_of_unknown_unit_is_named(bench: Make) -> None:
+    made = bench()
+    made.at_panel(lambda emulator: emulator.software.functions.remove("ZCtrl.CtrlListGet"))
+    peer = made.start()
+    peer.until(FREE)
+    made.until_logged("the active z controller is unknown")
 
 
 def test_a_frame_beyond_the_scanner_is_refused_and_the_old_one_stays(bench: Make) -> None:

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deadlines import DEADLINE_S
 from nanonis_spm import Nanonis as Client
 
 from afspm.basics.clock import ExperimentClock
@@ -41,7 +42,7 @@ def connected(folder: Path, speed: float, **settings: Any) -> Iterator[Any]:
     emulator = NanonisEmulator(port=0, **{"surface": "lattice", **settings})
     with emulator.running(folder, ExperimentClock.starting_now(speed=speed)) as address:
         host, port = address.split(":")
-        with socket.create_connection((host, int(port)), timeout=20.0) as connection:
+        with socket.create_connection((host, int(port)), timeout=DEADLINE_S) as connection:
             client = Client(connection)
             client.folder = folder
             yield client
@@ -243,7 +244,7 @@ def test_client_stops_a_moving_tip(client: Any) -> None:
 def test_client_switches_the_z_controller_with_a_delay(client: Any) -> None:
     for on in (0, 1):
         ask(client, "ZCtrl_OnOffSet", on)
-        until_s = time.monotonic() + 20.0
+        until_s = time.monotonic() + DEADLINE_S
         while ask(client, "ZCtrl_OnOffGet") != [on]:
             assert time.monotonic() < until_s
         assert ask(client, "ZCtrl_StatusGet") == [2 if on else 1]
@@ -253,7 +254,7 @@ def test_client_sets_z_only_with_the_controller_off(client: Any, capsys: pytest.
     assert client.ZCtrl_ZPosSet(1e-9)[0]
     assert "The following error appeared" in capsys.readouterr().out
     ask(client, "ZCtrl_OnOffSet", 0)
-    until_s = time.monotonic() + 20.0
+    until_s = time.monotonic() + DEADLINE_S
     while ask(client, "ZCtrl_OnOffGet") != [0]:
         assert time.monotonic() < until_s
     ask(client, "ZCtrl_ZPosSet", 1e-9)
@@ -492,7 +493,7 @@ def test_each_base_name_is_numbered_and_a_valid_file_name(client: Any) -> None:
 def test_the_tip_goes_to_the_centre_of_the_frame(client: Any) -> None:
     ask(client, "Scan_FrameSet", 40e-9, -30e-9, 10e-9, 10e-9, 0.0)
     ask(client, "Scan_Action", 6, 0)
-    until_s = time.monotonic() + 20.0
+    until_s = time.monotonic() + DEADLINE_S
     while ask(client, "FolMe_XYPosGet", 1) != pytest.approx([40e-9, -30e-9]):
         assert time.monotonic() < until_s
 
@@ -525,11 +526,11 @@ def test_signals_are_logged_on_a_port_of_their_own(tmp_path: Path) -> None:
     emulator = NanonisEmulator(port=0, surface="lattice")
     with emulator.running(tmp_path, ExperimentClock.starting_now(speed=1.0)) as address:
         host, port = address.split(":")
-        with socket.create_connection((host, int(port)), timeout=20.0) as connection:
+        with socket.create_connection((host, int(port)), timeout=DEADLINE_S) as connection:
             client = Client(connection)
             assert ask(client, "TCPLog_StatusGet") == [0]
-            with socket.create_connection((host, emulator.logger_port), timeout=20.0) as stream:
-                until_s = time.monotonic() + 20.0
+            with socket.create_connection((host, emulator.logger_port), timeout=DEADLINE_S) as stream:
+                until_s = time.monotonic() + DEADLINE_S
                 while ask(client, "TCPLog_StatusGet") != [1]:
                     assert time.monotonic() < until_s
                 ask(client, "TCPLog_ChsSet", 2, [0, 1])

@@ -24,8 +24,8 @@ from typing import Any, ClassVar, Final
 from afspm.basics.errors import ConfigError, FileError, Refused
 from afspm.basics.units import Duration
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
-from afspm.plugins.nanonis import fetched, geometry, parameter_groups, protocol
-from afspm.plugins.nanonis.activity import NanonisActivity
+from afspm.plugins.nanonis import fetched, geometry, parameter_groups, protocol, z_controller
+from afspm.plugins.nanonis.activity import SAFE_TIP, WITHDRAWING, NanonisActivity
 from afspm.plugins.nanonis.result_files import NanonisFiles
 from afspm.plugins.nanonis.session import MODULES, Session
 from afspm.translator.driver import Driver
@@ -53,7 +53,7 @@ _BY_VALUE: Final = (
     parameter_groups.Slope,
     parameter_groups.DriftRate,
 )
-_GROUPS: Final = (*_BY_VALUE, geometry.Probe, parameter_groups.FeedbackOn)
+_GROUPS: Final = (*_BY_VALUE, geometry.Probe, parameter_groups.FeedbackOn, parameter_groups.TipState)
 _TRANSLATED: Final = tuple(name for group in _GROUPS for name in group.names)
 
 
@@ -104,7 +104,8 @@ class Nanonis(Driver):
         ask = self._ask
         self._probe = geometry.Probe(ask, lambda: self.clock.now_s())
         feedback = parameter_groups.FeedbackOn(ask, lambda holds: self.wait_for(holds, reply_timeout_s))
-        self.groups = (*(group(ask) for group in _BY_VALUE), self._probe, feedback, self._kept)
+        self._tip = parameter_groups.TipState(ask)
+        self.groups = (*(group(ask) for group in _BY_VALUE), self._probe, feedback, self._tip, self._kept)
         self._files: NanonisFiles
 
     def connect(self) -> None:
@@ -116,7 +117,10 @@ class Nanonis(Driver):
             own_folder = (self.run_dir / "scans").resolve()
             patience_s = self.patience_s(self.common.result_timeout_s / 2)
             self._files = NanonisFiles(self.memory, self._session_dir, own_folder, patience_s, self.log)
-        self._activity = NanonisActivity(session, self._files, self._probe, self.memory, self.clock, self.log)
+        self._activity = NanonisActivity(
+            session, self._files, self._probe, self._tip, self.memory, self.clock, self.log
+        )
+        z_controller.compare(session.ask, self.table[names.ZCTRL_SETPOINT].unit, self.log)
         folder = self._session_dir or Path(session.ask("Util.SessionPathGet")[0])
         if not folder.is_dir():
             self.log.warning(
@@ -160,10 +164,19 @@ class Nanonis(Driver):
     # --- results ---
 
     def results(self) -> Sequence[str]:
+        if self._tip.is_undecided:
+            return self._files.listed()  # a measurement that ends meanwhile may be one in the air
         return self._files.results(self.clock.now_s(), self._fetch)
 
     def followed(self) -> bool | None:
         return self._files.followed()
+
+    def stopped_by_hand(self) -> str:
+        return self._activity.stopped_by_hand()
+
+    def withdrew_tip(self) -> str:
+        # who withdraws it shows only at the end
+        return SAFE_TIP if self._tip.is_safe else WITHDRAWING if self._tip.is_undecided else ""
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         return self._files.load(result)

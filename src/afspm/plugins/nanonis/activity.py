@@ -11,6 +11,7 @@ from afspm.basics.clock import Clock
 from afspm.basics.errors import Refused
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.plugins.nanonis.geometry import Probe, ScanFrame
+from afspm.plugins.nanonis.parameter_groups import TipState
 from afspm.plugins.nanonis.protocol import NanonisError
 from afspm.plugins.nanonis.result_files import NanonisFiles
 from afspm.plugins.nanonis.session import APPROACH, MODULES, CurveEnded, ListenerEvent, ScanEnded, Session
@@ -24,7 +25,9 @@ _SHOWS_S: Final = 10.0
 """Longest real time until a poll shows a started scan: the tip may first have to move to the first line."""
 _LATEST_S: Final = 10.0
 """Experiment time from the expected arrival of the tip until the move counts as failed."""
-_SAFE_TIP, _WITHDRAWING = 5, 6
+SAFE_TIP: Final = "Nanonis' safe tip withdrew the tip: find out why, then run x-engage to bring it back"
+
+WITHDRAWING: Final = "Nanonis is withdrawing the tip"
 
 
 class NanonisActivity(Activity):
@@ -45,6 +48,7 @@ class NanonisActivity(Activity):
         session: Session,
         files: NanonisFiles,
         probe: Probe,
+        tip: TipState,
         kept: Kept,
         clock: Clock,
         log: logging.Logger,
@@ -55,6 +59,7 @@ class NanonisActivity(Activity):
         self._opened = session.opened
         self._files = files
         self._probe = probe
+        self._tip = tip
         self._kept = kept
         self.curve: CurveEnded | None = None
         self._kind_asked = ""
@@ -184,14 +189,19 @@ class NanonisActivity(Activity):
                 return ScopeStatus(ScopeState.SCANNING)
             path = None
         if self._files.what == SCAN or path is not None:
+            self._look_for_new_frame()
             self.end(path)
         return self.at_rest(self._besides_scans())
 
     def refuse_safe_tip(self) -> None:
         """Raise Refused after the safe tip has withdrawn the tip: no measurement is useful then."""
-        if self._ask("ZCtrl.StatusGet")[0] == _SAFE_TIP:
-            reason = "Nanonis' safe tip withdrew the tip: find out why, then run x-engage to bring it back"
-            raise Refused(ControlResponse.ACTION_ERROR, reason)
+        self._tip.look()
+        if self._tip.is_safe:
+            raise Refused(ControlResponse.ACTION_ERROR, SAFE_TIP)
+
+    def stopped_by_hand(self) -> str:
+        # the safe tip ends a scan as well
+        return "" if self._tip.is_safe else super().stopped_by_hand()
 
     def _scanning(self, path: str | None) -> ScopeStatus:
         if path and self._ask("Scan.PropsGet")[0]:  # a continuous scan: one frame has ended, the next is running
@@ -202,10 +212,15 @@ class NanonisActivity(Activity):
         if not self._stopping:
             self._files.seen()
             self._listener.scan()
-            if self._watch_safe_tip(self._ask("ZCtrl.StatusGet")[0]):
+            self._look_for_new_frame()
+            if self._watch_safe_tip():
                 self.stop_scan()  # the scan may go on in the air, and its picture look plausible
                 self._failed = True
         return ScopeStatus(ScopeState.SCANNING)
+
+    def _look_for_new_frame(self) -> None:
+        if self._files.what == SCAN:
+            self._files.see_frame(frame(ScanFrame(self._ask).read())[0])
 
     def _besides_scans(self) -> ScopeState:
         kind = self._kind_running()
@@ -215,9 +230,8 @@ class NanonisActivity(Activity):
         state, until_s = self._occupied
         if self._clock.now_s() < until_s:
             return state
-        z_controller = self._ask("ZCtrl.StatusGet")[0]
-        self._watch_safe_tip(z_controller)
-        if z_controller == _WITHDRAWING or self._approaches():
+        self._watch_safe_tip()
+        if self._tip.is_withdrawing or self._approaches():
             return ScopeState.COARSE_MOTOR
         return ScopeState.FREE if self._is_there() else ScopeState.MOVING
 
@@ -248,9 +262,10 @@ class NanonisActivity(Activity):
         self._probe.give_up()
         return True
 
-    def _watch_safe_tip(self, z_controller: int) -> bool:
+    def _watch_safe_tip(self) -> bool:
         # Logged once, not at each poll.
-        safe = z_controller == _SAFE_TIP
+        self._tip.look()
+        safe = self._tip.is_safe
         if safe and not self._was_safe:
             self._log.error("Nanonis' safe tip withdrew the tip: nothing is measured until it is engaged again")
         self._was_safe = safe

@@ -13,7 +13,7 @@ from typing import ClassVar, Final
 from afspm.basics.formatting import lengths_text
 from afspm.model import Region, names
 from afspm.plugins.nanonis.parameter_groups import Ask, Group, MoveSpeed, keep_speed
-from afspm.plugins.nanonis.protocol import BadReply
+from afspm.plugins.nanonis.protocol import BadReply, NanonisError
 from afspm.translator.parameters import Value, refuse_value
 from afspm.translator.setting_groups import FRAME, POSITION, frame, frame_values
 
@@ -107,8 +107,12 @@ class Probe(Group):
     def write(self, values: Mapping[str, Value]) -> None:
         before_m = self.xy_m()
         x, y = (float(values.get(name, was)) for name, was in zip(self.names, before_m, strict=True))
-        self._range_m = self._numbers("Piezo.RangeGet")[:2]
         # Nanonis would clip the position to the range without an error.
+        try:
+            self._range_m = self._numbers("Piezo.RangeGet")[:2]
+        except NanonisError as error:
+            what = f"Nanonis does not report the scanner's range ({error}), so that no position can be checked"
+            raise refuse_value(self.names[0], f"{what}; move the tip at the panel") from error
         for name, value, whole in zip(self.names, (x, y), self._range_m, strict=True):
             if abs(value) > whole / 2:
                 raise refuse_value(

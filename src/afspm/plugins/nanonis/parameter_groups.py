@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Final
 
 from afspm.model import names
-from afspm.plugins.nanonis.protocol import BadReply
+from afspm.plugins.nanonis.protocol import BadReply, NanonisError
 from afspm.translator.parameters import FEEDBACK_ON, Value, refuse_value
 from afspm.translator.setting_groups import SettingsGroup
 
@@ -24,6 +24,11 @@ _ON, _OFF = 1, 2
 """Values of a switch in `…Set`; `…Get` returns 1 and 0 instead."""
 _DRIFT_WITHOUT_LIMIT: Final = 7
 """Number of results of Piezo.DriftCompGet in release 2021."""
+_CONTROLLER_OFF, _SAFE_TIP, _WITHDRAWING = 1, 5, 6
+"""Values of ZCtrl.StatusGet; the others are on, on hold and switching off."""
+_END_OF_RANGE: Final = 1e-3
+"""Distance from the upper limit of z, as a part of the range, within which the tip counts as withdrawn: more than its
+noise."""
 _KEEP_SPEED: Final = 1
 """Value of Scan.SpeedSet for the quantity that a change of the frame keeps; Scan.SpeedGet returns 0 instead."""
 
@@ -122,6 +127,53 @@ class FeedbackOn(Group):
         self._ask("ZCtrl.OnOffSet", int(wanted))
         # OnOffGet reports the real-time controller, which follows with a delay.
         self._wait_for(lambda: self.read()[FEEDBACK_ON] is wanted)
+
+
+class TipState(Group):
+    """The z controller's report on the tip: withdrawn or not.
+
+    Nanonis reports a withdrawal only while it lasts; until its end nothing shows whether a person or the safe tip
+    withdraws the tip. Afterwards the controller is off, with the tip at the upper limit of z. A tip that is held
+    elsewhere with the controller off is not withdrawn.
+
+    Attributes:
+        is_safe: whether the safe tip had withdrawn the tip at the last reading.
+        is_withdrawing: whether the tip was on its way up at the last reading.
+        is_undecided: whether it was so at the last reading, or when `x-engaged` was read.
+    """
+
+    names = (names.ENGAGED,)
+
+    def __init__(self, ask: Ask) -> None:
+        super().__init__(ask)
+        self.is_safe = self.is_withdrawing = self._was_withdrawing = False
+
+    @property
+    def is_undecided(self) -> bool:
+        # a withdrawal may end right after `x-engaged` was read: the value in force is still the one from before
+        return self.is_withdrawing or self._was_withdrawing
+
+    def look(self) -> int:
+        """Read the status of the z controller, which sets the attributes, and return it."""
+        status = int(self._ask("ZCtrl.StatusGet")[0])
+        self.is_safe, self.is_withdrawing = status == _SAFE_TIP, status == _WITHDRAWING
+        return status
+
+    def read(self) -> dict[str, Value]:
+        status = self.look()
+        self._was_withdrawing = self.is_withdrawing
+        is_away = self.is_safe or (status == _CONTROLLER_OFF and self._is_at_upper_limit())
+        return {names.ENGAGED: not is_away}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        raise refuse_value(names.ENGAGED, "it is read-only")
+
+    def _is_at_upper_limit(self) -> bool:
+        try:
+            high_m, low_m = self._numbers("ZCtrl.LimitsGet")
+        except NanonisError:
+            return False  # the place of a withdrawn tip is not known
+        return bool(self._numbers("ZCtrl.ZPosGet")[0] >= high_m - _END_OF_RANGE * (high_m - low_m))
 
 
 class MoveSpeed(Group):

@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from afspm.basics.errors import AfspmError, InvalidValue
+from afspm.storage.formats.content import text_of
 from afspm.translator.driver_base import ControllerLost
 
 HEADER_BYTES: Final = 40
@@ -144,15 +145,6 @@ def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[
     if status:
         raise NanonisError(f"Nanonis: {text or 'no reason given'} (error {status})", where=name)
     return found
-
-
-def text_of(raw: bytes | bytearray | memoryview) -> str:
-    """Decode a text as UTF-8, otherwise as Latin-1 (a µ in a name, an umlaut in a path)."""
-    raw = bytes(raw)
-    try:
-        return raw.decode()
-    except UnicodeDecodeError:
-        return raw.decode("latin-1")
 
 
 def _depends_on_release(name: str) -> bool:

@@ -7,7 +7,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path, PureWindowsPath
 from typing import Final
 
+import numpy as np
+
 from afspm.basics.errors import AfspmError, FileError
+from afspm.model import Region, Spectrum
 from afspm.plugins.nanonis import fetched
 from afspm.translator.driver_base import LOST
 from afspm.translator.result_files import (
@@ -16,13 +19,17 @@ from afspm.translator.result_files import (
     Entry,
     FilePrecision,
     ResultFiles,
+    as_region,
     lines_missing,
+    missing_text,
     newest,
     read_result,
 )
 
 _PRECISION: Final = FilePrecision(part=2e-6, angle_rad=1e-3, positions=True)
 """Scan files have seven digits of a length, and four digits of an angle in degrees: errors of up to 0.05 degrees."""
+
+_NEW_FRAME: Final = "its frame was changed at the panel while it ran"
 
 Fetch = Callable[[Entry], Content]
 
@@ -80,6 +87,15 @@ class NanonisFiles(ResultFiles):
         """Record that Nanonis has reported the measurement as running."""
         if self._kept["running"] is not None:
             self._kept["running"]["seen"] = True
+
+    def see_frame(self, region: Region) -> None:
+        """Register the frame in force during a scan: a scan whose frame a person changes has no result.
+
+        It is unknown whether Nanonis moves the running scan then, or waits for the next one.
+        """
+        running = self._kept["running"]
+        if running is not None and not _PRECISION.same(as_region(running["frame"]), region):
+            running["new_frame"] = True
 
     def end(self, now_ns: int, now_s: float, path: str | None = None) -> None:
         """Register the end of the running measurement, and the reported file of the ended measurement.
@@ -143,10 +159,18 @@ class NanonisFiles(ResultFiles):
         elif ended is not None:
             file = self._file(ended)
             if file is not None and (content := self._whole(file, ended)) is not None:
-                self._take(file, ended, content)
+                if ended.get("new_frame"):
+                    self._log.error("%s is not published: %s", file, _NEW_FRAME)
+                    self._kept["ended"], self.broken_off = None, True
+                else:
+                    self._take(file, ended, content)
             elif now_s >= ended["fetch_at_s"]:
                 self._kept["ended"] = None
                 self._fetch(fetch, ended, file)
+        return self._listed()
+
+    def listed(self) -> list[str]:
+        """Return the last results, without looking for new ones."""
         return self._listed()
 
     def read(self, entry: Entry) -> Content:
@@ -159,8 +183,11 @@ class NanonisFiles(ResultFiles):
                 raise FileError("the controller never reported it as running")
             content = fetch(ended)
             # A stopped scan stays in Nanonis' memory with NaN in the missing lines.
-            if missing := lines_missing(content):
-                raise FileError(f"{missing} of its {content[0].values.shape[0]} lines were not scanned")
+            if missing := missing_text(content) or _points_missing(content):
+                self.missing = missing
+                raise FileError(missing)
+            if ended.get("new_frame"):
+                raise FileError(_NEW_FRAME)
         except LOST:
             self._kept["ended"] = dict(ended)  # to fetch after the next connection
             raise
@@ -177,7 +204,10 @@ class NanonisFiles(ResultFiles):
 
     def _take_followed(self, followed: Entry, now_s: float) -> None:
         file = self._file(followed)
-        if file is not None and (content := self._whole(file, followed)) is not None:
+        if followed.get("new_frame"):
+            self._kept["followed"] = None
+            self._log.error("the scan before the present one is not published: %s", _NEW_FRAME)
+        elif file is not None and (content := self._whole(file, followed)) is not None:
             self._add(str(file), followed, {}, content)
             self._kept["followed"], self._has_followed = None, True
         elif now_s >= followed["fetch_at_s"]:
@@ -213,3 +243,11 @@ def _files(folder: Path, what: str) -> list[Path]:
 
 def _content(path: Path, entry: Entry) -> Content:
     return [_PRECISION.as_set(one, entry) for one in read_result(path)]
+
+
+def _points_missing(content: Content) -> str:
+    # (!) It is unknown how Nanonis returns a stopped spectrum: with NaN where it did not measure, as in its scans.
+    for one in content:
+        if isinstance(one, Spectrum) and (points := int(np.isnan(one.values[:, 1:]).all(axis=1).sum())):
+            return f"{points} of its {len(one.values)} points were not measured"
+    return ""

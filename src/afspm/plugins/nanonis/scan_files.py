@@ -16,27 +16,30 @@ import numpy as np
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import FileError
 from afspm.model import Region, Scan
-from afspm.storage.formats.content import FileContent, local_ns
+from afspm.storage.formats.content import FileContent, local_ns, text_of
 
 CONTROLLER = "Nanonis"
-_END = b":SCANIT_END:"
-_DATA = b"\x1a\x04"
+_END = re.compile(rb"^:SCANIT_END:\s*\x1a\x04", re.MULTILINE)
+_FIELD = re.compile(r":([^\r\n]+):")
+_AFTER_COMMENT = re.compile(r".+>.*|[A-Z][A-Z0-9_-]*|Multipass-Config")
+"""Names of the fields that may follow the comment, in which a user may have typed a line between colons."""
 _DIRECTIONS = {"both": ("Forward", "Backward"), "forward": ("Forward",), "backward": ("Backward",)}
 
 
 def read_scan(path: Path, zone: tzinfo | None) -> FileContent:
     """Read all channels, named e.g. "Z Forward" and "Z Backward". Raises FileError, KeyError, ValueError: damaged."""
-    head, found, rest = path.read_bytes().partition(_END)
-    start = rest.find(_DATA)
-    if not found or start < 0:
+    content = path.read_bytes()
+    if (end_of_header := _END.search(content)) is None:
         raise FileError("is not a Nanonis scan, or incomplete: its header does not end")
-    header = _header(head.decode("latin-1"))
+    header = _header(text_of(content[: end_of_header.start()]))
     if _field(header, "SCANIT_TYPE").split() != ["FLOAT", "MSBFIRST"]:
         raise FileError(f"holds values as {_field(header, 'SCANIT_TYPE')!r} instead of FLOAT MSBFIRST")
     nx, ny = (int(value) for value in _field(header, "SCAN_PIXELS").split())
     images = _images(_field(header, "DATA_INFO"))
-    values, size = rest[start + len(_DATA) :], 4 * len(images) * nx * ny
-    if min(nx, ny) < 2 or len(values) != size:
+    values, size = content[end_of_header.end() :], 4 * len(images) * nx * ny
+    if min(nx, ny) < 2:
+        raise FileError(f"has {nx} x {ny} pixels: afspm reads scans of two lines and columns or more")
+    if len(values) != size:
         raise FileError(f"is incomplete: {len(values)} bytes of values, not the {size} of {len(images)} images")
     direction = _field(header, "SCAN_DIR")
     if direction not in ("up", "down"):
@@ -54,9 +57,26 @@ def read_scan(path: Path, zone: tzinfo | None) -> FileContent:
 
 
 def _header(text: str) -> dict[str, str]:
-    # A field is a line `:NAME:` and the lines below it.
-    found = re.findall(r"^:([^\r\n]+):\r?\n(.*?)(?=^:[^\r\n]+:\r?$|\Z)", text, re.MULTILINE | re.DOTALL)
-    return {name: value.strip() for name, value in found}
+    # A field is a line `:NAME:` and the lines below it. The header of another scan may stand in the comment: of fields
+    # before the comment the first counts, of fields after it the last.
+    before: dict[str, list[str]] = {}
+    after: dict[str, list[str]] = {}
+    lines: list[str] = []
+    for line in text.splitlines():
+        field = _FIELD.fullmatch(line)
+        if field is None or ("COMMENT" in before and not _ends_comment(field[1], before)):
+            lines.append(line)
+            continue
+        lines = []
+        if "COMMENT" in before:
+            after[field[1]] = lines
+        else:
+            before.setdefault(field[1], lines)
+    return {name: "\n".join(value).strip() for name, value in {**after, **before}.items()}
+
+
+def _ends_comment(name: str, before: dict[str, list[str]]) -> bool:
+    return name not in {*before, "SCANIT_END"} and _AFTER_COMMENT.fullmatch(name) is not None
 
 
 def _field(header: dict[str, str], name: str) -> str:

@@ -97,6 +97,7 @@ class Session:
             self._link.release = release or self._found_release()
             # The spectroscopy modules of the real software answer only after their Open.
             self.opened = {module for module in (*MODULES.values(), APPROACH) if self._open(module)}
+            self._find_range()
             second = Link(addresses[-1], timeout_s, driver.clock.monotonic_s, self._link.release)
             self._listener = self.listener = Listener(second, driver.wake)
             driver.prove()
@@ -119,6 +120,12 @@ class Session:
         self.controller = f"{product} {version}, release {host_release}"
         self._log.info("%s (real-time engine %d)", self.controller, engine_release)
         return int(host_release)
+
+    def _find_range(self) -> None:
+        try:
+            self.ask("Piezo.RangeGet")
+        except NanonisError as error:
+            self._log.warning("Nanonis has no module Piezo, so positions of the probe will be refused: %s", error)
 
     def _open(self, module: str) -> bool:
         try:

@@ -67,10 +67,15 @@ class Dispatcher:
     def __init__(self, registers: Registers, modules: Iterable[object]) -> None:
         self._registers = registers
         self._handlers: dict[str, Handler] = {}
+        self._removed: tuple[str, ...] = ()
         for module in modules:
             for attribute, marked in vars(type(module)).items():
                 for name in getattr(marked, "answered_functions", ()):
                     self._handlers[name] = _bound(getattr(module, attribute), name)
+
+    def remove(self, *modules: str) -> None:
+        """Refuse all functions of some modules ("Piezo."), as software without a licence for them does."""
+        self._removed = modules
 
     def call(self, name: str, arguments: list[object]) -> Answer:
         """Execute a function; return its results.
@@ -79,6 +84,8 @@ class Dispatcher:
             FunctionRefused: no such module or function, or a value is not allowed. InstrumentBusy, InvalidValue: errors
                 of the handler.
         """
+        if name.startswith(self._removed):
+            raise FunctionRefused("Module not available")
         handler = self._handlers.get(name)
         _refuse_nan(name, arguments, keeps_nan=handler is None or name in _KEEPS_NAN)
         if handler is not None:

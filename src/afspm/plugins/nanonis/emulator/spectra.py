@@ -79,6 +79,7 @@ class SpectroscopyModules:
         self.sweeps = {module: SweepSettings() for module in _KINDS}
         self.running: SpectrumActivity | None = None
         self.ended = 0
+        self._stopped: tuple[SpectrumActivity | None, float] = (None, 0.0)
         self._base_names = dict(_FILE_NAMES)
 
     def advance(self, now_s: float) -> None:
@@ -157,8 +158,12 @@ class SpectroscopyModules:
             return [], np.zeros((0, 0)), []
 
         def ready(now_s: float) -> Results | None:
-            data = spectrum_columns(curve), curve.values.T, [*curve.position_m, float(curve.values[0, 0])]
-            return data if self.ended > ended else None
+            if self.ended == ended:
+                return None
+            # (!) It is unknown how the real software returns a stopped sweep: here with NaN where it did not measure.
+            values = curve.values.copy()
+            values[self._measured(curve) :] = np.nan
+            return spectrum_columns(curve), values.T, [*curve.position_m, float(curve.values[0, 0])]
 
         return DeferredResult(ready)
 
@@ -166,10 +171,18 @@ class SpectroscopyModules:
     def _stop(self, name: str) -> Answer:
         self._module(name)
         if self.running is not None:
+            self._stopped = (self.running, self._core.now_s)
             self._core.rig.stop_spectrum(self._core.now_s)
             self.running = None
             self.ended += 1
         return ()
+
+    def _measured(self, curve: SpectrumActivity) -> int:
+        stopped, at_s = self._stopped
+        points = len(curve.values)
+        if stopped is not curve:
+            return points
+        return int(points * (at_s - curve.start_s) / (curve.end_s - curve.start_s))
 
     @answers("BiasSpectr.PropsSet")
     def _set_bias_properties(
