@@ -15,9 +15,10 @@ from fake_clock import FakeClock
 from tests.plugins.nanosurf.nanosurf_bench import Bench
 from tests.plugins.vendor_bench import FLAT, TURNED, moved, ready, scanned, scans, small, states
 
-from afspm.basics.errors import InvalidValue
+from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.basics.exit_codes import ExitCode
 from afspm.model import ControlResponse, Region, Scan, ScanLines, ScopeState, Spectrum, names
+from afspm.plugins.nanosurf import Nanosurf
 from afspm.plugins.nanosurf.emulator import NanosurfEmulator
 from afspm.plugins.nanosurf.emulator.studio import SETPOINT, StudioProgram
 from afspm.simulation.faults import Faults
@@ -28,7 +29,7 @@ Settings = dict[str, Any]
 FREE = ScopeState.FREE
 
 
-@pytest.mark.parametrize("release", [17, 19])
+@pytest.mark.parametrize("release", [13, 17, 19])
 @pytest.mark.parametrize("direction", ["up", "down"])
 def test_scan_shows_the_sample_in_place(bench: Make, release: int, direction: str) -> None:
     made = bench(release=release, tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
@@ -51,6 +52,48 @@ def test_scan_shows_the_sample_in_place(bench: Make, release: int, direction: st
             assert likeness(mirrored) < likeness(scan.values) - 0.1
     assert made.emulator.rig.scan is not None
     assert made.emulator.rig.scan.upwards is (direction == "up")
+
+
+def test_studio_before_the_present_tree_scans_and_moves_the_tip_along_z(bench: Make) -> None:
+    made = bench(release=13)
+    peer = made.start(release=13)
+    peer.until(FREE)
+    made.until_logged("before Studio 17 curves of force and positions of the tip are not supported")
+    for act, is_engaged in ((names.RETRACT, False), (names.ENGAGE, True)):
+        assert peer.act(act).ok
+        peer.until(ScopeState.COARSE_MOTOR)
+        peer.until(FREE)
+        assert made.emulator.rig.engaged is is_engaged
+    assert peer.set(names.ZCTRL_SETPOINT, 0.6).ok
+    assert peer.get(names.ZCTRL_SETPOINT) == "0.6"
+    refused = peer.set(names.ZCTRL_SETPOINT, 11.0)
+    assert refused.code == ControlResponse.PARAM_ERROR
+    for response in (peer.act(names.START_SPEC), peer.act(names.STOP_SPEC)):
+        assert response.code == ControlResponse.ACTION_NOT_SUPPORTED
+        assert "known from Nanosurf Studio 17 on" in response.reason
+    assert peer.set(names.PROBE_POS_X, 0.0).code == ControlResponse.PARAM_NOT_SUPPORTED
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    assert peer.act(names.STOP_SCAN).ok
+    assert not scans(peer.until(FREE))
+
+
+def test_retraction_stops_a_scan_before_the_present_tree(bench: Make) -> None:
+    made = bench(release=13, speed=5.0)
+    peer = made.start(release=13)
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    assert peer.act(names.RETRACT).ok
+    assert not scans(peer.until(FREE))
+    assert not made.emulator.rig.engaged
+
+
+def test_studio_of_an_unknown_release_is_refused() -> None:
+    with pytest.raises(ConfigError, match="Nanosurf Studio 12 is too old: afspm knows the commands of 13 and later"):
+        Nanosurf(release=12)
+    with pytest.raises(ConfigError, match="known from Nanosurf Studio 17 on"):
+        Nanosurf(release=13, image_buffer=4410)
 
 
 def test_the_setpoint_of_a_frequency_shift_is_in_hertz(tmp_path: Path) -> None:
@@ -241,6 +284,8 @@ def test_restarted_translator_finds_the_scan(bench: Make) -> None:
     ("emulator", "settings", "logged"),
     [
         ({"release": 19}, {"release": 18}, "Studio is release 19, not 18"),
+        ({"release": 13}, {}, "Studio is release 13, not 19"),
+        ({"release": 12}, {}, "Nanosurf Studio 12 is too old: afspm knows the commands of 13 and later"),
         ({}, {"session": "91-99-999"}, "Studio has no single measurement session 91-99-999"),
         ({}, {"parameters": {"zctrl-setpoint": {"unit": "nm"}}}, "Studio has z_control.setpoint in V, not in nm"),
         ({}, {"parameters": {"x-a": {"vendor": "no.such"}}}, "Studio has no no.such"),

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from deadlines import DEADLINE_S
 from tests.plugins.nanosurf.nanosurf_bench import Emulated
 
 import afspm
@@ -36,7 +37,6 @@ connect = socket.socket.connect
 socket.socket.connect = lambda made, _: connect(made, (host, int(port)))
 """
 """For programs that connect to Studio's usual port."""
-DEADLINE_S = 60.0
 
 
 @pytest.fixture

@@ -19,12 +19,12 @@ from typing import Any, ClassVar, Final
 from afspm.basics.errors import ConfigError, Refused
 from afspm.basics.plain_data import PlainMapping
 from afspm.basics.units import Duration, PollPeriod
-from afspm.model import ControlResponse, Region, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.plugins.nanosurf import commands
-from afspm.plugins.nanosurf.activity import FORCE, NanosurfFiles, StudioActivity
+from afspm.plugins.nanosurf.activity import FORCE, NanosurfFiles, ScanTime, StudioActivity
 from afspm.plugins.nanosurf.link import Link, StudioError
 from afspm.plugins.nanosurf.session import Session, new_lines
-from afspm.plugins.nanosurf.settings import DIRECTION, UNITS, FrameSettings, Slopes, TipPlace, direction
+from afspm.plugins.nanosurf.settings import DIRECTION, SPEED_PATH, UNITS, FrameSettings, Slopes, TipPlace, direction
 from afspm.translator.driver import Driver
 from afspm.translator.driver_base import action, connected
 from afspm.translator.parameters import Value
@@ -41,7 +41,8 @@ class Nanosurf(Driver):
 
     Args:
         address: "host:port" of Studio's scripting interface.
-        release: release of Studio (Help > About), 17 or later, which decides the commands to use.
+        release: release of Studio (Help > About), 13 or later, which decides the commands to use. Before 17 neither
+            force curves nor positions of the tip are supported.
         session: name of the measurement session, such as "91-21-004". Default: the only open session.
         gallery_dir: local path of Studio's gallery folder. Default: Studio runs on this computer.
         image_buffer: number of the low-level buffer with the running scan, for its lines. Default: no lines are read.
@@ -80,6 +81,8 @@ class Nanosurf(Driver):
         late = "the tip did not reach the position that it was sent to"
         self._place = TipPlace(self._studio, lambda: self.clock.now_s(), lambda: self.log.error(late))
         self.groups = (self._kept, FrameSettings(self._studio), Slopes(self._studio), self._place)
+        if commands.is_before_this_tree(release):
+            self._leave_out_what_is_unknown()
 
     @classmethod
     def technique(cls, settings: PlainMapping) -> str:
@@ -89,11 +92,14 @@ class Nanosurf(Driver):
         self.close()
         session = self._session = Session(self._open_link, self._release, self._session_name, self._level)
         self.prove()
+        if self.lacking:
+            text = "before Studio %d curves of force and positions of the tip are not supported: %s"
+            self.log.warning(text, commands.WITH_THIS_TREE, commands.LACKING)
         self._check_table(session)
         self._kept.kept_in(self.memory)
         self._files = NanosurfFiles(self.memory, self.log)
         self._activity = StudioActivity(
-            session, self._files, self._place, self.memory, self._folder, self._frame_in_force, self.clock, self.log
+            session, self._files, self._place, self.memory, self._folder, self._scan_time, self.clock, self.log
         )
         self._save_files(session)
 
@@ -124,12 +130,15 @@ class Nanosurf(Driver):
     def results(self) -> Sequence[str]:
         return self._files.results(self.clock.now_ns())
 
+    def stopped_by_hand(self) -> str:
+        return self._doing.stopped_by_hand()
+
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         return self._files.load(result)
 
     def lines(self, start: int) -> Sequence[ScanLines]:
         """Return new lines of the running scan, from the buffer `image_buffer`."""
-        if self._image_buffer is None:
+        if self._image_buffer is None or self._doing.is_moved:
             return ()
         region, shape = frame(self.in_force(FRAME))
         upwards = self._studio().values([DIRECTION])[DIRECTION] != direction(names.DOWN)
@@ -188,8 +197,12 @@ class Nanosurf(Driver):
     def _doing(self) -> StudioActivity:
         return connected(self._activity, "Studio", self.controller_at)
 
-    def _frame_in_force(self) -> Region:
-        return frame(self.in_force(FRAME))[0]
+    def _scan_time(self) -> ScanTime:
+        set_now = self.in_force([*FRAME, names.SCAN_SPEED])
+        region, (lines, _) = frame(set_now)
+        speed_m_s = float(set_now[names.SCAN_SPEED])
+        line_s = SPEED_PATH * region.size_m[0] / speed_m_s if speed_m_s > 0.0 else 0.0
+        return ScanTime(region, lines, line_s)
 
     def _folder(self) -> Path:
         path = f"{_STORAGE}.gallery_directory"
@@ -210,12 +223,21 @@ class Nanosurf(Driver):
             raise ConfigError(problem, where="gallery_dir", hint='gallery_dir = "/where/it/is/mounted"')
         self._files.look(folder)
 
+    def _leave_out_what_is_unknown(self) -> None:
+        if self._image_buffer is not None:
+            raise ConfigError(f"image_buffer: {commands.LACKING}", where="image_buffer", hint="leave it out")
+        self.table = self.table.without({*POSITION, names.MOVE_SPEED, names.SPEC_KIND})
+        self.lacking = dict.fromkeys((names.START_SPEC, names.STOP_SPEC), commands.LACKING)
+
     def _check_table(self, session: Session) -> None:
         rows = {row.vendor: row for row in self.table.values() if "." in row.vendor}
+        is_before = commands.is_before_this_tree(self._release)
         # The tree differs between releases and licences: a missing path would fail in the middle of a night.
+        own = {commands.path_in(self._release, path): row for path, row in rows.items()}
         for path in session.missing(rows):
-            raise ConfigError(f"Studio has no {path}", where=rows[path].name, hint="a path below root.workflow")
-        expected = {**UNITS, **{path: (row.unit,) for path, row in rows.items() if row.type == "float"}}
+            raise ConfigError(f"Studio has no {path}", where=own[path].name, hint="a path below root.workflow")
+        units_of = {path: units for path, units in UNITS.items() if not (is_before and path.startswith("scanner."))}
+        expected = {**units_of, **{path: (row.unit,) for path, row in rows.items() if row.type == "float"}}
         # A value in another unit would be converted by a wrong factor: refuse at the start.
         units = session.units(expected)
         for path, unit in units.items():

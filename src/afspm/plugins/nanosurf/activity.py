@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Final
 
 from afspm.basics.clock import Clock
 from afspm.basics.errors import AfspmError, Refused
-from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
+from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum
 from afspm.plugins.nanosurf import commands
 from afspm.plugins.nanosurf.link import StudioError
 from afspm.plugins.nanosurf.session import Session
@@ -19,10 +20,29 @@ from afspm.translator.activity import Activity
 from afspm.translator.driver_base import ControllerLost
 from afspm.translator.folder_files import FolderFiles
 from afspm.translator.long_call import ANSWERS_S, LongCall
-from afspm.translator.result_files import SCAN, FilePrecision, as_list
+from afspm.translator.result_files import SCAN, Entry, FilePrecision, as_list
 from afspm.translator.state import Kept
 
 FORCE: Final = "force"
+_LEAST: Final = 0.45
+"""Duration of a complete scan, as the least share of its lines' time: a line may be one pass instead of two (!)."""
+_LEARNT: Final = 0.95
+"""The same, as a share of the duration of a complete scan of these lines: its way to the first line varies."""
+_PARTIAL: Final = "Studio saved the scan without its last lines, and no request had stopped it"
+_MOVED: Final = "its frame was changed at Studio's panel, and whether that moves a running scan is unknown (!)"
+
+
+@dataclass(frozen=True)
+class ScanTime:
+    """The frame of a scan, and the duration of its lines.
+
+    Attributes:
+        line_s: experiment seconds of a line, forward and backward; 0 if unknown.
+    """
+
+    region: Region
+    lines: int
+    line_s: float
 
 
 class NanosurfFiles(FolderFiles):
@@ -31,6 +51,27 @@ class NanosurfFiles(FolderFiles):
     pattern = "*.nhf"
     precision = FilePrecision(part=1e-9, angle_rad=1e-9)
 
+    @property
+    def running(self) -> Entry | None:
+        """The running measurement."""
+        found: Entry | None = self._kept["running"]
+        return found
+
+    def shortest_s(self, lines: int, line_s: float) -> float:
+        """Return the shortest duration that a complete scan of these lines can have, experiment time."""
+        known = self._kept.get("complete")
+        learnt_s = _LEARNT * known["lasted_s"] if known and known["lines"] == [lines, line_s] else 0.0
+        return float(max(_LEAST * lines * line_s, learnt_s))
+
+    def check(self, path: Path, one: Scan | Spectrum, measured: Entry) -> None:
+        """Learn the duration of a complete scan from its file: at least the time for which it was seen to run."""
+        if measured["what"] == SCAN:
+            key, lasted_s = measured["lines"], measured["seen_s"] - measured["begun_s"]
+            known = self._kept.get("complete")
+            if known and known["lines"] == key:  # a paused scan lasts longer
+                lasted_s = min(lasted_s, known["lasted_s"])
+            self._kept["complete"] = {"lines": key, "lasted_s": lasted_s}
+
 
 class StudioActivity(Activity):
     """The running measurement or move, started by a request or at Studio's panel.
@@ -38,7 +79,7 @@ class StudioActivity(Activity):
     Args:
         kept: persistent, JSON-able: name of the running approach or withdrawal.
         folder: returns the local path of Studio's files.
-        frame_in_force: returns the frame as it was set.
+        scan_time: returns frame and lines as they are set.
     """
 
     program: ClassVar[str] = "Studio"
@@ -52,13 +93,14 @@ class StudioActivity(Activity):
         place: TipPlace,
         kept: Kept,
         folder: Callable[[], Path],
-        frame_in_force: Callable[[], Region],
+        scan_time: Callable[[], ScanTime],
         clock: Clock,
         log: logging.Logger,
     ) -> None:
         super().__init__(files, clock, log)
         self._session, self._files, self._place = session, files, place
-        self._folder, self._frame_in_force = folder, frame_in_force
+        self._folder, self._scan_time = folder, scan_time
+        self._by_hand = ""
         self._kept = kept
         if what := kept.pop("call", ""):
             # Studio reports the end of a command only on the connection of this command
@@ -76,6 +118,7 @@ class StudioActivity(Activity):
                 self._session.do(commands.STOP_CURVE)
         self.follow(SCAN if scanning else FORCE if curve else "")
         if scanning:
+            self._watch_scan()
             return ScopeStatus(ScopeState.SCANNING)
         if call is not None:
             return ScopeStatus(ScopeState.SPEC if curve else ScopeState.COARSE_MOTOR)
@@ -88,11 +131,64 @@ class StudioActivity(Activity):
         return self.at_rest() if arrived else ScopeStatus(ScopeState.MOVING)
 
     def begin(self, what: str) -> None:
-        place = {"frame": as_list(self._frame_in_force())} if what == SCAN else {"position": list(self._place.xy_m())}
-        self._files.begin(what, self._folder(), place)
+        self._by_hand = ""
+        if what != SCAN:
+            self._files.begin(what, self._folder(), {"position": list(self._place.xy_m())})
+            return
+        time, now_s = self._scan_time(), self._clock.now_s()
+        facts = {"lines": [time.lines, time.line_s], "begun_s": now_s, "first_s": None, "seen_s": now_s}
+        self._files.begin(what, self._folder(), {"frame": as_list(time.region), **facts})
+        self._files.see_frame(time.region)
+
+    def _watch_scan(self) -> None:
+        running = self._files.running
+        if running is None:  # stopped by a request
+            return
+        running["seen_s"] = self._clock.now_s()
+        running["first_s"] = running["first_s"] or running["seen_s"]
+        was_moved = self.is_moved
+        self._files.see_frame(self._scan_time().region)
+        if self.is_moved and not was_moved:
+            self._log.warning("this scan will not be published: %s", _MOVED)
+
+    @property
+    def is_moved(self) -> bool:
+        """True if the frame of the running scan was changed at the panel."""
+        running = self._files.running
+        return running is not None and bool(running.get("new_frame"))
 
     def end(self) -> None:
+        running = self._files.running
+        if running is not None and running["what"] == SCAN:
+            self._by_hand = self._why_by_hand(running)
+            if self.is_moved:
+                self._log.error("the scan has no result: %s", _MOVED)
+                self._failed = True
+                self.forget()
+                return
         self._files.end(self._clock.now_ns())
+
+    def _why_by_hand(self, running: Entry) -> str:
+        # Studio reports only that no scan runs any more. A scan that ends within its first line may have failed.
+        lines, line_s = running["lines"]
+        now = self._scan_time()  # a person may have made the scan faster
+        if running["first_s"] is None or running["seen_s"] - running["first_s"] < line_s:
+            return ""
+        shortest_s = self._files.shortest_s(min(lines, now.lines), min(line_s, now.line_s))
+        lasted_s = self._clock.now_s() - running["begun_s"]
+        if lasted_s >= shortest_s:
+            return ""
+        return f"the scan ended after {lasted_s:.0f} s of at least {shortest_s:.0f} s, and no request had stopped it"
+
+    def at_rest(self, state: ScopeState = ScopeState.FREE) -> ScopeStatus:
+        if self._files.broken_off:
+            self._by_hand = self._by_hand or _PARTIAL
+        return super().at_rest(state)
+
+    def stopped_by_hand(self) -> str:
+        """Return once the evidence that a person stopped the last scan; empty: there is none."""
+        found, self._by_hand = self._by_hand, ""
+        return found
 
     def start_scan(self) -> None:
         """Start a scan of the frame.
@@ -144,11 +240,11 @@ class StudioActivity(Activity):
         self.close()
         self._kept["call"] = ""
         try:
-            self._move("withdrawal", commands.WITHDRAW, commands.STOP_ALL)
+            self._move("withdrawal", commands.WITHDRAW, self._session.stop_all)
         except ControllerLost as lost:
             # A Studio may serve one client only; the first connection then waits for the end of the withdrawal.
             self._log.warning("there is no further connection (%s): the tip is withdrawn by the first", lost)
-            self._session.run(f"{commands.STOP_ALL} {commands.WORKFLOW}.{commands.WITHDRAW}() return 0")
+            self._session.run(f"{self._session.stop_all} {self._session.path(commands.WITHDRAW)}() return 0")
 
     def _move(self, what: str, command: str, first: str = "") -> None:
         # a refused withdrawal must not count as done

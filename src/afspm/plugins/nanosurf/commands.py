@@ -1,6 +1,7 @@
 """Commands of Nanosurf Studio that the driver uses, and the releases that have them.
 
-The names come from the command tree in nanosurf-core 2.0.7 (MIT). The mark (!) stands for an unconfirmed fact.
+The names come from the command tree in nanosurf-core 2.0.7 (MIT), those before release 17 from nanosurf 1.9.4 (MIT),
+which users' scripts have for Studio 13. The mark (!) stands for an unconfirmed fact.
 """
 
 from __future__ import annotations
@@ -9,7 +10,10 @@ from typing import Final
 
 from afspm.basics.errors import ConfigError
 
-FIRST_RELEASE: Final = 17
+FIRST_RELEASE: Final = 13
+"""The oldest release for which a public script is known; older ones may have other commands."""
+WITH_THIS_TREE: Final = 17
+"""First release with the tree of this module; older ones have the names in `_BEFORE`."""
 _WITHOUT_OLD: Final = 19
 """First release without the commands that are older than release 17."""
 
@@ -56,7 +60,7 @@ local units = {}
 for i, path in ipairs({%s}) do
   local node = root.workflow
   for name in path:gmatch("[^.]+") do node = type(node) == "table" and node[name] or nil end
-  units[i] = node ~= nil and node.unit_get ~= nil and node.unit_get() or ""
+  units[i] = node ~= nil and (node.unit_get ~= nil and node.unit_get() or node.unit) or ""
 end
 return units
 """
@@ -64,14 +68,21 @@ return units
 
 PUT_ALL: Final = """
 local done = {}
+local function get(node, field)
+  if node[field .. "_get"] then return node[field .. "_get"]() end
+  return node[field]
+end
+local function set(node, field, value)
+  if node[field .. "_set"] then node[field .. "_set"](value) else node[field] = value end
+end
 local function same(node, unit)
-  local now = node.unit_get()
+  local now = get(node, "unit")
   if now ~= unit then error("its unit was changed from " .. unit .. " to " .. tostring(now), 0) end
 end
 local function put(node, field, value)
-  local before = node[field .. "_get"]()
-  node[field .. "_set"](value)
-  table.insert(done, 1, function() node[field .. "_set"](before) end)
+  local before = get(node, field)
+  set(node, field, value)
+  table.insert(done, 1, function() set(node, field, before) end)
 end
 local fine, problem = pcall(function() %s end)
 if not fine then
@@ -101,30 +112,88 @@ return found
 Nothing is returned while the buffer is not synchronized. The values are integers: the largest signed 32-bit integer
 stands for the range."""
 
-STOP_ALL: Final = f"""
-local imaging, spectroscopy, approach = {WORKFLOW}.imaging, {WORKFLOW}.spectroscopy, {WORKFLOW}.approach
-pcall(imaging.stop) pcall(spectroscopy.stop) pcall(approach.stop_approach)
+_STOPS: Final = (STOP, STOP_CURVE, "approach.stop_approach")
+
+_BEFORE: Final = {
+    **{
+        f"imaging.{name}": f"imaging.property.{name}"
+        for name in (
+            "points_per_line", "lines_per_frame", "scan_range_fast_axis", "scan_range_slow_axis", "rotation",
+            "line_rate", "slope_x", "slope_y", "scan_mode", "slow_axis_scan_direction",
+        )
+    },
+    "imaging.frame_center_offset_x": "imaging.property.image_offset_x",
+    "imaging.frame_center_offset_y": "imaging.property.image_offset_y",
+    "z_control.setpoint": "z_controller.property.setpoint",
+    "z_control.i_gain": "z_controller.property.i_gain",
+    "data.storage.gallery_directory": "storage.property.gallery_directory",
+    "data.storage.nhf_backend_enabled": "storage.property.nhf_backend_enabled",
+    "data.storage.nhf_auto_store_mode": "storage.property.nhf_auto_store_mode",
+    START: "imaging.start_imaging",
+    STOP: "imaging.stop_imaging",
+    APPROACH: "approach.start_approach",
+    WITHDRAW: "approach.start_withdraw",
+    "approach.stop_approach": "approach.abort",
+}  # fmt: skip
+"""Paths before release 17, by the paths of this module. (!) *Image offset* is taken for the centre of the frame."""
+_MOVE_SIGNALS: Final = tuple(
+    f"approach.signal.{name}.connect"
+    for name in ("approach_started", "withdraw_started", "approach_or_withdraw_finished")
+)
+
+WATCH_MOVES: Final = f"""
+if not afspm_moves then
+  afspm_moves = {{running = false}}
+  local signal = {WORKFLOW}.approach.signal
+  signal.approach_started.connect(function() afspm_moves.running = true end)
+  signal.withdraw_started.connect(function() afspm_moves.running = true end)
+  signal.approach_or_withdraw_finished.connect(function() afspm_moves.running = false end)
+end
+return {WORKFLOW}.approach.signal.approach_or_withdraw_finished.empty()
 """
-"""Stops scan, curve and approach; an error of one stop does not prevent the others."""
+"""Before release 17: connects handlers that watch approach and withdrawal, whose commands do not wait for the end."""
+
+LACKING: Final = f"commands for it are known from Nanosurf Studio {WITH_THIS_TREE} on"
+
+
+def is_before_this_tree(release: int) -> bool:
+    """Return whether a release has the names of `_BEFORE`."""
+    return release < WITH_THIS_TREE
+
+
+def path_in(release: int, path: str) -> str:
+    """Return the path of a value or command in the tree of a release."""
+    return _BEFORE.get(path, path) if is_before_this_tree(release) else path
+
+
+def stop_all(release: int) -> str:
+    """Return the script that stops scan, curve and approach; an error of one stop does not prevent the others."""
+    known = [path for path in _STOPS if path in _BEFORE or not is_before_this_tree(release)]
+    return " ".join(f"pcall({WORKFLOW}.{path_in(release, path)})" for path in known)
 
 
 def has_old_commands(release: int) -> bool:
-    """Return whether a release (17 or 18) has the old commands, which 19 lacks.
+    """Return whether a release before 19 has the old commands, which 19 lacks.
 
     Raises:
-        ConfigError: the release is older than 17.
+        ConfigError: the release is older than `FIRST_RELEASE`.
     """
     if release < FIRST_RELEASE:
-        hint = f"{FIRST_RELEASE} or later"
-        raise ConfigError(f"Nanosurf Studio {release} is too old for afspm", where="release", hint=hint)
+        problem = f"Nanosurf Studio {release} is too old: afspm knows the commands of {FIRST_RELEASE} and later"
+        raise ConfigError(problem, where="release", hint="update Studio, or send a script that controls this release")
     return release < _WITHOUT_OLD
 
 
 def used(release: int) -> tuple[str, ...]:
     """Return the paths of all commands used with a release."""
+    if is_before_this_tree(release):
+        return (START, STOP, APPROACH, WITHDRAW, IS_SCANNING, *_MOVE_SIGNALS)
     return (*_ALWAYS, *((IS_SCANNING,) if has_old_commands(release) else _SIGNALS))
 
 
 def level(release: int) -> int:
-    """Return the lowest session level with the used commands: the old commands need the highest level (!)."""
-    return 5 if has_old_commands(release) else 1
+    """Return the lowest session level with the used commands: the old commands need the highest level (!).
+
+    Before release 17 the number is no level: 1 is the microscope's own tree.
+    """
+    return 5 if has_old_commands(release) and not is_before_this_tree(release) else 1

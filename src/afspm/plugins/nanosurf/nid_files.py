@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.basics.errors import FileError
+from afspm.basics.units import si
 from afspm.model import Region, Scan, Spectrum
-from afspm.storage.formats.content import FileContent, local_ns
+from afspm.storage.formats.content import FileContent, local_ns, text_of
 
 _DATA: Final = b"#!"
 _CHANNEL: Final = re.compile(r"Gr(\d{1,6})-Ch(\d{1,6})")
@@ -38,7 +39,7 @@ def read_nid(path: Path, zone: tzinfo | None) -> FileContent:
         FileError: the file has another format, is cut off, or has neither images nor curves.
     """
     head, found, data = path.read_bytes().partition(_DATA)
-    sections = _sections(head.decode("utf-8", "replace"))
+    sections = _sections(text_of(head))
     if not found or "DataSet" not in sections:
         raise FileError("is not a Nanosurf .nid file")
     channels = list(_channels(sections, data))
@@ -107,11 +108,20 @@ def _frame(sections: Mapping[str, Section]) -> Region | None:
     # `ScanOffset=V[0,0,0]*[m,m,m]`, `ScanRotation=V[0,0,45]*[°,°,°]`.
     imaging = sections.get("DataSet\\Parameters\\Imaging")
     if imaging is None:
-        return None
+        return _frame_in_info(sections.get("DataSet-Info", {}))
     (x, y, _), (width, height, _), (_, _, angle_deg) = (
         _vector(imaging[name]) for name in ("ScanOffset", "ScanRange", "ScanRotation")
     )
     return Region((x, y), (width, height), math.radians(angle_deg))
+
+
+def _frame_in_info(info: Section) -> Region | None:
+    # of older programs: `X-Pos=1.3µm`, `Y-Pos=-166nm`, `Rotation=-45 °`, each without the others in some files
+    if not any(name in info for name in ("X-Pos", "Y-Pos", "Rotation")):
+        return None
+    x, y = (si(info.get(name, "0 m"), "m") for name in ("X-Pos", "Y-Pos"))
+    angle = info.get("Rotation", "0").replace("°", " ").strip()
+    return Region((x, y), (1.0, 1.0), math.radians(float(angle)))
 
 
 def _vector(text: str) -> list[float]:

@@ -55,6 +55,7 @@ class Session:
         self._open_link, self._release, self._name = open_link, release, name
         self._level = commands.level(release) if level is None else level
         self._old = commands.has_old_commands(release)
+        self._is_before_this_tree = commands.is_before_this_tree(release)
         self._units: Mapping[str, str] = {}
         self._link = open_link()
         try:
@@ -72,7 +73,7 @@ class Session:
     def do(self, command: str) -> None:
         """Call a command. Raises Refused: ACTION_ERROR: Studio reports an error."""
         try:
-            self.run(f"{WORKFLOW}.{command}() return 0")
+            self.run(f"{self.path(command)}() return 0")
         except StudioError as error:
             raise Refused(ControlResponse.ACTION_ERROR, f"Studio refused {command}: {error}") from error
 
@@ -85,8 +86,10 @@ class Session:
         """
         # One request for all values: they belong to the same moment, and a poll stays short.
         measured = [path for path in paths if path in self._units]
-        fields = [f"{path}.{_field(path)}_get()" for path in paths] + [f"{path}.unit_get()" for path in measured]
-        returned = self._returned(", ".join(f"{WORKFLOW}.{field}" for field in fields))
+        get = "" if self._is_before_this_tree else "_get()"
+        fields = [f"{self.path(path)}.{_field(path)}{get}" for path in paths]
+        fields += [f"{self.path(path)}.unit{get}" for path in measured]
+        returned = self._returned(", ".join(fields))
         found = dict(zip(paths, returned, strict=False))
         for path, unit in zip(measured, returned[len(paths) :], strict=False):
             if unit != self._units[path]:
@@ -103,8 +106,8 @@ class Session:
         Raises:
             Refused: PARAM_ERROR: Studio rejects a value, or has it in another unit than at the start.
         """
-        checks = [f"same({WORKFLOW}.{path}, {written(self._units[path])})" for path in values if path in self._units]
-        puts = [f"put({WORKFLOW}.{path}, {written(_field(path))}, {written(value)})" for path, value in values.items()]
+        checks = [f"same({self.path(path)}, {written(self._units[path])})" for path in values if path in self._units]
+        puts = [f"put({self.path(path)}, {written(_field(path))}, {written(value)})" for path, value in values.items()]
         try:
             self.run(commands.PUT_ALL % " ".join(checks + puts))
         except StudioError as error:
@@ -113,7 +116,7 @@ class Session:
     def units(self, paths: Iterable[str]) -> dict[str, str]:
         """Return Studio's units of values by path; empty: none."""
         paths = list(paths)
-        found = self.run(commands.UNITS % ", ".join(map(written, paths)))[0]
+        found = self.run(commands.UNITS % self._listed(paths))[0]
         return {path: str(found.get(number, "")) for number, path in enumerate(paths, 1)}
 
     def keep_units(self, units: Mapping[str, str]) -> None:
@@ -124,13 +127,29 @@ class Session:
         self._units = {path: unit for path, unit in units.items() if unit}
 
     def missing(self, paths: Iterable[str]) -> list[str]:
-        """Return the paths that Studio lacks."""
-        return [str(one) for one in self.run(commands.MISSING % ", ".join(map(written, paths)))[0].values()]
+        """Return the paths that Studio lacks, as in its own tree."""
+        return [str(one) for one in self.run(commands.MISSING % self._listed(paths))[0].values()]
+
+    def path(self, path: str) -> str:
+        """Return the full path of a value or command in Studio's own tree."""
+        return f"{WORKFLOW}.{commands.path_in(self._release, path)}"
+
+    @property
+    def stop_all(self) -> str:
+        """The script that stops scan, curve and approach."""
+        return commands.stop_all(self._release)
+
+    def moves(self) -> bool:
+        """Return whether an approach or withdrawal runs, before release 17. Raises ControllerLost."""
+        found = self._returned("afspm_moves.running")
+        if found not in ([True], [False]):
+            raise ControllerLost(f"Studio replied {found} when asked if the tip moves")
+        return bool(found[0])
 
     def scanning(self) -> Scanning:
         """Return whether a scan runs, and the number of started scans. Raises ControllerLost."""
         # Newer releases have no is_scanning: handlers of their signals count scans instead.
-        script = f"{WORKFLOW}.{commands.IS_SCANNING}(), 0" if self._old else "afspm_seen.scanning, afspm_seen.started"
+        script = f"{self.path(commands.IS_SCANNING)}(), 0" if self._old else "afspm_seen.scanning, afspm_seen.started"
         found = self._returned(script)
         if len(found) != 2 or not isinstance(found[0], bool) or not isinstance(found[1], int):
             raise ControllerLost(f"Studio replied {found} when asked if it scans")
@@ -149,17 +168,23 @@ class Session:
         try:
             self._select(link)
             # A long command blocks its connection: the first connection stays free for polls and stops.
-            link.begin(f"{first} return {WORKFLOW}.{command}()")
+            if self._is_before_this_tree:
+                self.run("afspm_moves.running = true")
+            link.begin(f"{first} return {self.path(command)}()")
             link.wait(wait_s)
         except BaseException:  # Ctrl-C, too: nothing else closes this connection
             link.close()
             raise
-        return LongCall(what, link)
+        # before release 17 a command may return at once: the signals of its end count
+        return LongCall(what, link, lambda _: self._is_before_this_tree and self.moves())
 
     def close(self) -> None:
         self._link.close()
 
     # --- inside ---
+
+    def _listed(self, paths: Iterable[str]) -> str:
+        return ", ".join(written(commands.path_in(self._release, path)) for path in paths)
 
     def _returned(self, script: str) -> list[Any]:
         # Any session can run these scripts: an error means that this session was closed or replaced.
@@ -170,8 +195,11 @@ class Session:
 
     def _checked_name(self, name: str) -> str:
         self._link.run("return root.session.select_main(0)")
-        major, full, listed = self._link.run("return root.version.major(), root.version.full(), root.session.list()")
+        # (!) before release 17 there may be no full version
+        full = "root.version.full and root.version.full() or root.version.major()"
+        major, full, listed = self._link.run(f"return root.version.major(), {full}, root.session.list()")
         self.controller = f"Nanosurf Studio {full}"
+        commands.has_old_commands(major)  # too old: the hint below would lead to a refusal
         if major != self._release:
             problem = f"Studio is release {major}, not {self._release}"
             raise ConfigError(problem, where="release", hint=f"release = {major}")
@@ -194,8 +222,10 @@ class Session:
             names = ", ".join(missing)
             hint = "name its release (Help > About) in the setting release, and look at the level of its licence"
             raise ConfigError(f"{self.controller} has no {names}", where="release", hint=hint)
-        if not self._old and self.run(commands.WATCH)[0]:
-            problem = f"{self.controller} does not report the start and end of scans to scripts"
+        watch = commands.WATCH_MOVES if self._is_before_this_tree else "" if self._old else commands.WATCH
+        if watch and self.run(watch)[0]:
+            what = "approaches" if self._is_before_this_tree else "scans"
+            problem = f"{self.controller} does not report the start and end of {what} to scripts"
             raise ConfigError(problem, where="release", hint="report it, with the release, to the afspm project")
 
 

@@ -28,7 +28,8 @@ class NanosurfEmulator(ScriptedEmulator):
     """The emulated program. Needs lupa.
 
     Args:
-        release: release of Studio; 19 lacks commands of 17 and 18.
+        release: release of Studio; 19 lacks commands of 17 and 18. Before 17 it has the tree that users' scripts for
+            Studio 13 speak, without spectroscopy.
         image_buffer: number of the low-level buffer with the lines of the running scan.
         start_s: duration of the ramp to the first line, experiment time.
         file_s: delay between the end of a measurement and the first half of its file, and between both halves,

@@ -92,26 +92,53 @@ local function blocking(call, waiting, outcome)
   end
 end
 
--- "value", "unit", "min" … can be read and set as fields as well as by value_get() and value_set(v).
-local function property(fields, enum)
-  local node = {enum = enum}
-  for name, access in pairs(fields) do
-    node[name .. "_get"] = as_function(access.get)
-    if access.set then node[name .. "_set"] = as_function(access.set) end
-  end
-  return setmetatable(node, {
-    __index = function(_, key) return fields[key] and fields[key].get() end,
-    __newindex = function(_, key, value)
-      if not (fields[key] and fields[key].set) then error("no such value: " .. tostring(key), 2) end
-      fields[key].set(value)
+-- Clients share the tree: a script sees it through tables that are empty, so that each assignment reaches `assign`.
+local behind = setmetatable({}, {__mode = "k"})
+local function guarded(inner, read, assign, fields)
+  local node = setmetatable({}, {
+    __index = function(_, key)
+      local found = inner[key]
+      if found == nil and read then return read(key) end
+      return found
     end,
+    __newindex = function(_, key, value) assign(key, value) end,
     __pairs = function()
       local all = {}
-      for key, inner in next, node do all[key] = inner end
-      for key, access in pairs(fields) do all[key] = access.get() end
+      for key, one in next, inner do all[key] = one end
+      for key, access in next, fields or {} do all[key] = access.get() end
       return next, all
     end,
+    __metatable = false,
   })
+  behind[node] = inner
+  return node
+end
+
+-- "value", "unit", "min" … can be read and set as fields as well as by value_get() and value_set(v).
+local properties = setmetatable({}, {__mode = "k"})
+-- Before release 17 there are the fields alone (`bare`).
+local function property(fields, enum, bare)
+  local inner = {enum = enum}
+  for name, access in pairs(bare and {} or fields) do
+    inner[name .. "_get"] = as_function(access.get)
+    if access.set then inner[name .. "_set"] = as_function(access.set) end
+  end
+  local function assign(key, value)
+    if not (fields[key] and fields[key].set) then error("no such value: " .. tostring(key), 3) end
+    fields[key].set(value)
+  end
+  local node = guarded(inner, function(key) return fields[key] and fields[key].get() end, assign, fields)
+  properties[node] = fields.value and "value" or "value_raw"
+  return node
+end
+
+-- The maker's client says that "root.workflow.imaging.size = value" sets a value. Nothing else can be assigned.
+local function branch(inner)
+  return guarded(inner, nil, function(key, value)
+    local field = properties[inner[key]]
+    if not field then error(tostring(key) .. " is no value that can be set", 3) end
+    inner[key][field] = value
+  end)
 end
 
 local function signal()
@@ -125,8 +152,20 @@ local function signal()
       if type(handler) == "function" then coroutine.resume(limited(coroutine.create(handler)), ...) end
     end
   end
-  return node
+  return branch(node)
+end
+
+local function plain(node)
+  local found = {}
+  for key, one in next, behind[node] or node do found[key] = type(one) == "table" and plain(one) or one end
+  return found
+end
+
+-- A function whose first argument, a node of the tree, Python can iterate over.
+local function with_plain_tree(call)
+  return function(node, ...) return call(plain(node), ...) end
 end
 
 return {start = start, step = step, collect = function() collectgarbage() end, environment = environment,
-        as_function = as_function, blocking = blocking, property = property, signal = signal}
+        as_function = as_function, blocking = blocking, property = property, signal = signal, branch = branch,
+        with_plain_tree = with_plain_tree}

@@ -347,18 +347,20 @@ class StudioProgram(MakerProgram):
             (self.values["scanner.offset_x_target"], self.values["scanner.offset_y_target"]), self.now_s
         )
 
-    def lines(self, channel: int) -> tuple[str, str, list[float]]:
-        """Return name, unit and the complete lines of the last started scan, flattened in scanning order.
+    def lines(self) -> list[tuple[str, str, list[float]]]:
+        """Return name, unit and the complete lines of each channel of the last started scan, as of one moment.
 
-        Empty before the first scan.
+        Lines are flattened in scanning order. Empty before the first scan.
         """
-        scan = self.rig.scan
+        scan, now_s = self.rig.scan, self.now_s
         if scan is None:
-            return "", "", []
-        name, (unit, values) = list(_named(scan.channels(self.now_s)).items())[channel]
-        done = scan.lines_done(self.now_s)
-        rows = values if scan.upwards else values[::-1]
-        return name, unit, [float(one) for one in rows[:done].ravel()]
+            return []
+        done = scan.lines_done(now_s)
+        found = []
+        for name, (unit, values) in _named(scan.channels(now_s)).items():
+            rows = values if scan.upwards else values[::-1]
+            found.append((name, unit, [float(one) for one in rows[:done].ravel()]))
+        return found
 
     # -- what the base asks
 

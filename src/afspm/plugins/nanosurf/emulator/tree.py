@@ -17,6 +17,7 @@ from afspm.simulation.emulation.scripted import ScriptFailed
 
 SESSION: Final = "91-01-000"
 """Name of the only session: the maker's client has this name for a simulated controller."""
+FIRST_WITH_THIS_TREE: Final = 17
 LAST_WITH_OLD_COMMANDS: Final = 18
 ALL_LEVELS: Final = 5
 _INT32: Final = 2**31 - 1
@@ -29,6 +30,33 @@ _ROOM: Final = 16 << 20
 """Highest memory that scripts may keep after their end, in bytes."""
 _WRAPPER: Final = Path(__file__).with_name("wrapper.py.in")
 
+_SCAN_SIGNALS: Final = ("scanning_started", "scanning_finished")
+_MOVE_SIGNALS: Final = ("approach_started", "withdraw_started", "approach_or_withdraw_finished")
+_BEFORE: Final = {
+    "imaging.property.points_per_line": "imaging.points_per_line",
+    "imaging.property.lines_per_frame": "imaging.lines_per_frame",
+    "imaging.property.scan_range_fast_axis": "imaging.scan_range_fast_axis",
+    "imaging.property.scan_range_slow_axis": "imaging.scan_range_slow_axis",
+    "imaging.property.image_offset_x": "imaging.frame_center_offset_x",
+    "imaging.property.image_offset_y": "imaging.frame_center_offset_y",
+    "imaging.property.rotation": "imaging.rotation",
+    "imaging.property.line_rate": "imaging.line_rate",
+    "imaging.property.slope_x": "imaging.slope_x",
+    "imaging.property.slope_y": "imaging.slope_y",
+    "imaging.property.scan_mode": "imaging.scan_mode",
+    "imaging.property.slow_axis_scan_direction": "imaging.slow_axis_scan_direction",
+    "z_controller.property.setpoint": SETPOINT,
+    "z_controller.property.i_gain": "z_control.i_gain",
+    "approach.property.approach_speed": "approach.approach_speed",
+    "storage.property.gallery_directory": "data.storage.gallery_directory",
+    "storage.property.name_pattern": "data.storage.file_basename",
+    "storage.property.next_file_index": "data.storage.next_file_index",
+    "storage.property.nhf_backend_enabled": "data.storage.nhf_backend_enabled",
+    "storage.property.nhf_auto_store_mode": "data.storage.nhf_auto_store_mode",
+    "storage.property.auto_save_partial_measurements": "data.storage.save_partial_measurements",
+}
+"""Values before release 17, with the panels' paths; the names are those of nanosurf 1.9.4."""
+
 Nested = Plain
 
 
@@ -36,7 +64,7 @@ class CommandTree:
     """Both trees in one Lua engine, and the scripts that run in them.
 
     Args:
-        release: release of Studio; 19 has no `is_scanning`.
+        release: release of Studio; 19 has no `is_scanning`, and before 17 there is another tree.
         image_buffer: number of the low-level buffer with the running scan.
         level_chosen: called with the level when a client selects the session, None for the application.
     """
@@ -50,7 +78,9 @@ class CommandTree:
         log: logging.Logger,
     ) -> None:
         self._program, self._release, self._image_buffer = program, release, image_buffer
+        self._buffered: list[tuple[str, str, list[float]]] = []
         self._level_chosen, self._log = level_chosen, log
+        self._is_moving, self._begun = False, ""
         self._workspace = Workspace(program)
         self._queue = MeasurementQueue(program, self._workspace)
         program.on_signal = self._signalled
@@ -64,12 +94,13 @@ class CommandTree:
             register_eval=False, register_builtins=False, unpack_returned_tuples=True, max_memory=_MEMORY
         )
         self._prelude = self._lua.execute(Path(__file__).with_name("prelude.lua").read_text(encoding="utf-8"))
-        self._signals = {name: self._prelude.signal() for name in ("scanning_started", "scanning_finished")}
+        self._signals = {name: self._prelude.signal() for name in (*_SCAN_SIGNALS, *_MOVE_SIGNALS)}
         shared = self._shared()
-        self._roots: dict[int | None, object] = {None: self._prelude.environment(self._table(shared))}
-        workflow = self._workflow()
+        self._roots: dict[int | None, object] = {None: self._prelude.environment(self._in_lua(shared))}
+        is_before = self._release < FIRST_WITH_THIS_TREE
+        workflow = self._old_workflow() if is_before else self._workflow()
         for level in range(1, ALL_LEVELS + 1):
-            self._roots[level] = self._prelude.environment(self._table({**shared, **self._session(workflow, level)}))
+            self._roots[level] = self._prelude.environment(self._in_lua({**shared, **self._session(workflow, level)}))
 
     def start(self, script: str, level: int | None) -> tuple[object, str | None]:
         """Return (script, None), or (None, reply with the error) if the script can't be compiled.
@@ -127,20 +158,26 @@ class CommandTree:
 
     def _in_lua(self, inner: Any) -> object:
         if isinstance(inner, dict):
-            return self._table(inner)
+            return self._prelude.branch(self._table(inner))
         return self._function(inner) if _is_python(inner) else inner
 
     def _shared(self) -> Nested:
-        version = {"major": lambda: self._release, "minor": lambda: 0, "name": lambda: "Nanosurf Studio SIMULATED"}
+        version: Nested = {
+            "major": lambda: self._release,
+            "minor": lambda: 0,
+            "name": lambda: "Nanosurf Studio SIMULATED",
+        }
+        if self._release >= FIRST_WITH_THIS_TREE:
+            version["full"] = lambda: f"{self._release}.0.0"
         session = {
             "list": lambda: self._lua.table_from([SESSION]),
             "select": self._select,
             "select_main": lambda *_: self._level_chosen(None),
         }
-        python = {"create_python_wrapper": self._write_wrapper}
+        python = {"create_python_wrapper": self._prelude.with_plain_tree(self._write_wrapper)}
         return {
             "session": session,
-            "version": {**version, "full": lambda: f"{self._release}.0.0"},
+            "version": version,
             "scripting": {"wrapper": {"python": python}},
             "util": {"fill_environments": lambda: None},
         }
@@ -154,25 +191,21 @@ class CommandTree:
         # A licence of a higher level adds commands to the application's own commands.
         imaging = workflow["imaging"]
         # The real tree has the old commands at the highest level only.
-        if level == ALL_LEVELS and self._release <= LAST_WITH_OLD_COMMANDS:
+        if level == ALL_LEVELS and FIRST_WITH_THIS_TREE <= self._release <= LAST_WITH_OLD_COMMANDS:
             imaging = {**imaging, "is_scanning": lambda: self._program.scanning}
         found: Nested = {"workflow": {**workflow, "imaging": imaging}}
-        if level > 1:
+        if level > 1 and self._release >= FIRST_WITH_THIS_TREE:
             found["core"] = {"acquisition": self._buffers()}
         return found
 
     def _workflow(self) -> Nested:
         workflow: Nested = {}
         for path in PANEL:
-            *parents, name = path.split(".")
-            node = workflow
-            for parent in parents:
-                node = node.setdefault(parent, {})
-            node[name] = self._property(path)
+            _put(workflow, path, self._property(path))
         program = self._program
         busy = program.rig.busy
         workflow["imaging"] |= {
-            **self._signals,
+            **{name: self._signals[name] for name in _SCAN_SIGNALS},
             "start": lambda: program.start_scan(self._now_s),
             "stop": lambda: program.stop_scan(self._now_s),
             "pause": lambda: program.pause(self._now_s),
@@ -199,15 +232,46 @@ class CommandTree:
         for mode, commands in MODES.items():
             workflow["mode"][mode] = {command: lambda mode=mode: program.load_mode(mode) for command in commands}
         for path in PROCEDURES_S:
-            *parents, name = path.split(".")
-            node = workflow
-            for parent in parents:
-                node = node.setdefault(parent, {})
-            node[name] = self._procedure(path)
+            _put(workflow, path, self._procedure(path))
         workflow["probe"]["cantilever_calibration"]["apply"] = program.apply_calibration
         workflow["workspace"] = self._workspace_commands()
         workflow["automation"] |= self._automation_commands()
         return workflow
+
+    def _old_workflow(self) -> Nested:
+        # The tree before release 17, without spectroscopy. Its commands do not wait for their end.
+        workflow: Nested = {}
+        for path, panel in _BEFORE.items():
+            _put(workflow, path, self._property(panel, bare=True))
+        program = self._program
+        program.when_advanced = self._watch_move
+        workflow["imaging"] |= {
+            "start_imaging": lambda: program.start_scan(self._now_s),
+            "stop_imaging": lambda: program.stop_scan(self._now_s),
+            "is_scanning": lambda: program.scanning,
+            "signal": {name: self._signals[name] for name in _SCAN_SIGNALS},
+        }
+        workflow["approach"] |= {
+            "start_approach": lambda: self._move("approach_started", program.engage),
+            "start_withdraw": lambda: self._move("withdraw_started", lambda: program.withdraw(self._now_s)),
+            "abort": program.stop_engaging,
+            "signal": {name: self._signals[name] for name in _MOVE_SIGNALS},
+        }
+        return workflow
+
+    def _move(self, signal: str, begin: Callable[[], None]) -> None:
+        begin()
+        self._is_moving, self._begun = True, signal
+
+    def _watch_move(self, now_s: float) -> bool:
+        # not in `_move`: handlers can't be called while the script of a client runs
+        if self._begun:
+            self._signalled(self._begun)
+            self._begun = ""
+        if self._is_moving and not self._program.engages and not self._program.rig.busy(now_s):
+            self._is_moving = False
+            self._signalled("approach_or_withdraw_finished")
+        return False
 
     def _procedure(self, path: str) -> object:
         program = self._program
@@ -279,7 +343,7 @@ class CommandTree:
     ) -> object:
         return self._prelude.blocking(call, waiting, message)
 
-    def _property(self, path: str) -> object:
+    def _property(self, path: str, *, bare: bool = False) -> object:
         row, program = PANEL[path], self._program
         field = "value_raw" if row.enum else "value"
         fields: Nested = {field: {"get": lambda: program.get(path), "set": lambda value: program.put(path, value)}}
@@ -293,7 +357,7 @@ class CommandTree:
             fields["max"] = {"get": lambda: program.bounds(path)[1]}
         table = {name: self._lua.table_from(access) for name, access in fields.items()}
         enum = self._lua.table_from(dict(row.enum)) if row.enum else None
-        return self._prelude.property(self._lua.table_from(table), enum)
+        return self._prelude.property(self._lua.table_from(table), enum, bare)
 
     def _buffers(self) -> Nested:
         def numbers(buffer: float, channel: float) -> object:
@@ -304,11 +368,16 @@ class CommandTree:
         def known(buffer: float) -> bool:
             return buffer == self._image_buffer
 
+        def synchronize(buffer: float) -> None:
+            # until the next call all reads are of one moment: a line that ends in between would have another range
+            if known(buffer):
+                self._buffered = self._program.lines()
+
         return {
             "reserve_lu_data_buffer": lambda buffer: None,
-            "synchronize_lu_data_buffer": lambda buffer: None,
-            "lu_data_buffer_state": lambda buffer: _SYNCHRONIZED if known(buffer) else 0,
-            "lu_data_buffer_channel_count": lambda buffer: len(self._program.rig.channels) if known(buffer) else 0,
+            "synchronize_lu_data_buffer": synchronize,
+            "lu_data_buffer_state": lambda buffer: _SYNCHRONIZED if known(buffer) and self._buffered else 0,
+            "lu_data_buffer_channel_count": lambda buffer: len(self._buffered) if known(buffer) else 0,
             "lu_data_buffer_channel_name": lambda buffer, channel: self._channel(buffer, channel)[0],
             "lu_data_buffer_channel_unit": lambda buffer, channel: self._channel(buffer, channel)[1],
             "lu_data_buffer_channel_range": lambda buffer, channel: self._span(self._channel(buffer, channel)[2]),
@@ -316,9 +385,9 @@ class CommandTree:
         }
 
     def _channel(self, buffer: float, channel: float) -> tuple[str, str, list[float]]:
-        if buffer != self._image_buffer or not 0 <= channel < len(self._program.rig.channels):
+        if buffer != self._image_buffer or not 0 <= channel < len(self._buffered):
             raise ScriptFailed(f"there is no channel {channel} in the buffer {buffer}")
-        return self._program.lines(int(channel))
+        return self._buffered[int(channel)]
 
     @staticmethod
     def _span(values: list[float]) -> float:
@@ -332,6 +401,13 @@ class CommandTree:
         tree = json.dumps(_described(root))
         text = _WRAPPER.read_text(encoding="utf-8").replace("@TREE@", repr(tree)).replace("@ROOT@", repr(name))
         file.write_text(text, encoding="utf-8")
+
+
+def _put(tree: Nested, path: str, node: object) -> None:
+    *parents, name = path.split(".")
+    for parent in parents:
+        tree = tree.setdefault(parent, {})
+    tree[name] = node
 
 
 def _is_python(value: object) -> bool:

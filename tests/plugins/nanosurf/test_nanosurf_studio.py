@@ -1,0 +1,49 @@
+"""The emulated Studio's program, without its protocol."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_clock import FakeClock
+
+from afspm.plugins.nanosurf.emulator import NanosurfEmulator
+from afspm.plugins.nanosurf.emulator.studio import StudioProgram
+from afspm.simulation.faults import Faults
+from afspm.simulation.instrument import SimulatedInstrument
+
+
+class RunningClock(FakeClock):
+    """A clock on which half a line of a scan passes between two reads."""
+
+    def now_s(self) -> float:
+        self.t_s += 0.5
+        return self.t_s
+
+
+@pytest.mark.parametrize("direction", [0, 1])
+def test_buffered_lines_are_complete_while_the_next_line_ends(direction: int, tmp_path: Path) -> None:
+    clock = RunningClock()
+    rig = SimulatedInstrument({}, 1, clock.t_s)
+    program = StudioProgram(
+        rig,
+        Faults([], NanosurfEmulator.all_faults(), clock.t_s),
+        clock,
+        tmp_path,
+        logging.getLogger(),
+        start_s=0.0,
+        file_s=0.0,
+    )
+    for path, value in (("lines_per_frame", 8), ("points_per_line", 4), ("slow_axis_scan_direction", direction)):
+        program.put(f"imaging.{path}", value)
+    program.start_scan(clock.t_s)
+    program.advance(clock.t_s)
+    counts = set()
+    for _ in range(20):
+        lines = program.lines()
+        [count] = {len(values) for _, _, values in lines}
+        assert all(np.isfinite(values).all() for _, _, values in lines)
+        counts.add(count // 4)
+    assert {1, 2, 3, 4, 5, 6, 7, 8} <= counts
