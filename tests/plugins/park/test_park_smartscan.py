@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
+from deadlines import DEADLINE_S
 from fake_clock import FakeClock
 
+from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import InvalidValue
 from afspm.plugins.park.emulator import ParkEmulator, engine
-from afspm.plugins.park.emulator.engine import LONGEST_S, Script, Wait
+from afspm.plugins.park.emulator.engine import LONGEST_S, MOST_ALONE, Script, Wait
 from afspm.plugins.park.emulator.smartscan import SmartScanProgram
 from afspm.simulation.emulation.scripted import ScriptFailed
 from afspm.simulation.faults import Faults
@@ -272,7 +274,7 @@ def test_malformed_request_gets_the_json_rpc_error(errors: Any, tmp_path: Path) 
         context.socket(zmq.REQ) as client,
     ):
         client.setsockopt(zmq.LINGER, 0)
-        client.setsockopt(zmq.RCVTIMEO, 10_000)
+        client.setsockopt(zmq.RCVTIMEO, int(DEADLINE_S * 1000))
         client.connect(address)
         for request in NO_REQUESTS:
             client.send(request)
@@ -280,3 +282,110 @@ def test_malformed_request_gets_the_json_rpc_error(errors: Any, tmp_path: Path) 
             assert (reply["error"]["code"], reply["id"]) == (-32700, None)
         client.send_json({"jsonrpc": "2.0", "method": "js_connect", "params": "None", "id": 7})
         assert client.recv_json() == {"jsonrpc": "2.0", "result": "true", "id": 7}
+
+
+# --- values of users' scripts ---
+
+VOLTAMMETRY = """
+var before = spm.dataLocation;
+spm.dataLocation = {baseDir: before.baseDir, subDir: "cv", envLogDir: before.envLogDir, fieldWidth: before.fieldWidth};
+spm.spect.iv = {pixels: 64, bias: {lowest: -0.5, highest: 0.5, start: 0, end: 0}};
+spm.spect.start("iv", "here");
+var iv = spm.spect.iv;
+spm.dataLocation = before;
+var types = [typeof before.envLogDir, typeof before.fieldWidth, typeof iv.speed];
+types.concat([iv.pixels, iv.bias.lowest, spm.dataLocation.subDir]).join();
+"""
+
+
+def test_sweep_and_folder_are_read_and_set_as_in_users_scripts(tmp_path: Path) -> None:
+    clock = ExperimentClock.starting_now(speed=100.0)
+    with (
+        ParkEmulator(seed=2).running(tmp_path / "data", clock) as address,
+        zmq.Context() as context,
+        connect(context, address) as client,
+    ):
+        assert evaluated(client, VOLTAMMETRY) == "string,number,number,64,-0.5,"
+
+
+@pytest.mark.parametrize("assigned", ["spect.iv = 5", "dataLocation = 'C:/'"])
+def test_object_is_not_replaced_by_a_simple_value(smartscan: SmartScan, assigned: str) -> None:
+    script = Script(f"spm.{assigned}", smartscan.names, smartscan.ask)
+    with pytest.raises(ScriptFailed, match="is no object"):
+        run_on(script)
+
+
+# --- scripts that loop ---
+
+LOOP = "while (true) { try { spm.zscanner.pos; } catch (e) {} }"
+
+
+def test_looping_script_takes_turns_with_others(smartscan: SmartScan, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine, "_AT_ONCE_S", 0.01)
+    script = Script(LOOP, smartscan.names, smartscan.ask)
+    assert script.step() is None
+    assert script.step() is None
+    script.end()
+
+
+def test_script_whose_client_has_gone_is_ended_after_some_requests(smartscan: SmartScan) -> None:
+    asked: list[str] = []
+    has_gone = False
+
+    def ask(kind: str, path: str, given: list[object]) -> object:
+        nonlocal has_gone
+        asked.append(path)
+        has_gone = len(asked) >= 100
+        return smartscan.ask(kind, path, given)
+
+    script = Script(LOOP, smartscan.names, ask, is_alone=lambda: has_gone)
+    with pytest.raises(ScriptFailed, match="its client has gone"):
+        run_on(script)
+    assert len(asked) == 100 + MOST_ALONE
+
+
+def connect(context: zmq.Context[Any], address: str) -> zmq.Socket[bytes]:
+    client: zmq.Socket[bytes] = context.socket(zmq.REQ)
+    client.setsockopt(zmq.LINGER, 0)
+    client.setsockopt(zmq.RCVTIMEO, int(DEADLINE_S * 1000))
+    client.connect(address)
+    return client
+
+
+def evaluated(client: zmq.Socket[bytes], source: str) -> str:
+    client.send_json({"jsonrpc": "2.0", "method": "js_cmd", "params": source, "id": 1})
+    reply = client.recv_json()
+    assert isinstance(reply, dict)
+    return str(reply.get("value"))
+
+
+def test_other_clients_are_answered_beside_a_looping_script_which_ends_with_its_client(tmp_path: Path) -> None:
+    with (
+        ParkEmulator(seed=2).running(tmp_path / "data") as address,
+        zmq.Context() as context,
+        connect(context, address) as other,
+    ):
+        with connect(context, address) as looping:
+            looping.send_json({"jsonrpc": "2.0", "method": "js_cmd", "params": LOOP, "id": 1})
+            while not is_running(other):
+                pass
+            assert evaluated(other, "1 + 1") == "2"
+            assert is_running(other)
+        while is_running(other):
+            pass
+
+
+def is_running(client: zmq.Socket[bytes]) -> bool:
+    client.send_json({"jsonrpc": "2.0", "method": "js_run", "params": "None", "id": 1})
+    return client.recv_json() == {"jsonrpc": "2.0", "result": "true", "id": 1}
+
+
+def test_emulator_stops_beside_a_looping_script(tmp_path: Path) -> None:
+    with zmq.Context() as context:
+        with ParkEmulator(seed=2).running(tmp_path / "data") as address:
+            looping, other = connect(context, address), connect(context, address)
+            looping.send_json({"jsonrpc": "2.0", "method": "js_cmd", "params": LOOP, "id": 1})
+            while not is_running(other):
+                pass
+        looping.close()
+        other.close()

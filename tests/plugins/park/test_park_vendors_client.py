@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from deadlines import DEADLINE_S
 from tests.plugins.park.park_bench import Emulated
 
 from afspm.basics.clock import ExperimentClock
@@ -23,7 +24,6 @@ from SmartRemote import SmartRemote
 SmartRemote.address = sys.argv[1]
 remote = SmartRemote()
 """
-DEADLINE_S = 60.0
 
 
 @pytest.fixture

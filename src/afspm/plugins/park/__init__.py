@@ -91,7 +91,7 @@ class Park(Driver):
         self._place = TipPlace(self._smartscan, self._begun)
         self._kept = KeptSettings(_AT_FIRST)
         self._gains = Gains(self._smartscan)
-        self.groups = (self._kept, FrameSettings(self._smartscan), self._gains, self._place)
+        self.groups = (self._kept, FrameSettings(self._smartscan, self._see_frame), self._gains, self._place)
         self._whole_table = self.table
 
     @classmethod
@@ -146,6 +146,9 @@ class Park(Driver):
 
     def results(self) -> Sequence[str]:
         return self._files.results(self.clock.now_ns())
+
+    def stopped_by_hand(self) -> str:
+        return self._doing.stopped_by_hand()
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         return self._files.load(result)
@@ -203,6 +206,11 @@ class Park(Driver):
 
     def _begun(self, call: LongCall) -> None:
         self._doing.watch(call)
+
+    def _see_frame(self, region: Region, rows: int, lines_per_s: float) -> None:
+        # read for the first time before the activity exists
+        if self._activity is not None:
+            self._activity.see_frame(region, rows, lines_per_s)
 
     def _frame_in_force(self) -> Region:
         return frame(self.in_force(FRAME))[0]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Final
 
@@ -24,8 +26,38 @@ START, STOP, STOP_CURVE = "scan.triggerImageScan()", "scan.stop()", "spect.stop(
 CURVES: Final = {"force": "fd", "IV": "iv"}
 """Kinds of curves, with SmartScan's names."""
 APPROACH: Final = '(spm.approach.start("q+s"), 0)'
+_WHOLE: Final = 0.9
+"""Part of a scan's expected duration, before which a scan that ends was stopped."""
 _ENDED_FIRST: Final = ("scan.stop", "spect.stop", "approach.stop")
 _STATES: Final = {MOVE: ScopeState.MOVING, **dict.fromkeys(CURVES, ScopeState.SPEC)}
+
+
+@dataclass
+class ScanDuration:
+    """The duration of a scan, which shows that it was stopped: SmartScan reports no progress.
+
+    Attributes:
+        began_s: experiment time right before the start.
+        at_least_s: shortest duration by the lines and line rates seen so far.
+        is_under_way: whether SmartScan has reported the scan as running.
+        ended_early: how much too early it ended, in words; empty: not, or not yet.
+    """
+
+    began_s: float = 0.0
+    at_least_s: float = math.inf
+    is_under_way: bool = False
+    ended_early: str = ""
+
+    def see(self, rows: int, lines_per_s: float) -> None:
+        # a person may have made the running scan faster
+        if rows > 0 and lines_per_s > 0.0:
+            self.at_least_s = min(self.at_least_s, rows / lines_per_s)
+
+    def end(self, now_s: float) -> None:
+        lasted_s = now_s - self.began_s
+        if math.isfinite(self.at_least_s) and lasted_s < _WHOLE * self.at_least_s:
+            took = f"after {lasted_s:.0f} s instead of {self.at_least_s:.0f} s, and left no complete file"
+            self.ended_early = f"SmartScan ended it without a request of the run, {took}"
 
 
 class SmartScanActivity(Activity):
@@ -55,6 +87,7 @@ class SmartScanActivity(Activity):
         self._session, self._files = session, files
         self._folder, self._frame_in_force = folder, frame_in_force
         self._curve_at: XY = (0.0, 0.0)
+        self._lasts = ScanDuration()
         self._kept = kept
         # removed here, and stored again by the next poll: after a failed poll the script is not resumed for ever
         if what := kept.pop("call", ""):
@@ -71,6 +104,7 @@ class SmartScanActivity(Activity):
                 self._session.do(STOP_CURVE)
         if scanning:
             self.follow(self._files.what or SCAN)
+            self._goes_on()
             return ScopeStatus(ScopeState.SCANNING)
         if not self.curve_awaited:
             self.follow(call.what if call is not None and curve else "")
@@ -79,11 +113,24 @@ class SmartScanActivity(Activity):
         return self.at_rest()
 
     def begin(self, what: str) -> None:
+        self._lasts = ScanDuration(self._clock.now_s())
         place = {"frame": as_list(self._frame_in_force())} if what == SCAN else {"position": list(self._curve_at)}
         self._files.begin(what, self._folder(), place)
 
     def end(self) -> None:
+        if self._files.what == SCAN:
+            self._frame_in_force()
+            self._lasts.end(self._clock.now_s())
         self._files.end(self._clock.now_ns())
+
+    def see_frame(self, region: Region, rows: int, lines_per_s: float) -> None:
+        """Register a frame that was read; it counts while a scan is seen running."""
+        if self._lasts.is_under_way:
+            self._files.see_frame(region)
+        self._lasts.see(rows, lines_per_s)
+
+    def stopped_by_hand(self) -> str:
+        return super().stopped_by_hand() or self._lasts.ended_early
 
     def start_scan(self) -> None:
         """Start a scan of the frame.
@@ -92,6 +139,7 @@ class SmartScanActivity(Activity):
             Refused: ACTION_ERROR: SmartScan reports an error, or shows no scan within `settles_s`.
         """
         self.started(SCAN, lambda: self._session.do(START), lambda: self._session.scanning() or self._files.has_file())
+        self._goes_on()
 
     def start_curve(self, kind: str, place_m: XY) -> None:
         """Move the tip to `place_m`, (x, y) in m, where `status` takes a curve of this kind on arrival."""
@@ -149,6 +197,11 @@ class SmartScanActivity(Activity):
         super().stopped()
 
     # --- inside ---
+
+    def _goes_on(self) -> None:
+        if self._files.what == SCAN and not self._lasts.is_under_way:
+            self._lasts.is_under_way = True
+            self._frame_in_force()  # which calls `see_frame`
 
     def _running_call(self) -> LongCall | None:
         # The move to a curve and the curve are two scripts: the curve starts when the move has ended.

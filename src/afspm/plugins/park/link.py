@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from afspm.basics.errors import AfspmError
-from afspm.basics.plain_data import Plain
+from afspm.basics.plain_data import Plain, from_json
 from afspm.translator.driver_base import ControllerLost
 from afspm.translator.zmq_connection import ZmqConnection
 
@@ -90,7 +90,7 @@ class Link:
     def _outcome(self, reply: Plain) -> Any:
         value = reply.get("value")
         try:
-            outcome = json.loads(value) if isinstance(value, str) else value
+            outcome = from_json(value) if isinstance(value, str) else value
         except ValueError:
             outcome = None
         if not isinstance(outcome, dict) or len(outcome) != 1 or not outcome.keys() & {OK, ERROR}:
@@ -139,7 +139,7 @@ def _request(method: str, parameters: str) -> bytes:
 
 def _fields(raw: bytes) -> Plain:
     try:
-        reply = json.loads(raw)
+        reply = from_json(raw)
     except ValueError as error:
         raise ControllerLost(f"a reply that is not JSON: {raw[:_SHOWN]!r}") from error
     if not isinstance(reply, dict):

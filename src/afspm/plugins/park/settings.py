@@ -36,12 +36,17 @@ _SPEED_PATH: Final = 2.0
 
 
 class FrameSettings(SettingsGroup):
-    """Frame and speed, set together since the speed depends on the width and the line rate."""
+    """Frame and speed, set together since the speed depends on the width and the line rate.
+
+    Args:
+        on_read: receives each frame that was read, its number of lines, and the lines per second.
+    """
 
     names = frozenset({*FRAME, names.SCAN_SPEED})
 
-    def __init__(self, session: Callable[[], Session]) -> None:
+    def __init__(self, session: Callable[[], Session], on_read: Callable[[Region, int, float], None]) -> None:
         self._session = session
+        self._on_read = on_read
 
     def read(self) -> dict[str, Value]:
         found = self._session().geometry()
@@ -50,6 +55,7 @@ class FrameSettings(SettingsGroup):
         region = Region(center, (width, found["height"] * MICROMETRE), math.radians(found["rotation"]))
         shape = (round(found["pixelHeight"]), round(found["pixelWidth"]))
         rate = float(self._session().values([_RATE])[_RATE])
+        self._on_read(region, shape[0], rate)
         return {**frame_values(region, shape), names.SCAN_SPEED: _SPEED_PATH * width * rate}
 
     def write(self, values: Mapping[str, Value]) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NoReturn, cast
 
 import zmq
+from zmq.utils.monitor import recv_monitor_message
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.plain_data import Plain, PlainMapping
@@ -87,7 +88,7 @@ class ParkEmulator(ScriptedEmulator):
         if asked is None:
             raise ScriptFailed("a request is no object of JSON")
         if asked.get("method") == "js_cmd":
-            return self._run(request, str(asked.get("params", "")))
+            return self._run(client, request, str(asked.get("params", "")))
         return _reply(request, result=self._queried(str(asked.get("method"))))
 
     def failure(self, request: bytes, reason: str) -> bytes:
@@ -135,6 +136,9 @@ class ParkEmulator(ScriptedEmulator):
             script.end()
         scripts.clear()
 
+    def _has(self, client: Client) -> bool:
+        return isinstance(self._wire, SmartRemoteWire) and self._wire.has(client)
+
     def _queried(self, method: str) -> str:
         program = self._smartscan
         if method == "js_connect":
@@ -149,8 +153,9 @@ class ParkEmulator(ScriptedEmulator):
             return ",".join(repr(program.geometry[name]) for name in GEOMETRY)
         raise ScriptFailed(f"there is no method {method!r}")
 
-    def _run(self, request: bytes, source: str) -> bytes | Unfinished:
-        script = Script(source, self._smartscan.names, self._smartscan.ask, self.woken.post)
+    def _run(self, client: Client, request: bytes, source: str) -> bytes | Unfinished:
+        program = self._smartscan
+        script = Script(source, program.names, program.ask, self.woken.post, lambda: not self._has(client))
         self._scripts[script] = False
         return self._step(request, script)
 
@@ -203,30 +208,49 @@ class SmartRemoteWire:
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.SNDTIMEO, 0)
         self._socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_REQUEST)
+        self._monitor = self._socket.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
         try:
             self._socket.bind(f"tcp://{LOOPBACK}:{port or '*'}")
         except zmq.ZMQError as error:
             self.close()
             raise OSError(error.errno, str(error)) from error
         self.port = int(self._socket.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
+        self._clients: dict[int, Client] = {}  # by the file descriptors of open connections; b"": nothing received yet
         self._poller = zmq.Poller()
-        self._poller.register(wakes, zmq.POLLIN)
-        self._poller.register(self._socket, zmq.POLLIN)
+        for readable in (wakes, self._socket, self._monitor):
+            self._poller.register(readable, zmq.POLLIN)
 
     @property
     def address(self) -> str:
         return f"tcp://{LOOPBACK}:{self.port}"
 
     def poll(self, timeout_s: float) -> None:
-        if self._socket not in dict(self._poller.poll(max(0, round(timeout_s * 1000)))):
-            return
+        self._poller.poll(max(0, round(timeout_s * 1000)))
+        self._follow_connections()
         while True:
             try:
-                client, *frames = self._socket.recv_multipart(zmq.NOBLOCK)
+                identity, *frames = self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
             except zmq.Again:
                 return
-            if len(frames) == 2 and not frames[0]:
-                self._on_request(client, frames[1])
+            # after the message: a new connection may have the descriptor of one that has ended since the last look
+            self._follow_connections()
+            descriptor = int(identity.get(zmq.SRCFD))
+            if descriptor in self._clients:
+                self._clients[descriptor] = identity.bytes
+            if len(frames) == 2 and not frames[0].bytes:
+                self._on_request(identity.bytes, frames[1].bytes)
+
+    def _follow_connections(self) -> None:
+        while self._monitor.poll(0):
+            event = recv_monitor_message(self._monitor)
+            if event["event"] == zmq.EVENT_ACCEPTED:
+                self._clients[event["value"]] = b""
+            else:
+                self._clients.pop(event["value"], None)
+
+    def has(self, client: Client) -> bool:
+        """Return whether a client is connected."""
+        return client in self._clients.values()
 
     def send(self, client: Client, reply: bytes) -> None:
         self._socket.send_multipart([cast(bytes, client), b"", reply])

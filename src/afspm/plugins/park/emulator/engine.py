@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from threading import Thread
+from threading import Event, Thread
 from typing import Final
 
 from afspm.basics.errors import AfspmError
@@ -24,7 +24,9 @@ LONGEST_S: Final = 5.0
 
 The script's thread continues: the engine can't be interrupted."""
 _AT_ONCE_S: Final = 0.25
-"""Longest wait for a script before other clients are served, in real seconds; most scripts end earlier."""
+"""Longest turn of a script before other clients are served, in real seconds; most scripts end earlier."""
+MOST_ALONE: Final = 20
+"""Requests that a script may still send to the instrument once its client has gone: enough for a withdrawal."""
 _MEMORY: Final = 64 << 20
 _PRELUDE: Final = Path(__file__).with_name("prelude.js")
 _REFUSALS: Final = (AfspmError, ArithmeticError, TypeError, ValueError)
@@ -51,23 +53,33 @@ class Script:
     Args:
         names: the "values" and "methods" of `spm`.
         wake: called from the script's thread when `step` has more to do.
+        is_alone: returns whether the script's client has gone.
     """
 
-    def __init__(self, source: str, names: str, ask: Ask, wake: Callable[[], None] = lambda: None) -> None:
-        self._ask, self._wake = ask, wake
+    def __init__(
+        self,
+        source: str,
+        names: str,
+        ask: Ask,
+        wake: Callable[[], None] = lambda: None,
+        is_alone: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._ask, self._wake, self._is_alone = ask, wake, is_alone
+        self._asked_alone = 0
         self._computes_since_s = time.monotonic()
         self._asks: SimpleQueue[tuple[str, str]] = SimpleQueue()
         self._answers: SimpleQueue[str] = SimpleQueue()
         self._wait: Wait | None = None
-        self._ended = False
+        self._ended = self._was_refused = False
         Thread(target=self._work, args=(source, names), name="emulated script", daemon=True).start()
 
     def step(self) -> tuple[object, str] | None:
         """Continue the script; return its value and text, or None while the script waits or computes.
 
         Raises:
-            ScriptFailed: the script failed, or computed longer than `LONGEST_S`.
+            ScriptFailed: the script failed, computed longer than `LONGEST_S`, or goes on although its client has gone.
         """
+        until_s = time.monotonic() + _AT_ONCE_S
         if self._wait is not None:
             if self._wait.waiting():
                 return None
@@ -75,7 +87,7 @@ class Script:
             self._answer(ended)
         while True:
             try:
-                kind, content = self._asks.get(timeout=_AT_ONCE_S)
+                kind, content = self._asks.get(timeout=max(until_s - time.monotonic(), 0.0))
             except Empty:
                 if self.computes_for_s > 0.0:
                     return None
@@ -86,7 +98,13 @@ class Script:
             if kind == "done":
                 value, text = json.loads(content)
                 return value, text
-            if not self._answered(content):
+            if self._is_alone():
+                self._asked_alone += 1
+            if self._asked_alone > MOST_ALONE:
+                self.end()
+                raise ScriptFailed("its client has gone, and the script does not come to an end")
+            # a script that sends one request after the other gets a turn like the others: its next request wakes
+            if not self._answered(content) or time.monotonic() >= until_s:
                 return None
 
     @property
@@ -143,7 +161,10 @@ class Script:
 
     def _asked(self, content: str) -> str:
         # Never raises: the engine would not survive it.
+        if self._ended and self._was_refused:
+            Event().wait()  # for ever: a script that catches the error and asks again would keep a processor busy
         if self._ended:
+            self._was_refused = True
             return _END
         self._hand_over("ask", content)
         return self._answers.get()

@@ -40,7 +40,11 @@ _OTHER_NAMES: Final = {
 _SHOWN: Final = {"m": ("um", 1e6), "A": ("pA", 1e12)}
 """Units of read values, with the factor from SI."""
 _MOST_READ: Final = 10_000
-_LOCATION: Final = {"subDir": "", "fileName": "SIMULATED", "fileSuffix": "", "direction": "auto", "jpegSave": False}
+_LOCATION: Final = {
+    "subDir": "", "fileName": "SIMULATED", "fileSuffix": "", "direction": "auto", "envLogDir": "", "fieldWidth": 4,
+    "precision": 1, "jpegSave": False, "cameraSave": False, "imageQualitySave": False,
+}  # fmt: skip
+"""Members of `dataLocation` besides the base folder, as users' scripts set them; folder and name have an effect."""
 _RETRACTED_UM, _EXTENDED_UM = 7.5, -7.5
 _SCANNER_UM_S, _STAGE_UM_S = 10.0, 1000.0
 """Default speed of the scanner; speed of a stage at its normalized speed of 1."""
@@ -79,6 +83,7 @@ class SmartScanProgram(MakerProgram):
             "zservo.setpoint.normalized": False,
             "zservo.setpoint.normValue": 1.0,
             _GAIN: {"p": 0.5, "i": 0.5, "z+": 1.0, "z-": 1.0},
+            "spect.iv": self._sweep_at_first(),
             "scan.options": {"twoWay": False, "overScan": {"enable": False, "percent": 5}},
             "dataLocation": {"baseDir": str(self.folder), **_LOCATION},
         }
@@ -129,6 +134,22 @@ class SmartScanProgram(MakerProgram):
         self._wakings_s: list[float] = []
         self._saved = 0
         self._apply()
+
+    def _sweep_at_first(self) -> Plain:
+        # the names are those of users' scripts; the sweep itself is a setting of the emulator
+        iv = self.rig.world.settings.iv
+        bias = {"start": 0.0, "end": 0.0, "lowest": -iv.range_v, "highest": iv.range_v, "isReversed": False}
+        return {
+            "bias": {**bias, "useStartEndSplit": False},
+            "pixels": iv.points,
+            "speed": 4.0 * iv.range_v / iv.duration_s,
+            "period": iv.duration_s,
+            "usePeriod": False,
+            "cycle": {"count": 1, "use": False},
+            "lift": {"enabled": False, "height": 0.0},
+            "limit": {"enabled": False, "current": 10.0},
+            "isLaserOff": False,
+        }
 
     @property
     def names(self) -> str:
