@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from deadlines import DEADLINE_S
 from igor2 import binarywave
 from tests.plugins.asylum.asylum_bench import Bench, Emulated
 from tests.plugins.vendor_bench import FLAT, SHAPE, TURNED, Peer, left_in_danger, moved, ready, scanned, states
@@ -142,7 +143,7 @@ def test_consecutive_images_from_the_panel_are_each_published_once(bench: Make) 
 
     made.at_panel(lambda emulator: emulator.controller.scan(made.clock.now_s(), True))
     received = peer.until(lambda one: one == ScopeStatus(ScopeState.SCANNING))
-    deadline_s = made.clock.monotonic_s() + 20.0
+    deadline_s = made.clock.monotonic_s() + DEADLINE_S
     while suffix() < 2:
         assert made.clock.monotonic_s() < deadline_s
     last = f"Image{suffix(last_scan=True):04d}.ibw"

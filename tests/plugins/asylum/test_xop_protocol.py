@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
+from deadlines import DEADLINE_S
 from tests.plugins.asylum.igor_test_functions import WithTestFunctions
 
 from afspm.basics.clock import ExperimentClock
@@ -332,7 +333,7 @@ def test_files_are_read_by_igor2(tmp_path: Path) -> None:
             client.call("PV", name, value)
         client.call("DoScanFunc", "UpScan")
         path = tmp_path / "Image0000.ibw"
-        deadline_s = clock.monotonic_s() + 20.0
+        deadline_s = clock.monotonic_s() + DEADLINE_S
         while client.call("GV", "ScanStatus")["result"]["value"] and clock.monotonic_s() < deadline_s:
             pass
         while clock.monotonic_s() < deadline_s:

@@ -67,6 +67,7 @@ class Asylum(Driver):
     software: ClassVar[str] = "Asylum Research in Igor Pro"
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
+    start_engages: ClassVar[bool] = True
     _activity: AsylumActivity
 
     def __init__(
@@ -95,7 +96,7 @@ class Asylum(Driver):
         self._kept = KeptSettings(_AT_FIRST)
         image = (lambda: self._activity.image) if spots == "image" else None
         self._place = TipPlace(self._igor, image, lambda: self._activity.moves(move_s))
-        frame_settings = FrameSettings(self._igor, lambda: self.in_force(NAMES))
+        frame_settings = FrameSettings(self._igor, lambda: self.in_force(NAMES), self._see_frame)
         feedback = FeedbackSwitch(self._igor, lambda holds: self.wait_for(holds, reply_timeout_s))
         self.groups = (self._kept, frame_settings, self._place, feedback)
 
@@ -144,6 +145,11 @@ class Asylum(Driver):
     def _frame_in_force(self) -> Region:
         return frame(self.in_force(FRAME))[0]
 
+    def _see_frame(self, region: Region) -> None:
+        # read for the first time before the activity exists
+        if hasattr(self, "_activity"):
+            self._activity.see_frame(region)
+
     def status(self) -> ScopeStatus:
         return self._activity.status()
 
@@ -172,6 +178,12 @@ class Asylum(Driver):
 
     def results(self) -> Sequence[str]:
         return self._files.results(self.clock.now_ns())
+
+    def stopped_by_hand(self) -> str:
+        return self._activity.stopped_by_hand()
+
+    def withdrew_tip(self) -> str:
+        return self._activity.withdrew_tip
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         return self._files.load(result)
@@ -211,8 +223,7 @@ class Asylum(Driver):
     @action(names.STOP_SCAN)
     def stop_scan(self) -> None:
         """Stop the scan. Asylum also withdraws the tip."""
-        self._igor().do("DoScanFunc", "StopScan")
-        self._activity.stopped()
+        self._activity.withdraw()
         # a warning, since a withdrawn tip may surprise the user: StopScan stops more than the scan
         self.log.warning("Asylum withdrew the tip, as it does whenever a scan is stopped")
 
@@ -248,12 +259,12 @@ class Asylum(Driver):
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
         """Stop scan, force curve and feedback, and withdraw the tip."""
-        self._igor().do("DoScanFunc", "StopScan")
-        self._activity.stopped()
+        self._activity.withdraw()
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
         """Approach the sample, like the button Engage."""
+        self._activity.withdrew_tip = ""
         # the function takes the name of the pressed button
         if not self._igor().do("SimpleEngageMe", "SimpleEngageButton"):
             raise Refused(ControlResponse.ACTION_ERROR, "Asylum refused to engage")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar, Final
 
@@ -22,6 +23,7 @@ FORCE: Final = "force"
 _SAVED_TO: Final = {SCAN: "SaveImage", FORCE: "SaveForce"}
 """Asylum's name for saving, by kind of measurement: for GV a number (2: results are saved), for GS the folder."""
 _SAVE: Final = 2.0
+_WITHDRAWS: Final = "LastScanWithdraw"
 
 
 class AsylumActivity(Activity):
@@ -35,6 +37,9 @@ class AsylumActivity(Activity):
         frame_in_force: returns the frame as it was set.
         spot_m: returns the target position of the tip, (x, y) in m; None: moving the tip is disabled.
         take_curve: starts a force curve.
+
+    Attributes:
+        withdrew_tip: why Asylum has withdrawn the tip, or will do so, without a person: empty since the last start.
     """
 
     program: ClassVar[str] = "Asylum"
@@ -61,6 +66,8 @@ class AsylumActivity(Activity):
         self._frame_in_force = frame_in_force
         self._spot_m, self._take_curve = spot_m, take_curve
         self.way = TipWay(kept, clock)
+        self.withdrew_tip = ""
+        self._is_under_way = False
 
     def status(self) -> ScopeStatus:
         """Return the present state. Register measurements that began or ended, and take a curve that awaits the tip."""
@@ -98,14 +105,19 @@ class AsylumActivity(Activity):
     def _image_begins(self) -> None:
         # only once a poll shows the scan running: a scan that does not start leaves the previous image open, and its
         # spots valid
-        if (frame := self._files.frame) is not None:
-            self._kept["image"] = frame
+        if (frame := self._files.frame) is None:
+            return
+        self._kept["image"] = frame
+        if not self._is_under_way:
+            self._is_under_way = True
+            self._look_at_frame()
 
     def begin(self, what: str) -> None:
         """Register the start of a scan, or of a force curve at the panel.
 
         The position of such a curve is later read from its file.
         """
+        self.withdrew_tip, self._is_under_way = "", False
         taken: dict[str, object] = {"position": None}
         if what == SCAN:
             # only if the tip was ever sent to a spot: else a force curve is taken at the present position
@@ -120,7 +132,34 @@ class AsylumActivity(Activity):
         self._files.begin_at(FORCE, self._target(FORCE), {"position": spot_m})
 
     def end(self) -> None:
+        if self._files.what == SCAN:
+            self._look_at_frame()
+            if self._withdraws_after_scan():
+                self.withdrew_tip = "Asylum withdrew the tip after the scan, as its LastScanWithdraw says"
         self._files.end(self._clock.now_ns())
+
+    def see_frame(self, region: Region) -> None:
+        """Register a frame that was read; it counts while a scan is seen running."""
+        if self._is_under_way:
+            self._files.see_frame(region)
+
+    def _look_at_frame(self) -> None:
+        # which calls `see_frame`. In a mode without these values the frame of the file decides
+        with suppress(Refused):
+            self._frame_in_force()
+
+    def withdraw(self) -> None:
+        """Press *Stop*, which ends what runs, and withdraws the tip."""
+        # the tip goes up for a while after the answer
+        self.withdrew_tip = "the tip was withdrawn by a stop on request"
+        self._session.do("DoScanFunc", "StopScan")
+        self.stopped()
+
+    def _withdraws_after_scan(self) -> bool:
+        try:
+            return bool(self._session.values([_WITHDRAWS])[_WITHDRAWS])
+        except Refused:
+            return False  # this release has no such value
 
     def saves(self, what: str) -> None:
         """Switch on saving, and check that the folder is reachable.

@@ -132,6 +132,7 @@ def _image(wave: igor.Wave, note: Note, path: Path, zone: tzinfo | None) -> File
     size_m = (wave.steps[0] * (nx - 1), wave.steps[1] * (ny - 1))
     region = Region(center_m, size_m, angle_rad)
     labels = wave.labels[2] if any(wave.labels[2]) else [wave.name] * count
+    labels = [label or f"Channel {k + 1}" for k, label in enumerate(labels)]
     if len(labels) != count:
         raise FileError(f"{count} channels with {len(labels)} names")
     end = end_ns(note, zone)

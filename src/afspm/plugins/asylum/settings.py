@@ -91,16 +91,25 @@ class FrameSettings(SettingsGroup):
     Args:
         igor: returns the session.
         in_force: returns all of `NAMES` as set before.
+        on_read: receives each frame that was read.
     """
 
     names = NAMES
 
-    def __init__(self, igor: Callable[[], Session], in_force: Callable[[], Mapping[str, Value]]) -> None:
+    def __init__(
+        self,
+        igor: Callable[[], Session],
+        in_force: Callable[[], Mapping[str, Value]],
+        on_read: Callable[[Region], None],
+    ) -> None:
         self._igor = igor
         self._in_force = in_force
+        self._on_read = on_read
 
     def read(self) -> dict[str, Value]:
-        return generic(self._igor().values(GLOBALS))
+        found = generic(self._igor().values(GLOBALS))
+        self._on_read(frame(found)[0])
+        return found
 
     def write(self, values: Mapping[str, Value]) -> None:
         wanted = asylums(values, self._in_force())
