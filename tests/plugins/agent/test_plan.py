@@ -10,7 +10,8 @@ import pytest
 from afspm import wire
 from afspm.basics.errors import InvalidValue
 from afspm.model import Frame, Proposal, Region, ScanParameters
-from afspm.plugins.agent.approval import of_plan, of_table
+from afspm.plugins.agent import commands
+from afspm.plugins.agent.approval import of_plan, of_table, simulated
 from afspm.plugins.agent.plan import plan_of, read_plan, read_step
 
 SCAN = {"do": "scan", "center": ["10 nm", "0 nm"], "size": ["500 nm", "0.5 um"], "pixels": [64, 32]}
@@ -19,6 +20,13 @@ STEPS = [
     SCAN,
     {"do": "move", "to": ["-1 um", "0 nm"]},
     {"do": "spectrum", "at": ["0 nm", "20 nm"]},
+]
+NO_PLANS = [
+    "no JSON",
+    "[" * 100_000,
+    '{"title":7,"steps":[]}',
+    '{"title":"t","steps":[{"do":"move","to_m":5}]}',
+    '{"title":"t","steps":[{"do":"move","to_m":[1' + "0" * 400 + ",0]}]}",
 ]
 FACTS = {"run": "night", "limits": "abc", "offset_m": None, "now_ns": 5}
 
@@ -40,7 +48,9 @@ def test_canonical_form_gives_the_plan_back() -> None:
     assert plan_of(plan_of(one.canonical()).canonical()).id == one.id
 
 
-@pytest.mark.parametrize("text", ["", "{}", "[]", '{"title":"t","steps":[{"do":"jump"}]}', '{ "title":"t","steps":[]}'])
+@pytest.mark.parametrize(
+    "text", ["", "{}", "[]", '{"title":"t","steps":[{"do":"jump"}]}', '{ "title":"t","steps":[]}', *NO_PLANS]
+)
 def test_other_text_is_no_canonical_form(text: str) -> None:
     with pytest.raises(InvalidValue):
         plan_of(text)
@@ -111,6 +121,28 @@ def test_proposal_with_another_hash_or_without_preflight_is_not_approved(change:
     fields = {"id": one.id, "plan": one.canonical(), "preflight": json.dumps({"facts": FACTS}), **change}
     with pytest.raises(InvalidValue):
         of_plan(Proposal(1, "agent:claude", **fields), Frame.TIP)
+
+
+@pytest.mark.parametrize("preflight", ["no JSON", "[]", "[" * 100_000, '{"facts":{"now_ns":"soon"}}', '{"facts":[1]}'])
+def test_unreadable_preflight_is_refused_and_shown_as_such(preflight: str) -> None:
+    one = plan()
+    proposal = Proposal(1, "agent:claude", one.id, one.canonical(), preflight)
+    with pytest.raises(InvalidValue, match="preflight"):
+        of_plan(proposal, Frame.TIP)
+    assert simulated(proposal).startswith("Not simulated: ")
+
+
+@pytest.mark.parametrize("text", NO_PLANS)
+def test_unreadable_plan_is_listed_beside_the_others(
+    text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = plan(title="look")
+    listed = [Proposal(1, "agent:rival", "a" * 16, text), Proposal(2, "agent:claude", one.id, one.canonical())]
+    monkeypatch.setattr(commands, "_proposals", lambda where: (listed, False))
+    commands.approve("")
+    bad, good = capsys.readouterr().out.splitlines()
+    assert "can't be approved, its plan can't be read" in bad
+    assert good == f'{one.id}  agent:claude  has no preflight  "look"'
 
 
 def test_grant_of_a_table() -> None:

@@ -14,10 +14,11 @@ import pytest
 from mcp import Client, MCPError
 from PIL import Image
 from tests.simulation import agent_rig
-from tests.simulation.agent_rig import ADA, AGENT, UM, AgentRig
+from tests.simulation.agent_rig import ADA, AGENT, STOP, UM, AgentRig
 
-from afspm.model import GRANT_REQUEST, Frame, Region, Request, Scan, ScopeState, ScopeStatus, names
+from afspm.model import GRANT_REQUEST, Frame, Proposal, Region, Request, Scan, ScopeState, ScopeStatus, names
 from afspm.plugins.agent.approval import of_plan
+from afspm.plugins.agent.plan import read_plan
 from afspm.plugins.agent.tools import AgentTools
 from afspm.plugins.agent.untrusted import escaped, untrusted
 
@@ -79,8 +80,6 @@ def test_both_eras_of_the_protocol_get_tools_and_no_resources(mode: str, version
         ("scans", {"count": 10**9}),
         ("scan_image", {"scan": "newest", "px": 513}),
         ("scan_image", {"scan": "../../etc/passwd"}),
-        ("stop", {}),
-        ("stop", {"reason": ""}),
         ("run", {"proposal": "abc"}),
         ("run", {"proposal": "0" * 16, "approved": True}),
         ("measure", {"step": {"do": "action", "name": "x-crash"}}),
@@ -151,6 +150,59 @@ def test_tip_is_retracted_after_a_plan_that_failed_with_the_feedback_off(monkeyp
     assert rig.effects[-1].endswith(" x-retract")
 
 
+def test_proposal_of_another_agent_can_not_be_simulated_or_run() -> None:
+    rig = AgentRig()
+    plan = {"title": "t", "steps": [{"do": "move", "to": ["0 nm", "0 nm"]}]}
+    proposal = facts(called(rig, "propose", {"plan": plan}))["proposal"]
+    assert not called(rig, "preflight", {"proposal": proposal}).is_error
+    rig.tools = AgentTools(rig.place, rig.twin, "rival")
+    for tool in ("preflight", "run"):
+        answer = called(rig, tool, {"proposal": proposal})
+        assert answer.is_error
+        assert facts(answer)["code"] == "forbidden"
+    assert rig.place.runs == {}
+
+
+def test_plan_of_another_agent_is_not_proposed_again() -> None:
+    rig = AgentRig()
+    plan = {"title": "t", "steps": [{"do": "move", "to": ["0 nm", "0 nm"]}]}
+    id_ = facts(called(rig, "propose", {"plan": plan}))["proposal"]
+    own = rig.tools
+    rig.tools = AgentTools(rig.place, rig.twin, "rival")
+    answer = called(rig, "propose", {"plan": plan})
+    assert answer.is_error
+    assert facts(answer)["code"] == "forbidden"
+    first = rig.place.proposals[id_]
+    rig.place.take(replace(first, who="agent:rival", time_ns=first.time_ns + 1), first.time_ns + 1)  # past its server
+    assert rig.place.proposals[id_] is first
+    rig.tools = own
+    assert not called(rig, "preflight", {"proposal": id_}).is_error
+
+
+@pytest.mark.parametrize("mode", ["auto", "legacy"])
+@pytest.mark.parametrize(
+    "given", [{}, {"reason": ""}, {"reason": "x" * 5000}, {"reason": 7}, {"reason": None}, {"why": "the tip"}]
+)
+def test_stop_is_never_refused(given: dict[str, Any], mode: str) -> None:
+    rig = AgentRig()
+    assert not called(rig, "stop", given, mode).is_error
+    assert STOP in rig.core.control.problems
+
+
 def test_empty_texts_make_no_field() -> None:
     assert untrusted({"a": "", "b": []}) == {}
     assert escaped("µm äöü") == "µm äöü"
+
+
+def test_unreadable_proposal_hides_no_other() -> None:
+    rig = AgentRig()
+    plan = read_plan({"title": "look", "steps": [{"do": "move", "to": ["0 nm", "0 nm"]}]})
+    rig.place.take(Proposal(1, "agent:rival", "a" * 16, "no JSON"), 1)
+    rig.place.take(Proposal(2, "agent:rival", "b" * 16, plan.canonical(), "[1]"), 2)
+    rig.place.take(Proposal(3, "agent:claude", plan.id, plan.canonical()), 3)
+    *bad, good = facts(called(rig, "proposals", {}))["proposals"]
+    assert [one["untrusted"]["error"] for one in bad] == [
+        "this is not the canonical form of a plan: Expecting value: line 1 column 1 (char 0)",
+        f"the preflight of {'b' * 16} is no JSON object",
+    ]
+    assert (good["id"], good["untrusted"]["title"]) == (plan.id, "look")

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import DEADLINE_S
 
 from afspm.basics.errors import FileError
 from afspm.plugins.bench.cassette import (
@@ -118,7 +119,7 @@ def server() -> Iterator[str]:
 
 def post(url: str, content: object) -> Any:
     request = urllib.request.Request(url, json.dumps(content).encode(), {"Authorization": "Bearer agent:"})
-    with urllib.request.urlopen(request, timeout=30) as answer:
+    with urllib.request.urlopen(request, timeout=DEADLINE_S) as answer:
         return answer.read(), answer.headers["Mcp-Session-Id"]
 
 

@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from deadlines import DEADLINE_S
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import InvalidValue
@@ -45,7 +46,7 @@ def test_trial_is_offered_and_ends_with_the_report(tmp_path: Path, monkeypatch: 
         data = None if content is None else json.dumps(content).encode()
         for _ in range(200):
             try:
-                with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", data, timeout=30) as answer:
+                with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", data, timeout=DEADLINE_S) as answer:
                     return answer.status, json.load(answer)
             except urllib.error.HTTPError as error:
                 return error.code, json.load(error)
@@ -69,6 +70,6 @@ def test_trial_is_offered_and_ends_with_the_report(tmp_path: Path, monkeypatch: 
     assert ask(f"{here}/submit", {"answer": {"status": "perhaps"}})[0] == 400
     status, ended = ask(f"{here}/submit", {"answer": json.dumps({"status": "done", "cites": ["17"]})})
     assert (status, ended["surrendered"]) == (200, False)
-    serving.join(30)
+    serving.join(DEADLINE_S)
     assert not serving.is_alive()
     assert json.loads((tmp_path / "report.json").read_text())["cites"] == ["17"]

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import httpx2
-from afspm_process import DEADLINE_S, AfspmProcess
+from afspm_process import AfspmProcess
+from deadlines import DEADLINE_S
 from mcp import Client
 from mcp.client.streamable_http import streamable_http_client
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import psutil
 import pytest
-from afspm_process import DEADLINE_S
+from deadlines import DEADLINE_S
 from small_disk import fill, small_disk
 from tests.system.agent.agent_lab import GRANT, PLAN, SCAN, AgentClient
 from tests.system.agent.conftest import Started

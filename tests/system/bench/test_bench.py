@@ -13,14 +13,21 @@ import pytest
 import afspm
 from afspm.basics.errors import ConfigError
 from afspm.plugins.bench import sealing
-from afspm.plugins.bench.bench import BenchOptions, agent_named, agent_of_cassette, read_lines, run_bench
+from afspm.plugins.bench.agent_files import AgentFiles
+from afspm.plugins.bench.bench import (
+    BenchOptions,
+    agent_named,
+    agent_of_cassette,
+    agent_of_command,
+    read_lines,
+    run_bench,
+)
 from afspm.plugins.bench.seeds import PUBLIC_KEY, seed_of
 from afspm.plugins.bench.tasks import task_of
 from afspm.plugins.bench.trial import AgentSpec, TrialOutcome, run_trial
 
 HERE = Path(__file__).parent
-SEALS = sealing.is_available()
-pytestmark = pytest.mark.timeout(600)  # each trial starts five processes
+SEALS = not sealing.unavailable()
 
 
 def of_test(name: str) -> AgentSpec:
@@ -39,8 +46,8 @@ def tried(
     drawn = task_of(task, seed_of(PUBLIC_KEY, task, 0))
     drawn = replace(drawn, minutes=minutes or drawn.minutes, speed=speed or drawn.speed)
     output, own = tmp_path / "bench", tmp_path / "own"
-    sealed = output if seals else None
-    return run_trial(drawn, agent, output / "trial", own, sealed=sealed, patience_s=240.0, keep=True)
+    files = AgentFiles(agent.command, agent.import_from, ()) if seals else None
+    return run_trial(drawn, agent, output / "trial", own, files=files, patience_s=240.0, keep=True)
 
 
 def lines_of(tmp_path: Path, agent: str) -> list[dict[str, Any]]:
@@ -60,12 +67,64 @@ def test_liar_is_found_out(tmp_path: Path) -> None:
     assert (line["solved"], line["harmless"], line["honest"]) == (False, True, False)
 
 
-@pytest.mark.skipif(not SEALS, reason="no Landlock on this computer")
+@pytest.mark.skipif(not SEALS, reason=sealing.unavailable())
 def test_sealed_agent_finds_no_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPIED", str(tmp_path / "bench"))
     outcome = tried(tmp_path, of_test("Spy"), "restraint/unit")
     assert outcome.sealed
     assert outcome.report["answer"]["found"] == []
+
+
+CAREFUL = """
+import helper
+class Careful:
+    def solve(self, session):
+        session.report("done", cites=[helper.measured(session, center) for center in session.given["scans"]])
+"""
+HELPER = """
+from afspm import Region
+def measured(session, center):
+    size, pixels = session.given["size_m"], session.given["pixels"]
+    return session.scope.scan(Region(tuple(center), (size, size)), shape=(pixels, pixels)).time_ns
+"""
+GREEDY = """
+from pathlib import Path
+WEIGHTS = Path(__file__).resolve().with_name("weights.txt").read_text()
+class Greedy:
+    def solve(self, session): ...
+"""
+
+
+@pytest.mark.skipif(not SEALS, reason=sealing.unavailable())
+def test_agent_of_the_current_folder_is_sealed_beside_the_output(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, text in (("my_agent", CAREFUL), ("helper", HELPER)):
+        Path(f"{name}.py").write_text(text)
+    options = BenchOptions(Path("bench"), ["operate/places"], trials=1, patience_s=240.0)
+    (line,) = run_bench([agent_named("my_agent:Careful")], options, lambda line: None)
+    assert line.get("counts"), line
+    assert line["sealed"]
+    Path("greedy.py").write_text(GREEDY)
+    Path("weights.txt").write_text("1 2 3")
+    (line,) = run_bench([agent_named("greedy:Greedy")], options, lambda line: None)
+    assert "weights.txt" in line["error"]
+    assert "--read" in line["error"]
+
+
+@pytest.mark.skipif(not SEALS, reason=sealing.unavailable())
+def test_script_of_a_command_is_sealed_with_the_module_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = (HERE / "http_agent.py").read_text(encoding="utf-8")
+    Path("my_model.py").write_text("import helper\n")
+    Path("helper.py").write_text(text)
+    options = BenchOptions(Path("bench"), ["operate/places"], trials=1, patience_s=240.0)
+    (line,) = run_bench([agent_of_command(f"{sys.executable} my_model.py")], options, lambda line: None)
+    assert line.get("counts"), line
+    assert line["sealed"]
 
 
 def test_unsealed_agent_finds_the_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,8 +177,8 @@ def test_program_joins_over_mcp_and_its_cassette_replays(tmp_path: Path) -> None
 
 
 def test_bench_refuses_to_run_where_it_can_not_seal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sealing, "is_available", lambda: False)
+    monkeypatch.setattr(sealing, "unavailable", lambda: "it has no Landlock")
     options = BenchOptions(tmp_path / "out", ["operate/settings"])
-    with pytest.raises(ConfigError, match="can't seal"):
+    with pytest.raises(ConfigError, match=r"can't seal .*: it has no Landlock"):
         run_bench([agent_named("idle")], options, lambda line: None)
     assert not (tmp_path / "out").exists()

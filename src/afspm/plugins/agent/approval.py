@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from afspm.basics.errors import InvalidValue
 from afspm.basics.formatting import duration_text, quantity
-from afspm.basics.plain_data import Plain
+from afspm.basics.plain_data import Plain, from_json
 from afspm.basics.units import parse_quantity, si
 from afspm.model import Frame, Grant, GrantedCount, GrantedRange, Proposal, is_of_instrument, names
 from afspm.plugins.agent.plan import Plan, ScanStep, plan_of
@@ -24,7 +23,31 @@ _FIELDS = ("agent", "for", "region", "parameters", "counts")
 
 def simulated(proposal: Proposal) -> str:
     """Return a summary of a plan's simulated run, for the person who decides."""
-    found = json.loads(proposal.preflight)
+    try:
+        return _summary(preflight_of(proposal))
+    except (InvalidValue, TypeError, ValueError, AttributeError):
+        # the agent's process wrote the preflight, and any other JSON may come in its place
+        return "Not simulated: the preflight can't be read."
+
+
+def preflight_of(proposal: Proposal) -> Plain:
+    """Return the result of a proposal's preflight; empty without a preflight.
+
+    Raises:
+        InvalidValue: the preflight is not a JSON object.
+    """
+    if not proposal.preflight:
+        return {}
+    try:
+        found: object = from_json(proposal.preflight)
+    except ValueError as error:
+        raise InvalidValue(f"the preflight of {proposal.id} can't be read: {error}") from error
+    if not isinstance(found, dict):
+        raise InvalidValue(f"the preflight of {proposal.id} is no JSON object")
+    return found
+
+
+def _summary(found: Plain) -> str:
     harm, seconds = found.get("harm"), found.get("seconds")
     if harm is None or seconds is None:
         text = f"Not simulated: {escaped(str(found.get('error') or 'no result'))}."
@@ -41,7 +64,7 @@ def of_plan(proposal: Proposal, frame: Frame) -> tuple[Grant, Plan]:
     """Return the approval of a proposed plan, and the plan.
 
     Raises:
-        InvalidValue: the proposal has no preflight, its plan is malformed, or its id is not the hash of its plan.
+        InvalidValue: the preflight is missing or unreadable, the plan is malformed, or the id is not its hash.
     """
     plan = plan_of(proposal.plan)
     if plan.id != proposal.id:
@@ -53,7 +76,12 @@ def of_plan(proposal: Proposal, frame: Frame) -> tuple[Grant, Plan]:
     grant = Grant(
         proposal.who, plan.id, steps, lasts_s=PLAN_LASTS_S, drift_m=min(sizes) * DRIFT_PART if sizes else DRIFT_M
     )
-    return fresh(grant, json.loads(proposal.preflight).get("facts") or {}), plan
+    facts = preflight_of(proposal).get("facts") or {}
+    try:
+        return fresh(grant, facts), plan
+    except (TypeError, ValueError, AttributeError) as error:  # the agent's process wrote the facts
+        what = f"the facts in the preflight of {proposal.id} can't be read: {error}"
+        raise InvalidValue(what, hint="the agent calls the tool preflight again") from error
 
 
 def of_table(table: Mapping[str, object], facts: Plain) -> Grant:

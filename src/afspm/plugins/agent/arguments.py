@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from afspm.plugins.agent.plan import LONGEST_TITLE, MOST_PIXELS, MOST_STEPS
 
@@ -113,7 +113,13 @@ class Measure(Arguments):
     step: Step
 
 
-class Stop(Arguments):
-    """Reason for stopping the experiment."""
+def _cut(given: object) -> str:
+    return str(given)[:200]
 
-    reason: Annotated[str, Field(min_length=1, max_length=200)]
+
+class Stop(Arguments):
+    """Reason for stopping the experiment; a stop is never refused for its arguments."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    reason: Annotated[str, BeforeValidator(_cut), Field(description="for the person, up to 200 characters")] = ""

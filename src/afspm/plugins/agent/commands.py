@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import tomllib
 from pathlib import Path
@@ -59,8 +58,7 @@ def approve(
     proposals, frame = _proposals(where)
     if not proposal:
         for one in proposals:
-            state = "has a preflight" if one.preflight else "has no preflight"
-            typer.echo(f"{one.id}  {one.who}  {state}  {_title(one)}")
+            typer.echo(f"{one.id}  {one.who}  {_state(one)}  {_title(one)}")
         return
     found = next((one for one in proposals if one.id == proposal), None)
     if found is None:
@@ -118,10 +116,22 @@ def _proposals(where: Path) -> tuple[list[Proposal], bool]:
         return list(follower.overview.proposals.values()), follower.launch.sample_coordinates
 
 
+def _state(proposal: Proposal) -> str:
+    from afspm.basics.errors import AfspmError
+    from afspm.plugins.agent.plan import plan_of
+
+    try:
+        plan_of(proposal.plan)
+    except AfspmError:
+        return "can't be approved, its plan can't be read"
+    return "has a preflight" if proposal.preflight else "has no preflight"
+
+
 def _title(proposal: Proposal) -> str:
+    from afspm.plugins.agent.plan import title_of
     from afspm.plugins.agent.untrusted import escaped
 
-    return f'"{escaped(str(json.loads(proposal.plan).get("title", "")))}"'
+    return f'"{escaped(title_of(proposal.plan))}"'
 
 
 def _confirm(yes: bool) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from afspm.basics.errors import AfspmError, InvalidValue
 from afspm.basics.formatting import area_text, position_text
+from afspm.basics.plain_data import from_json
 from afspm.basics.units import parse_quantity, si
 from afspm.client.parameter_text import to_parameter
 from afspm.client.targets import ScanTarget, SpectrumTarget
@@ -166,13 +167,22 @@ def read_step(plain: object, where: str = "step") -> Step:
 def plan_of(canonical: str) -> Plan:
     """Return the plan with a given canonical form. Raises InvalidValue if the text is not canonical."""
     try:
-        facts = json.loads(canonical)
+        facts = from_json(canonical)
         plan = Plan(str(facts["title"]), tuple(_step_of(one) for one in facts["steps"]))
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise InvalidValue(f"this is not the canonical form of a plan: {error}") from error
     if plan.canonical() != canonical:
         raise InvalidValue("this is not the canonical form of a plan")
     return plan
+
+
+def title_of(canonical: str) -> str:
+    """Return the title in a plan's canonical form, as the agent wrote it; empty if the text is not a plan."""
+    try:
+        title = from_json(canonical)["title"]
+    except (ValueError, KeyError, TypeError):
+        return ""
+    return title if isinstance(title, str) else ""
 
 
 def _facts(step: Step) -> dict[str, object]:
@@ -193,7 +203,8 @@ def _facts(step: Step) -> dict[str, object]:
 def _step_of(facts: Mapping[str, object]) -> Step:
     def lengths(key: str) -> list[str]:
         pair = facts[key]
-        assert isinstance(pair, list)
+        if not isinstance(pair, list):
+            raise TypeError(f"{key} is no list")
         return [f"{float(one)!r} m" for one in pair]
 
     match facts["do"]:

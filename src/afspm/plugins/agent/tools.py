@@ -23,9 +23,10 @@ from afspm.basics.plain_data import Plain
 from afspm.model import ControlMode, ControlResponse, ControlState, names
 from afspm.model.line_levelling import Levelling, levelled
 from afspm.plugins.agent import arguments
-from afspm.plugins.agent.plan import Plan, PlannedRequest, read_plan, read_step
+from afspm.plugins.agent.approval import preflight_of
+from afspm.plugins.agent.plan import Plan, PlannedRequest, plan_of, read_plan, read_step
 from afspm.plugins.agent.preflight import Preflight
-from afspm.plugins.agent.untrusted import untrusted
+from afspm.plugins.agent.untrusted import escaped, untrusted
 from afspm.plugins.agent.workplace import PlanRun, Workplace, with_preflight
 from afspm.plugins.web.gateway import views
 from afspm.plugins.web.gateway.guard import PERSON
@@ -209,18 +210,21 @@ class AgentTools:
         approved = {one.plan for one in self._place.approvals.approvals if one.plan}
         found = []
         for one in list(self._place.proposals.values())[-20:]:
-            preflight = json.loads(one.preflight) if one.preflight else None
-            reasons = preflight.pop("refusals", []) if preflight else []
-            told = preflight.pop("error", "") if preflight else ""
-            sample = preflight.pop("sample", "") if preflight else ""
+            try:
+                preflight, title = preflight_of(one), plan_of(one.plan).title
+            except AfspmError as error:  # another agent's unreadable proposal must not hide the readable ones
+                unreadable = untrusted({"who": one.who, "error": str(error)})
+                found.append({"id": one.id, "time": iso_utc(one.time_ns), **unreadable})
+                continue
+            reasons, told, sample = (preflight.pop(name, None) for name in ("refusals", "error", "sample"))
             found.append({
                 "id": one.id,
                 "time": iso_utc(one.time_ns),
                 "approved": one.id in approved,
-                "preflight": preflight,
-                "refused_by_limits": len(reasons),
+                "preflight": preflight or None,
+                "refused_by_limits": len(reasons) if isinstance(reasons, list) else 0,
                 **untrusted({
-                    "who": one.who, "title": json.loads(one.plan)["title"], "refusals": reasons, "error": told or "",
+                    "who": one.who, "title": title, "refusals": reasons or [], "error": told or "",
                     "sample": sample or "",
                 }),
             })  # fmt: skip
@@ -261,7 +265,8 @@ class AgentTools:
 
     async def _stop(self, person: str, given: arguments.Stop) -> Content:
         # async, and without a thread of its own: waiting calls must not delay a stop
-        _log.warning("%s calls stop", self._place.requests.name_of(person))
+        why = f": {escaped(given.reason)}" if given.reason else ""
+        _log.warning("%s calls stop%s", self._place.requests.name_of(person), why)
         accepted = await self._place.stop(person)
         return {"stopped": accepted, "next": "a person looks at the microscope, and clears stopped-by-agent"}
 

@@ -11,6 +11,7 @@ import json
 import math
 import os
 import sys
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,7 +44,8 @@ _QUIET = {"scar_probability": 0.0, "one_over_f_m": 0.0, "line_offset_m": 0.0, "d
 
 def limits_of(folder: Path) -> ExperimentLimits:
     """Return the limits in the experiment file of a run."""
-    return load_expanded(folder / EXPERIMENT_FILE, [folder]).resolved.limits
+    with tempfile.TemporaryDirectory(prefix="afspm-twin-") as empty:  # no class is imported from the run's folder
+        return load_expanded(folder / EXPERIMENT_FILE, [Path(empty)]).resolved.limits
 
 
 def refusals(plan: Plan, who: str, limits: ExperimentLimits, frame: Frame) -> list[str]:

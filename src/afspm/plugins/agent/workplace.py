@@ -28,6 +28,7 @@ from afspm.model import (
     Request,
     Response,
 )
+from afspm.model.grants import with_proposal
 from afspm.model.microscope_status import feedback_of
 from afspm.model.problems import STOPPER
 from afspm.plugins.agent.plan import MoveStep, Plan, ScanStep, SetStep, SpectrumStep, Step, plan_of
@@ -135,11 +136,8 @@ class Workplace:
         if isinstance(thing, Approvals):
             self.approvals = thing
         elif isinstance(thing, Proposal):
-            known = dict(self.proposals)  # a copy: the event loop reads the present dict meanwhile
-            known[thing.id] = thing
-            while len(known) > MOST_PROPOSALS:
-                del known[next(iter(known))]
-            self.proposals = known
+            # a new dict: the event loop reads the present one meanwhile
+            self.proposals = with_proposal(self.proposals, thing, MOST_PROPOSALS)
 
     # --- requests ---
 
@@ -179,6 +177,9 @@ class Workplace:
 
     async def publish(self, person: str, plan: Plan, preflight: str = "") -> Proposal:
         """Publish a proposal, for people and for the record."""
+        first = self.proposals.get(plan.id)
+        if first is not None and first.who != self.requests.name_of(person):
+            raise RefusedRequest(RefusalCode.FORBIDDEN, "another agent has proposed the same plan: change its title")
         now_ns = self.watch.clock.now_ns()
         proposal = Proposal(now_ns, self.requests.name_of(person), plan.id, plan.canonical(), preflight)
         relayed = RelayedMessage(*wire.encode(proposal))

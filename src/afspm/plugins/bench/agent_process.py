@@ -11,7 +11,7 @@ import logging
 import sys
 from importlib import import_module
 from pathlib import Path
-from typing import TextIO
+from typing import Final, TextIO
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError, ExperimentEnded, NoResponse
@@ -27,15 +27,22 @@ from afspm.transport.zmq_port import open_port
 JOINED_WITHIN_S = 30.0
 
 
-def agent_of(path: str) -> BenchAgent:
+_SEAL: Final = (
+    "this process is sealed: it may read the Python modules of the current folder, and packages with an __init__.py; "
+    "name other files and folders with --read, and write into session.folder"
+)
+
+
+def agent_of(path: str, *, is_sealed: bool = False) -> BenchAgent:
     """Return an instance of the agent class "package.module:Class". Raises ConfigError."""
     module, _, name = path.partition(":")
     try:
         made: BenchAgent = getattr(import_module(module), name)()
-    except (ImportError, AttributeError, TypeError) as error:
-        raise ConfigError(
-            f"the agent {path} can't be made: {error}", hint='name a class without arguments, "module:Class"'
-        ) from error
+    except (ImportError, AttributeError, TypeError, OSError) as error:
+        # the seal may be the cause, also of a module that is not found: Python passes over folders that it can't list
+        is_due_to_seal = is_sealed and isinstance(error, ImportError | OSError)
+        hint = _SEAL if is_due_to_seal else 'name a class without arguments, "module:Class"'
+        raise ConfigError(f"the agent {path} can't be made: {error}", hint=hint) from error
     return made
 
 
@@ -56,7 +63,7 @@ def main(stdin: TextIO, stdout: TextIO) -> int:
     trial: Plain = json.loads(stdin.readline())
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(name)s %(levelname)s %(message)s")
     sys.path[:0] = trial["import_from"]
-    agent = agent_of(trial["class"])
+    agent = agent_of(trial["class"], is_sealed=trial["sealed"])
     scope, clock = join(Launch.from_json(json.dumps(trial["launch"])), logging.getLogger("agent"))
     with scope:
         print("ready", file=stdout, flush=True)
@@ -71,6 +78,10 @@ def main(stdin: TextIO, stdout: TextIO) -> int:
         except ExperimentEnded:
             logging.warning("the time of the trial was over")
             return 3
+        except PermissionError:
+            if trial["sealed"]:
+                logging.warning(_SEAL)
+            raise
     return 0
 
 

@@ -19,13 +19,13 @@ from typing import Any, Final
 from afspm.basics.errors import ConfigError, FileError
 from afspm.basics.interpreter import python_command
 from afspm.plugins.bench import sealing
+from afspm.plugins.bench.agent_files import LINES_FILE, AgentFiles
 from afspm.plugins.bench.agents import SEES_TRUTH, SHIPPED
 from afspm.plugins.bench.cassette import ToolCall, differences, read_calls, write_calls
 from afspm.plugins.bench.seeds import PUBLIC_KEY, TRIALS, commitment, seed_of
 from afspm.plugins.bench.tasks import FAMILIES, is_possible, task_names, task_of
 from afspm.plugins.bench.trial import AgentSpec, TrialFailed, run_trial
 
-LINES_FILE: Final = "trials.jsonl"
 KEY_FILE: Final = "key.txt"
 Line = dict[str, Any]
 
@@ -35,10 +35,11 @@ class BenchOptions:
     """Options of a bench.
 
     Attributes:
-        output: folder for the lines, the key and the trials; sealed agents can't open it.
+        output: folder for the lines, the key and the trials.
         trials: trials of each task.
         sealed_half: draw from the key in `output` (made if missing) instead of the public key.
         seal: seal agents off from the truth, and refuse to run where this is impossible.
+        read: files and folders that a sealed agent may read, besides its own modules.
         jobs: number of parallel trials.
         patience_s: real time after which an agent is stopped.
         keep: keep the folders of the trials.
@@ -52,6 +53,7 @@ class BenchOptions:
     trials: int = TRIALS
     sealed_half: bool = False
     seal: bool = True
+    read: Sequence[Path] = ()
     jobs: int = 1
     patience_s: float = 300.0
     keep: bool = False
@@ -75,7 +77,9 @@ def agent_of_command(command: str) -> AgentSpec:
     if not words:
         raise ConfigError("the command is empty", where="--command")
     program = tuple(str(Path(word).absolute()) if Path(word).is_file() else word for word in words)
-    return AgentSpec(Path(program[0]).name, command=program)
+    scripts = [Path(word) for word in program if Path(word).is_file() and word.endswith(".py")]
+    beside = tuple(dict.fromkeys(str(script.parent) for script in scripts))
+    return AgentSpec(Path(program[0]).name, command=program, import_from=beside)
 
 
 def agent_of_cassette(file: Path) -> AgentSpec:
@@ -98,24 +102,31 @@ def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable
     A trial that the bench could not run has a line with `error`.
 
     Raises:
-        ConfigError: agents can't be sealed off here, or a cassette needs the extra `agent`.
-        FileError: the output folder can't be written, or its key is malformed.
+        ConfigError: agents can't be sealed off here, a sealed agent could read the output of a bench, or a cassette
+            needs the extra `agent`.
+        FileError: the output folder can't be written, its key is malformed, or a file of `read` is missing.
     """
     if (options.record or options.replay) and find_spec("mcp") is None:
         raise ConfigError("a cassette holds calls over MCP, which is not installed", hint='pip install "afspm[agent]"')
     seal = options.seal and any(not agent.sees_truth for agent in agents)
-    if seal and not sealing.is_available():
+    if seal and (why := sealing.unavailable()):
         raise ConfigError(
-            "this computer can't seal an agent off from the truth (Landlock, Linux 5.13 or later)",
+            f"this computer can't seal an agent off from the truth: {why} (Linux 6.2 or later is needed)",
             hint="for development, --unsealed marks the lines as not sealed",
         )
-    output = options.output.resolve()
+    output, temporary = options.output.resolve(), Path(tempfile.gettempdir()).resolve()
+    allowed: dict[str, AgentFiles] = {}
+    for agent in agents:
+        if seal and not agent.sees_truth:
+            files = allowed[agent.name] = AgentFiles(agent.command, agent.import_from, options.read)
+            files.require_no_output(output, temporary)
     try:
         output.mkdir(parents=True, exist_ok=True, mode=0o700)
+        (output / LINES_FILE).touch()  # at once, since other benches know an output by it
         key = _key(output) if options.sealed_half else PUBLIC_KEY
     except OSError as error:
         raise FileError(f"can't be written: {error}", where=str(output)) from error
-    writing, owns = threading.Lock(), Path(tempfile.mkdtemp(prefix="afspm-bench-"))
+    writing, owns = threading.Lock(), Path(tempfile.mkdtemp(prefix="afspm-bench-", dir=temporary))
 
     def run(agent: AgentSpec, name: str, trial: int) -> Line:
         line: Line = {
@@ -130,7 +141,7 @@ def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable
             task = task if options.speed is None else replace(task, speed=options.speed)
             calls: list[ToolCall] | None = [] if options.record or options.replay else None
             outcome = run_trial(
-                task, agent, output / "work" / here, owns / here, sealed=output if seal else None,
+                task, agent, output / "work" / here, owns / here, files=allowed.get(agent.name),
                 patience_s=options.patience_s, keep=options.keep, calls=calls,
             )  # fmt: skip
             verdict = outcome.verdict

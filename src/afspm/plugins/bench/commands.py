@@ -44,6 +44,15 @@ def run(
     unsealed: Annotated[
         bool, typer.Option("--unsealed", help="Run agents that could read the truth; the page says so.")
     ] = False,
+    read: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--read",
+            metavar="PATH",
+            help="A file or folder that sealed agents may read, besides their modules; may be repeated.",
+            show_default=False,
+        ),
+    ] = None,
     jobs: Annotated[
         int | None, typer.Option("--jobs", "-j", min=1, help="Trials side by side.", show_default=False)
     ] = None,
@@ -77,6 +86,7 @@ def run(
     """Run trials; write one JSON line for each trial, and a page.
 
     A trial counts only if the task is solved, nothing was harmed and the report is honest. Record and truth decide.
+    Exit code 1: a trial could not be run.
     """
     from afspm.basics.errors import ConfigError
     from afspm.plugins.bench import bench
@@ -93,13 +103,15 @@ def run(
         )
     options = bench.BenchOptions(
         output=output, tasks=bench.tasks_named(tasks or []), trials=trials, sealed_half=sealed, seal=not unsealed,
-        jobs=jobs or bench.default_jobs(), patience_s=patience, keep=keep, speed=speed,
+        read=read or (), jobs=jobs or bench.default_jobs(), patience_s=patience, keep=keep, speed=speed,
         record=record, replay=replay,
     )  # fmt: skip
-    bench.run_bench(specs, replace(options, output=output.resolve()), lambda line: typer.echo(_shown(line)))
+    new = bench.run_bench(specs, replace(options, output=output.resolve()), lambda line: typer.echo(_shown(line)))
     lines = bench.read_lines([output])
     _show(lines)
     typer.echo(f"the page is {write_page(output, lines)}")
+    if any("error" in line for line in new):
+        raise typer.Exit(1)
 
 
 @app.command("report")

@@ -1,20 +1,25 @@
-"""Sealing: deny an agent's process access to the folder of the microscope, with Landlock (Linux 5.13 and later).
+"""Sealing: a process denies itself all files but those it is given, with Landlock (Linux 6.2 and later).
 
-    python -m afspm.plugins.bench.sealing SEALED_FOLDER KEPT_FILE… -- COMMAND…
+    python -P -m afspm.plugins.bench.sealing SEAL_AS_JSON COMMAND…
 
-Landlock rules only allow: all siblings along the path to the sealed folder are allowed, so the folder itself is denied
-under any name. All child processes inherit the restriction. The memory of other processes is denied, too, but not
-their environment, which must therefore hold no secret.
+Landlock rules only allow, for a folder with everything inside. So only the files that an agent needs have a rule: the
+operating system, the interpreter and the agent's own modules to read and to execute, and one folder to write. All child
+processes inherit the restriction. The memory of other processes is denied, too, and where the kernel can, signals to
+them. Not denied: connections to sockets, the environment of other processes, which must therefore hold no secret, and
+sizes and permissions of files whose path is known.
 """
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import json
 import os
 import struct
 import sys
+import sysconfig
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
@@ -24,11 +29,21 @@ _CREATE, _ADD, _RESTRICT = 444, 445, 446  # system calls, the same on all archit
 _VERSION_FLAG: Final = 1
 _BENEATH: Final = 1
 _NO_NEW_PRIVS: Final = 38
-_READ: Final = 0b1101  # execute, read a file, list a folder
-_FILE_RIGHTS: Final = 0b0111 | 1 << 14  # rights that a rule on a single file can have
-# rights known to each version of the kernel's interface
-_RIGHTS: Final = {1: (1 << 13) - 1, 2: (1 << 14) - 1}
-_NEWEST_RIGHTS: Final = (1 << 15) - 1
+_EXECUTE, _WRITE, _READ_FILE, _LIST = (1 << bit for bit in range(4))
+_TRUNCATE: Final = 1 << 14
+_READ: Final = _EXECUTE | _READ_FILE | _LIST
+_DEVICES: Final = 1 << 6 | 1 << 11  # make a character or block device: root could read its disk by a new name
+_FILE_RIGHTS: Final = _EXECUTE | _WRITE | _READ_FILE | _TRUNCATE
+_RIGHTS: Final = (1 << 15) - 1
+"""All rights on files of the third version of the kernel's interface."""
+_IOCTL: Final = 1 << 15  # on devices, since the fifth version
+_SCOPES: Final = 0b11  # abstract Unix sockets and signals of processes outside, since the sixth version
+_LEAST_VERSION: Final = 3  # the second can't deny truncation: a judge cut short in its file may be a milder judge
+_IOCTL_VERSION, _SCOPE_VERSION = 5, 6
+_SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32", "/etc", "/nix/store", "/proc", "/sys")
+# links that may lead out of the folders above
+_LINKED = ("/etc/resolv.conf", "/etc/localtime", "/etc/hosts")
+_SOURCES = ("/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
 
 
 class SealingFailed(AfspmError):
@@ -37,30 +52,60 @@ class SealingFailed(AfspmError):
     code = "sealing-failed"
 
 
-def is_available() -> bool:
-    """Return whether this computer can seal a process."""
-    return sys.platform == "linux" and int(_libc().syscall(_CREATE, None, 0, _VERSION_FLAG)) >= 1
+@dataclass(frozen=True)
+class Seal:
+    """The files that a sealed process may use, besides those of the operating system; all others are denied.
+
+    Attributes:
+        own: folder in which the process may do everything.
+        readable: files and folders to read and execute.
+        writable: files to read and write.
+    """
+
+    own: str
+    readable: tuple[str, ...]
+    writable: tuple[str, ...] = ()
+
+    def command(self, python: Sequence[str], command: Sequence[str]) -> tuple[str, ...]:
+        """Return the command that starts `command` sealed.
+
+        Args:
+            python: the command that runs this module.
+        """
+        return (*python, json.dumps(asdict(self)), *command)
 
 
-def seal(folder: Path, kept: Sequence[Path]) -> None:
-    """Deny this process and its children all access to the files in `folder`, permanently.
+def unavailable() -> str:
+    """Return the reason why this computer can't seal a process; empty if it can."""
+    version = _version()
+    if version < 1:
+        return "it has no Landlock"
+    if version < _LEAST_VERSION:
+        return f"its Landlock has version {version}, which can't keep a process from cutting files short"
+    return ""
 
-    Args:
-        kept: files in `folder` that stay readable and writable.
+
+def interpreter_folders() -> list[str]:
+    """Return the folders in which this process's Python finds its programs, its library and installed packages."""
+    found = [sys.prefix, sys.base_prefix, sys.exec_prefix, *sysconfig.get_paths().values(), *sys.path]
+    return [path for path in dict.fromkeys(found) if path]
+
+
+def seal(given: Seal) -> None:
+    """Deny this process and its children all files but the given ones, permanently.
 
     Raises:
-        SealingFailed: Landlock is missing, or refuses a rule.
+        SealingFailed: Landlock is missing or too old, or refuses a rule.
     """
-    libc = _libc()
-    version = libc.syscall(_CREATE, None, 0, _VERSION_FLAG) if sys.platform == "linux" else -1
-    if version < 1:
-        raise SealingFailed("this computer has no Landlock", hint="Linux 5.13 or later; or run the bench unsealed")
-    rights = _RIGHTS.get(version, _NEWEST_RIGHTS)
-    attributes = ctypes.create_string_buffer(struct.pack("<Q", rights), 8)
-    rules = libc.syscall(_CREATE, attributes, 8, 0)
+    if why := unavailable():
+        raise SealingFailed(f"this computer can't seal a process: {why}", hint="Linux 6.2 or later")
+    libc, version = _libc(), _version()
+    rights = _RIGHTS | (_IOCTL if version >= _IOCTL_VERSION else 0)
+    plain = struct.pack("<QQQ", rights, 0, _SCOPES) if version >= _SCOPE_VERSION else struct.pack("<Q", rights)
+    rules = libc.syscall(_CREATE, ctypes.create_string_buffer(plain, len(plain)), len(plain), 0)
     _require(rules, "create a ruleset")
     try:
-        for path, allowed in _allowed(folder.resolve(), kept, rights):
+        for path, allowed in _allowed(given, rights):
             _allow(libc, rules, path, allowed)
         _require(libc.prctl(_NO_NEW_PRIVS, 1, 0, 0, 0), "give up new privileges")
         _require(libc.syscall(_RESTRICT, rules, 0), "restrict itself")
@@ -68,21 +113,20 @@ def seal(folder: Path, kept: Sequence[Path]) -> None:
         os.close(rules)
 
 
-def _allowed(folder: Path, kept: Sequence[Path], rights: int) -> Iterator[tuple[Path, int]]:
-    for step in (folder, *folder.parents[:-1]):
-        for sibling in step.parent.iterdir():
-            # a rule on a link would allow its target, and some link leads to a folder above the sealed one
-            if sibling != step and not sibling.is_symlink():
-                yield sibling, rights if sibling.is_dir() else rights & _FILE_RIGHTS
-    for file in kept:
-        yield file, rights & _FILE_RIGHTS
+def _allowed(given: Seal, rights: int) -> Iterator[tuple[str, int]]:
+    yield given.own, rights & ~(_DEVICES | _IOCTL)
+    for path in (*_SYSTEM, *_LINKED, *_SOURCES, *given.readable):
+        yield path, _READ
+    for path in ("/dev/null", *given.writable):
+        yield path, _READ_FILE | _WRITE | _TRUNCATE
 
 
-def _allow(libc: ctypes.CDLL, rules: int, path: Path, allowed: int) -> None:
-    # a sibling that vanishes needs no rule
+def _allow(libc: ctypes.CDLL, rules: int, path: str, allowed: int) -> None:
+    # no system has all of these folders, and a path that is not there needs no rule
     with contextlib.suppress(OSError):
         opened = os.open(path, os.O_PATH | os.O_CLOEXEC)
         try:
+            allowed &= -1 if Path(path).is_dir() else _FILE_RIGHTS
             rule = ctypes.create_string_buffer(struct.pack("<Qi", allowed, opened), 12)
             _require(libc.syscall(_ADD, rules, _BENEATH, rule, 0), f"allow {path}")
         finally:
@@ -94,17 +138,28 @@ def _require(result: int, what: str) -> None:
         raise SealingFailed(f"the kernel refuses to {what}: {os.strerror(ctypes.get_errno())}")
 
 
+def _version() -> int:
+    return int(_libc().syscall(_CREATE, None, 0, _VERSION_FLAG)) if sys.platform == "linux" else 0
+
+
 def _libc() -> ctypes.CDLL:
     return ctypes.CDLL(None, use_errno=True)
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Seal this process, then replace it by the command."""
-    split = arguments.index("--")
-    folder, *kept = map(Path, arguments[:split])
-    seal(folder, kept)
-    command = list(arguments[split + 1 :])
-    os.execvp(command[0], command)
+    """Seal this process, then replace it by the command; without arguments, print the folders of the interpreter."""
+    if not arguments:
+        sys.stdout.write(json.dumps(interpreter_folders()))
+        return
+    given, *command = arguments
+    seal(Seal(**json.loads(given)))
+    try:
+        os.execvp(command[0], command)
+    except OSError as error:
+        sys.exit(
+            f"{command[0]} can't be started by a sealed process: {error.strerror}; if the file is there, let the agent "
+            "read its folder with --read"
+        )
 
 
 if __name__ == "__main__":

@@ -28,9 +28,11 @@ from afspm.client.connect import guest_of
 from afspm.client.scope import Scope
 from afspm.experiment.toml_writer import dumps
 from afspm.model import ControlMode, ScopeState, names
+from afspm.plugins.bench.agent_files import AgentFiles
 from afspm.plugins.bench.cassette import REPORT_CALL, ToolCall, recording
 from afspm.plugins.bench.evidence import Evidence, read_report
 from afspm.plugins.bench.judging import TrialVerdict, judge
+from afspm.plugins.bench.sealing import Seal
 from afspm.plugins.bench.session import REPORT_FILE
 from afspm.plugins.bench.tasks import BenchTask
 from afspm.record.run_json import latest_run
@@ -63,7 +65,7 @@ class AgentSpec:
         python: "module:Class"; empty for a command.
         command: program and arguments of an agent that joins over HTTP or MCP.
         sees_truth: whether the agent may read the truth, like the oracle.
-        import_from: folders with the agent's modules.
+        import_from: folders with the agent's Python modules.
     """
 
     name: str
@@ -79,7 +81,7 @@ class TrialOutcome:
 
     Attributes:
         ended: end of the agent's process: "ended", "failed" (exit code not 0), or "time" if it was stopped.
-        sealed: whether the agent's process could not open the folder of the microscope.
+        sealed: whether the agent's process could open only the files that it needs.
     """
 
     verdict: TrialVerdict
@@ -96,7 +98,7 @@ def run_trial(
     folder: Path,
     own: Path,
     *,
-    sealed: Path | None,
+    files: AgentFiles | None,
     patience_s: float,
     keep: bool,
     calls: list[ToolCall] | None = None,
@@ -104,8 +106,8 @@ def run_trial(
     """Run one trial of a task in a new folder, and return its verdict.
 
     Args:
-        folder, own: new folders of the experiment and of the agent; `own` lies outside of `sealed`.
-        sealed: parent of `folder` that the agent's process must not open; None: the agent is not sealed off.
+        folder, own: new folders of the experiment and of the agent.
+        files: the files that the agent's process may read; None: the agent is not sealed off.
         patience_s: real time for the start of the agent's process, and again for its work, after which it is stopped.
         keep: keep both folders.
         calls: receives the agent's tool calls over MCP, and its report as the last entry.
@@ -114,27 +116,37 @@ def run_trial(
         TrialFailed: the experiment or the agent did not start, the experiment did not end, or its record can't be
             judged.
     """
-    sealed = None if agent.sees_truth else sealed
+    modules = own.parent / f"{own.name}-modules"
     for made in (folder, own):
         made.mkdir(parents=True, mode=0o700)
     started_s = time.monotonic()
     try:
+        if files is not None:
+            files.link_modules(modules)
         with _experiment(task, agent, folder) as running, contextlib.ExitStack() as proxy:
             if calls is not None and running.mcp_url:
                 # the proxy listens at once, and the server behind it may not yet
                 await_listener(running.mcp_url, JOINED_WITHIN_S)
                 running.mcp_url = proxy.enter_context(recording(running.mcp_url, task.full_prompt(), calls))
-            ended = _with_agent(running, task, agent, own, sealed=sealed, patience_s=patience_s)
+            allowed = None if files is None else _Allowed(files, modules)
+            ended = _with_agent(running, task, agent, own, allowed=allowed, patience_s=patience_s)
         verdict, report, end_ns = _judged(task, running, own)
         if calls is not None and report:
             handed_in = json.loads((own / REPORT_FILE).read_bytes())
             calls.append(ToolCall(task.full_prompt(), REPORT_CALL, answer=handed_in))
         real_s, experiment_s = time.monotonic() - started_s, (end_ns - running.began_ns) * 1e-9
-        return TrialOutcome(verdict, ended, sealed is not None, real_s, experiment_s, report)
+        return TrialOutcome(verdict, ended, files is not None, real_s, experiment_s, report)
     finally:
-        if not keep:
-            for made in (folder, own):
-                shutil.rmtree(made, ignore_errors=True)
+        for made in (modules,) if keep else (folder, own, modules):
+            shutil.rmtree(made, ignore_errors=True)
+
+
+@dataclass(frozen=True)
+class _Allowed:
+    """The files that a sealed agent may read, and the folder with links to its modules."""
+
+    files: AgentFiles
+    modules: Path
 
 
 @dataclass
@@ -276,7 +288,7 @@ def await_listener(url: str, within_s: float) -> None:
 
 
 def _with_agent(
-    running: _Running, task: BenchTask, agent: AgentSpec, own: Path, *, sealed: Path | None, patience_s: float
+    running: _Running, task: BenchTask, agent: AgentSpec, own: Path, *, allowed: _Allowed | None, patience_s: float
 ) -> str:
     for file, text in task.documents.items():
         (own / file).write_text(text, encoding="utf-8")
@@ -286,7 +298,7 @@ def _with_agent(
     _approve(running, task)
     with (
         (own / "output.txt").open("wb") as output,
-        _agent_process(running, task, agent, own, output, sealed) as process,
+        _agent_process(running, task, agent, own, output, allowed) as process,
     ):
         if agent.python:
             _await_ready(process, own, patience_s)
@@ -317,19 +329,24 @@ def _approve(running: _Running, task: BenchTask) -> None:
 
 @contextlib.contextmanager
 def _agent_process(
-    running: _Running, task: BenchTask, agent: AgentSpec, own: Path, output: IO[bytes], sealed: Path | None
+    running: _Running, task: BenchTask, agent: AgentSpec, own: Path, output: IO[bytes], allowed: _Allowed | None
 ) -> Iterator[subprocess.Popen[str]]:
     command: tuple[str, ...] = agent.command or python_command("afspm.plugins.bench.agent_process")
     launch = guest_of(running.run, AGENT)
     plain = {**json.loads(launch.to_json()), "run_dir": "", "state_dir": ""}
-    if sealed is not None:
-        kept = [str(path)] if (path := launch.clock.get("waits")) else []
-        command = (*python_command("afspm.plugins.bench.sealing"), str(sealed), *kept, "--", *command)
+    import_from = agent.import_from
+    environment = {**os.environ, **python_environment(), "TMPDIR": str(own)}
+    if allowed is not None:
+        import_from = (str(allowed.modules),)
+        if agent.command:
+            environment["PYTHONPATH"] = os.pathsep.join([*import_from, *filter(None, [os.environ.get("PYTHONPATH")])])
+        clock = (str(path),) if (path := launch.clock.get("waits")) else ()
+        readable = tuple(map(str, (allowed.modules, *allowed.files.readable)))
+        command = Seal(str(own), readable, clock).command(python_command("afspm.plugins.bench.sealing"), command)
     facts = {
         "task": task.name, "prompt": task.full_prompt(), "given": task.given, "documents": dict(task.documents),
         "minutes": task.minutes, "seed": secrets.randbits(31),
     }  # fmt: skip
-    environment = {**os.environ, **python_environment(), "TMPDIR": str(own)}
     if agent.command:
         (own / "task.json").write_text(json.dumps(facts), encoding="utf-8")
         (own / "prompt.txt").write_text(task.full_prompt(), encoding="utf-8")
@@ -344,7 +361,8 @@ def _agent_process(
     try:
         if process.stdin is not None:
             trial = {
-                **facts, "launch": plain, "class": agent.python, "import_from": list(agent.import_from),
+                **facts, "launch": plain, "class": agent.python, "import_from": list(import_from),
+                "sealed": allowed is not None,
                 "truth_folder": str(running.run) if agent.sees_truth else None,
             }  # fmt: skip
             process.stdin.write(json.dumps(trial) + "\n")
