@@ -46,6 +46,7 @@ from afspm.model.instruments import (
     is_of_instrument,
 )
 from afspm.model.packet import LoggedPacket, Packet, PacketHeader
+from afspm.model.panel import ActByHand, ChangedValue, MeasurementConditions, PanelAct, TipStatus
 from afspm.model.problems import HIGHEST_PROBLEM, STOPPED_BY_AGENT, Problem, ProblemNames
 from afspm.model.registration_outcome import RegistrationOutcome, registration_summary
 from afspm.model.requests import (
@@ -93,8 +94,10 @@ __all__ = [
     "RESTART_REQUEST",
     "STOPPED_BY_AGENT",
     "WAIT_FOR_CONTROL",
+    "ActByHand",
     "Approval",
     "Approvals",
+    "ChangedValue",
     "ControlEvent",
     "ControlMode",
     "ControlRequest",
@@ -116,11 +119,13 @@ __all__ = [
     "LogLine",
     "LogLines",
     "LoggedPacket",
+    "MeasurementConditions",
     "MeasurementSettings",
     "Note",
     "OrderOutcome",
     "Packet",
     "PacketHeader",
+    "PanelAct",
     "Parameter",
     "PositionChange",
     "ProbePosition",
@@ -148,6 +153,7 @@ __all__ = [
     "ScopeStatus",
     "ShapeChange",
     "Spectrum",
+    "TipStatus",
     "component_of",
     "instrument_of",
     "is_of_instrument",

@@ -69,7 +69,7 @@ class ProcessCondition(IntEnum):
 
 
 class ControlEvent(IntEnum):
-    """A change of control, mode or problems; numbers as on the wire."""
+    """A change of control, mode or problems, or an act at the microscope itself; numbers as on the wire."""
 
     UNDEFINED = 0
     STARTED = 1
@@ -80,6 +80,7 @@ class ControlEvent(IntEnum):
     PROBLEM_CLEARED = 6
     MODE_CHANGED = 7
     EXPERIMENT_ENDED = 8
+    BY_HAND = 9
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from afspm.basics.errors import InvalidValue
@@ -159,6 +160,19 @@ class Proposal:
     id: str
     plan: str
     preflight: str = ""
+
+
+def with_proposal(known: Mapping[str, Proposal], proposal: Proposal, most: int) -> dict[str, Proposal]:
+    """Return at most `most` proposals by id with one more, newest last.
+
+    An id is the hash of the plan, which all can read: a plan that another agent proposes again stays the first one's,
+    with its preflight.
+    """
+    first = known.get(proposal.id)
+    if first is not None and first.who != proposal.who:
+        return dict(known)
+    rest = {id_: one for id_, one in known.items() if id_ != proposal.id}
+    return dict([*rest.items(), (proposal.id, proposal)][-most:])
 
 
 def _region(numbers_m: tuple[float, ...]) -> Region | None:

@@ -18,6 +18,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from afspm.basics.errors import InvalidValue
 from afspm.basics.plain_data import Plain
+from afspm.basics.type_aliases import unaliased
 
 T = TypeVar("T")
 
@@ -89,6 +90,7 @@ def from_plain(type_: Any, plain: Any) -> Any:
         ValueError: a field is unknown, or a value is not allowed.
         AttributeError: the plain data of a dataclass are no mapping.
     """
+    type_ = unaliased(type_)
     origin, arguments = get_origin(type_), get_args(type_)
     if type_ is Any:
         return plain

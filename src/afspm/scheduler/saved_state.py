@@ -9,6 +9,7 @@ from afspm.basics.frozen import replace
 from afspm.model.idempotency_cache import SentAction
 from afspm.model.microscope_status import TipRisk
 from afspm.scheduler.control.arbitration import ArbitrationState
+from afspm.scheduler.control.panel_state import PanelState
 from afspm.scheduler.publishing.event_log import SentStart
 from afspm.scheduler.safety.grants import GrantBook
 from afspm.scheduler.safety.limit_state import LimitState
@@ -66,6 +67,7 @@ class SavedState:
     instrument_units: Mapping[str, str] = field(default_factory=dict)
     instrument_orders: int = 0
     grants: GrantBook = field(default_factory=GrantBook)
+    panel: PanelState = field(default_factory=PanelState)
 
     def without_holder(self) -> SavedState:
         """Return the state without a holder: an older state does not know the present holder."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
+import math
 import threading
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
+from afspm import wire
+from afspm.basics import named_imports
 from afspm.basics.errors import ConfigError, FileError, InvalidValue
 from afspm.basics.exit_codes import ExitCode
 from afspm.model.fencing import Epoch
@@ -24,6 +26,7 @@ from afspm.scheduler.step_log import RecordedCore, StepLog
 from afspm.scheduler.wire_codec import WireCodec
 from afspm.scheduler.write_ahead import StateFile, WriteAhead
 from afspm.storage.packet_log import PacketLog, cached_packets, log_folder
+from afspm.transport.polling import milliseconds
 from afspm.transport.probe import versions_here
 from afspm.transport.process.context import ProcessContext
 from afspm.transport.rate_limited_log import RateLimitedLog
@@ -96,11 +99,12 @@ class Scheduler:
             sockets.wake_up()
 
         context.when_stopping(stop)
-        shell = SchedulerShell(core, sockets, clock, write_ahead, warnings, log, coordinates.worker)
+        shell = SchedulerShell(core, sockets, wire, clock, write_ahead, warnings, log, coordinates.worker)
         try:
             shell.start()
             while not (shell.over or stopping.is_set()):
-                ready = shell.wait()
+                timeout_s = shell.due_s - clock.monotonic_s()
+                ready = sockets.wait(None if timeout_s == math.inf else milliseconds(timeout_s))
                 with context.activity.step():
                     shell.handle(ready)
             shell.stop()
@@ -169,9 +173,10 @@ def _section(type_: type[T], plain: Mapping[str, object], name: str) -> T:
 def _mapping(name: str) -> EnvelopeMapping:
     module, _, function = name.rpartition(".")
     try:
-        mapping = getattr(importlib.import_module(module), function)
+        mapping = getattr(named_imports.import_named(module), function)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"the mapping {name!r} can't be loaded: {error}", where="[cache] mapping") from error
     if not callable(mapping):
         raise ConfigError(f"{name!r} is not a function", where="[cache] mapping")
+    named_imports.require_trusted(mapping, name)
     return mapping  # type: ignore[no-any-return]

@@ -8,11 +8,13 @@ from typing import Any
 from afspm.basics.frozen import replace
 from afspm.model import (
     ControlMode,
+    ControlResponse,
     ControlState,
     JournalEntries,
     JournalEntry,
     LoggedPacket,
     Problem,
+    Response,
     component_of,
 )
 from afspm.scheduler.control import control_change
@@ -61,6 +63,7 @@ from afspm.scheduler.publishing.event_log import SCHEDULER, SentStart, start_ent
 from afspm.scheduler.requests import answers, approvals, instrument_requests, request_pipeline
 from afspm.scheduler.requests.forwarder import AskForFrame
 from afspm.scheduler.safety import safety_commands
+from afspm.scheduler.safety.limit_checker import is_get
 from afspm.scheduler.saved_state import SavedState
 from afspm.scheduler.settings import SchedulerSettings
 from afspm.scheduler.state import Environment, SchedulerState, StateDraft, restored_state, saved_state
@@ -172,8 +175,13 @@ class SchedulerCore:
         return due_s(self.state)
 
     def deadline_ns(self) -> int | None:
-        """Return when a Tick is due at the latest, in experiment time; None: no lease of the experiment file runs."""
-        return self.state.lease.deadline_ns(is_free=self.state.microscope.is_free)
+        """Return when a Tick is due at the latest, in experiment time; None: no deadline.
+
+        Deadlines are a lease of the experiment file, and the end of an approval of the agent in control.
+        """
+        lease_ns = self.state.lease.deadline_ns(is_free=self.state.microscope.is_free)
+        approved_ns = self.state.grants.ends_ns(self.state.control.holder)
+        return min((one for one in (lease_ns, approved_ns) if one is not None), default=None)
 
     def snapshot(self) -> SavedState:
         """Return the state that must survive a kill, without the cache."""
@@ -303,6 +311,11 @@ def _on_reconsidered(draft: StateDraft, output: Reconsider) -> None:
 
 
 def _on_ask_microscope(draft: StateDraft, output: AskMicroscope) -> None:
+    if draft.control.mode is ControlMode.MANUAL and not is_get(output.request):
+        why = "the mode is MANUAL: a person is in control"
+        refused = Response(int(ControlResponse.WRONG_CONTROL_MODE), b"", why, output.request.id)
+        draft.raised.append(FrameAnswered(output.purpose, refused))
+        return
     # the values, and not who may set them: no component asks
     refusal = draft.limits.check(SCHEDULER, output.request, draft.now_ns, used=())
     if refusal is not None:
@@ -379,6 +392,7 @@ def _handle_deadlines(draft: StateDraft) -> None:
     is_idle = (lease_ns is not None and draft.now_ns >= lease_ns) or _is_due(_lease_ends_at_s(draft), draft.now_s)
     if (holder := draft.control.holder) is not None and is_idle:
         control_change.decide(draft, ControlInput(ArbitrationEvent.IDLE, holder))
+    approvals.end(draft)
     for name in draft.pending.still_unclear(draft.now_s):  # both connections stay open: they belong to two processes
         draft.pending, waiting = draft.pending.clear_up(name)
         if waiting is not None:

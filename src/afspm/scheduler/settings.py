@@ -45,6 +45,10 @@ class ControlSettings:
             flag is cleared when the microscope is back.
         stop_scan_on_problem: whether to stop a running scan when a flagged problem takes control from the holder.
         stop_scan_on_manual: whether to stop a running scan when the mode changes to MANUAL.
+        stopped_by_hand: what follows a person's stop of a measurement at the microscope. `"pause"`: the mode becomes
+            MANUAL, until a person lets the run continue; `"repeat"`: it is measured again.
+        changed_by_hand: what follows a person's change of a setting at the microscope. `"tell"`: it is logged, and
+            kept; `"pause"`: the mode becomes MANUAL, as it always does for a value outside `[limits]`.
         retract: whether to retract the tip, if the microscope can, when a holder loses control in a dangerous state.
             The tip is not retracted when the holder gives control back, or a person takes control.
         dangerous: list of the dangerous states: `MOVING`, `SCANNING`, `COARSE_MOTOR`, `BUSY_PARAM`, `SPEC`,
@@ -68,6 +72,8 @@ class ControlSettings:
     malfunction_after_s: Duration = 5.0
     stop_scan_on_problem: Switch = True
     stop_scan_on_manual: Switch = True
+    stopped_by_hand: Literal["pause", "repeat"] = "pause"
+    changed_by_hand: Literal["tell", "pause"] = "tell"
     retract: Switch = True
     dangerous: tuple[DangerousState, ...] | None = None
     request_timeout_s: PositiveDuration = 5.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import TYPE_CHECKING, Protocol
 
 from afspm import wire
@@ -16,22 +16,22 @@ from afspm.model import (
     ControlResponse,
     LoggedPacket,
     Packet,
+    PacketHeader,
+    Request,
     Response,
     ResponseDetail,
 )
 from afspm.scheduler import events
-from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
-from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
-from afspm.transport.scheduler_sockets import LinkReply, LinkUp
+from afspm.transport.router import PeerAsked, PeerConnected, PeerDisconnected
+from afspm.transport.scheduler_sockets import LinkDown, LinkReply, LinkUp
 
 if TYPE_CHECKING:
     from afspm.basics.clock import Clock
     from afspm.scheduler.saved_state import SavedState
     from afspm.scheduler.scheduler_core import SchedulerCore
-    from afspm.scheduler.write_ahead import WriteAhead
     from afspm.transport.rate_limited_log import RateLimitedLog
-    from afspm.transport.scheduler_sockets import SchedulerSockets, Source
+    from afspm.transport.scheduler_sockets import SocketEvent, Source
 
 _LEVELS = logging.getLevelNamesMapping()
 _LATE_S = 0.005
@@ -67,23 +67,112 @@ class FrameWorker(Protocol):
         ...
 
 
+class Messages(Protocol):
+    """The encoding of requests, answers and packets on the sockets; `afspm.wire` is one.
+
+    Methods that read frames raise `WireError` if the frames can't be read.
+    """
+
+    def decode_request(self, frames: Sequence[bytes], /) -> Request: ...
+    def encode_request(self, request: Request, /) -> Sequence[bytes]: ...
+    def decode_response(self, frames: Sequence[bytes], /) -> Response: ...
+    def encode_response(self, response: Response, /) -> Sequence[bytes]: ...
+    def id_of(self, frames: Sequence[bytes], /) -> str:
+        """Return the id of a request, even a malformed one; "" without one."""
+        ...
+
+    def header(self, envelope: str, payload: bytes | memoryview, /) -> PacketHeader: ...
+
+
+class ShellSockets(Protocol):
+    """The connections of a scheduler: `SchedulerSockets`, or lines in memory.
+
+    Attributes:
+        history: returns the packets that a subscriber lacks when it joins.
+    """
+
+    history: Callable[[Hashable, tuple[str, ...], int], Iterable[Packet]]
+
+    @property
+    def due_s(self) -> float:
+        """Real monotonic time at which `receive` must be called even if no source is ready."""
+        ...
+
+    def receive(self, ready: Sequence[Source]) -> Iterable[Sequence[SocketEvent]]:
+        """Yield the events of each ready source, packets apart from all others, and let new subscribers join."""
+        ...
+
+    def reply(self, connection: int, frames: Sequence[bytes]) -> None: ...
+    def send(self, number: int, frames: Sequence[bytes]) -> object:
+        """Send a request to the translator, if it is connected."""
+        ...
+
+    def publish(self, packet: Packet) -> None: ...
+    def end(self) -> None:
+        """Send the end of the experiment to all subscribers, and to each that joins later."""
+        ...
+
+    def wake_up(self) -> None:
+        """Let `handle` be called soon. Thread-safe."""
+        ...
+
+
+class ShellDisk(Protocol):
+    """The memory that outlives the process: `WriteAhead`, or a simulated disk."""
+
+    def write(self, state: SavedState | None, entries: Sequence[LoggedPacket], /) -> None:
+        """Save the state and append the packets, before either is published."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class StepObserver(Protocol):
+    """An observer of the decisions, in the order in which they take effect."""
+
+    def decided(self, event: events.Input | None, effects: Sequence[events.Effect]) -> None:
+        """Observe a decision before its effects are carried out; the event None is the start."""
+        ...
+
+    def carrying_out(self, effect: events.Effect) -> None:
+        """Observe an effect just before it is carried out, after state and packets have been written."""
+        ...
+
+    def carried_out(self) -> None:
+        """Observe that the effects of all decisions so far have been carried out."""
+        ...
+
+
 class SchedulerShell:
-    """A running scheduler: `start`, then `handle` the result of `wait` until it is `over`."""
+    """A running scheduler over its sockets and its disk.
+
+    Call `start`, then `handle` whenever a source is ready or `due_s` has passed, until the scheduler is `over`.
+
+    Args:
+        messages: the encoding on the sockets.
+        disk: state and packets are written there before they are published.
+        warnings: messages about malformed input, which must not flood the log.
+        worker: executes the jobs of the coordinate frame; None: the frame has no jobs.
+        observer: sees each decision and effect.
+    """
 
     def __init__(
         self,
         core: SchedulerCore,
-        sockets: SchedulerSockets,
+        sockets: ShellSockets,
+        messages: Messages,
         clock: Clock,
-        write_ahead: WriteAhead,
+        disk: ShellDisk,
         warnings: RateLimitedLog,
         log: logging.Logger,
         worker: FrameWorker | None = None,
+        observer: StepObserver | None = None,
     ) -> None:
         self._core = core
         self._sockets = sockets
+        self._messages = messages
         self._clock = clock
-        self._write_ahead = write_ahead
+        self._disk = disk
         self._warnings = warnings
         self._log = log
         self._replay: tuple[Packet, ...] = ()
@@ -91,92 +180,92 @@ class SchedulerShell:
         self.ended = False
         self._tip_is_safe = True
         self._worker = worker
+        self._observer = observer
         if worker is not None:
             worker.wake = sockets.wake_up
-        sockets.publisher.history = self._history
+        sockets.history = self._history
 
     def start(self) -> None:
-        self._carry_out(self._core.start(self._clock.monotonic_s(), self._clock.now_ns()))
+        effects = self._core.start(self._clock.monotonic_s(), self._clock.now_ns())
+        self._carry_out(self._seen(None, effects))
 
-    def wait(self) -> list[Source]:
-        """Wait for a message or a deadline, and return the sources that are ready."""
-        next_s = min(self._core.leave_at_s if self.ended else self._next_deadline_s, self._sockets.router.due_s)
-        timeout_s = next_s - self._clock.monotonic_s()
-        return self._sockets.wait(None if timeout_s == math.inf else milliseconds(timeout_s))
+    @property
+    def due_s(self) -> float:
+        """Real monotonic time at which `handle` must be called even if no source is ready."""
+        return min(self._core.leave_at_s if self.ended else self._next_deadline_s, self._sockets.due_s)
 
     @property
     def over(self) -> bool:
         """Whether the experiment and the grace period after it have ended."""
         return self.ended and self._clock.monotonic_s() >= self._core.leave_at_s
 
-    def handle(self, ready: list[Source]) -> None:
+    def handle(self, ready: Sequence[Source]) -> None:
         """Process the worker's reports and incoming messages, then expired deadlines."""
-        if self.ended:
-            self._handle_after_end(ready)
-            return
-        for report in () if self._worker is None else self._worker.reports():
+        for report in () if self._worker is None or self.ended else self._worker.reports():
             self._step_with(events.FrameReported(report))
-        sockets = self._sockets
-        for source in ready:
-            if source in (sockets.router, sockets.router.monitor):
-                self._receive_requests()
-            elif source is sockets.link:
-                for heard in sockets.link.receive():
-                    self._step_with(events.TranslatorReply(heard.number, _response(heard)))
-            elif source is sockets.subscriber:
-                self._receive_packets()
-            elif source is sockets.publisher:
-                sockets.publisher.serve()
-            elif source is sockets.subscriber.monitor:
-                sockets.subscriber.follow()
-            else:
-                for change in sockets.link.follow():
-                    self._step_with(events.TranslatorUp() if isinstance(change, LinkUp) else events.TranslatorDown())
+        for incoming in self._sockets.receive(ready):
+            self._take(incoming)
+        if self.ended:
+            return
         now_s = self._clock.monotonic_s()
-        if now_s >= sockets.router.due_s:
-            self._receive_requests()
         if now_s >= self._next_deadline_s:
             self._deadlines(now_s)
         elif now_s + _LATE_S < self._next_deadline_s:
             self._next_deadline_s = now_s + _LATE_S  # the messages may have set an earlier deadline
 
-    def _handle_after_end(self, ready: list[Source]) -> None:
-        # after the end no request is decided: each is answered that the experiment has ended
-        sockets = self._sockets
-        for source in ready:
-            if source is sockets.publisher:
-                # a subscriber that joins now has missed the signal
-                if sockets.publisher.serve():
-                    sockets.publisher.kill()
-            elif source in (sockets.router, sockets.router.monitor):
-                self._receive_requests()
-            elif source is sockets.link:
-                sockets.link.receive()
-            elif source is sockets.link.monitor:
-                if any(isinstance(change, LinkUp) for change in sockets.link.follow()):
-                    self._close_translator()
-            elif source is sockets.subscriber:
-                sockets.subscriber.receive()
-            else:
-                sockets.subscriber.follow()
-        if self._clock.monotonic_s() >= sockets.router.due_s:
-            self._receive_requests()
+    def _take(self, incoming: Sequence[SocketEvent]) -> None:
+        # small packets go to the disk's thread together: handing one over and waiting takes as long as receiving and
+        # publishing it
+        effects, size = list[events.Effect](), 0
+        for event in incoming:
+            if not isinstance(event, PacketReceived | CaughtUp):
+                self._take_one(event)
+                continue
+            if self.ended:
+                continue
+            effects += self._of_translator(event)
+            size += len(event.packet.payload) if isinstance(event, PacketReceived) else 0
+            if size >= _TOGETHER_BYTES:
+                self._carry_out(effects)
+                effects, size = [], 0
+        if effects:
+            self._carry_out(effects)
+
+    def _of_translator(self, event: PacketReceived | CaughtUp) -> list[events.Effect]:
+        if isinstance(event, CaughtUp):
+            return self._decide(events.TranslatorCaughtUp())
+        packet = event.packet
+        try:
+            header = self._messages.header(packet.envelope, packet.payload)
+        except WireError as error:
+            self._warnings.warning(f"dropped a packet of the translator: {error}")
+            return []
+        return self._decide(events.PacketIn(packet, header))
+
+    def _take_one(self, event: SocketEvent) -> None:
+        match event:
+            case PeerAsked():
+                self._request(event)
+            case LinkUp() if self.ended:
+                self._close_translator()
+            case _ if self.ended:
+                return
+            case PeerConnected():
+                self._step_with(events.Connected(event.connection))
+            case PeerDisconnected():
+                self._step_with(events.Disconnected(event.connection))
+            case LinkReply():
+                self._step_with(events.TranslatorReply(event.number, self._response(event)))
+            case LinkUp():
+                self._step_with(events.TranslatorUp())
+            case LinkDown():
+                self._step_with(events.TranslatorDown())
 
     def _close_translator(self) -> None:
         # a translator subscribes to nothing, so CLOSE is sent to it. With a tip in danger it gets none: it retracts the
         # tip by itself when it is stopped or its parent has gone
         if self._tip_is_safe:
-            self._sockets.link.send(0, [wire.CLOSE])
-
-    def _request_after_end(self, asked: RouterEvent) -> None:
-        # final process states, and problems seen after the end, still belong in the record
-        if not isinstance(asked, PeerAsked) or not asked.frames:
-            return
-        if asked.frames[0] in _WRITTEN_DOWN_LATE:
-            self._request(asked)
-            return
-        ended = ResponseDetail.EXPERIMENT_ENDED
-        self._answer(asked, Response(ControlResponse.FAILURE, b"", HAS_ENDED, wire.id_of(asked.frames), ended))
+            self._sockets.send(0, [wire.CLOSE])
 
     def stop(self) -> None:
         """Save the duty towards a tip in danger for a resumed run, unless the experiment has ended."""
@@ -187,7 +276,7 @@ class SchedulerShell:
         """Stop the frame's worker, and flush the files."""
         if self._worker is not None:
             self._worker.close()
-        self._write_ahead.close()
+        self._disk.close()
 
     # --- inputs ---
 
@@ -195,60 +284,40 @@ class SchedulerShell:
         self._carry_out(self._decide(event))
 
     def _decide(self, event: events.Input) -> list[events.Effect]:
-        return self._core.step(event, self._clock.monotonic_s(), self._clock.now_ns())
+        return self._seen(event, self._core.step(event, self._clock.monotonic_s(), self._clock.now_ns()))
 
-    def _receive_requests(self) -> None:
-        for event in self._sockets.router.receive():
-            if self.ended:
-                self._request_after_end(event)
-            elif isinstance(event, PeerAsked):
-                self._request(event)
-            elif isinstance(event, PeerConnected):
-                self._step_with(events.Connected(event.connection))
-            else:
-                self._step_with(events.Disconnected(event.connection))
+    def _seen(self, event: events.Input | None, effects: list[events.Effect]) -> list[events.Effect]:
+        if self._observer is not None:
+            self._observer.decided(event, effects)
+        return effects
 
     def _request(self, asked: PeerAsked) -> None:
-        name = asked.name
-        if not asked.frames:
-            self._step_with(events.Greeted(asked.connection, name, asked.user))
+        name, frames = asked.name, asked.frames
+        if not frames:
+            if not self.ended:
+                self._step_with(events.Greeted(asked.connection, name, asked.user))
+            return
+        if self.ended and frames[0] not in _WRITTEN_DOWN_LATE:
+            # after the end no request is decided, but final process states and late problems belong in the record
+            ended = ResponseDetail.EXPERIMENT_ENDED
+            response = Response(ControlResponse.FAILURE, b"", HAS_ENDED, self._messages.id_of(frames), ended)
+            self._reply(asked.connection, response)
             return
         try:
-            request = wire.decode_request(asked.frames)
+            request = self._messages.decode_request(frames)
         except WireError as error:
             self._warnings.warning(f"refused a request of {name or 'a nameless peer'}: {error}")
-            response = Response(error.response, reason=str(error), id=wire.id_of(asked.frames))
-            self._answer(asked, response)
+            response = Response(error.response, reason=str(error), id=self._messages.id_of(frames))
+            self._reply(asked.connection, response)
             self._step_with(events.Unreadable(name, response))
             return
-        now_s = self._clock.monotonic_s()
-        event = events.RequestIn(asked.connection, name, request, asked.user, now_s)
-        self._carry_out(self._core.step(event, now_s, self._clock.now_ns()))
+        self._step_with(events.RequestIn(asked.connection, name, request, asked.user, self._clock.monotonic_s()))
 
-    def _answer(self, asked: PeerAsked, response: Response) -> None:
-        self._reply(events.Reply(asked.connection, asked.name, response))
-
-    def _receive_packets(self) -> None:
-        # small packets go to the disk's thread together: handing one over and waiting takes as long as receiving and
-        # publishing it
-        effects, size = list[events.Effect](), 0
-        for incoming in self._sockets.subscriber.receive():
-            if isinstance(incoming, CaughtUp):
-                effects += self._decide(events.TranslatorCaughtUp())
-            if not isinstance(incoming, PacketReceived):
-                continue
-            packet = incoming.packet
-            try:
-                header = wire.header(packet.envelope, packet.payload)
-            except WireError as error:
-                self._warnings.warning(f"dropped a packet of the translator: {error}")
-                continue
-            effects += self._decide(events.PacketIn(packet, header))
-            size += len(packet.payload)
-            if size >= _TOGETHER_BYTES:
-                self._carry_out(effects)
-                effects, size = [], 0
-        self._carry_out(effects)
+    def _response(self, reply: LinkReply) -> Response:
+        try:
+            return self._messages.decode_response(reply.frames)
+        except WireError as error:
+            return Response(int(ControlResponse.FAILURE), reason=f"the translator's answer can't be read: {error}")
 
     def _history(self, subscriber: Hashable, prefixes: tuple[str, ...], since_ns: int) -> Iterable[Packet]:
         self._replay = ()
@@ -269,19 +338,20 @@ class SchedulerShell:
 
     # --- effects ---
 
-    def _carry_out(self, effects: Iterable[events.Effect]) -> None:
-        sockets = self._sockets
-        effects = [*effects]
+    def _carry_out(self, effects: Sequence[events.Effect]) -> None:
         # first: a kill between two effects must leave nothing published that a restart does not know
         self._persist(effects)
+        sockets = self._sockets
         for effect in effects:
+            if self._observer is not None:
+                self._observer.carrying_out(effect)
             match effect:
                 case events.Reply():
-                    self._reply(effect)
+                    self._reply(effect.connection, effect.response)
                 case events.Forward():
-                    sockets.link.send(effect.number, wire.encode_request(effect.request))
+                    sockets.send(effect.number, self._messages.encode_request(effect.request))
                 case events.Publish():
-                    sockets.publisher.publish(effect.packet)
+                    sockets.publish(effect.packet)
                 case events.Replay():
                     self._replay = effect.packets
                 case events.Log():
@@ -290,16 +360,18 @@ class SchedulerShell:
                     assert self._worker is not None, "a frame with jobs has a worker"
                     self._worker.take(effect.job)
                 case events.Kill():
-                    sockets.publisher.serve()  # a subscriber that connects at this moment gets the end, too
-                    sockets.publisher.kill()
+                    sockets.end()
                     self._tip_is_safe = effect.tip_is_safe
                     self._close_translator()
                     self.ended = True
 
-    def _reply(self, reply: events.Reply) -> None:
-        self._sockets.router.reply(reply.connection, wire.encode_response(reply.response))
+        if self._observer is not None:
+            self._observer.carried_out()
 
-    def _persist(self, effects: list[events.Effect]) -> None:
+    def _reply(self, connection: int, response: Response) -> None:
+        self._sockets.reply(connection, self._messages.encode_response(response))
+
+    def _persist(self, effects: Sequence[events.Effect]) -> None:
         entries: list[LoggedPacket] = []
         state: SavedState | None = None
         over = self.ended
@@ -311,11 +383,4 @@ class SchedulerShell:
                 entries.append(LoggedPacket(effect.packet, effect.source_ns, 0 if over else effect.history))
             elif isinstance(effect, events.Kill):
                 over = True
-        self._write_ahead.write(state, entries)
-
-
-def _response(reply: LinkReply) -> Response:
-    try:
-        return wire.decode_response(reply.frames)
-    except WireError as error:
-        return Response(int(ControlResponse.FAILURE), reason=f"the translator's answer can't be read: {error}")
+        self._disk.write(state, entries)

@@ -13,6 +13,7 @@ from afspm.scheduler.control.arbitration import ArbitrationState
 from afspm.scheduler.control.descriptions import HandSettings
 from afspm.scheduler.control.holder_timeout import HolderTimeout, Lease
 from afspm.scheduler.control.lifecycle import ExperimentEnd, StartupBarrier
+from afspm.scheduler.control.panel_state import PanelState
 from afspm.scheduler.control.supervisor_registry import SupervisorRegistry
 from afspm.scheduler.coordinate_frame import TIP_FRAME, CoordinateFrame
 from afspm.scheduler.events import Codec, Effect, FrameAnswered, Log, SaveState
@@ -71,6 +72,7 @@ class SchedulerState:
     barrier: StartupBarrier
     end: ExperimentEnd
     by_hand: HandSettings
+    panel: PanelState
     logged: frozenset[str]
     frame: CoordinateFrame
     grants: GrantChecker
@@ -93,6 +95,7 @@ class SchedulerState:
             barrier=StartupBarrier(waits.catch_up_s),
             end=ExperimentEnd(),
             by_hand=HandSettings(),
+            panel=PanelState(),
             logged=frozenset(),
             frame=frame,
             grants=GrantChecker(settings.rules, settings.limits, settings.run.name),
@@ -104,6 +107,7 @@ class SchedulerState:
         return (
             *saved,
             self.grants.book,
+            self.panel,
             self.limits.state.usage,
             self.idempotency.sent_actions,
             self.event_log.starts,
@@ -157,6 +161,7 @@ class StateParts:
     barrier: StartupBarrier
     end: ExperimentEnd
     by_hand: HandSettings
+    panel: PanelState
     logged: frozenset[str]
     frame: CoordinateFrame
     grants: GrantChecker
@@ -230,6 +235,7 @@ def saved_state(state: SchedulerState, env: Environment) -> SavedState:
         instrument_units=state.instruments.units,
         instrument_orders=state.instruments.number,
         grants=state.grants.book,
+        panel=state.panel,
     )
 
 
@@ -259,4 +265,5 @@ def restored_state(
         microscope=replace(state.microscope, risk=saved.tip_risk),
         instruments=replace(state.instruments, units=saved.instrument_units, number=saved.instrument_orders),
         grants=replace(state.grants, book=saved.grants),
+        panel=saved.panel,
     )

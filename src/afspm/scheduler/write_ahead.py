@@ -32,6 +32,7 @@ class StateFile:
         self._generations = None if path is None else CheckpointFile(path)
         self._log = log
         self._outage = OutageLog("a restart would not know the present state", log)
+        self._missed: SavedState | None = None
 
     def load(self) -> SavedState | None:
         """Return the state saved last; None if there is no file.
@@ -63,8 +64,15 @@ class StateFile:
         """
         if self._generations is None:
             return
+        self._missed = state
         with self._outage.trying():
             self._generations.save(json.dumps(snapshot(state, KIND, VERSION), ensure_ascii=False).encode())
+            self._missed = None
+
+    def save_missed(self) -> None:
+        """Write the state that a full disk did not take, if there is one."""
+        if self._missed is not None:
+            self.save(self._missed)
 
     def close(self) -> None:
         """Flush the last state to the disk."""
@@ -118,6 +126,8 @@ class WriteAhead:
         def work() -> None:
             if state is not None:
                 self._state.save(state)
+            else:
+                self._state.save_missed()
             self._append(entries)
 
         with self._outage.trying():

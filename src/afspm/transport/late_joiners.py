@@ -24,6 +24,7 @@ History = Callable[[Hashable, tuple[str, ...], int], Iterable[Packet]]
 LONGEST = 8 << 10
 """Longest marker, in bytes."""
 _BEGIN = b"\0replay/"
+_LONGEST_NONCE = 9
 _MOST_PREFIXES = 1000
 _MOST_PACKETS = 1000
 _MOST_BYTES = 256 << 20
@@ -63,6 +64,22 @@ class Marker(NamedTuple):
         except ValueError:
             return None
         return cls(b"\0" + parts[0], since_ns, prefixes)
+
+    @property
+    def subscriber(self) -> str:
+        """Return the name of the subscriber."""
+        return self._parts[0].decode("utf-8", "replace")
+
+    @property
+    def reconnections(self) -> int:
+        """Return how often the subscriber has connected again: its nonce counts its connections."""
+        nonce = self._parts[1]
+        return int(nonce) if nonce.isdigit() and len(nonce) <= _LONGEST_NONCE else 0
+
+    @property
+    def _parts(self) -> tuple[bytes, bytes]:
+        name, _, nonce = self.topic.removeprefix(_BEGIN).rpartition(b"/")
+        return name, nonce
 
 
 def topic(name: str, nonce: int) -> bytes:

@@ -33,13 +33,17 @@ QUEUE_LENGTH = 4000
 _LINGER_MS = 200
 # ZMTP heartbeats: a peer that is frozen or cut off is noticed within seconds, not after hours as by TCP.
 _ALIVE_CHECK_MS = 2_000
-_ALIVE_TIMEOUT_MS = round(CUT_OFF_SHOWS_WITHIN_S * 1e3) - _ALIVE_CHECK_MS
+_ALIVE_TIMEOUT_MS = _ANSWERED_WITHIN_MS = round(CUT_OFF_SHOWS_WITHIN_S * 1e3) - _ALIVE_CHECK_MS
 # libzmq 4.3.5 aborts the process (`Assertion failed: !_io_error`) if it sends or answers a heartbeat of ZMTP on a
 # connection that was lost while its receive queue was full. So the receive queues of sockets with heartbeats, and of
 # their peers, are unlimited.
 # When a subscriber stands still, its heartbeats stop, and its publisher drops the packets that wait for it
 # (`HEARTBEAT_TTL`); this works on unix sockets too, where no option of TCP helps. A publisher sends no heartbeats:
 # behind unsent packets they would never leave.
+# For libzmq only a whole frame is a sign of life, not its bytes: behind 33 MB on a slow link, the answer to a heartbeat
+# would come too late, and the frame would be sent again from its first byte, without end. So a subscriber awaits no
+# answers. On a cut link its heartbeats are not acknowledged, which ends its connection (`_STALLED_MS`; on macOS
+# keepalive ends it, by the time since the last byte). Requests and answers are short: 1 MB takes 8 s at 131 kB/s.
 _WITH_HEARTBEATS = frozenset({zmq.ROUTER, zmq.DEALER, zmq.XSUB})
 _UNLIMITED = frozenset({*_WITH_HEARTBEATS, zmq.XPUB, zmq.SUB})
 _KEEPALIVE_S, _KEEPALIVE_TRIES = 2, 3
@@ -64,11 +68,6 @@ _OPTIONS = (
     (zmq.HANDSHAKE_IVL, _HANDSHAKE_MS),
     (zmq.CONNECT_TIMEOUT, _CONNECT_MS),
 )
-_HEARTBEATS = (
-    (zmq.HEARTBEAT_IVL, _ALIVE_CHECK_MS),
-    (zmq.HEARTBEAT_TIMEOUT, _ALIVE_TIMEOUT_MS),
-    (zmq.HEARTBEAT_TTL, _ALIVE_TIMEOUT_MS),
-)
 
 
 @cache
@@ -82,6 +81,18 @@ def _can_end_stalled() -> bool:
         except OSError:
             return False
     return True
+
+
+def _heartbeats(kind: int) -> tuple[tuple[int, int], ...]:
+    if kind not in _WITH_HEARTBEATS:
+        return ()
+    # without TCP_MAXRT (Wine) nothing else ends the connection of a subscriber that is cut off
+    awaits_answers = kind != zmq.XSUB or not _can_end_stalled()
+    return (
+        (zmq.HEARTBEAT_IVL, _ALIVE_CHECK_MS),
+        (zmq.HEARTBEAT_TIMEOUT, _ANSWERED_WITHIN_MS if awaits_answers else 0),
+        (zmq.HEARTBEAT_TTL, _ALIVE_TIMEOUT_MS),
+    )
 
 
 class Network:
@@ -132,7 +143,7 @@ class Network:
         """Return a socket with afspm's limits; a frame over `max_bytes` ends its connection."""
         socket = self._context.socket(kind)
         self._sockets.append(socket)  # a reference, else the garbage collector may close the socket at any time
-        options = _OPTIONS + (_HEARTBEATS if kind in _WITH_HEARTBEATS else ())
+        options = _OPTIONS + _heartbeats(kind)
         if _can_end_stalled():
             options += ((zmq.TCP_MAXRT, _STALLED_MS),)
         for option, value in (

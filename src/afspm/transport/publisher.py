@@ -5,10 +5,12 @@ from __future__ import annotations
 import zmq
 
 from afspm import wire
+from afspm.basics.formatting import counted
 from afspm.model import Packet
 from afspm.transport.frames import property_of, receive_frames, send_packet
 from afspm.transport.late_joiners import LONGEST, History, Marker, is_reserved, spelled_out
 from afspm.transport.network import Network
+from afspm.transport.rate_limited_log import RateLimitedLog
 
 _BATCH, _MOST_REPLAYS = 100, 5
 """Limit of received messages and sent replays in one turn, so that other sockets get a turn."""
@@ -26,10 +28,13 @@ class Publisher:
 
     Args:
         history: returns earlier packets for a new subscriber.
+        log: gets a warning for each subscriber that has lost its connection and lacks packets.
     """
 
-    def __init__(self, network: Network, address: str, history: History) -> None:
+    def __init__(self, network: Network, address: str, history: History, log: RateLimitedLog) -> None:
         self.history = history
+        self._log = log
+        self._bytes_again = 0
         self.socket = network.socket(zmq.XPUB, max_bytes=LONGEST + 1)
         self.socket.setsockopt(zmq.XPUB_MANUAL, 1)
         self.socket.setsockopt(zmq.XPUB_VERBOSER, 1)
@@ -79,8 +84,22 @@ class Publisher:
         socket.setsockopt(zmq.SUBSCRIBE, topic)
         for prefix in spelled_out(prefix.encode() for prefix in marker.prefixes):
             socket.setsockopt(zmq.SUBSCRIBE, prefix)
+        count = size = 0
         for packet in self.history(topic, marker.prefixes, marker.since_ns):
             stamp = b"" if packet.time_ns is None else wire.encode_time(packet.time_ns)
             send_packet(socket, packet, stamp, topic=topic)
+            count, size = count + 1, size + len(packet.payload)
         socket.send(topic)
         socket.setsockopt(zmq.UNSUBSCRIBE, topic)
+        if count and marker.reconnections:
+            self._warn_again(marker, count, size)
+
+    def _warn_again(self, marker: Marker, count: int, size: int) -> None:
+        # without this line, a link that breaks within each packet would carry the same bytes for a night unnoticed
+        self._bytes_again += size
+        self._log.warning(
+            f"{marker.subscriber} has lost its connection to {self.address} (reconnection {marker.reconnections}): "
+            f"{counted(count, 'packet')} ({size / 1e6:.1f} MB) had not arrived and are sent again, "
+            f"to all subscribers so far {self._bytes_again / 1e6:.1f} MB; "
+            "if this repeats, look for a link that breaks or a process that hangs"
+        )

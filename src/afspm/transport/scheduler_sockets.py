@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from typing import NamedTuple
 
 import zmq
@@ -12,11 +12,13 @@ from afspm.basics.errors import ConfigError
 from afspm.basics.launch import Launch
 from afspm.model import Packet
 from afspm.transport.frames import receive_frames, send_frames
+from afspm.transport.late_joiners import History
 from afspm.transport.network import CONNECTED, DISCONNECTED, Monitor, Network
 from afspm.transport.polling import Poller, WakeUp
+from afspm.transport.port import Incoming
 from afspm.transport.publisher import Publisher
 from afspm.transport.rate_limited_log import RateLimitedLog
-from afspm.transport.router import Router
+from afspm.transport.router import Router, RouterEvent
 from afspm.transport.subscriber import Subscriber
 
 _LONGEST_NUMBER = 18
@@ -104,6 +106,8 @@ def _parted(frames: list[bytes]) -> tuple[list[bytes], list[bytes]]:
 
 
 Source = Router | TranslatorLink | Subscriber | Publisher | Monitor
+SocketEvent = RouterEvent | LinkReply | LinkUp | LinkDown | Incoming
+"""An event of a component, of the connection to the translator, or of the translator's packets."""
 
 
 class SchedulerSockets:
@@ -127,7 +131,9 @@ class SchedulerSockets:
             )
         self._network = Network.from_launch(launch.name, launch.keys)
         self._wake_up: WakeUp[None] = WakeUp()
-        self.publisher = Publisher(self._network, sockets.publish, _nothing)
+        self._clock = clock
+        self._has_ended = False
+        self.publisher = Publisher(self._network, sockets.publish, _nothing, log)
         self.router = Router(self._network, sockets.serve, log, clock)
         self.link = TranslatorLink(self._network, sockets.control, log, epoch)
         self.subscriber = Subscriber(
@@ -138,6 +144,55 @@ class SchedulerSockets:
             self._poller.register(source.socket, source)
         for monitor in (self.router.monitor, self.link.monitor, self.subscriber.monitor):
             self._poller.register(monitor.socket, monitor)
+
+    @property
+    def history(self) -> History:
+        """Return the packets that a subscriber lacks when it joins."""
+        return self.publisher.history
+
+    @history.setter
+    def history(self, history: History) -> None:
+        self.publisher.history = history
+
+    @property
+    def due_s(self) -> float:
+        """Real monotonic time at which `receive` must be called even if no source is ready."""
+        return self.router.due_s
+
+    def receive(self, ready: Sequence[Source]) -> Iterator[Sequence[SocketEvent]]:
+        """Yield the events of each ready source, and let new subscribers join."""
+        for source in ready:
+            if source in (self.router, self.router.monitor):
+                yield self.router.receive()
+            elif source is self.link:
+                yield self.link.receive()
+            elif source is self.link.monitor:
+                yield self.link.follow()
+            elif source is self.subscriber:
+                yield self.subscriber.receive()
+            elif source is self.subscriber.monitor:
+                self.subscriber.follow()
+            elif self.publisher.serve() and self._has_ended:
+                self.publisher.kill()  # a subscriber that joins now has missed the signal
+        if self._clock.monotonic_s() >= self.router.due_s:
+            yield self.router.receive()
+
+    def reply(self, connection: int, frames: Sequence[bytes]) -> None:
+        """Answer a component, if it is still connected."""
+        self.router.reply(connection, frames)
+
+    def send(self, number: int, frames: Sequence[bytes]) -> bool:
+        """Send a request to the translator; return False if it is not connected."""
+        return self.link.send(number, frames)
+
+    def publish(self, packet: Packet) -> None:
+        self.publisher.publish(packet)
+
+    def end(self) -> None:
+        """Send the end of the experiment to all subscribers, and to each that joins later."""
+        self.publisher.serve()  # a subscriber that connects at this moment gets the end, too
+        self.publisher.kill()
+        self._has_ended = True
 
     def wait(self, timeout_ms: int | None) -> list[Source]:
         """Return the readable sources, after a wait of up to `timeout_ms` (None: without limit).

@@ -36,8 +36,9 @@ class BasePort(Generic[T]):
         self._published = PublishedHistory(clock)
         self._publisher = None
         self._closed = False
+        self._log = RateLimitedLog(logging.getLogger("afspm.transport"), clock)
         if publish is not None:
-            self._publisher = Publisher(network, publish, self._published)
+            self._publisher = Publisher(network, publish, self._published, self._log)
             self._poller.register(self._publisher.socket, self._serve)
 
     @property
@@ -104,14 +105,13 @@ class ZmqPort(BasePort[Incoming]):
     ) -> None:
         super().__init__(network, clock, publish)
         self._name = name
-        log = RateLimitedLog(logging.getLogger("afspm.transport"), clock)
         self._control = None
         if control is not None:
-            self._control = ControlClient(network, name, control, log)
+            self._control = ControlClient(network, name, control, self._log)
             self._poller.register(self._control.socket, self._control.receive)
             self._poller.register(self._control.monitor.socket, self._control.follow)
         for address in subscribe:
-            subscriber = Subscriber(network, name, address, envelopes, log)
+            subscriber = Subscriber(network, name, address, envelopes, self._log)
             self._poller.register(subscriber.socket, subscriber.receive)
             self._poller.register(subscriber.monitor.socket, subscriber.follow)
 

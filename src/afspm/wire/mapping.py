@@ -16,7 +16,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from afspm import model
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import InvalidValue
-from afspm.wire.generated import control_pb2, feedback_pb2, grants_pb2, instruments_pb2, journal_pb2
+from afspm.wire.generated import control_pb2, feedback_pb2, grants_pb2, instruments_pb2, journal_pb2, panel_pb2
 from afspm.wire.messages import parse
 from afspm.wire.split import Buffer
 
@@ -165,6 +165,13 @@ def _needed(what: str) -> Callable[[str], str]:
     return checked
 
 
+def _panel_act(name: str) -> model.PanelAct:
+    try:
+        return model.PanelAct(name)
+    except ValueError:
+        raise InvalidValue(f"{name!r} is no act at the microscope") from None
+
+
 FEEDBACK = MessageMapping(
     model.Feedback,
     feedback_pb2.ZCtrlParameters,
@@ -285,7 +292,39 @@ _APPROVAL = MessageMapping(
     ranges=_each("ranges", _RANGE),
     counts=_each("counts", _COUNT),
 )
+TIP_STATUS = MessageMapping(
+    model.TipStatus,
+    panel_pb2.TipStatus,
+    *("engaged", "feedback_on"),
+    by_hand=FieldMapping("by_hand", sparse=True),
+)
+_CHANGED_VALUE = MessageMapping(
+    model.ChangedValue,
+    panel_pb2.ChangedValue,
+    *("parameter", "before", "after"),
+    unit=FieldMapping("units", sparse=True),
+)
+ACT_BY_HAND = MessageMapping(
+    model.ActByHand,
+    panel_pb2.ActByHand,
+    time_ns=_time(),
+    act=FieldMapping("act", str, _panel_act),
+    evidence=FieldMapping("evidence", sparse=True),
+    changes=_each("changes", _CHANGED_VALUE),
+)
+_TIP = FieldMapping("", TIP_STATUS.to_wire, TIP_STATUS.from_wire)
 MAPPINGS: tuple[MessageMapping[Any], ...] = (
+    TIP_STATUS,
+    ACT_BY_HAND,
+    MessageMapping(
+        model.MeasurementConditions,
+        panel_pb2.MeasurementConditions,
+        time_ns=_time(),
+        filename="filename",
+        begin=_TIP._replace(name="begin"),
+        end=_TIP._replace(name="end"),
+        acts=_each("acts", ACT_BY_HAND),
+    ),
     GRANT,
     MessageMapping(model.Approvals, grants_pb2.Approvals, approvals=_each("approvals", _APPROVAL)),
     MessageMapping(model.Proposal, grants_pb2.Proposal, "who", "id", "plan", "preflight", time_ns=_time()),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 import sys
 from collections.abc import Iterable
@@ -10,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 
 from afspm import wire
+from afspm.basics import named_imports
 from afspm.basics.errors import ConfigError
 
 
@@ -42,7 +42,7 @@ def register_all(sources: Iterable[str]) -> None:
 
 def _imported(name: str) -> ModuleType:
     try:
-        return importlib.import_module(name)
+        return named_imports.import_named(name)
     except Exception as error:  # importing runs the user's code, which may raise anything
         raise ConfigError(
             f"can't be imported: {error}", where=name, hint="is it on the Python path, or beside the experiment file?"

@@ -35,6 +35,7 @@ from afspm.wire.generated import (
     instruments_pb2,
     journal_pb2,
     lines_pb2,
+    panel_pb2,
     scan_pb2,
     spectroscopy_pb2,
 )
@@ -192,6 +193,34 @@ PROBE_POSITION: Final = MessageDeclaration(
     set_by=ControlRequest.SET_PROBE_POS,
     event="probe-position",
 )
+TIP_STATUS: Final = MessageDeclaration(
+    type=panel_pb2.TipStatus,
+    kind=MessageKind.STATE,
+    source=Role.TRANSLATOR,
+    always=False,
+    attribute="tip",
+    event="tip",
+    in_past=True,
+)
+ACT_BY_HAND: Final = MessageDeclaration(
+    type=panel_pb2.ActByHand,
+    kind=MessageKind.STATE,
+    source=Role.TRANSLATOR,
+    always=False,
+    history=20,
+    attribute="by_hand",
+    event="by-hand",
+    in_past=True,
+)
+CONDITIONS: Final = MessageDeclaration(
+    type=panel_pb2.MeasurementConditions,
+    kind=MessageKind.EVENT,
+    source=Role.TRANSLATOR,
+    always=False,
+    history=20,
+    event="measurement-conditions",
+    in_past=True,
+)
 JOURNAL: Final = MessageDeclaration(
     type=journal_pb2.JournalEntries,
     kind=MessageKind.EVENT,
@@ -281,7 +310,7 @@ TIP_VERDICT: Final = MessageDeclaration(
 
 _MODULES = (
     analysis_pb2, control_pb2, drift_pb2, feedback_pb2, geometry_pb2, grants_pb2, instruments_pb2,
-    journal_pb2, lines_pb2, scan_pb2, spectroscopy_pb2,
+    journal_pb2, lines_pb2, panel_pb2, scan_pb2, spectroscopy_pb2,
 )  # fmt: skip
 # collected by their class, so that no declaration above can be forgotten
 _declared: dict[str, MessageDeclaration] = {

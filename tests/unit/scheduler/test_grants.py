@@ -48,6 +48,7 @@ from afspm.scheduler.control.arbitration import RoleTable
 from afspm.scheduler.events import Forward, Tick
 from afspm.scheduler.instruments.conditions import InstrumentSettings
 from afspm.scheduler.safety.grants import GrantChecker, limits_digest
+from afspm.scheduler.safety.limit_state import LimitState
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit, RoleLimits
 from afspm.scheduler.settings import ControlSettings, RunFacts, SchedulerSettings
 
@@ -229,6 +230,23 @@ def test_drift_makes_a_plan_stale_and_no_grant(agent: AgentLab) -> None:
     assert "not known" in checker.given(ADA, grant, now_ns, (math.nan, 0.0))[1]
 
 
+def test_drift_after_the_approval_refuses_the_next_step_of_a_plan(agent: AgentLab) -> None:
+    now_ns, bias = agent.lab.now_ns, Parameter(names.TIP_BIAS_VOLTAGE, "0.1", "V")
+    plan = agent.plan((PARAM, bias), (SCAN, ScanParameters(HERE)), offset_m=(0.0, 0.0), drift_m=1e-9)
+    checker, why = GrantChecker(agent.settings.rules, agent.settings.limits, "night").given(
+        ADA, plan, now_ns, (0.0, 0.0)
+    )
+    assert why == ""
+    first, second = (
+        Request(kind, subject, agent.lab.codec.encode(subject), f"{AGENT}/1/{kind}")
+        for kind, subject in ((PARAM, bias), (SCAN, ScanParameters(HERE)))
+    )
+    assert checker.refused(AGENT, first, now_ns, (0.9e-9, 0.0), LimitState()) == ""
+    checker = checker.sending(AGENT, first, now_ns, (0.9e-9, 0.0)).done(AGENT, first)
+    assert checker.refused(AGENT, second, now_ns, (0.9e-9, 0.0), LimitState()) == ""
+    assert "drifted by 1.1 nm" in checker.refused(AGENT, second, now_ns, (1.1e-9, 0.0), LimitState())
+
+
 @pytest.mark.parametrize("disturb", ["problem", "manual"])
 def test_preflight_before_a_problem_or_manual_is_stale(agent: AgentLab, disturb: str) -> None:
     approval = agent.grant()
@@ -253,6 +271,14 @@ def test_problem_ends_a_plan_and_leaves_a_grant(agent: AgentLab) -> None:
     assert agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.4", "V")) == ""
 
 
+def test_problem_that_a_person_solves_ends_all_approvals(agent: AgentLab) -> None:
+    agent.begin(agent.grant())
+    agent.lab.flag("classifier", Problem.DEVICE_MALFUNCTION)
+    agent.lab.clear(ADA, Problem.DEVICE_MALFUNCTION)
+    assert agent.lab.core.state.grants.book.approvals() == Approvals()
+    assert agent.lab.take_control(AGENT) is REFUSED
+
+
 def test_manual_ends_all_approvals(agent: AgentLab) -> None:
     agent.begin(agent.grant())
     agent.lab.mode(ADA, ControlMode.MANUAL)
@@ -264,6 +290,33 @@ def test_approval_ends_with_its_time(agent: AgentLab) -> None:
     agent.begin(agent.grant(lasts_s=60.0))
     agent.lab.later(experiment_s=61.0)
     assert "no approval" in agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.1", "V"))
+
+
+def test_control_and_scan_end_with_the_time_of_the_approval(agent: AgentLab) -> None:
+    agent.begin(agent.grant(lasts_s=60.0))
+    assert agent.do(SCAN, ScanParameters(HERE)) == ""
+    assert agent.do(ACTION, names.START_SCAN) == ""
+    agent.lab.scope_is(ScopeState.SCANNING)
+    due_ns = agent.lab.core.deadline_ns()
+    assert due_ns is not None
+    assert agent.lab.now_ns < due_ns <= agent.lab.now_ns + 60 * 10**9
+    agent.lab.later(experiment_s=59.0)
+    agent.lab.step(Tick())
+    assert agent.lab.holder == AGENT
+    agent.lab.later(experiment_s=2.0)
+    agent.lab.step(Tick())
+    assert agent.lab.holder is None
+    assert sent(agent.lab)[-1].request.subject == names.STOP_SCAN
+    assert agent.lab.core.state.grants.book.approvals() == Approvals()
+    assert agent.lab.core.deadline_ns() is None
+
+
+def test_agent_keeps_control_while_another_approval_is_in_force(agent: AgentLab) -> None:
+    agent.begin(agent.grant(lasts_s=60.0))
+    assert agent.give(plan_of(agent)) is OK
+    agent.lab.later(experiment_s=61.0)
+    agent.lab.step(Tick())
+    assert agent.lab.holder == AGENT
 
 
 def test_one_packet_revokes_and_takes_control(agent: AgentLab) -> None:
@@ -308,8 +361,73 @@ def test_refused_step_may_be_repeated_and_one_of_unknown_outcome_not(agent: Agen
     bias = Parameter(names.TIP_BIAS_VOLTAGE, "0.9", "V")
     agent.begin(plan_of(agent))
     assert agent.do(PARAM, bias, answers=ControlResponse.NOT_FREE) == ""
-    assert agent.do(PARAM, bias, answers=ControlResponse.NO_RESPONSE) == ""
+    assert agent.do(PARAM, bias, "agent:claude/1/a", ControlResponse.NO_RESPONSE) == ""
+    for wanted in ((PARAM, bias), (SCAN, ScanParameters(HERE, (64, 64)))):
+        assert "request 1 of abc has no known success" in agent.do(*wanted)
+    assert agent.do(PARAM, bias, "agent:claude/1/a") == ""
+    assert agent.do(SCAN, ScanParameters(HERE, (64, 64))) == ""
+
+
+@pytest.mark.parametrize("stop", [names.STOP_SCAN, names.STOP_SPEC])
+def test_stop_is_no_step_of_a_plan(agent: AgentLab, stop: str) -> None:
+    agent.begin(plan_of(agent))
+    assert agent.do(ACTION, stop) == ""
+    assert "not request 1" in agent.do(SCAN, ScanParameters(HERE, (64, 64)))
+    assert agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.9", "V")) == ""
+    assert agent.do(ACTION, stop, answers=ControlResponse.NO_RESPONSE) == ""
+    assert "not request 2" in agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.9", "V"))
+    assert agent.do(SCAN, ScanParameters(HERE, (64, 64))) == ""
+
+
+def test_stop_counts_where_it_is_a_step_of_the_plan(agent: AgentLab) -> None:
+    bias = Parameter(names.TIP_BIAS_VOLTAGE, "0.9", "V")
+    agent.begin(agent.plan((PARAM, bias), (ACTION, names.STOP_SCAN), (SCAN, ScanParameters(HERE))))
+    assert agent.do(PARAM, bias) == ""
+    assert "not request 2" in agent.do(SCAN, ScanParameters(HERE))
+    assert agent.do(ACTION, names.STOP_SCAN) == ""
+    assert agent.do(SCAN, ScanParameters(HERE)) == ""
+
+
+def test_stop_is_sent_after_the_end_of_the_approval(agent: AgentLab) -> None:
+    agent.begin(agent.grant(lasts_s=60.0))
+    agent.lab.later(experiment_s=61.0)
+    assert agent.do(ACTION, names.STOP_SCAN) == ""
+    assert "no approval" in agent.do(ACTION, names.START_SCAN)
+
+
+def test_reads_and_repeated_requests_are_no_steps_of_a_plan(agent: AgentLab) -> None:
+    bias = Parameter(names.TIP_BIAS_VOLTAGE, "0.9", "V")
+    agent.begin(plan_of(agent))
+    assert agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE), answers=None) == ""
+    agent.lab.answer_reads(tip_bias_voltage="0")
+    assert "not request 1" in agent.do(SCAN, ScanParameters(HERE, (64, 64)))
+    assert agent.do(PARAM, bias, "agent:claude/1/a", ControlResponse.NO_RESPONSE) == ""
+    assert agent.do(PARAM, bias, "agent:claude/1/a", ControlResponse.NO_RESPONSE) == ""
+    assert agent.do(PARAM, bias, "agent:claude/1/a") == ""
     assert "not request 2" in agent.do(PARAM, bias)
+
+
+def test_grant_waits_while_a_plan_is_carried_out(agent: AgentLab) -> None:
+    low, high = (Parameter(names.TIP_BIAS_VOLTAGE, volts, "V") for volts in ("0.1", "0.4"))
+    place = (SCAN, ScanParameters(HERE, (64, 64)))
+    agent.begin(agent.grant(), agent.plan((PARAM, low), place, (ACTION, names.START_SCAN)))
+    assert agent.do(PARAM, high) == ""
+    assert agent.do(PARAM, low) == ""
+    assert "the grant waits for the end of the plan" in agent.do(PARAM, high)
+    assert agent.do(*place) == ""
+    assert agent.do(ACTION, names.START_SCAN) == ""
+    assert agent.do(PARAM, high) == ""
+
+
+def test_plan_approved_again_does_not_go_back_for_a_late_refusal(agent: AgentLab) -> None:
+    bias, place = Parameter(names.TIP_BIAS_VOLTAGE, "0.9", "V"), ScanParameters(HERE, (64, 64))
+    agent.begin(plan_of(agent))
+    assert agent.do(PARAM, bias, answers=None) == ""
+    sent_before = agent.lab.forwarded[-1]
+    agent.give(plan_of(agent))
+    agent.lab.answer(sent_before, ControlResponse.NOT_FREE)
+    assert agent.do(PARAM, bias) == ""
+    assert agent.do(SCAN, place) == ""
 
 
 def test_repeated_id_with_another_content_is_refused(agent: AgentLab) -> None:
@@ -554,6 +672,13 @@ def test_agent_without_a_lease_of_its_own_loses_control_after_a_minute(agent: Ag
     agent.lab.step(Tick())
     assert agent.lab.holder is None
     assert "not in control" in agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.1", "V"))
+
+
+def test_command_that_arrives_with_the_end_of_the_lease_is_refused(agent: AgentLab) -> None:
+    # a frozen scheduler finds both in one step
+    agent.begin(agent.grant())
+    agent.lab.later(real_s=61.0)
+    assert "lease of agent:claude has ended" in agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.1", "V"))
 
 
 def test_stop_needs_no_approval_and_only_a_person_clears_it(agent: AgentLab) -> None:

@@ -209,6 +209,15 @@ def test_report_that_waited_in_a_queue_is_as_old_as_its_token(cryo: Cryo) -> Non
     assert "older than 4 s" in cryo.answer_to(ControlRequest.PARAM, Parameter(T))[1]
 
 
+def test_report_with_a_token_before_the_last_is_of_unknown_age(cryo: Cryo) -> None:
+    cryo.known()
+    before_last = cryo.token
+    cryo.report(4.2)
+    cryo.token = before_last
+    cryo.report(4.2)
+    assert "older than 4 s" in cryo.answer_to(ControlRequest.PARAM, Parameter(T))[1]
+
+
 def test_reading_in_another_unit_is_not_believed_also_after_a_restart(cryo: Cryo) -> None:
     cryo.known()
     for scheduler in (cryo, Cryo(AllowedBand(4.15, 4.25, unit="K"), saved=cryo.core.snapshot())):

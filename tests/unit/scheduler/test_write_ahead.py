@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import DEADLINE_S
 
 from afspm.basics.clock import ExperimentClock
 from afspm.model import LoggedPacket, Packet
@@ -20,7 +21,6 @@ from afspm.storage.disk import SYNCER
 from afspm.storage.packet_log import PacketLog, cached_packets, commit, expect_recorder, logged_packets
 
 STATE = SavedState(last_ns=7)
-DEADLINE_S = 20.0
 SYNCED_WITHIN_S = 60.0  # of a busy disk
 
 

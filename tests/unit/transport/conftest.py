@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from typing import Any
 
 import pytest
+from deadlines import DEADLINE_S
 
 
 @pytest.fixture
@@ -28,7 +29,7 @@ def until() -> Callable[..., Any]:
     return wait_until
 
 
-def wait_until(condition: Callable[[], Any], *pumped: Any, timeout_s: float = 10.0) -> Any:
+def wait_until(condition: Callable[[], Any], *pumped: Any, timeout_s: float = DEADLINE_S) -> Any:
     """Poll the ports in turn, collecting what they receive, until `condition()` is true; returns its value.
 
     `pumped` are pairs (port, list to append to).

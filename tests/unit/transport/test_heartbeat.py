@@ -6,12 +6,13 @@ import time
 from typing import Any
 
 import pytest
+from deadlines import DEADLINE_S
 
 from afspm.transport.heartbeat import Heartbeat, HeartbeatListener, HeartbeatSender, read_beat
 from afspm.transport.polling import WakeUp
 
 
-def beats(listener: HeartbeatListener, count: int, timeout_s: float = 5.0) -> list[Heartbeat]:
+def beats(listener: HeartbeatListener, count: int, timeout_s: float = DEADLINE_S) -> list[Heartbeat]:
     found: list[Heartbeat] = []
     deadline_s = time.monotonic() + timeout_s
     while len(found) < count:
@@ -40,7 +41,7 @@ def test_heartbeats_arrive_under_the_name_of_their_process(open_: Any) -> None:
     for name in ("One", "Two"):
         open_(HeartbeatSender(listener.listen(name)[0], 0.02, lambda: 0.0, lambda: 30.0))
     names: set[str] = set()
-    deadline_s = time.monotonic() + 5.0
+    deadline_s = time.monotonic() + DEADLINE_S
     while names != {"One", "Two"}:
         assert time.monotonic() < deadline_s
         names |= {beat.name for beat in listener.poll(0.1)}
@@ -55,7 +56,7 @@ def test_only_the_process_itself_can_send_its_heartbeats(open_: Any, needs_token
     found = beats(listener, 1)
     for token in ("", "guess"):  # each says at its end that it closes
         stranger = open_(HeartbeatSender(address, 0.005, lambda: 7.0, lambda: 30.0, token))
-        deadline_s = time.monotonic() + 5.0
+        deadline_s = time.monotonic() + DEADLINE_S
         while not stranger.heard.is_set():
             assert time.monotonic() < deadline_s
             found += listener.poll(0.01)

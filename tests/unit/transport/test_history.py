@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import pytest
@@ -13,8 +14,10 @@ from afspm.transport import late_joiners
 from afspm.transport.late_joiners import Marker, PublishedHistory
 from afspm.transport.network import Network
 from afspm.transport.publisher import Publisher
+from afspm.transport.rate_limited_log import RateLimitedLog
 
 CLOCK = ExperimentClock.real()
+LOG = RateLimitedLog(logging.getLogger("test"), CLOCK)
 
 
 def test_packet_about_the_moment_is_not_sent_to_late_joiners() -> None:
@@ -48,7 +51,7 @@ def test_a_replay_has_only_packets_newer_than_the_time_in_its_marker(
     """Subscribers drop repeated packets, so only the wire shows a needless replay."""
     published, packets = three
     network = open_(Network())
-    publisher = Publisher(network, "tcp://127.0.0.1:0", published)
+    publisher = Publisher(network, "tcp://127.0.0.1:0", published, LOG)
     subscriber = plain(zmq.XSUB)  # a SUB socket would drop a topic that it has not subscribed to itself
     subscriber.connect(publisher.address)
     topic = late_joiners.topic("Late", 1)

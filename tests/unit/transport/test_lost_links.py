@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import zmq
+from deadlines import DEADLINE_S
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import TransportError
@@ -132,7 +133,7 @@ def test_connection_lost_behind_an_answer_ends_neither_scheduler_nor_answer(tmp_
     address = f"ipc://{tmp_path}/serve"
     process = multiprocessing.get_context("spawn").Process(target=_lose_connection_before_last_frame, args=(address,))
     process.start()
-    process.join(60.0)
+    process.join(DEADLINE_S)
     assert process.exitcode == 0
 
 

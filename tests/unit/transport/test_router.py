@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import zmq
+from deadlines import DEADLINE_S
 
 from afspm import wire
 from afspm.basics.clock import ExperimentClock
@@ -34,7 +35,7 @@ class Listening:
 
     def until(self, count: int, kind: type = PeerAsked, *ports: ZmqPort) -> list[Any]:
         """Return the events of a kind once there are `count`, while polling `ports`."""
-        deadline_s = time.monotonic() + 5.0
+        deadline_s = time.monotonic() + DEADLINE_S
         while len(found := [event for event in self.told if isinstance(event, kind)]) < count:
             assert time.monotonic() < deadline_s, self.told
             self.told += self.router.receive()
@@ -173,7 +174,7 @@ class Run:
         network = Network(self.keys(name))
         port: ZmqPort = self._open(ZmqPort(network, claimed or name, CLOCK, control=self.listening.router.address))
         found: list[Any] = []
-        deadline_s = time.monotonic() + 5.0
+        deadline_s = time.monotonic() + DEADLINE_S
         while ControlConnected() not in found:
             assert time.monotonic() < deadline_s
             found += port.poll(0.01)
@@ -181,10 +182,10 @@ class Run:
         return port
 
 
-def answered(port: ZmqPort) -> list[bytes]:
-    """Return the payloads of the answers within a moment."""
+def answered(port: ZmqPort, within_s: float = DEADLINE_S) -> list[bytes]:
+    """Return the payloads of the first answers."""
     found: list[Any] = []
-    deadline_s = time.monotonic() + 0.5
+    deadline_s = time.monotonic() + within_s
     while not found and time.monotonic() < deadline_s:
         found += [incoming for incoming in port.poll(0.05) if isinstance(incoming, ReplyReceived)]
     return [bytes(incoming.response.payload) for incoming in found]
@@ -209,7 +210,7 @@ def test_second_sender_of_a_name_gets_no_answers_of_the_first(open_: Any, plain:
     assert {(one.name, one.user) for one in run.listening.until(3, PeerAsked, thief)[1:]} == {("series", "thief")}
     run.listening.router.reply(asked.connection, wire.encode_response(Response(0, b"hers", id="series/x/1")))
     assert answered(series) == [b"hers"]
-    assert answered(thief) == []
+    assert answered(thief, 0.5) == []
     while bare.poll(100):
         assert bare.recv_multipart() == [b""]  # a look whether it is there
 
@@ -276,7 +277,7 @@ def test_peer_without_a_key_is_refused_and_logged_once(
     series = run.client("series")
     series.send(wire.encode_request(Request(CLOCK_REQUEST, id="series/x/1")))
     assert [one.user for one in run.listening.until(1, PeerAsked, series)] == ["series"]
-    deadline_s = time.monotonic() + 5.0
+    deadline_s = time.monotonic() + DEADLINE_S
     while "its key is missing" not in caplog.text:
         assert time.monotonic() < deadline_s
         run.listening.router.receive()

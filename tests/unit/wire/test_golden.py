@@ -35,6 +35,9 @@ AS_MODEL = {
     "Grant",
     "Approvals",
     "Proposal",
+    "TipStatus",
+    "ActByHand",
+    "MeasurementConditions",
 }
 
 

@@ -42,6 +42,7 @@ class ArbitrationEvent(Enum):
     DEAD = "is dead"
     IDLE = "has let its lease run out"
     REVOKED = "has lost its approval"
+    BY_HAND = "reports an act at the microscope"
 
 
 class ControlChange(Enum):
@@ -54,6 +55,8 @@ class ControlChange(Enum):
     FLAG = auto()
     UNFLAG = auto()
     SET_MODE = auto()
+    PAUSE = auto()
+    """The mode becomes MANUAL."""
     END = auto()
     FORWARD = auto()
     """The request is forwarded to the translator, which answers it."""
@@ -66,6 +69,7 @@ class Cause(Enum):
     PROBLEM = "problem"
     SOLVED = "solved"
     MANUAL = "manual"
+    BY_HAND = "by-hand"
     DEAD = "dead"
     IDLE = "idle"
     REVOKED = "revoked"
@@ -83,6 +87,7 @@ _CAUSE_TEXTS = {
     Cause.PROBLEM: "a problem was flagged",
     Cause.SOLVED: "the problem it solved was cleared",
     Cause.MANUAL: "the mode changed to MANUAL",
+    Cause.BY_HAND: "a person acted at the microscope itself",
     Cause.DEAD: "its process died",
     Cause.IDLE: "it did nothing for longer than its lease",
     Cause.REVOKED: "its approval ended",
@@ -184,11 +189,17 @@ class Rules:
 
 @dataclass(frozen=True)
 class ControlInput:
-    """An event caused by the component `who`; `number` is the problem or mode of the event, else 0."""
+    """An event caused by the component `who`.
+
+    Attributes:
+        number: the problem or mode of the event, else 0.
+        why: the act, in words, of `ArbitrationEvent.BY_HAND`.
+    """
 
     event: ArbitrationEvent
     who: str
     number: int = 0
+    why: str = ""
 
 
 @dataclass(frozen=True)
@@ -419,6 +430,15 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
         _without_answer(ASKER_HOLDS, (_D.TAKE,), "an agent without an approval does not keep control", Cause.REVOKED),
         _without_answer(OTHERWISE, (), "it was not in control"),
     ),
+    ArbitrationEvent.BY_HAND: (
+        _without_answer(IS_MANUAL, (), "a person is in control already"),
+        _without_answer(
+            OTHERWISE,
+            (_D.PAUSE, _D.TAKE),
+            "the microscope belongs to the person at it, until a person lets the run continue",
+            Cause.BY_HAND,
+        ),
+    ),
 }
 
 
@@ -465,6 +485,7 @@ _APPLY: dict[ControlChange, Callable[[ArbitrationState, ControlInput], Arbitrati
     ControlChange.FLAG: _flag,
     ControlChange.UNFLAG: _unflag,
     ControlChange.SET_MODE: lambda control, ask: replace(control, mode=ControlMode(ask.number)),
+    ControlChange.PAUSE: lambda control, ask: replace(control, mode=ControlMode.MANUAL),
     ControlChange.END: lambda control, ask: replace(control, ended=True),
     ControlChange.FORWARD: lambda control, ask: control,
 }

@@ -116,6 +116,8 @@ def _carry_out(draft: StateDraft, change: _Change) -> None:
     entries = control_entries(draft.now_ns, before, after, change.ask, change.row, problems)
     draft.event_log = draft.event_log.add(draft.now_s, *entries)
     draft.lease = draft.lease.held_by(after.holder, draft.now_ns)
+    if draft.panel.why and after.mode is not ControlMode.MANUAL:  # a person has let the run continue
+        draft.panel = replace(draft.panel, why="")
     if after.holder is not None and after.holder != before.holder and rules.is_agent(after.holder):
         draft.lease = draft.lease.asked(AGENT_LEASE_S, draft.now_s)  # also for a client that requests no lease
     _log_change(draft, change, _alert_watchdog(draft, change))
@@ -137,7 +139,7 @@ def _alert_watchdog(draft: StateDraft, change: _Change) -> list[str]:
         # a cleared malfunction means that the tip is well: it may be at the surface, where it can be in danger again
         draft.watchdog = draft.watchdog.seen_to()
         draft.microscope = draft.microscope.with_tip(away=False)
-    if cause is None or (former is None and cause not in (Cause.MANUAL, Cause.ENDED, Cause.STOPPED)):
+    if cause is None or (former is None and cause not in (Cause.MANUAL, Cause.BY_HAND, Cause.ENDED, Cause.STOPPED)):
         return []
     flight = draft.forwarder.flight
     feedback = None if flight is None else feedback_of(flight.request)
@@ -162,7 +164,8 @@ def _alert_watchdog(draft: StateDraft, change: _Change) -> list[str]:
 def _log_change(draft: StateDraft, change: _Change, wanted: list[str]) -> None:
     before, after, ask, cause = change.before, change.after, change.ask, change.cause
     routine = is_routine(before, after, ask, draft.lease.announced)
-    draft.log("DEBUG" if routine else "INFO", change_text(before, after, ask, change.row, draft.env.settings.rules))
+    level = "WARNING" if cause is Cause.BY_HAND else "DEBUG" if routine else "INFO"
+    draft.log(level, change_text(before, after, ask, change.row, draft.env.settings.rules))
     draft.lease = replace(draft.lease, announced=after.holder or draft.lease.announced)
     is_sent = "is sent to the microscope" if draft.forwarder.up else "will be sent when the translator is back"
     for action in wanted:
@@ -177,6 +180,6 @@ def _log_change(draft: StateDraft, change: _Change, wanted: list[str]) -> None:
         return
     draft.microscope, danger = draft.microscope.telling()
     if danger is not None:
-        expected = cause in (None, Cause.RELEASED, Cause.SOLVED, Cause.MANUAL)
+        expected = cause in (None, Cause.RELEASED, Cause.SOLVED, Cause.MANUAL, Cause.BY_HAND)
         why = cause.text if cause else "the mode is automated again"
         draft.log("WARNING" if expected else "CRITICAL", f"{danger}, and no component is in control: {why}")

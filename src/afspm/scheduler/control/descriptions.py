@@ -70,7 +70,9 @@ def change_text(
     for number in sorted(after.problems.keys() ^ before.problems.keys()):
         done = "flagged" if number in after.problems else "cleared"
         parts.append(f"{ask.who} {done} {rules.problems.name(number)};")
-    if after.mode is not before.mode:
+    if after.mode is not before.mode and row.cause is Cause.BY_HAND:
+        parts.append(f"{ask.why}: the mode is MANUAL, and nothing is sent to the microscope until `afspm continue`;")
+    elif after.mode is not before.mode:
         parts.append(f"{ask.who} switched to {after.mode.name};")
     if after.ended and not before.ended:
         parts.append(f"{ask.who} ended the experiment;")

@@ -15,6 +15,7 @@ from afspm.model import (
     CLOCK_REQUEST,
     RELAY_REQUEST,
     RESTART_REQUEST,
+    ActByHand,
     ControlEvent,
     ControlRequest,
     ControlResponse,
@@ -211,6 +212,10 @@ def start_entry(now_ns: int, control: ArbitrationState, *, is_restart: bool) -> 
     return JournalEntry(now_ns, CONTROL, SCHEDULER, what, event=ControlEvent.RESTARTED)
 
 
+def panel_entry(now_ns: int, who: str, act: ActByHand) -> JournalEntry:
+    return JournalEntry(now_ns, CONTROL, who, str(act), event=ControlEvent.BY_HAND)
+
+
 def control_entries(
     now_ns: int,
     before: ArbitrationState,
@@ -232,7 +237,8 @@ def control_entries(
         why, cleared = f"it was flagged by {before.problems[number]}", ControlEvent.PROBLEM_CLEARED
         entries.append(entry(ask.who, f"cleared {name(number)}", reason=why, event=cleared, problem=number))
     if after.mode is not before.mode:
-        entries.append(entry(ask.who, f"mode {after.mode.name}", event=ControlEvent.MODE_CHANGED, mode=after.mode))
+        changed = ControlEvent.MODE_CHANGED
+        entries.append(entry(ask.who, f"mode {after.mode.name}", reason=ask.why, event=changed, mode=after.mode))
     if after.holder is not None and (after.holder, after.solving) != (before.holder, before.solving):
         solving, gained = f" to solve {name(after.solving)}" if after.solving else "", ControlEvent.CONTROL_GAINED
         problem = after.solving or None

@@ -4,22 +4,27 @@ from __future__ import annotations
 
 from afspm import wire
 from afspm.basics.errors import AfspmError
+from afspm.basics.frozen import replace
 from afspm.model import (
+    ActByHand,
     ControlMode,
     Feedback,
     Packet,
     PacketHeader,
+    Parameter,
     ProbePosition,
     Problem,
     Role,
     ScanParameters,
     ScopeState,
     ScopeStatus,
+    TipStatus,
 )
 from afspm.scheduler.control import control_change
 from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlInput
 from afspm.scheduler.control.control_change import TRANSLATOR
 from afspm.scheduler.events import PacketIn, Publish
+from afspm.scheduler.publishing.event_log import panel_entry
 from afspm.scheduler.safety import safety_commands
 from afspm.scheduler.state import StateDraft
 from afspm.wire.messages import CONTROL_STATE
@@ -84,8 +89,32 @@ def _update_state(draft: StateDraft, published: object) -> None:
         draft.by_hand = draft.by_hand.published(published, is_manual=is_manual)
         if draft.microscope.risk != before.risk:
             safety_commands.send(draft)
+    elif isinstance(published, TipStatus):
+        draft.panel = replace(draft.panel, tip=published)
+        if published.remedy:  # the act itself may have been lost with its translator
+            _give_to_person(draft, published.by_hand)
+    elif isinstance(published, ActByHand):
+        _take_act(draft, published)
     if isinstance(published, Feedback | ScanParameters | ProbePosition):
         draft.limits = draft.limits.published(published, draft.now_ns)
+
+
+def _take_act(draft: StateDraft, act: ActByHand) -> None:
+    draft.event_log = draft.event_log.add(draft.now_s, panel_entry(draft.now_ns, TRANSLATOR, act))
+    for one in act.changes:
+        changed = Parameter(one.parameter, one.after, one.unit or None)
+        draft.panel = draft.panel.with_change(one.parameter, draft.limits.outside(changed))
+        draft.limits = draft.limits.in_force(changed, draft.now_ns)
+    control = draft.env.settings.control
+    if draft.panel.asks_for_pause(act, stopped=control.stopped_by_hand, changed=control.changed_by_hand):
+        outside = [draft.panel.outside[one.parameter] for one in act.changes if one.parameter in draft.panel.outside]
+        _give_to_person(draft, "; ".join([str(act), *outside]))
+
+
+def _give_to_person(draft: StateDraft, why: str) -> None:
+    draft.panel = replace(draft.panel, why=draft.panel.why or why)
+    safety_commands.leave_to_person(draft)
+    control_change.decide(draft, ControlInput(ArbitrationEvent.BY_HAND, TRANSLATOR, why=why))
 
 
 def _update_scope_state(draft: StateDraft, state: ScopeState) -> None:

@@ -33,6 +33,16 @@ def decide(draft: StateDraft, event: RequestIn) -> None:
     answers.answer(draft, event, ControlResponse.SUCCESS)
 
 
+def end(draft: StateDraft) -> None:
+    """Remove the approvals of the agent in control that have run out; it loses control, and its scan is stopped."""
+    holder = draft.control.holder
+    if holder is None or (ends_ns := draft.grants.ends_ns(holder)) is None or draft.now_ns < ends_ns:
+        return
+    draft.grants = draft.grants.without(holder)
+    draft.log("WARNING", f"the approval of {holder} has run out")
+    control_change.decide(draft, ControlInput(ArbitrationEvent.REVOKED, holder))
+
+
 def publish_changes(draft: StateDraft) -> None:
     """Publish the approvals if this step changed them."""
     now = draft.grants.book.approvals()

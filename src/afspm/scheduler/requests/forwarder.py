@@ -14,7 +14,7 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from afspm.basics.frozen import replace
-from afspm.model import ControlResponse, Request, Response, ResponseDetail
+from afspm.model import ControlRequest, ControlResponse, Request, Response, ResponseDetail
 from afspm.scheduler.coordinate_frame import MappedRequest
 from afspm.scheduler.events import Forward, RequestIn
 
@@ -189,6 +189,11 @@ class Forwarder:
             mapped=mapped, heard_s=now_s, purpose=purpose,
         )  # fmt: skip
         return replace(self, number=number, own=(*self.own, job)), job
+
+    def without_own_actions(self) -> tuple[Forwarder, bool]:
+        """Remove the scheduler's own waiting actions; return whether there were any."""
+        rest = tuple(job for job in self.own if job.request.kind != ControlRequest.ACTION or job.purpose is not None)
+        return replace(self, own=rest), rest != self.own
 
     def sent(self, job: ForwardedRequest, now_s: float) -> Forwarder:
         """Send a waiting request."""

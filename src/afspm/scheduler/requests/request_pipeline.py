@@ -191,12 +191,29 @@ def authorise(draft: StateDraft, event: RequestIn) -> bool:
     elif kind <= 0:
         why = f"there is no request with the number {kind}"
         answers.answer(draft, event, ControlResponse.CMD_NOT_SUPPORTED, why)
+    elif remedy := _refusal_to_continue(draft, event):
+        answers.answer(draft, event, ControlResponse.FAILURE, remedy)
     elif (control_event := _CONTROL_EVENTS.get(kind)) is not None:
         return control_change.decide(draft, ControlInput(control_event, event.name, int(subject or 0)), event)
     else:
         wanted = _microscope_event(event.request, draft.env.settings.rules)
         return control_change.decide(draft, ControlInput(wanted, event.name), event)
     return False
+
+
+def _refusal_to_continue(draft: StateDraft, event: RequestIn) -> str:
+    # the translator publishes tip and feedback whenever they change, so the newest are in force
+    kind, mode = event.request.kind, event.request.subject
+    if kind != ControlRequest.SET_CONTROL_MODE or mode != ControlMode.AUTOMATED:
+        return ""
+    if draft.control.mode is not ControlMode.MANUAL:
+        return ""
+    if draft.env.settings.rules.is_agent(event.name):
+        return "a person lets the run continue, and never an agent"
+    if draft.panel.outside and not draft.panel.tip.remedy:  # a value may have been set back unseen
+        for name in draft.panel.outside:
+            _read(draft, name, ReadAhead(name))
+    return draft.panel.remedy
 
 
 def _microscope_event(request: Request, rules: Rules) -> ArbitrationEvent:
@@ -526,6 +543,7 @@ def settle(draft: StateDraft, settled: SettledRequest) -> None:
         response = answers.with_id(response, job.request)
         if response.ok and (job.command or job.request.kind == _PARAM):
             response = _apply_success(draft, job, response)
+            _look_at_value(draft, job, response)
     # it may have been carried out: its values are read before the next request that depends on them
     if job.command and end is not ForwardOutcome.NOT_SENT and _is_unknown(response):
         draft.limits = draft.limits.unknown(job.outgoing)
@@ -544,6 +562,14 @@ def settle(draft: StateDraft, settled: SettledRequest) -> None:
             _action_started(draft, job, is_certain=False)
         _track_feedback(draft, job, response)
         answers.finish(draft, job, response, _unknown_status(response))
+
+
+def _look_at_value(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
+    # of a setting that a person has left outside the limits
+    if job.request.kind == _PARAM and job.request.subject.name in draft.panel.outside and response.payload:
+        answered = draft.env.codec.decode_parameter(response.payload)
+        if answered is not None and answered.value is not None:
+            draft.panel = draft.panel.with_change(answered.name, draft.limits.outside(answered))
 
 
 def _settle_own(draft: StateDraft, job: ForwardedRequest, end: ForwardOutcome, response: Response) -> None:

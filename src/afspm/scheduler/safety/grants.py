@@ -57,7 +57,8 @@ _HOUR_NS = 3600 * 10**9
 _PROBE_M = 5e-9
 """Side of the square, in m, within which a probe counts as at its set position: controllers round."""
 _STOPS = frozenset({names.STOP_SCAN, names.STOP_SPEC})
-"""Actions that stop a measurement, and need no approval."""
+"""Actions that stop a measurement: the holder of control may always send them, and they count as no use of an
+approval."""
 _PLACES = frozenset((*REGION_CHANGES, *SHAPE_CHANGES, *PROBE_CHANGES))
 _OF_SUPERVISORS = frozenset({PROCESSES.name, LOG.name})
 _SET_REGION, _SET_PROBE = int(ControlRequest.SET_SCAN_PARAMS), int(ControlRequest.SET_PROBE_POS)
@@ -103,6 +104,7 @@ class HeldGrant:
         by: the person who approved.
         given_ns: the experiment time of the approval.
         step: the number of requests of a plan that were sent.
+        unsettled: the id of the newest request of a plan, until its success is known.
         used: the uses of a grant, by action.
     """
 
@@ -110,6 +112,7 @@ class HeldGrant:
     by: str
     given_ns: int
     step: int = 0
+    unsettled: str = ""
     used: Mapping[str, int] = field(default_factory=dict)
 
     @property
@@ -221,7 +224,12 @@ class GrantChecker:
 
     def has_approval(self, agent: str, now_ns: int) -> bool:
         """Return whether an approval of an agent is in force."""
-        return any(one.until_ns > now_ns for one in self._held(agent))
+        ends_ns = self.ends_ns(agent)
+        return ends_ns is not None and now_ns < ends_ns
+
+    def ends_ns(self, agent: str | None) -> int | None:
+        """Return the experiment time at which the last approval of an agent runs out; None: it has none."""
+        return None if agent is None else max((one.until_ns for one in self._held(agent)), default=None)
 
     def control_changed(
         self, before: ArbitrationState, after: ArbitrationState, by_hand: frozenset[int], now_ns: int
@@ -294,7 +302,7 @@ class GrantChecker:
             return f"{who} is an agent: it solves no problems"
         if not request.id and kind in _COMMANDS:
             return "a command of an agent needs an id"
-        if not self.has_approval(who, now_ns):
+        if not _is_stop(request) and not self.has_approval(who, now_ns):
             return f"{who} has no approval in force; a person approves a plan or gives a grant"
         return ""
 
@@ -324,12 +332,17 @@ class GrantChecker:
         if (known := self._spent(who, request.id)) is not None:
             is_same = (known.request, known.payload) == (request.kind, request.payload)
             return "" if is_same else "this id is of another request"
+        if _is_stop(request):
+            return ""
         if why := self._refused_at_place(who, request, now_ns, offset_m, state):
             return why
         plan, grant = self.book.plans.get(who), self.book.grants.get(who)
         why_not = "no plan is approved"
         if plan is not None and not (why_not := self._refused_by_plan(plan, request, now_ns, offset_m)):
             return ""
+        # between two requests of a plan a grant would undo what the first has set: the bias, before the scan
+        if plan is not None and plan.step and plan.until_ns > now_ns:
+            return f"{why_not}; the grant waits for the end of the plan, which also ends by releasing control"
         if grant is None:
             return f"{why_not}, and there is no grant"
         refused = self._refused_by_grant(grant, who, request, now_ns, state)
@@ -347,7 +360,8 @@ class GrantChecker:
         approved = ""
         if plan is not None and not self._refused_by_plan(plan, request, now_ns, offset_m):
             approved = plan.grant.plan
-            book = replace(book, plans={**book.plans, who: replace(plan, step=plan.step + 1)})
+            sent = replace(plan, step=plan.step + 1, unsettled=request.id)
+            book = replace(book, plans={**book.plans, who: sent})
         elif action and action not in _STOPS and (grant := book.grants.get(who)) is not None:
             used = {**grant.used, action: grant.used.get(action, 0) + 1}
             book = replace(book, grants={**book.grants, who: replace(grant, used=used)})
@@ -362,8 +376,8 @@ class GrantChecker:
         book = self.book
         plan, grant = book.plans.get(who), book.grants.get(who)
         if spent.plan:
-            if plan is not None and plan.grant.plan == spent.plan:
-                book = replace(book, plans={**book.plans, who: replace(plan, step=plan.step - 1)})
+            if plan is not None and plan.unsettled == request.id:
+                book = replace(book, plans={**book.plans, who: replace(plan, step=plan.step - 1, unsettled="")})
         elif spent.action and grant is not None and grant.used.get(spent.action):
             used = {**grant.used, spent.action: grant.used[spent.action] - 1}
             book = replace(book, grants={**book.grants, who: replace(grant, used=used)})
@@ -371,13 +385,15 @@ class GrantChecker:
         return replace(self, book=replace(book, spent={**book.spent, who: rest}))
 
     def done(self, who: str, request: Request) -> GrantChecker:
-        """Store the place that an agent has set, and remove a completed plan, after a success."""
+        """Store the place that an agent has set, and settle a step of its plan, after a success."""
         book = self.book
         if request.kind in (_SET_REGION, _SET_PROBE) and self.rules.is_agent(who):
             book = replace(book, placed=book.placed.after(who, request))
         plan = book.plans.get(who)
-        if plan is not None and plan.step >= len(plan.grant.steps):
-            book = replace(book, plans=_less(book.plans, who))
+        if plan is not None and plan.unsettled and plan.unsettled == request.id:
+            is_last = plan.step >= len(plan.grant.steps)
+            settled = {} if is_last else {who: replace(plan, unsettled="")}
+            book = replace(book, plans={**_less(book.plans, who), **settled})
         return self if book is self.book else replace(self, book=book)
 
     # --- within ---
@@ -421,10 +437,10 @@ class GrantChecker:
 
     def _refused_by_plan(self, held: HeldGrant, request: Request, now_ns: int, offset_m: XY | None) -> str:
         grant = held.grant
-        if request.kind == ControlRequest.ACTION and request.subject in _STOPS:
-            return ""
         if held.until_ns <= now_ns:
             return f"the approval of {grant.plan} has run out"
+        if held.unsettled:  # it may not have been carried out, and the next step relies on it
+            return f"request {held.step} of {grant.plan} has no known success; send it again under its id"
         if held.step >= len(grant.steps):
             return f"all of {grant.plan} was carried out"
         if why := self._drifted(grant, offset_m):
@@ -437,7 +453,7 @@ class GrantChecker:
     def _refused_at_place(self, who: str, request: Request, now_ns: int, offset_m: XY | None, state: LimitState) -> str:
         # a person at the panel, or another component before, may have set another place than the one approved
         action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
-        if not action or action in _STOPS:
+        if not action:
             return ""
         place = self.book.placed.for_action(who, action)
         if place is None:
@@ -451,8 +467,6 @@ class GrantChecker:
             return "the grant has run out"
         if request.kind == ControlRequest.ACTION:
             action = str(request.subject)
-            if action in _STOPS:
-                return ""
             left = next((one.count for one in held.left() if one.action == action), None)
             if left is None:
                 return f"the grant does not include the action {action}"
@@ -477,6 +491,10 @@ class GrantChecker:
 
 def _less(held: Mapping[str, HeldGrant], agent: str) -> dict[str, HeldGrant]:
     return {name: one for name, one in held.items() if name != agent}
+
+
+def _is_stop(request: Request) -> bool:
+    return request.kind == ControlRequest.ACTION and request.subject in _STOPS
 
 
 def _limits_of(grant: Grant) -> ExperimentLimits:

@@ -131,6 +131,17 @@ class LimitChecker:
                 return _action_error(request, breach)
         return None
 
+    def outside(self, changed: Parameter) -> str:
+        """Return why a value that a person has set lies outside its range; empty: it does not."""
+        limit, value = self.limits.parameters.get(changed.name), self._number(changed)
+        if limit is None or value is None:
+            return ""
+        try:
+            self._check_range(changed.name, value, limit, _TOLD_REACH)
+        except _Breach as breach:
+            return breach.reason
+        return ""
+
     def depends_on(self, request: Request, *, is_mapped: bool = False) -> list[str]:
         """Return the parameters to read before a request is checked.
 

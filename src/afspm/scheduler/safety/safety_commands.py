@@ -33,6 +33,12 @@ def send(draft: StateDraft) -> None:
             return
 
 
+def leave_to_person(draft: StateDraft) -> None:
+    """Drop what the watchdog would send: the person at the microscope sees to the tip."""
+    draft.forwarder, unsent = draft.forwarder.without_own_actions()
+    draft.watchdog = draft.watchdog.left_to_person(is_unsent=unsent)
+
+
 def settle(draft: StateDraft, job: ForwardedRequest, end: ForwardOutcome, response: Response) -> None:
     """Process the translator's answer to a safety command, or the failure to get an answer."""
     subject, now_s = str(job.request.subject), draft.now_s
@@ -46,11 +52,15 @@ def settle(draft: StateDraft, job: ForwardedRequest, end: ForwardOutcome, respon
         return
     if not draft.forwarder.up:
         draft.watchdog = draft.watchdog.unsent(now_s)
+        if draft.panel.why:
+            leave_to_person(draft)
         return
     is_retract = draft.watchdog.tip.duty is TipDuty.ASKED
     draft.watchdog, result = draft.watchdog.answered(response.code, draft.microscope, now_s)
     if is_retract and result is SafetyResult.DONE:
         draft.microscope = draft.microscope.with_tip(away=True)
+    if draft.panel.why:  # a person acted at the microscope meanwhile
+        leave_to_person(draft)
     send(draft)
     if result is SafetyResult.DONE:
         draft.log("INFO", f"{subject}: done")

@@ -15,7 +15,7 @@ from afspm.model import ControlResponse, ScopeState, names
 from afspm.model.microscope_status import FEEDBACK_OFF, STARTS, STOPS, MicroscopeStatus
 from afspm.scheduler.control.arbitration import Cause
 
-_DEFAULT_STOPS = frozenset(set(Cause) - {Cause.RELEASED, Cause.SOLVED, Cause.ENDED})
+_DEFAULT_STOPS = frozenset(set(Cause) - {Cause.RELEASED, Cause.SOLVED, Cause.ENDED, Cause.BY_HAND})
 _SOON_S = 1.0
 
 
@@ -265,6 +265,8 @@ class Watchdog:
         # a holder that gives control back knows the state it leaves, and so does a person who takes control
         knows = cause in (Cause.RELEASED, Cause.MANUAL) or (cause is Cause.SOLVED and by_holder)
         dog = self
+        if cause is Cause.BY_HAND:  # see `left_to_person`
+            return dog
         if cause is Cause.MANUAL or (was_seen_to and knows and not had_died):
             dog = dog.seen_to()
         if dog.can_retract and (had_died or not knows) and microscope.danger is not None:
@@ -274,6 +276,15 @@ class Watchdog:
             return dog
         is_to_stop = cause in dog.settings.stop_when or dog.owes_retract
         return dog._with_stops((stop, *dog.tip.stops)) if is_to_stop else dog
+
+    def left_to_person(self, *, is_unsent: bool) -> Watchdog:
+        """Drop all duties: a person at the microscope sees to the tip, and may have begun a scan.
+
+        Args:
+            is_unsent: whether the action that counts as sent still waited, and was removed.
+        """
+        dog = replace(self, sent=None)._after(TipEvent.NOT_YET) if is_unsent else self
+        return replace(dog.seen_to()._with_stops(()), starting=None)
 
     def newly_wanted(self, before: Watchdog) -> list[str]:
         """Return the actions wanted now and not before."""

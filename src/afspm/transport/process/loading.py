@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import difflib
-import importlib
 import inspect
 
+from afspm.basics import named_imports
 from afspm.basics.errors import AfspmError, ConfigError
 from afspm.basics.launch import Launch
 from afspm.transport.process.context import ExperimentProcess
@@ -17,7 +17,9 @@ def load(launch: Launch) -> ExperimentProcess:
     Raises:
         ConfigError: the class does not exist, or can't be constructed with these settings. A restart would not help.
     """
-    class_ = find_class(launch.class_, launch.name)
+    class_ = find_class(launch.class_, launch.name, of_process=True)
+    if not hasattr(class_, "run_process"):  # before it is constructed: a record may name any class, of any effect
+        raise _not_a_process(launch)
     _check_settings(class_, launch)
     try:
         plain = getattr(class_, "plain_settings", ())  # tables whose `class` the class handles itself
@@ -28,12 +30,12 @@ def load(launch: Launch) -> ExperimentProcess:
         where = f"{launch.name}: {error.where}" if error.where else launch.name
         raise ConfigError(error.what, where=where, hint=error.hint) from error
     if not isinstance(made, ExperimentProcess):
-        raise ConfigError(
-            f"{launch.class_} can't be run",
-            where=launch.name,
-            hint="derive it from afspm.Component",
-        )
+        raise _not_a_process(launch)
     return made
+
+
+def _not_a_process(launch: Launch) -> ConfigError:
+    return ConfigError(f"{launch.class_} can't be run", where=launch.name, hint="derive it from afspm.Component")
 
 
 def made_of(value: object, where: str) -> object:
@@ -53,32 +55,35 @@ def made_of(value: object, where: str) -> object:
     return inside if path is None else {"class": path, **inside}
 
 
-def find_class(path: str, where: str) -> type[object]:
+def find_class(path: str, where: str, *, of_process: bool = False) -> type[object]:
     """Return the class "package.module.Name".
 
+    Args:
+        of_process: the class of a process, rather than of an object in its settings.
+
     Raises:
-        ConfigError: there is no such class.
+        ConfigError: there is no such class, or its module is not trusted.
     """
-    class_ = find_object(path, where, "class")
+    class_ = find_object(path, where, "class", of_process=of_process)
     if not isinstance(class_, type):
         raise ConfigError(f"{path} is not a class", where=where)
     return class_
 
 
-def find_object(path: str, where: str, what: str = "function") -> object:
+def find_object(path: str, where: str, what: str = "function", *, of_process: bool = False) -> object:
     """Return the object "package.module.name".
 
     Args:
         what: kind of the object, for the error.
 
     Raises:
-        ConfigError: there is no such object.
+        ConfigError: there is no such object, or its module is not trusted.
     """
     module_name, _, name = path.rpartition(".")
     if not module_name:
         raise ConfigError(f"{path!r} names no {what}", where=where, hint=f'write {what} = "module.name"')
     try:
-        module = importlib.import_module(module_name)
+        module = named_imports.import_named(module_name, of_process=of_process)
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"the {what} {path} can't be imported: {error}", where=where, hint="is it installed, or on the path?"
@@ -91,6 +96,8 @@ def find_object(path: str, where: str, what: str = "function") -> object:
             where=where,
             hint=f"did you mean {near[0]!r}?" if near else "",
         )
+    if not of_process:
+        named_imports.require_trusted(found, path)
     return found
 
 

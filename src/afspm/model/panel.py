@@ -1,0 +1,121 @@
+"""What a person does at the microscope itself, as a translator sees it, and the state of tip and feedback."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class PanelAct(StrEnum):
+    """An act at the microscope; the values are those on the wire."""
+
+    STOP = "stop"
+    """A measurement of the run was stopped."""
+    PAUSE = "pause"
+    """A scan of the run was paused; it goes on when it is resumed there."""
+    SCAN = "scan"
+    """A scan was begun."""
+    SPECTRUM = "spectrum"
+    WITHDRAW = "withdraw"
+    """The tip was withdrawn or lifted."""
+    FEEDBACK_OFF = "feedback-off"
+    """The z feedback was switched off with the tip at the sample."""
+    VALUES = "values"
+    """Settings were changed."""
+
+
+_IN_WORDS = {
+    PanelAct.STOP: "the measurement was stopped",
+    PanelAct.PAUSE: "the scan was paused",
+    PanelAct.SCAN: "a scan was begun",
+    PanelAct.SPECTRUM: "a spectrum was begun",
+    PanelAct.WITHDRAW: "the tip was withdrawn",
+    PanelAct.FEEDBACK_OFF: "the z feedback was switched off",
+    PanelAct.VALUES: "settings were changed",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ChangedValue:
+    """A setting before and after a change, as texts in `unit`."""
+
+    parameter: str
+    before: str
+    after: str
+    unit: str = ""
+
+    def __str__(self) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        return f"{self.parameter} = {self.after}{unit} (before: {self.before}{unit})"
+
+
+@dataclass(frozen=True, slots=True)
+class ActByHand:
+    """An act at the microscope that no request of the run has caused.
+
+    Attributes:
+        evidence: how the translator knows, in words.
+        changes: of `PanelAct.VALUES`.
+    """
+
+    time_ns: int
+    act: PanelAct
+    evidence: str = ""
+    changes: tuple[ChangedValue, ...] = ()
+
+    def __str__(self) -> str:
+        if self.act is PanelAct.VALUES:
+            return f"set at the microscope: {', '.join(map(str, self.changes))}"
+        why = f" ({self.evidence})" if self.evidence else ""
+        return f"{_IN_WORDS[self.act]} at the microscope{why}"
+
+
+@dataclass(frozen=True, slots=True)
+class TipStatus:
+    """The tip and its feedback, as the controller reports them.
+
+    Attributes:
+        engaged: whether the tip is at the sample; None: the controller does not report it.
+        feedback_on: whether the z feedback is on; None: the controller does not report it.
+        by_hand: what was done by hand, and keeps afspm from measuring, in words; empty: nothing.
+    """
+
+    engaged: bool | None = None
+    feedback_on: bool | None = None
+    by_hand: str = ""
+
+    def __str__(self) -> str:
+        tip = {True: "the tip is at the sample", False: "the tip is withdrawn", None: "the tip is not reported"}
+        feedback = {
+            True: "the z feedback is on",
+            False: "the z feedback is off",
+            None: "the z feedback is not reported",
+        }
+        return f"{tip[self.engaged]}, {feedback[self.feedback_on]}"
+
+    @property
+    def remedy(self) -> str:
+        """What a person has to do before anything is measured; empty: nothing."""
+        if not self.by_hand:
+            return ""
+        if self.engaged is False:
+            return "the tip is still withdrawn: approach at the panel"
+        if self.feedback_on is False:
+            return "the z feedback is still off: switch it on at the panel"
+        return ""
+
+
+@dataclass(frozen=True, slots=True)
+class MeasurementConditions:
+    """The tip at the begin and at the end of a scan or spectrum, and what was done by hand meanwhile.
+
+    Attributes:
+        time_ns, filename: of the scan or spectrum.
+        begin, end: None: not known, for example after a restart of the translator.
+    """
+
+    time_ns: int
+    filename: str
+    begin: TipStatus | None = None
+    end: TipStatus | None = None
+    acts: tuple[ActByHand, ...] = ()
