@@ -227,6 +227,8 @@ def _summary(folder: Path) -> RunSummary:
             return _read(run)
     except FileError as error:
         return RunSummary("", folder.name, damage=error.what)
+    except Exception as error:  # broad: a folder of another person may hold anything, and must not hide all other runs
+        return RunSummary("", folder.name, damage=f"is damaged: {type(error).__name__}: {error}")
 
 
 def _read(run: Run) -> RunSummary:

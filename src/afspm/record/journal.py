@@ -152,7 +152,17 @@ def check_format(connection: sqlite3.Connection, path: Path) -> None:
         raise FileError(f"is not a journal of this version: {name}", where=str(path), hint="a newer afspm may read it")
 
 
-class _OfCopy(sqlite3.Connection):
+class _Reader(sqlite3.Connection):
+    """A connection that is closed when it is collected: a notebook opens a run without `with`."""
+
+    def __del__(self) -> None:
+        # Since Python 3.13 sqlite3 warns of a connection that is collected while it is open. If the file could not be
+        # opened, there is nothing to close.
+        with suppress(sqlite3.ProgrammingError):
+            self.close()
+
+
+class _OfCopy(_Reader):
     """A connection to a copy, removed when the connection is closed or collected, or (except on Windows) at exit."""
 
     remove: Callable[[], object] = staticmethod(lambda: None)
@@ -165,8 +175,6 @@ class _OfCopy(sqlite3.Connection):
         super().close()  # first: Windows removes no file that is open
         self.remove()
         atexit.unregister(self.remove)
-
-    __del__ = close
 
 
 def _checked_copy(path: Path) -> sqlite3.Connection:
@@ -190,7 +198,7 @@ def _checked_copy(path: Path) -> sqlite3.Connection:
     return connection
 
 
-def _checked(uri: str, path: Path, kind: type[sqlite3.Connection] = sqlite3.Connection) -> sqlite3.Connection:
+def _checked(uri: str, path: Path, kind: type[_Reader] = _Reader) -> sqlite3.Connection:
     connection = sqlite3.connect(
         uri, uri=True, isolation_level=None, check_same_thread=False, timeout=30.0, factory=kind
     )

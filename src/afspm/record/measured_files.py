@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -125,7 +125,7 @@ class MeasuredFiles:
         mapping = provenance.drift(self._journal, published_ns, stood.began_ns, filenames)
         if mapping is not None:
             facts["drift"] = mapping
-        facts |= self._surroundings(published_ns, stood)
+        facts |= self._surroundings(published_ns, stood, filenames, time_ns)
         at = FileProvenance(time_ns, stood.began_ns, facts, header_of(filename, self._folder))
         if scans:
             self._batch.write(self._folder / name, nexus_writer.encode_scan(scans, at))
@@ -185,7 +185,7 @@ class MeasuredFiles:
             stood = provenance.control_at_start(self._journal, published_ns, ScopeState.SPEC, time_ns)
             number, name = self._next(SPECTRA, time_ns)
             facts = {**self._facts, **stood.facts(self._problems), "number": number}
-            facts |= self._surroundings(published_ns, stood)
+            facts |= self._surroundings(published_ns, stood, {spectrum.filename}, time_ns)
             at = FileProvenance(time_ns, stood.began_ns, facts, header_of(spectrum.filename, self._folder))
             self._batch.write(self._folder / name, nexus_writer.encode_spectrum(spectrum, at))
             place = (None, None) if spectrum.position_m is None else spectrum.position_m
@@ -210,9 +210,15 @@ class MeasuredFiles:
             orphan.unlink()  # written right before a kill; the journal never got its number
         return number, name
 
-    def _surroundings(self, published_ns: int, stood: ControlAtStart) -> dict[str, object]:
-        found = provenance.instruments(self._journal, published_ns, stood.began_ns)
-        return {"instruments": found} if found else {}
+    def _surroundings(
+        self, published_ns: int, stood: ControlAtStart, filenames: Collection[str], measured_ns: int
+    ) -> dict[str, object]:
+        since_ns = stood.began_ns
+        found = {
+            "instruments": provenance.instruments(self._journal, published_ns, since_ns),
+            "tip": provenance.tip(self._journal, published_ns, since_ns, filenames, measured_ns),
+        }
+        return {name: facts for name, facts in found.items() if facts}
 
     def _control(self, stood: ControlAtStart) -> tuple[str | None, str | None, str]:
         facts = stood.facts(self._problems)

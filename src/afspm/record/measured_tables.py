@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from afspm import wire
 from afspm.basics.errors import NoSuchItem, UnitError, WireError
+from afspm.basics.plain_data import from_json
 from afspm.basics.units import convert, si_unit
 from afspm.model import (
     Frame,
@@ -249,13 +249,13 @@ def scan_row(
         number,
         time_ns,
         began_ns,
-        tuple((name, unit) for name, unit in json.loads(channels)),
+        tuple((name, unit) for name, unit in from_json(channels)),
         region,
         None if rows is None else (rows, columns),
         bool(interrupted),
         holder,
         mode,
-        tuple(json.loads(problems)),
+        tuple(from_json(problems)),
         filename,
         file,
         key,
@@ -276,11 +276,11 @@ def spectrum_row(row: Row, key: str = "") -> SpectrumRow:
         None if x is None else (x, y),
         Frame(frame),
         points,
-        tuple(json.loads(names)),
-        tuple(json.loads(units)),
+        tuple(from_json(names)),
+        tuple(from_json(units)),
         holder,
         mode,
-        tuple(json.loads(problems)),
+        tuple(from_json(problems)),
         filename,
         file,
         key,

@@ -5,7 +5,6 @@ It also reads a grid of spectra in one file (`record.export.nexus`), with the me
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from datetime import tzinfo
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.basics.errors import FileError
-from afspm.basics.plain_data import Plain
+from afspm.basics.plain_data import Plain, from_json
 from afspm.model import Frame, Region, Scan, Spectrum
 from afspm.record.spectrum_grid import PointGrid
 from afspm.storage.formats import hdf5
@@ -63,7 +62,7 @@ def about_of(file: h5py.File) -> Plain:
         FileError: the file is damaged.
     """
     try:
-        about: Plain = json.loads(hdf5.text(file["entry"][ABOUT]["about"][()]))
+        about: Plain = from_json(hdf5.text(file["entry"][ABOUT]["about"][()]))
     except (KeyError, ValueError) as error:
         raise FileError(f"is damaged: {error}") from error
     return about
@@ -74,7 +73,7 @@ def vendor_header(file: h5py.File) -> dict[str, object]:
     group = file["entry"].get(VENDOR)
     if group is None or "header" not in group:
         return {}
-    header: dict[str, object] = json.loads(hdf5.text(group["header"][()]))
+    header: dict[str, object] = from_json(hdf5.text(group["header"][()]))
     return header
 
 

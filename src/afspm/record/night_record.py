@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import base64
-import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.plain_data import Plain
+from afspm.basics.plain_data import Plain, from_json
 from afspm.model import ControlMode, ControlState, Problem, Scan
 from afspm.model.line_levelling import flattened
 from afspm.record.bad_scans import bad_scans
@@ -96,7 +95,7 @@ class NightRecord:
         record = cls()
         for line in lines:
             try:
-                entry = json.loads(line)
+                entry = from_json(line)
                 record.add(entry)
             except (ValueError, KeyError, TypeError):
                 continue

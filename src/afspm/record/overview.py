@@ -40,9 +40,11 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
     Spectrum,
+    TipStatus,
     registration_summary,
 )
 from afspm.model.events import PERSON
+from afspm.model.grants import with_proposal
 from afspm.model.problems import CONDITIONS
 from afspm.record.measurement_history import (
     SOON_NS,
@@ -178,7 +180,7 @@ class Overview:
 
     Attributes:
         newest_ns: the time of the newest packet; 0 before the first.
-        status, control: the newest state of the microscope and of control; None before the first.
+        status, control, tip: the newest state of the microscope, of control and of the tip; None before the first.
         processes, progress_reports: the newest state and progress of each process, by name.
         instruments: the curve of each instrument parameter, by its name.
         proposals: the proposals of agents by id, newest last, bounded.
@@ -194,6 +196,7 @@ class Overview:
         self.status: ScopeStatus | None = None
         self.control: ControlState | None = None
         self.readings = Readings()
+        self.tip: TipStatus | None = None
         self.processes: dict[str, ProcessState] = {}
         self.instruments: dict[str, ReadingCurve] = {}
         self.progress_reports: dict[str, Progress] = {}
@@ -278,10 +281,26 @@ class Overview:
             return ""
         if self.control.mode is not ControlMode.MANUAL:
             return self.control.holder or ""
+        if self.by_hand:
+            return "a person at the microscope"
+        entry = self._manual_entry
+        who = "" if entry is None else entry.who
+        return who.partition(PERSON)[2] or who or "a person"
+
+    @property
+    def by_hand(self) -> str:
+        """The act at the microscope for which the mode is MANUAL; empty without one."""
+        if self.control is None or self.control.mode is not ControlMode.MANUAL:
+            return ""
+        entry = self._manual_entry
+        return "" if entry is None else entry.reason
+
+    @property
+    def _manual_entry(self) -> JournalEntry | None:
+        # of the change to the present MANUAL; it may come a moment after the mode
         changes = (one for one in reversed(self.entries) if one.event is ControlEvent.MODE_CHANGED)
         newest = next(changes, None)
-        who = newest.who if newest is not None and newest.mode is ControlMode.MANUAL else ""
-        return who.partition(PERSON)[2] or who or "a person"
+        return newest if newest is not None and newest.mode is ControlMode.MANUAL else None
 
     @property
     def ended_ns(self) -> int | None:
@@ -361,6 +380,9 @@ class Overview:
         elif status.state in (ScopeState.FREE, ScopeState.INTERRUPTED):
             self._measured.end_scan(time_ns, interrupted=status.state is ScopeState.INTERRUPTED)
 
+    def _on_tip_status(self, status: TipStatus, time_ns: int) -> None:
+        self.tip = status
+
     def _on_scan_lines(self, lines: ScanLines, time_ns: int) -> None:
         if self.running is not None:
             self.running.take(lines)
@@ -378,10 +400,7 @@ class Overview:
             curve.add(time_ns, one.value if one.value is not None and one.is_number else math.nan)
 
     def _on_proposal(self, proposal: Proposal, time_ns: int) -> None:
-        self.proposals.pop(proposal.id, None)
-        self.proposals[proposal.id] = proposal
-        while len(self.proposals) > MOST_PROPOSALS:
-            del self.proposals[next(iter(self.proposals))]
+        self.proposals = with_proposal(self.proposals, proposal, MOST_PROPOSALS)
 
     def _on_approvals(self, approvals: Approvals, time_ns: int) -> None:
         self.approvals = approvals

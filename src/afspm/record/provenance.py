@@ -11,13 +11,16 @@ from afspm import wire
 from afspm.basics.errors import WireError
 from afspm.basics.plain_data import Plain
 from afspm.model import (
+    ActByHand,
     ControlState,
     Feedback,
     InstrumentReading,
     InstrumentReadings,
+    MeasurementConditions,
     ProblemNames,
     ScopeState,
     ScopeStatus,
+    TipStatus,
 )
 from afspm.record.drift_mapping import drift_knowledge
 
@@ -136,6 +139,47 @@ def instruments(journal: sqlite3.Connection, time_ns: int, since_ns: int | None)
         for name, (at_ns, one) in newest.items()
         if at_ns > time_ns - _READINGS_NS
     ]
+
+
+def tip(
+    journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filenames: Collection[str], measured_ns: int
+) -> Plain:
+    """Return the tip and its feedback at the begin and end of a measurement, and the acts at the microscope meanwhile.
+
+    Args:
+        time_ns: the time of publication.
+        since_ns: the start of the measurement; None: unknown.
+        filenames: the controller's files of the measurement.
+        measured_ns: the end of the measurement.
+
+    Returns:
+        "begin", "end" and "by_hand", each only if known.
+    """
+    found: Plain = {}
+    rows = journal.execute(
+        "SELECT payload FROM packets WHERE message = 'MeasurementConditions' AND time_ns <= ?"
+        f" ORDER BY time_ns DESC LIMIT {_BACK}",
+        (time_ns,),
+    )
+    for (payload,) in rows:
+        one = _decoded("MeasurementConditions", payload)
+        if isinstance(one, MeasurementConditions) and (one.time_ns == measured_ns or one.filename in filenames):
+            ends = {"begin": one.begin, "end": one.end}
+            found = {name: _tip_facts(status) for name, status in ends.items() if status not in (None, TipStatus())}
+            break
+    if since_ns is not None:
+        acts = journal.execute(
+            "SELECT payload FROM packets WHERE message = 'ActByHand' AND time_ns BETWEEN ? AND ? ORDER BY time_ns",
+            (since_ns, time_ns),
+        )
+        told = [str(one) for (payload,) in acts if isinstance(one := _decoded("ActByHand", payload), ActByHand)]
+        found |= {"by_hand": told} if told else {}
+    return found
+
+
+def _tip_facts(status: TipStatus | None) -> Plain:
+    facts = {} if status is None else {"engaged": status.engaged, "feedback_on": status.feedback_on}
+    return {name: value for name, value in facts.items() if value is not None}
 
 
 def is_corrected(journal: sqlite3.Connection) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from afspm import wire
 from afspm.basics.errors import FileError, InvalidValue, NoSuchItem, WireError
 from afspm.basics.formatting import counted
+from afspm.basics.plain_data import from_json
 from afspm.model import (
     ControlState,
     Feedback,
@@ -42,7 +42,7 @@ from afspm.record.measured_tables import (
     scan_row,
     spectrum_row,
 )
-from afspm.record.packets import packets, without_reading_files
+from afspm.record.packets import PacketLookup, packets, without_reading_files
 from afspm.record.run_json import EXPERIMENT_FILE, METADATA, REPLAY_OF, latest_run, run_json_or_empty
 from afspm.record.tables import ControlRow, NoteRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
 from afspm.record.treatment_ledger import KEEP_AWAY_M, TreatmentLedger, treatment_ledger
@@ -317,6 +317,10 @@ class Run:
         """
         yield from packets(self._query, self.folder, since_ns, messages, tell)
 
+    def packet_lookup(self) -> PacketLookup:
+        """Return a function that returns the scheduler's packet of a time and an envelope, as it was published."""
+        return PacketLookup(self._query, self.folder)
+
     def messages(self, messages: Sequence[str] | None = None) -> Iterator[tuple[Packet, str, Any]]:
         """Yield packet, name of its message and decoded content, without reading files.
 
@@ -436,7 +440,7 @@ class Run:
 
     def _note(self, name: str) -> Any:
         found = self._query("SELECT value FROM about WHERE name = ?", (name,))
-        return json.loads(found[0][0]) if found else None
+        return from_json(found[0][0]) if found else None
 
     def _row(self, table: str, index: int, made: Callable[[Row], R]) -> R:
         order, offset = ("ASC", index) if index >= 0 else ("DESC", -index - 1)

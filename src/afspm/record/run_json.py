@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Final
 
 from afspm.basics.errors import FileError
-from afspm.basics.plain_data import Plain
+from afspm.basics.plain_data import Plain, from_json
 
 RUN_FILE: Final = "run.json"
 STATE_DIR: Final = "state"
@@ -42,7 +41,7 @@ def read_run_json(folder: Path) -> Plain:
     """
     file = folder / RUN_FILE
     try:
-        facts = json.loads(file.read_text(encoding="utf-8"))
+        facts = from_json(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise FileError(f"can't be read: {error}", where=str(file)) from error
     if not isinstance(facts, dict):

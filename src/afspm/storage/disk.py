@@ -15,6 +15,7 @@ import os
 import queue
 import sys
 import threading
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -61,21 +62,43 @@ class DiskTask:
                 raise self.error
 
 
-class DiskThread:
-    """A thread that runs one task after the other.
+class _Backlog:
+    # shared by a DiskThread and its thread, which must not keep the DiskThread alive
 
-    Attributes:
-        hangs: whether a task was late or refused; until all tasks are finished, `run` does not wait.
-    """
+    def __init__(self) -> None:
+        self.tasks: queue.SimpleQueue[DiskTask | None] = queue.SimpleQueue()
+        self.lock = threading.Lock()
+        self.bytes = self.count = 0
+        self.hangs = False
+
+    def work(self) -> None:
+        while (task := self.tasks.get()) is not None:
+            try:
+                task.work()
+            except Exception as error:  # the work may be any code; the caller that waits raises its error
+                task.error = error
+            with self.lock:
+                self.bytes -= task.size
+                self.count -= 1
+                if not self.count:
+                    self.hangs = False
+            task.done.release()
+            del task  # its work may hold the owner of the DiskThread
+
+
+class DiskThread:
+    """A thread that runs one task after the other; it ends after the last task once this object is gone."""
 
     def __init__(self, deadline_s: float = DEADLINE_S, most_bytes: int = MOST_BYTES) -> None:
-        self.hangs = False
         self._deadline_s = deadline_s
         self._most_bytes = most_bytes
-        self._tasks: queue.SimpleQueue[DiskTask | None] = queue.SimpleQueue()
-        self._lock = threading.Lock()
-        self._bytes = self._count = 0
+        self._backlog = _Backlog()
         self._thread: threading.Thread | None = None
+
+    @property
+    def hangs(self) -> bool:
+        """True from a late or refused task until all tasks are finished; meanwhile `run` does not wait."""
+        return self._backlog.hangs
 
     def run(self, work: Callable[[], object], size: int = 0) -> None:
         """Run a task and wait for it.
@@ -91,7 +114,7 @@ class DiskThread:
         task = self.submit(work, size)
         # while the disk hangs no caller waits again: each would lose the deadline
         if not task.done.acquire(timeout=0.0 if self.hangs else self._deadline_s):
-            self.hangs = True
+            self._backlog.hangs = True
             raise DiskTimeout(self._deadline_s)
         if task.error is not None:
             raise task.error
@@ -102,39 +125,29 @@ class DiskThread:
         Raises:
             DiskBacklogFull: too many tasks or bytes wait; the task never runs.
         """
-        with self._lock:
-            if self._count and (self._bytes + size > self._most_bytes or self._count >= MOST_TASKS):
-                self.hangs = True
+        backlog = self._backlog
+        with backlog.lock:
+            if backlog.count and (backlog.bytes + size > self._most_bytes or backlog.count >= MOST_TASKS):
+                backlog.hangs = True
                 raise DiskBacklogFull(self._deadline_s)
-            self._bytes += size
-            self._count += 1
+            backlog.bytes += size
+            backlog.count += 1
         if self._thread is None:
-            self._thread = threading.Thread(target=self._work, name="disk", daemon=True)
+            self._thread = threading.Thread(target=backlog.work, name="disk", daemon=True)
             self._thread.start()
+            # not at the end of the process, which does not wait for a disk
+            weakref.finalize(self, backlog.tasks.put, None).atexit = False
         task = DiskTask(work, size)
-        self._tasks.put(task)
+        backlog.tasks.put(task)
         return task
 
     def close(self, within_s: float) -> bool:
         """Finish the queued tasks within a time limit; return whether all are finished. Safe to repeat."""
         if self._thread is None:
             return True
-        self._tasks.put(None)
+        self._backlog.tasks.put(None)
         self._thread.join(within_s)
         return not self._thread.is_alive()
-
-    def _work(self) -> None:
-        while (task := self._tasks.get()) is not None:
-            try:
-                task.work()
-            except Exception as error:  # the work may be any code; the caller that waits raises its error
-                task.error = error
-            with self._lock:
-                self._bytes -= task.size
-                self._count -= 1
-                if not self._count:
-                    self.hangs = False
-            task.done.release()
 
 
 def run_bounded(work: Callable[[], T], within_s: float) -> T:

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from afspm.basics.errors import FileError
-from afspm.basics.plain_data import PlainList
+from afspm.basics.plain_data import PlainList, from_json
 from afspm.storage.disk import DEADLINE_S, DiskBacklogFull, DiskThread, DiskTimeout
 
 REQUESTS_FOLDER = "requests"
@@ -99,7 +99,7 @@ def read_lines(path: Path) -> Iterator[PlainList]:
         with path.open("rb") as file:
             for text in file:
                 try:
-                    line = json.loads(text)
+                    line = from_json(text)
                 except ValueError:
                     continue
                 if isinstance(line, list) and line:

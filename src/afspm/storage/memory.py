@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from afspm.basics.errors import InvalidValue
-from afspm.basics.plain_data import Plain
+from afspm.basics.plain_data import Plain, from_json
 from afspm.storage.atomic import CheckpointFile, OutageLog, append_generation, load_checkpoint, write_atomic
 from afspm.storage.disk import DEADLINE_S, DiskThread
 
@@ -135,7 +135,7 @@ def _number(value: Any) -> object:
 
 
 def _read(content: bytes) -> Plain:
-    values = json.loads(content)
+    values = from_json(content)
     if not isinstance(values, dict):
         raise ValueError("the file is not the memory of a component")
     return values

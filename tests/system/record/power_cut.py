@@ -36,7 +36,7 @@ from afspm.model import ControlMode, Packet, ScopeState
 from afspm.wire import KILL, decode_packet
 
 CLOCK = ExperimentClock.real()
-DEADLINE_S = 60.0
+DEADLINE_S = 480.0
 LOSS_S = 1.5
 """Packets published in this time before a power cut may be lost. A tenth of a second is guaranteed; the
 rest is for a busy machine. A running sync adds its time: it copies whole files here."""

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from deadlines import DEADLINE_S
 from systems import WINDOWS, can_interrupt, interrupt
 
 import afspm
@@ -122,7 +123,7 @@ def test_stopped_replay_records_and_publishes_its_end(
     with Follower(folder) as follower:
         follower.catch_up()
         stop(replaying)
-        assert replaying.wait(20.0) == 0
+        assert replaying.wait(DEADLINE_S) == 0
         assert json.loads((folder / "run.json").read_text(encoding="utf-8"))["ended"] == "the replay is over"
         until_s = follower.clock.monotonic_s() + 20.0
         while not follower.ended:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from systems import PATIENCE
+from deadlines import DEADLINE_S
 
 import afspm
 from afspm.basics.clock import NS_PER_S
@@ -20,7 +20,6 @@ from afspm.record.run_lock import lock_run
 from afspm.supervisor import resume
 from afspm.supervisor.run import RunOptions
 
-DEADLINE_S = 60.0 * PATIENCE
 EXPERIMENT = """
 [clock]
 start = 2026-03-14T20:00:00Z

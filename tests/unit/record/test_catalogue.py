@@ -17,6 +17,7 @@ from afspm.basics.errors import FileError, InvalidValue
 from afspm.cli.app import app
 from afspm.record import catalogue
 from afspm.record.catalogue import INDEX_FILE, find_runs
+from afspm.record.journal import JOURNAL_FILE
 from afspm.record.run_json import RUN_FILE
 from afspm.record.store import RecordStore
 
@@ -78,6 +79,22 @@ def test_catalogue_lists_every_run_with_its_facts(root: Path) -> None:
 )
 def test_words_select_runs(root: Path, words: list[str], found: list[str]) -> None:
     assert names(root, *words) == found
+
+
+@pytest.mark.parametrize("channels", ["no JSON", "[" * 100_000, "7"])
+def test_damaged_run_hides_no_other(root: Path, channels: str) -> None:
+    with sqlite3.connect(root / "gold-1" / JOURNAL_FILE) as journal:
+        journal.execute("UPDATE scans SET channels = ?", (channels,))
+    journal.close()
+    damaged, whole = sorted(find_runs(root), key=lambda run: run.folder)
+    assert (damaged.name, whole.scans) == ("gold-1", 1)
+    assert "is damaged" in (damaged.damage or "")
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000])
+def test_nested_facts_of_a_run_hide_no_other(root: Path, text: str) -> None:
+    (root / "gold-1" / RUN_FILE).write_text(text, encoding="utf-8")
+    assert {run.folder for run in find_runs(root)} == {"gold-1", "spring/mica-1"}
 
 
 def test_days_select_runs(root: Path) -> None:

@@ -20,6 +20,7 @@ from afspm import wire
 from afspm.basics.errors import FileError
 from afspm.components.tip_verdict import BAD, GOOD, verdict_message
 from afspm.model import Problem, Region, RegistrationOutcome, RescanKind, Scan, ScopeState, Spectrum
+from afspm.record import journal
 from afspm.record.bad_scans import VERDICT_MESSAGE
 from afspm.record.journal import JOURNAL_FILE, open_to_write, read_only
 from afspm.record.overview import Overview
@@ -42,6 +43,17 @@ def test_killed_run_is_readable(night: Night, store: RecordStore, tmp_path: Path
     for file in tmp_path.glob(f"{JOURNAL_FILE}*"):  # with all that was not yet put into the main file
         (left / file.name).write_bytes(file.read_bytes())
     assert len(afspm.open_run(left).scans) == 1
+
+
+def test_run_that_is_opened_without_with_is_closed_in_silence(
+    night: Night, store: RecordStore, tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    store.take(night.whole_scan(1))
+    assert len(afspm.open_run(tmp_path).scans) == 1
+    with pytest.raises(sqlite3.OperationalError):
+        journal._Reader(str(tmp_path / "missing" / JOURNAL_FILE))
+    gc.collect()
+    assert not recwarn.list
 
 
 def test_copy_of_a_read_only_journal_is_removed_when_closed_or_collected(

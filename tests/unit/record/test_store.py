@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from afspm.model import (
     ScopeState,
 )
 from afspm.record.store import _PROCESS, RecordSettings, RecordStore
+from afspm.storage import formats
 from afspm.storage.formats import read
 
 
@@ -103,6 +105,26 @@ def test_packets_are_read_back_as_published(night: Night, store: RecordStore, tm
     assert same(list(run.packets()), given)
     assert same(list(run.packets(messages=["ControlState"])), given[:1])
     assert same(list(run.packets(since_ns=given[6][0].time_ns or 0)), given[7:])
+
+
+def test_single_packets_are_read_back_as_published_from_one_reading_of_their_file(
+    night: Night, store: RecordStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = [night.control(), night.state(ScopeState.SCANNING), night.lines(2), *night.scans(1)]
+    given += [night.state(ScopeState.FREE)]
+    height = wire.decode("Scan2d", given[3][0].payload).values
+    lines = wire.decode("ScanLines", given[2][0].payload)
+    given[2] = (replace(given[2][0], payload=wire.encode(replace(lines, values=height[:2]))[1]), given[2][1])
+    store.take(given)
+    files: list[Path] = []
+    monkeypatch.setattr(formats, "read", lambda path: (files.append(path), read(path))[1])
+    run = afspm.open_run(tmp_path)
+    packet_of = run.packet_lookup()
+    for _ in range(2):
+        assert same([packet_of(packet.time_ns or 0, packet.envelope) for packet, _ in given], given)
+    assert len(files) == 1
+    with pytest.raises(FileError, match=r"lacks the packet Scan2d_none of \d+ ns"):
+        packet_of(START_NS, "Scan2d_none")
 
 
 def test_scan_without_values_is_read_back_as_published(night: Night, store: RecordStore, tmp_path: Path) -> None:

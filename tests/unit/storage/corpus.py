@@ -1,8 +1,7 @@
-"""Files to cut and damage: those of real microscopes, if present, and small ones in the controllers' formats."""
+"""Files to cut and damage: small ones in the controllers' formats, and for `make real-data` real ones."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
@@ -10,20 +9,17 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
+from benchmarks.data_folder import DATA
 from systems import not_on_wine
-from tests.unit.storage.samples import DATA, WHOLE
+from tests.unit.storage.samples import WHOLE
 
 import afspm
-from afspm.storage.formats import FileContent, suffixes
-
-_FILES = sorted(path.relative_to(DATA).as_posix() for path in DATA.rglob("*") if path.suffix in suffixes())
-REAL = sorted({re.sub(r"\w+\.h5$|\d+", "", name): name for name in reversed(_FILES)}.values())
-"""One of each series, and one .h5, all of which one program made: the others are built the same."""
+from afspm.storage.formats import FileContent
 
 
 @cache
 def whole(name: str) -> bytes:
-    """Return the bytes of a file in `WHOLE` or `REAL`."""
+    """Return the bytes of a file in `WHOLE`, or of one in the folder of real files."""
     if name not in WHOLE:
         return (DATA / name).read_bytes()
     with TemporaryDirectory() as folder:

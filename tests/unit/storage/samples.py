@@ -14,8 +14,6 @@ from afspm.plugins.park.emulator import files as park
 from afspm.simulation.activities import ScanActivity, SpectrumActivity
 from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 
-DATA = Path(__file__).parents[4] / "shared" / "data"
-
 NX, NY = 6, 4
 # [y, x], both ascending; no two pixels alike, none of them zero
 HEIGHT_M = (np.arange(NX * NY, dtype=np.float64).reshape(NY, NX) + 1.0) * 2.0**-30

@@ -2,86 +2,42 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.unit.storage import damage
 from tests.unit.storage.corpus import reading, to_damage, whole
-from tests.unit.storage.samples import DATA, WHOLE
+from tests.unit.storage.samples import WHOLE
 
 from afspm.basics.errors import FileError
 from afspm.model import Region, Scan
 from afspm.record import nexus_writer
 from afspm.storage.formats import read
 
-h5py = pytest.importorskip("h5py")
-pytest.importorskip("scipy")
 
-SOME = [
-    "asylum/DTMicroscope_scan_0001.ibw",
-    "asylum/fmt-igor-fd_SiN_FD_plot.ibw",
-    "nanonis/ProbeFlow_nanonis.sxm",
-    "nanonis/Bias-Spectroscopy002.dat",
-    "gxsm/gxsm3/scan002-M-Xp-Topo.nc",
-    "gxsm/gxsm4/scan002-M-Xp-ZSmTopo.nc",
-    "gxsm/gxsm4/scan006-VP001-VP.vpdata",
-]
-
-
-def need(name: str) -> None:
-    if name not in WHOLE and not (DATA / name).is_file():
-        pytest.skip(f"{DATA / name} is missing")
-
-
-@pytest.mark.parametrize("name", [*WHOLE, *SOME])
+@pytest.mark.parametrize("name", WHOLE)
 @settings(max_examples=20)
 @given(data=st.data())
 def test_a_file_that_was_cut_off_is_refused_or_holds_the_same(name: str, data: st.DataObject) -> None:
-    """The same content if only unneeded bytes are cut off; a table of text cut at a line is a shorter table."""
-    need(name)
-    content = whole(name)
-    length = data.draw(
-        st.one_of(st.integers(0, len(content) - 1), st.integers(max(len(content) - 40, 0), len(content) - 1))
-    )
-    with contextlib.suppress(FileError):
-        cut, full = reading(content[:length], name), reading(content, name)
-        for part, complete in zip(cut, full, strict=True):
-            rows = len(part.values) if name.endswith(".dat") else None
-            np.testing.assert_array_equal(part.values, complete.values[:rows])
+    damage.require_same_or_refusal_of_cut(name, data)
 
 
-@pytest.mark.parametrize("name", [n for n in [*WHOLE, *SOME] if not n.endswith(".dat")])
+@pytest.mark.parametrize("name", [name for name in WHOLE if not name.endswith(".dat")])
 def test_values_that_are_cut_off_are_refused(name: str) -> None:
-    need(name)
-    content = whole(name)
-    for length in (len(content) // 2, len(content) // 3):
-        with pytest.raises(FileError):
-            reading(content[:length], name)
+    damage.require_refusal_without_values(name)
 
 
-@pytest.mark.parametrize("name", to_damage([*WHOLE, *SOME]))
+@pytest.mark.parametrize("name", to_damage(WHOLE))
 @settings(max_examples=30)
 @given(data=st.data())
 def test_damaged_bytes_are_refused_or_read_and_nothing_else(name: str, data: st.DataObject) -> None:
-    need(name)
-    content = bytearray(whole(name))
-    # headers are at the beginning, of some formats at the end
-    places = st.one_of(
-        st.integers(0, min(len(content), 3000) - 1),
-        st.integers(max(len(content) - 1000, 0), len(content) - 1),
-        st.integers(0, len(content) - 1),
-    )
-    for place in data.draw(st.lists(places, min_size=1, max_size=8)):
-        content[place] = data.draw(st.integers(0, 255))
-    with contextlib.suppress(FileError):
-        for one in reading(bytes(content), name):
-            assert one.values.ndim == 2
-            assert one.values.dtype == np.float64
+    damage.require_values_or_refusal_of_damaged(name, data)
 
 
 @pytest.mark.parametrize("size", [0, 2**63])

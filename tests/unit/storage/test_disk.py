@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import os
 import sys
 import threading
@@ -10,11 +11,10 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from deadlines import DEADLINE_S
 
 from afspm.storage import disk
 from afspm.storage.disk import DiskThread, DiskTimeout, Syncer, run_bounded
-
-DEADLINE_S = 10.0
 
 
 class Hanging:
@@ -64,6 +64,24 @@ def test_tasks_for_a_hanging_disk_are_bounded() -> None:
     hanging.goes_on.set()
     assert work.close(DEADLINE_S)
     assert hanging.done == ["hung", "60", "30"]
+
+
+def test_thread_ends_after_its_tasks_once_its_owner_is_gone() -> None:
+    before = set(threading.enumerate())
+    go_on, done = threading.Event(), list[int]()
+    work = DiskThread(deadline_s=0.01)
+    with pytest.raises(DiskTimeout):
+        work.run(go_on.wait)
+    work.submit(lambda: done.append(1))
+    assert run_bounded(lambda: 7, 10.0) == 7
+    left = set(threading.enumerate()) - before
+    del work
+    gc.collect()
+    go_on.set()
+    for thread in left:
+        thread.join(60.0)
+    assert not any(thread.is_alive() for thread in left)
+    assert done == [1]
 
 
 def test_single_read_has_a_time_limit() -> None:

@@ -7,7 +7,6 @@ import logging
 import os
 import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -36,10 +35,8 @@ def test_writer_goes_on_while_the_disk_hangs_and_lines_come_later_in_order(
 ) -> None:
     log, disk = LineLog(tmp_path / "log.jsonl", _LOGGER), Disk()
     monkeypatch.setattr(os, "write", disk.write)
-    began_s = time.monotonic()
-    for number in range(20):
+    for number in range(20):  # none of them waits for the disk, or it would wait without end
         log.add(["line", number])
-    assert time.monotonic() - began_s < 2.0
     assert caplog.text.count("requests are recorded late") == 1
     disk.answers.set()
     log.add(["line", 20])

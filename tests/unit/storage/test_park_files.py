@@ -10,7 +10,9 @@ from pathlib import Path
 import gwyfile
 import numpy as np
 import pytest
+from deadlines import DEADLINE_S
 from PIL import Image
+from pspylib import tiff
 
 import afspm
 from afspm.basics.errors import FileError
@@ -101,9 +103,6 @@ def test_curves_that_are_not_whole_are_refused(tmp_path: Path) -> None:
 
 def test_the_makers_own_reader_reads_the_same(written: dict[str, Path], tmp_path: Path) -> None:
     """The reader needs a coloured picture in several strips, which every Park file has."""
-    tiff = pytest.importorskip(
-        "pspylib.tiff", reason="pspylib, Park's own reader, is not installed (pip install pspylib)"
-    )
     image = tiff.TiffReader(str(written["Z Height_Forward"])).data
     np.testing.assert_allclose(np.reshape(image.scanData.ZData, (12, 20)) * 1e-6, HEIGHTS, atol=1e-13)
     assert len(image.metaData.thumbnail) == HEIGHTS.size
@@ -121,7 +120,7 @@ def test_the_makers_own_reader_reads_the_same(written: dict[str, Path], tmp_path
 def test_gwyddion_shows_the_same(written: dict[str, Path], tmp_path: Path) -> None:
     converted = tmp_path / "converted.gwy"
     command = ["gwyddion", f"--convert-to-gwy={converted}", str(written["Z Height_Forward"])]
-    subprocess.run(command, check=True, capture_output=True, timeout=60)
+    subprocess.run(command, check=True, capture_output=True, timeout=DEADLINE_S)
     shown = gwyfile.load(str(converted))
     field = shown["/0/data"]
     assert (field["xres"], field["yres"]) == (20, 12)

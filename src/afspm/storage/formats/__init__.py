@@ -83,13 +83,18 @@ def _read(name: str, path: Path, zone: tzinfo | None) -> FileContent:
 
 def _with_unique_channels(content: FileContent) -> FileContent:
     # users may give two signals of a controller the same name
-    taken: set[str] = set()
-    scans = []
-    for scan in content.scans:
-        name, number = scan.channel, 1
+    names = _unique([scan.channel for scan in content.scans])
+    scans = (replace(scan, channel=name) for scan, name in zip(content.scans, names, strict=True))
+    spectra = (replace(spectrum, names=_unique(spectrum.names)) for spectrum in content.spectra)
+    return replace(content, scans=tuple(scans), spectra=tuple(spectra))
+
+
+def _unique(names: Sequence[str]) -> tuple[str, ...]:
+    taken: dict[str, None] = {}
+    for first in names:
+        name, number = first, 1
         while name in taken:
             number += 1
-            name = f"{scan.channel} #{number}"
-        taken.add(name)
-        scans.append(scan if name == scan.channel else replace(scan, channel=name))
-    return replace(content, scans=tuple(scans))
+            name = f"{first} #{number}"
+        taken[name] = None
+    return tuple(taken)

@@ -69,13 +69,27 @@ def name_and_unit(column: str) -> tuple[str, str]:
     return (column[: unit.start()] + column[unit.end() :]).strip(), unit[1].strip()
 
 
-def local_ns(text: str, layout: str, zone: tzinfo | None) -> int:
+def text_of(raw: bytes | bytearray | memoryview) -> str:
+    """Decode a text of unknown encoding (a µ in a name): as UTF-8, otherwise as cp1252 of Windows."""
+    raw = bytes(raw)
+    for encoding in ("utf-8", "cp1252"):
+        try:
+            return raw.decode(encoding)
+        except UnicodeDecodeError:
+            pass
+    return raw.decode("latin-1")  # five bytes have no meaning in cp1252
+
+
+def local_ns(text: str, layout: str, zone: tzinfo | None, *, fold: int = 0) -> int:
     """Return a date and time of the controller's clock in ns since the Unix epoch.
+
+    Args:
+        fold: 1: the second reading of an hour that the end of summer time repeats.
 
     Raises:
         ValueError: the text does not follow the layout (as in `datetime.strptime`).
     """
-    return clock_ns(datetime.strptime(text.strip(), layout), zone)  # noqa: DTZ007  (the zone comes next)
+    return clock_ns(datetime.strptime(text.strip(), layout).replace(fold=fold), zone)  # noqa: DTZ007  (the zone comes next)
 
 
 def clock_ns(time: datetime, zone: tzinfo | None) -> int:

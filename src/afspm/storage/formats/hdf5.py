@@ -37,7 +37,8 @@ def opened(path: Path) -> h5py.File:
     if not is_hdf5(path):
         raise FileError("is not an HDF5 file", where=str(path))
     _check_heaps(path.read_bytes(), path)
-    file = h5py.File(path, "r")
+    # without a lock: files are written whole, and another program (or a file system without locks) may hold one
+    file = h5py.File(path, "r", locking=False)
     try:
         _check_links(file, path)
     except BaseException:  # after any error, Ctrl-C too, the caller has no file to close

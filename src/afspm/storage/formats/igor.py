@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from afspm.basics.errors import FileError
+from afspm.storage.formats.content import text_of
 
 _DATA = 384  # offset of the values, after a header of 64 bytes and one of 320
 _LABEL = 32
@@ -43,13 +44,15 @@ def read_wave(data: bytes) -> Wave:
     Raises:
         FileError: the file has another version or no real numbers, is incomplete, or its checksum is wrong.
     """
-    if len(data) < _DATA:
+    if len(data) < 2:
         raise FileError(f"is incomplete: {len(data)} bytes are too few for an Igor wave")
     # the version, a 16-bit number below 256, comes first: its first byte is 0 in a big-endian file
     order = "<" if data[0] else ">"
     (version,) = struct.unpack_from(f"{order}h", data)
     if version != 5:
         raise FileError(f"is an Igor wave of version {version}, not 5", hint="save it again in Igor, as version 5")
+    if len(data) < _DATA:
+        raise FileError(f"is incomplete: {len(data)} bytes are too few for an Igor wave")
     # the 16-bit words of both headers sum to zero (Technical Note 003)
     if int(np.frombuffer(data, f"{order}i2", _DATA // 2).sum(dtype=np.int64)) & 0xFFFF:
         raise FileError("has a damaged header: the checksum is wrong")
@@ -71,16 +74,8 @@ def read_wave(data: bytes) -> Wave:
         steps=struct.unpack_from(f"{order}4d", data, 148),
         dimension_units=tuple(_text(data[216 + 4 * k : 220 + 4 * k]) or _text(parts[3 + k]) for k in range(4)),
         labels=labels,
-        note=decoded(parts[1]),
+        note=text_of(parts[1]),
     )
-
-
-def decoded(text: bytes) -> str:
-    """Return text from bytes: UTF-8 as of Igor 7, else Latin-1 in place of the unknown system's encoding."""
-    try:
-        return text.decode("utf-8")
-    except UnicodeDecodeError:
-        return text.decode("latin-1")
 
 
 def _values(data: bytes, order: str) -> tuple[np.ndarray, int]:
@@ -105,10 +100,11 @@ def _labels(text: bytes, count: int) -> list[str]:
     # the first label names the dimension itself; a NUL ends a label, and the bytes after it are left from a longer text
     if not text:
         return []
-    if len(text) != _LABEL * (count + 1):
+    # the elements after the last one with a label have none
+    if len(text) % _LABEL or len(text) > _LABEL * (count + 1):
         raise FileError(f"{len(text)} bytes of labels for a dimension of {count}")
     return [_text(text[k * _LABEL : (k + 1) * _LABEL]) for k in range(1, count + 1)]
 
 
 def _text(raw: bytes) -> str:
-    return decoded(raw.split(b"\0", 1)[0])
+    return text_of(raw.split(b"\0", 1)[0])

@@ -8,9 +8,11 @@ from datetime import UTC
 from functools import cache
 from itertools import pairwise
 
+import igor2.binarywave
 import numpy as np
 import pytest
-from tests.unit.storage.samples import DATA
+from benchmarks.data_folder import DATA
+from scipy import io as scipy_io
 
 import afspm
 from afspm.model import Scan
@@ -18,14 +20,9 @@ from afspm.plugins.drift.estimators import estimator
 from afspm.plugins.drift.registration import DriftScan
 from afspm.storage.formats import FileContent
 
-pytest.importorskip("h5py")
-pytest.importorskip("scipy")
-
 
 @cache
 def real(name: str) -> FileContent:
-    if not (DATA / name).is_file():
-        pytest.skip(f"{DATA / name} is missing")
     return afspm.read(DATA / name, zone=UTC)
 
 
@@ -39,9 +36,8 @@ def alike(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_wave_of_asylum_agrees_with_another_reader() -> None:
-    igor2 = pytest.importorskip("igor2.binarywave")
     content = real("asylum/DTMicroscope_scan_0001.ibw")
-    raw = igor2.load(str(DATA / "asylum/DTMicroscope_scan_0001.ibw"))["wave"]["wData"]
+    raw = igor2.binarywave.load(str(DATA / "asylum/DTMicroscope_scan_0001.ibw"))["wave"]["wData"]
     assert [scan.channel for scan in content.scans] == [
         "HeightRetrace", "Amplitude1Retrace", "Amplitude2Retrace", "Phase1Retrace", "Phase2Retrace", "FrequencyRetrace",
     ]  # fmt: skip
@@ -56,12 +52,11 @@ def test_wave_of_asylum_agrees_with_another_reader() -> None:
 
 @pytest.mark.parametrize(("name", "points"), [("SiN_FD_plot", 2016), ("U3_3_p10004", 10097)])
 def test_force_curves_of_asylum(name: str, points: int) -> None:
-    igor2 = pytest.importorskip("igor2.binarywave")
     content = real(f"asylum/fmt-igor-fd_{name}.ibw")
     (curve,) = content.spectra
     assert curve.names == ("Raw", "Defl", "ZSnsr", "Time")
     assert curve.values.shape == (points, 4)
-    raw = igor2.load(str(DATA / f"asylum/fmt-igor-fd_{name}.ibw"))["wave"]["wData"]
+    raw = igor2.binarywave.load(str(DATA / f"asylum/fmt-igor-fd_{name}.ibw"))["wave"]["wData"]
     np.testing.assert_array_equal(curve.values[:, :3], raw)
     assert content.header["StartHeadTemp"].endswith("°C")
 
@@ -91,7 +86,6 @@ PIXEL_M = 2e-6 / 255
 
 @pytest.mark.parametrize("spec", [{"class": "brief", "transform": "affine"}, {"class": "correlation"}])
 def test_the_drift_between_real_scans_is_found(spec: dict[str, str]) -> None:
-    pytest.importorskip("skimage")
     pair = seen("PMN28Pt0001", "DeflectionRetrace"), seen("PMN28Pt0002", "DeflectionRetrace")
     found = estimator(spec).register(*pair)
     assert found.accepted, found.reason
@@ -101,7 +95,6 @@ def test_the_drift_between_real_scans_is_found(spec: dict[str, str]) -> None:
 @pytest.mark.parametrize("kind", ["brief", "orb", "sift", "correlation"])
 @pytest.mark.parametrize("channel", ["HeightRetrace", "DeflectionRetrace", "PhaseRetrace"])
 def test_scans_of_different_samples_are_refused(kind: str, channel: str) -> None:
-    pytest.importorskip("skimage")
     first = seen("PZT_final0001", channel)
     for name in ("PMN28Pt0002", "PTO_Funakubo0005"):
         other = seen(name, channel)
@@ -153,7 +146,6 @@ def test_spectra_of_nanonis(name: str, kind: str, shape: tuple[int, int]) -> Non
 
 
 def test_scans_of_both_versions_of_gxsm() -> None:
-    scipy_io = pytest.importorskip("scipy.io")
     third = real("gxsm/gxsm3/scan002-M-Xp-Topo.nc").scans[0]
     with scipy_io.netcdf_file(DATA / "gxsm/gxsm3/scan002-M-Xp-Topo.nc", mmap=False) as file:
         raw = file.variables["FloatField"].data[0, 0] * file.variables["dz"].getValue() * 1e-10
