@@ -530,10 +530,15 @@ class SimulatedInstrument:
     def _check_free(self, now_s: float) -> None:
         doing = self.doing(now_s)
         if doing:
-            raise InstrumentBusy(f"the instrument is busy with a {doing}")
+            raise busy_with(doing)
         # a stopped scan may still be computed, and only one thread at a time may use the world
         self.drawing.wait()
         self.account(now_s)
+
+
+def busy_with(doing: str) -> InstrumentBusy:
+    """Return the error for a request during an activity, such as a scan or an approach."""
+    return InstrumentBusy(f"the instrument is busy with {'an' if doing[0] in 'aeiou' else 'a'} {doing}")
 
 
 def _finite(what: str, *values: float) -> None:

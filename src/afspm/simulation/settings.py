@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
 from afspm.basics.errors import ConfigError, ErrorCollector, individual_errors
+from afspm.basics.type_aliases import unaliased
 
 T = TypeVar("T")
 
@@ -100,6 +101,7 @@ def _is_required(cls: Any, name: str) -> bool:
 
 
 def _convert(hint: Any, value: object, where: str) -> object:
+    hint = unaliased(hint)
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:

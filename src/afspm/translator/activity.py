@@ -124,6 +124,14 @@ class Activity(ABC):
     def forget(self) -> None:
         self._results.forget()
 
+    def stopped_by_hand(self) -> str:
+        """Return what shows that a person ended the measurement just interrupted; empty: nothing does.
+
+        A measurement that a request has stopped is forgotten, so that nothing of it is known to be missing.
+        """
+        missing = self._results.missing
+        return f"{self.program} ended it without a request of the run, and {missing}" if missing else ""
+
     def at_rest(self, state: ScopeState = ScopeState.FREE) -> ScopeStatus:
         """Return the state while nothing is measured.
 

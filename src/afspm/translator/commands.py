@@ -14,7 +14,9 @@ from afspm.basics import units
 from afspm.basics.errors import AfspmError, ConfigError, Refused
 from afspm.basics.plain_data import PlainMapping
 from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, request_name
+from afspm.model.microscope_status import STARTS
 from afspm.translator.driver_base import LOST, Action, DriverBase
+from afspm.translator.panel_watch import PanelWatch
 from afspm.translator.parameters import Value
 from afspm.translator.sequence import SequenceStep, StatusSequence
 from afspm.translator.setters import apply, wanted_values
@@ -44,6 +46,7 @@ class Commands:
     """The executor of requests to one microscope.
 
     Args:
+        panel: knows of a tip that a person has withdrawn.
         sequence: decides whether the microscope is free, and the order of published states.
         about_to_act: called after all checks, right before the first change.
     """
@@ -53,12 +56,14 @@ class Commands:
         driver: DriverBase,
         sequence: StatusSequence,
         temporary: TemporarySettings,
+        panel: PanelWatch,
         about_to_act: Callable[[Request], None],
         log: logging.Logger,
     ) -> None:
         self._driver = driver
         self._sequence = sequence
         self._temporary = temporary
+        self._panel = panel
         self._about_to_act = about_to_act
         self._log = log
         driver.for_a_while = temporary.begin
@@ -76,12 +81,19 @@ class Commands:
             return CommandOutcome(Response(refused.response, reason=refused.reason, id=request.id))
         except LOST:
             raise
+        except AfspmError as error:
+            # The controller's or the driver's own message says all that a person can use, and a traceback nothing more.
+            self._log.error("%s failed: %s", request_name(request.kind), error)
+            return self._failed(request, str(error))
         except Exception as error:
             # broad: a driver may raise anything, and must not end the process; its error is the reason of the refusal
             self._log.exception("%s failed", request_name(request.kind))
-            is_action = request.kind == ControlRequest.ACTION
-            code = ControlResponse.ACTION_ERROR if is_action else ControlResponse.PARAM_ERROR
-            return CommandOutcome(Response(code, reason=f"{type(error).__name__}: {error}", id=request.id))
+            return self._failed(request, f"{type(error).__name__}: {error}")
+
+    def _failed(self, request: Request, reason: str) -> CommandOutcome:
+        is_action = request.kind == ControlRequest.ACTION
+        code = ControlResponse.ACTION_ERROR if is_action else ControlResponse.PARAM_ERROR
+        return CommandOutcome(Response(code, reason=reason, id=request.id))
 
     def _dispatch(self, request: Request) -> CommandOutcome:
         if request.kind == ControlRequest.ACTION_SUPPORT:
@@ -126,6 +138,8 @@ class Commands:
         if action.only_stops and state not in action.interrupts:
             return done
         self._refuse_if_busy(action.while_busy)
+        if action.name in STARTS:
+            self._refuse_without_tip()
         self._about_to_act(request)
         action.do()
         if state in action.interrupts:
@@ -133,6 +147,19 @@ class Commands:
         elif action.state is not None:
             done.steps = self._sequence.begin(action.state)
         return done
+
+    def _refuse_without_tip(self) -> None:
+        # what the last look showed; a driver refuses by itself what else it knows, such as a safe tip
+        tip = self._panel.tip
+        if tip.remedy:
+            raise Refused(ControlResponse.NOT_FREE, f"{tip.by_hand}; {tip.remedy}")
+        if tip.engaged is False and not self._driver.start_engages:
+            if not self._panel.was_engaged and not self._driver.withdrew_tip():
+                # a person has begun the run so, for example to commission the controller
+                self._log.warning("the tip has been withdrawn since before this run: the measurement is in the air")
+                return
+            reason = self._driver.withdrew_tip() or "the tip is withdrawn: bring it to the sample first"
+            raise Refused(ControlResponse.ACTION_ERROR, reason)
 
     def _find_action(self, name: str) -> Action:
         if name not in self.actions:

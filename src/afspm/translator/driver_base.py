@@ -210,6 +210,9 @@ class DriverBase(ABC):
     memory_is_all: ClassVar[bool] = False
     """True if all state of the (simulated) microscope is in `memory`: an action missing there was not executed."""
 
+    start_engages: ClassVar[bool] = False
+    """True if the start of a scan brings a withdrawn tip to the sample."""
+
     program_s: ClassVar[float] = 0.0
     """Real seconds that the controller's program may need for work beside measuring, such as saving a file. They do not
     depend on the speed of the experiment's clock."""
@@ -331,6 +334,26 @@ class DriverBase(ABC):
             once for each such measurement: True if it was complete, False if it was interrupted; None without one.
         """
         return None
+
+    def stopped_by_hand(self) -> str:
+        """Return how the controller shows that a person ended the measurement just interrupted; "" if unknown.
+
+        Override where such an end differs from an end by the controller itself. Called once for an interruption that no
+        request caused; the controller has answered all the time.
+        """
+        return ""
+
+    def withdrew_tip(self) -> str:
+        """Return why the controller itself has withdrawn the tip, and what to do; "" if it has not.
+
+        Override for a controller that withdraws the tip by itself, for example by a safe tip: the last reading of
+        `x-engaged` or `status` decides. No person has withdrawn the tip then.
+        """
+        return ""
+
+    def is_last_written(self, name: str, value: Value) -> bool:
+        """Return whether the run has set this parameter last, and to this value."""
+        return name in self._last_written and self.table[name].same(self._last_written[name], value)
 
     def lines(self, start: int) -> Sequence[ScanLines]:
         """Return the complete lines of a running scan after the first `start`, in the order of scanning.

@@ -7,14 +7,16 @@ from pathlib import Path
 
 from afspm.basics.errors import AfspmError, FileError
 from afspm.basics.plain_data import PlainMapping
-from afspm.model import Scan, Spectrum
+from afspm.model import Region, Scan, Spectrum
 from afspm.translator.result_files import (
     SCAN,
     Content,
     Entry,
     FilePrecision,
     ResultFiles,
-    lines_missing,
+    as_list,
+    as_region,
+    missing_text,
     modified_ns,
     newest,
     read_result,
@@ -44,6 +46,17 @@ class FolderFiles(ResultFiles):
     def look(self, folder: Path) -> int:
         """Register the files in a folder as no results; return the time of the newest file, in ns."""
         return self.newest_ns(folder, self._files(folder))
+
+    def see_frame(self, region: Region) -> None:
+        """Register the frame in force during a scan, for a controller that may move the running scan to a new frame.
+
+        A scan during which the frame was changed has no result.
+        """
+        running = self._kept["running"]
+        if running is None or running["what"] != SCAN:
+            return
+        if not self.precision.same(as_region(running.setdefault("under_way", as_list(region))), region):
+            running["new_frame"] = True
 
     def end(self, now_ns: int) -> None:
         if self._kept["running"] is not None:
@@ -87,6 +100,8 @@ class FolderFiles(ResultFiles):
     def _goes_on(self, running: Entry) -> None:
         # the controller repeats scans: only a newer file belongs to the next image
         running["newest_ns"] = self.look(Path(running["folder"]))
+        for of_one in ("under_way", "new_frame"):
+            running.pop(of_one, None)
 
     def _take(self, measured: Entry) -> bool:
         # True also for an incomplete scan: there is nothing more to wait for
@@ -99,7 +114,11 @@ class FolderFiles(ResultFiles):
         # a file that changed while it was read is still being written
         if not content or [modified_ns(path) for path in paths] != [written_ns for _, written_ns in files]:
             return False
-        if lines_missing(content):  # the controller saved an interrupted scan
+        if missing := missing_text(content):  # the controller saved an interrupted scan
+            self.broken_off, self.missing = True, missing
+            return True
+        if measured.get("new_frame"):
+            self._log.error("%s is not published: its frame was changed at the panel while it ran", paths[0].name)
             self.broken_off = True
             return True
         self.check(paths[0], content[0], measured)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
@@ -11,17 +12,31 @@ from dataclasses import replace
 from afspm import wire
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import AfspmError
-from afspm.model import ScopeState, ScopeStatus, names
+from afspm.model import (
+    ActByHand,
+    ControlRequest,
+    MeasurementConditions,
+    PanelAct,
+    Request,
+    ScopeState,
+    ScopeStatus,
+    TipStatus,
+    names,
+)
 from afspm.storage.disk import is_full
 from afspm.translator import setting_groups
 from afspm.translator.driver_base import LOST, MEASURING, DriverBase
 from afspm.translator.outbox import Outbox, Outgoing
-from afspm.translator.parameters import Value
+from afspm.translator.panel_watch import EXTRA, PanelWatch
+from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.translator.polling import AdaptivePolling, OverdueScan
 from afspm.translator.sequence import DiscardResults, LogError, PublishResults, PublishStatus, SequenceStep
 from afspm.translator.state import TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
 from afspm.transport.port import ServerPort
+
+_ROUNDING_S = 1e-5
+"""More than the rounding of an experiment time, which has 16 digits since 1970."""
 
 
 class Observer:
@@ -29,6 +44,7 @@ class Observer:
 
     Attributes:
         values: values at the last reading.
+        panel: what was done at the microscope by hand.
     """
 
     def __init__(
@@ -49,6 +65,11 @@ class Observer:
         self._polling = AdaptivePolling(driver.common.poll_period_s, driver.eager_poll_s)
         self._live = LiveLines(driver)
         self.values: dict[str, Value] = {}
+        self.panel = PanelWatch(state.kept, driver.table, driver.is_last_written)
+        self._published_tip: TipStatus | None = None
+        self._began_with: TipStatus | None = None
+        self._acts: list[ActByHand] = []
+        self._others_told = False
         self._polled_for = ScopeState.UNDEFINED
         self._all_at_s = 0.0
         self._result_since_s: float | None = None
@@ -66,14 +87,17 @@ class Observer:
                 self._port.publish(*packet)
             self._state.save()
         self._temporary.end()  # impossible before a kill, or while the controller was lost
+        self.panel.lost()
+        self._began_with = None
         self._take_in(self._read())
+        self.panel.read({}, self.values, ScopeState.UNDEFINED, self._clock.now_ns())
         self.publish_all()
 
     def look(self) -> None:
         """Read the controller, and publish the changes since the last reading."""
         published = self._state.sequence.published
         self._temporary.end_if_due()
-        if self._clock.monotonic_s() >= self._all_at_s:
+        if self.reads_settings:
             self.observe()
         elif (status := self._status()) != published:
             # the end of a measurement changes no setting; any other change of state may
@@ -105,6 +129,32 @@ class Observer:
                 wait_s = min(wait_s, until_s if until_s > 0.0 else self._driver.eager_poll_s)
         return max(0.0, wait_s)
 
+    @property
+    def reads_settings(self) -> bool:
+        """True if a look now reads all settings; otherwise it reads the state alone."""
+        return self._clock.monotonic_s() >= self._all_at_s
+
+    def idle_until_s(self) -> float:
+        """Return the real time until which a look does nothing, provided that the controller answers as before.
+
+        The time may be some microseconds early; it has passed if a look may do something now.
+        """
+        waits_for = (self._state.sequence.deadline_s(), self._temporary.until_s, self._result_since_s)
+        if waits_for != (None, None, None):
+            return -math.inf
+        due_s = self._live.due_s
+        lines_s = math.inf if due_s is None else self.real_time_s(due_s)
+        return min(lines_s, self._overdue.due_s)
+
+    def real_time_s(self, at_s: float) -> float:
+        """Return the real monotonic time of an experiment time, or some microseconds earlier."""
+        return self._clock.monotonic_s() + self._clock.real_s(at_s - self._clock.now_s()) - _ROUNDING_S
+
+    def skip_look(self) -> None:
+        """Plan the next look as after a look that found no change, for a bench that knows that there is none."""
+        if self.reads_settings:
+            self._plan_reading()
+
     def observe(self, announce: Sequence[str] = (), *, values: bool = True, status: ScopeStatus | None = None) -> None:
         """Publish all changes.
 
@@ -113,20 +163,32 @@ class Observer:
             values: False leaves out the settings, whose reading takes a question for each parameter.
             status: the status just read, since a driver reports an interruption only once; None: read the status now.
         """
+        before, sequence = self.values, self._state.sequence
         if values:
             self._observe_values(announce)
         # the state first: a result that appears in between waits for the next look, and is not lost
         status = self._status() if status is None else status
-        is_over = self._state.sequence.published.state in MEASURING and status.state not in MEASURING
+        is_over = sequence.published.state in MEASURING and status.state not in MEASURING
         if is_over:
             self._polling.over(self._clock.monotonic_s())
+            # after the state: the tip may have been withdrawn between the reading of the values and the end
+            if self._tip_has_changed():
+                self._observe_values(())
+                values = True
+        if values:
+            withdrew = self._driver.withdrew_tip()
+            self._tell(self.panel.read(before, self.values, status.state, self._clock.now_ns(), withdrew))
+        was, is_requested = sequence.published, sequence.is_requested
         # a fast simulated clock waits here: otherwise much experiment time would pass before the results are published
         with self._clock.late() if is_over else nullcontext():
             results = self._outbox.look()
             is_whole = True if self._is_of_earlier_scan(status, results) else self._driver.followed()
             steps = [] if is_whole is None else self._state.sequence.follow(is_whole=is_whole)
-            steps += self._state.sequence.observe(status, results and not steps, self._clock.now_s())
-            self.play(steps)
+            steps += sequence.observe(status, results and not steps, self._clock.now_s())
+            self._tell(self._acts_shown_by(steps, was, is_requested=is_requested))
+            self.play(self._without_spoiled(steps))
+        # only now: a free microscope whose result is awaited, or whose scan this look shows to have ended, is no proof
+        self.panel.is_certain = self.panel.is_certain or sequence.published.state is ScopeState.FREE
 
     def _is_of_earlier_scan(self, status: ScopeStatus, results: bool) -> bool:
         # A controller that repeats scans at the panel may never be free: a result that has waited for long during a
@@ -140,6 +202,70 @@ class Observer:
         if self._result_since_s is None:
             self._result_since_s = now_s
         return now_s - self._result_since_s >= self._driver.patience_s(self._driver.common.result_timeout_s / 2)
+
+    def asked(self, request: Request) -> None:
+        """Note that a request of the run is about to change something."""
+        self.panel.asked(str(request.subject) if request.kind == ControlRequest.ACTION else "")
+        self._others_told = False
+
+    def look_before_start(self) -> None:
+        """Publish all changes, and what a person has just done to the tip, before a measurement is begun."""
+        self.observe(values=self._tip_has_changed())
+
+    def _acts_shown_by(self, steps: Sequence[SequenceStep], was: ScopeStatus, *, is_requested: bool) -> list[ActByHand]:
+        # only changes of state that no request caused: the steps of a request are played apart
+        states = [step.status for step in steps if isinstance(step, PublishStatus)]
+        if not (states and self.panel.is_certain):
+            return []
+        now_ns, acts = self._clock.now_ns(), []
+        is_told = bool(self._state.kept.get("spoiled"))  # a tip withdrawn by hand may end the scan as well
+        if is_requested and not is_told and any(one.state is ScopeState.INTERRUPTED for one in states):
+            evidence = self._driver.stopped_by_hand()
+            acts += [ActByHand(now_ns, PanelAct.STOP, evidence)] if evidence else []
+        if is_requested and states[0].paused and not was.paused:
+            acts.append(ActByHand(now_ns, PanelAct.PAUSE))
+        begun = next((one.state for one in states if one.state in MEASURING and was.state is ScopeState.FREE), None)
+        if begun is not None and not self._others_told:
+            self._others_told = True  # a panel that repeats scans would tell each
+            acts.append(ActByHand(now_ns, PanelAct.SCAN if begun is ScopeState.SCANNING else PanelAct.SPECTRUM))
+        return acts
+
+    def _without_spoiled(self, steps: Sequence[SequenceStep]) -> list[SequenceStep]:
+        # what was measured while a person withdrew the tip, or switched the feedback off, is never complete
+        spoiled = self._state.kept.get("spoiled")
+        if not spoiled or not any(isinstance(step, PublishResults) for step in steps):
+            return list(steps)
+        reason = LogError(f"the measurement is not published: {spoiled} while it ran")
+        interrupted = PublishStatus(ScopeStatus(ScopeState.INTERRUPTED))
+        instead: list[SequenceStep] = [reason, interrupted, DiscardResults()]
+        return [one for step in steps for one in (instead if isinstance(step, PublishResults) else [step])]
+
+    def _tell(self, acts: Sequence[ActByHand]) -> None:
+        for act in acts:
+            self._log.warning("by hand: %s", act)
+            if self._state.sequence.published.state in MEASURING:
+                self._acts.append(act)
+                if act.act in (PanelAct.WITHDRAW, PanelAct.FEEDBACK_OFF):
+                    self._state.kept["spoiled"] = str(act)
+                    self._live.end()
+        if acts:
+            self._state.save()
+        for act in acts:
+            self._port.publish(*wire.encode(act), self._state.stamp()[0])
+        self._publish_tip()
+
+    def _publish_tip(self) -> None:
+        tip = self.panel.tip
+        if tip not in (self._published_tip, TipStatus()):
+            self._published_tip = tip
+            self._port.publish(*wire.encode(tip), self._state.stamp()[0])
+
+    def _tip_has_changed(self) -> bool:
+        shown = [name for name in (names.ENGAGED, FEEDBACK_ON) if name in self._driver.table]
+        return any(self.values.get(name) != value for name, value in self._driver.in_force(shown).items())
+
+    def _conditions(self, time_ns: int, filename: str) -> MeasurementConditions:
+        return MeasurementConditions(time_ns, filename, self._began_with, self.panel.tip, tuple(self._acts))
 
     def play(self, steps: Sequence[SequenceStep]) -> None:
         """Carry out the steps of a status sequence: save all their changes at once, then publish.
@@ -155,7 +281,7 @@ class Observer:
             if isinstance(step, PublishStatus):
                 packets.append(self._packet(step.status))
             elif isinstance(step, PublishResults):
-                packets += self._outbox.take()
+                packets += self._outbox.take(self._conditions)
             elif isinstance(step, DiscardResults):
                 self._outbox.discard()
             elif isinstance(step, LogError):
@@ -167,11 +293,20 @@ class Observer:
         for step in steps:
             if isinstance(step, PublishStatus):
                 self._adapt_polling(step.status.state)
+                self._begin_conditions(step.status.state)
+
+    def _begin_conditions(self, state: ScopeState) -> None:
+        if state in MEASURING or state is ScopeState.FREE:
+            self._began_with, self._acts = self.panel.tip if state in MEASURING else None, []
+            if self._state.kept.pop("spoiled", None):
+                self._state.save()
 
     def publish_all(self) -> None:
         """Publish the present settings and the published state again, for a newly connected scheduler."""
         for thing in setting_groups.messages(self.values).values():
             self.publish(thing)
+        self._published_tip = None
+        self._publish_tip()
         published = self._state.sequence.published
         if published.state is not ScopeState.UNDEFINED:
             self.publish(published)
@@ -179,7 +314,8 @@ class Observer:
         if published.state in MEASURING and self._polled_for not in MEASURING:
             self._polled_for = published.state
             self._polling.began(object(), self._clock.monotonic_s())
-            if published.state is ScopeState.SCANNING:  # of an earlier process: its lines come again, from the first
+            # of an earlier process: its lines come again, from the first
+            if published.state is ScopeState.SCANNING and not self._state.kept.get("spoiled"):
                 self._live.begin(self._clock.now_ns())
 
     def publish(self, thing: setting_groups.Published | ScopeStatus) -> None:
@@ -193,12 +329,16 @@ class Observer:
         return self._temporary.status or self._driver.status()
 
     def _observe_values(self, announce: Sequence[str]) -> None:
-        values = self._read()
-        before = setting_groups.messages(self.values)
+        values, old = self._read(), self.values
         self._take_in(values)
-        for name, thing in setting_groups.messages(values).items():
-            if name in announce or before.get(name) != thing:
-                self.publish(thing)
+        if announce or values != old:
+            before = setting_groups.messages(old)
+            for name, thing in setting_groups.messages(values).items():
+                if name in announce or before.get(name) != thing:
+                    self.publish(thing)
+        self._plan_reading()
+
+    def _plan_reading(self) -> None:
         wait_s, next_s = self._driver.common.poll_period_s, self._driver.next_change_s()
         if next_s is not None:
             wait_s = min(wait_s, max(0.0, self._clock.real_s(next_s - self._clock.now_s())))
@@ -207,7 +347,7 @@ class Observer:
     def _read(self) -> dict[str, Value]:
         # a difference below the controller's resolution is no change
         table, old = self._driver.table, self.values
-        values = self._driver.in_force(setting_groups.watched(table))
+        values = self._driver.in_force([*setting_groups.watched(table), *(name for name in EXTRA if name in table)])
         return {
             name: old[name] if name in old and table[name].same(old[name], value) else value
             for name, value in values.items()
@@ -222,10 +362,10 @@ class Observer:
         before, self._polled_for, now_s = self._polled_for, state, self._clock.monotonic_s()
         if over := self._overdue.state_changed(now_s, is_scanning=state is ScopeState.SCANNING):
             self._log.info("%s", over)
-        if state is ScopeState.SCANNING:
-            self._live.begin(self._clock.now_ns())
-        else:
+        if state is not ScopeState.SCANNING:
             self._live.end()
+        elif before is not ScopeState.SCANNING:  # a pause and its end are published too, during the same scan
+            self._live.begin(self._clock.now_ns())
         if state in MEASURING:
             lasts_s, extent = self._expected_scan() if state is ScopeState.SCANNING else (None, ())
             self._polling.began((state, *extent), now_s, lasts_s)

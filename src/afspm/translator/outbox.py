@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.plain_data import Plain
-from afspm.model import Scan, Spectrum
+from afspm.model import MeasurementConditions, Scan, Spectrum
 from afspm.translator.driver_base import DriverBase
 from afspm.wire import encode
+from afspm.wire.messages import CONDITIONS
 
 KEPT_FOR_REPLAY = 8
 """The number of last results published again after a restart, for a scheduler that had not received them."""
@@ -26,6 +27,14 @@ class Outgoing(NamedTuple):
     envelope: str
     payload: bytes
     time_ns: int
+
+
+class _Loaded(NamedTuple):
+    """A result as messages, with the time and the file of its measurement."""
+
+    messages: list[tuple[str, bytes]]
+    time_ns: int | None
+    filename: str
 
 
 class Outbox:
@@ -48,7 +57,7 @@ class Outbox:
         self._kept = kept
         self._stamp = stamp
         self._log = log
-        self._read: dict[str, list[tuple[str, bytes]]] = {}
+        self._read: dict[str, _Loaded] = {}
         self._complained: set[str] = set()
 
     def start(self) -> list[Outgoing]:
@@ -65,11 +74,12 @@ class Outbox:
             return []
         again = []
         for sent in self._kept["sent"]:
-            messages = self._load(sent["result"])
-            if messages is None:
+            loaded = self._load(sent["result"])
+            if loaded is None:
                 self._log.warning("%s can't be read again; it is not published again", sent["result"])
             else:
-                again += _packets(messages, sent["times"])
+                conditions = CONDITIONS.name, bytes.fromhex(sent["conditions"])
+                again += _packets([conditions, *loaded.messages], sent["times"])
         return again
 
     def look(self) -> bool:
@@ -80,19 +90,26 @@ class Outbox:
         if len(known) > len(listed):  # a result that the microscope lists no longer need not be remembered
             self._kept["known"] = [result for result in self._kept["known"] if result in set(listed)]
         for result in new:
-            if result not in self._read and (messages := self._load(result)) is not None:
-                self._read[result] = messages
+            if result not in self._read and (loaded := self._load(result)) is not None:
+                self._read[result] = loaded
         return bool(self._read)
 
-    def take(self) -> list[Outgoing]:
-        """Return the packets of the new results; save the memory before publishing them."""
+    def take(self, conditions: Callable[[int, str], MeasurementConditions]) -> list[Outgoing]:
+        """Return the packets of the new results; save the memory before publishing them.
+
+        Args:
+            conditions: returns the conditions of a measurement, by the time and the file of its result. They precede
+                it.
+        """
         packets = []
-        for result, messages in self._read.items():
+        for result, loaded in self._read.items():
             # one time each: subscribers recognise a duplicate by its time
-            times = self._stamp(len(messages))
-            packets += _packets(messages, times)
+            times = self._stamp(1 + len(loaded.messages))
+            told = encode(conditions(times[0] if loaded.time_ns is None else loaded.time_ns, loaded.filename))
+            packets += _packets([told, *loaded.messages], times)
             self._kept["known"].append(result)
-            self._kept["sent"] = [*self._kept["sent"], {"result": result, "times": times}][-KEPT_FOR_REPLAY:]
+            sent = {"result": result, "times": times, "conditions": told[1].hex()}
+            self._kept["sent"] = [*self._kept["sent"], sent][-KEPT_FOR_REPLAY:]
         self._read.clear()
         return packets
 
@@ -102,12 +119,14 @@ class Outbox:
         known = set(self._kept["known"])
         self._kept["known"] += [result for result in self._microscope.results() if result not in known]
 
-    def _load(self, result: str) -> list[tuple[str, bytes]] | None:
+    def _load(self, result: str) -> _Loaded | None:
         try:
             found: list[Scan | Spectrum] = list(self._microscope.load(result))
             if blank := [one.channel for one in found if isinstance(one, Scan) and one.is_blank]:
                 self._log.warning("%s has no value in %s: NaN alone", result, ", ".join(blank))
-            return [encode(one) for one in found]
+            first_ns = next((one.time_ns for one in found if one.time_ns is not None), None)
+            filename = next((one.filename for one in found if one.filename), result)
+            return _Loaded([encode(one) for one in found], first_ns, filename)
         except Exception as error:  # a reader may raise anything; a bad file must not end the process
             if result not in self._complained:
                 why = error if isinstance(error, AfspmError | OSError) else f"{type(error).__name__}: {error}"

@@ -129,6 +129,11 @@ class OverdueScan:
         self._began_s, self._again_s = (now_s, now_s + OVERDUE_S) if is_scanning else (math.inf, math.inf)
         return f"the controller reports the scan no longer; {NO_LONGER_TRUE}{lasted}" if lasted else ""
 
+    @property
+    def due_s(self) -> float:
+        """Real monotonic time from which `look` examines the scan; infinite without a scan."""
+        return self._again_s
+
     def look(self, now_s: float, expected_s: Callable[[], float | None]) -> str:
         """Return the log line about an overdue scan, once; "" otherwise.
 

@@ -6,6 +6,7 @@ import base64
 import hashlib
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 from afspm import wire
@@ -23,6 +24,7 @@ from afspm.model import (
 )
 from afspm.model.fencing import Epoch, SchedulerFence
 from afspm.model.idempotency_cache import TOO_OLD, Floors
+from afspm.model.microscope_status import STARTS
 from afspm.model.sessions import number_of, run_of
 from afspm.translator.commands import Commands
 from afspm.translator.connection import Connection
@@ -67,7 +69,7 @@ class RequestHandler:
         self._is_connected = is_connected
         self._reply = reply
         self._outcomes = RequestOutcomes(state.kept, all_or_nothing=driver.memory_is_all)
-        self.commands = Commands(driver, state.sequence, temporary, self._record_begin, log)
+        self.commands = Commands(driver, state.sequence, temporary, observer.panel, self._record_begin, log)
         self._acting: Request | None = None
         self._commander = b""
         self._last_refusal = ""
@@ -95,7 +97,7 @@ class RequestHandler:
             return
         known = self._outcomes.outcome(request)
         if known is not None:
-            self._reply(known, logging.INFO)
+            self._reply(known, logging.DEBUG)  # logged with the first answer; a client may repeat it each second
             return
         try:
             self._carry_out(request)
@@ -117,7 +119,8 @@ class RequestHandler:
         connection, observer = self._connection, self._observer
         # the last look may be old: the microscope must be free now
         if connection.stands and not _is_read_only(request):
-            connection.guarded(partial(observer.observe, values=False))
+            starts = request.kind == ControlRequest.ACTION and request.subject in STARTS
+            connection.guarded(observer.look_before_start if starts else partial(observer.observe, values=False))
         if request.subject != names.RETRACT:
             connection.require()
         elif request.kind == ControlRequest.ACTION:  # the question whether there is such an action needs no controller
@@ -139,6 +142,7 @@ class RequestHandler:
         self._driver.prove()
         self._acting = request
         TRACE.command(f"{request_name(request.kind)} {request.subject}")
+        self._observer.asked(request)
         in_doubt = self._state.feedback.may_switch(request)
         self._outcomes.begin(request)
         # saved before: after a kill a setting may be written again, but an action must not be repeated
@@ -156,6 +160,10 @@ class RequestHandler:
             is_lost = response.code == ControlResponse.NO_RESPONSE and request.kind != ControlRequest.ACTION
             if response.code == ControlResponse.PARAM_ERROR or is_lost:
                 self._outcomes.forget(request)
+            elif response.code == ControlResponse.NO_RESPONSE:
+                # a repetition may come when the controller is back: its answer must not say that it can't be reached
+                lost = "the controller was lost during this request: it may or may not have been carried out"
+                self._outcomes.finish(request, replace(response, reason=f"{lost} ({response.reason})"))
             else:
                 self._outcomes.finish(request, response)
             self._state.save()

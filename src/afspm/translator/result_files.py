@@ -41,13 +41,14 @@ class ResultFiles(ABC):
 
     Attributes:
         broken_off: True if the ended measurement was interrupted at the controller; until the next `results`.
+        missing: what the last interrupted measurement lacks, in words; empty: nothing, or that is not known.
     """
 
     def __init__(self, kept: Entry, log: logging.Logger) -> None:
         self._kept = kept
         self._log = log
         self._content: dict[str, Content] = {}
-        self.broken_off = False
+        self.broken_off, self.missing = False, ""
         for key, empty in (("running", None), ("ended", None), ("results", [])):
             kept.setdefault(key, empty)
 
@@ -107,6 +108,7 @@ class ResultFiles(ABC):
 
     def _begins(self, what: str, facts: Mapping[str, object]) -> None:
         self._kept["running"], self._kept["ended"] = {"what": what, **facts}, None
+        self.missing = ""
 
     def _ends(self, facts: Mapping[str, object]) -> None:
         self._kept["running"], self._kept["ended"] = None, {**self._kept["running"], **facts}
@@ -189,6 +191,12 @@ def as_region(kept: Sequence[float]) -> Region:
 def lines_missing(content: Iterable[Scan | Spectrum]) -> int:
     """Return the largest number of lines without any value in a scan: lines missing from an interrupted scan."""
     return max((one.lines_missing for one in content if isinstance(one, Scan)), default=0)
+
+
+def missing_text(content: Sequence[Scan | Spectrum]) -> str:
+    """Return how many lines an interrupted scan lacks, in words; empty for a complete scan."""
+    missing = lines_missing(content)
+    return f"{missing} of its {content[0].values.shape[0]} lines were not scanned" if missing else ""
 
 
 def modified_ns(path: Path) -> int:

@@ -143,5 +143,7 @@ class StatusSequence:
             return []
         if status == _INTERRUPTED:
             self._broken_off = self.published.state
-        self.published, self.is_requested = status, False
+        # a scan that is paused, or goes on, is the requested one still
+        self.is_requested = self.is_requested and status.state is self.published.state
+        self.published = status
         return [PublishStatus(status)]

@@ -19,7 +19,7 @@ from typing import IO, Final
 
 from afspm.basics.clock import NS_PER_S, Clock, ExperimentClock
 from afspm.basics.errors import FileError
-from afspm.basics.plain_data import Plain
+from afspm.basics.plain_data import Plain, from_json
 
 FILE: Final = "controller.trace.jsonl"
 FORMAT: Final = 1
@@ -85,7 +85,7 @@ def read_trace(file: Path) -> list[TraceLine]:
     """
     try:
         lines = file.read_text(encoding="utf-8").split("\n")[:-1]
-        found = [_line(json.loads(line)) for line in lines]
+        found = [_line(from_json(line)) for line in lines]
     except (OSError, ValueError, TypeError, KeyError, zlib.error) as error:
         raise FileError(f"can't be read as a trace: {error}", where=str(file)) from error
     if not found or not isinstance(found[0], TraceHeader) or found[0].trace != FORMAT:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import logging
+import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -154,6 +155,10 @@ class Translator:
     def look(self) -> None:
         """Poll the controller, and publish the changes since the last poll."""
         self._connection.guarded(self._look)
+
+    def idle_until_s(self) -> float:
+        """Return the real time until which `look` does nothing, provided that the controller answers as before."""
+        return self.observer.idle_until_s() if self._connection.stands else -math.inf
 
     def wait_s(self) -> float:
         """Return the real seconds until the next poll or connection attempt."""

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 import zmq
+from deadlines import DEADLINE_S
 from makers import MAKERS
-from systems import PATIENCE, can_interrupt, interrupt
+from systems import can_interrupt, interrupt
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.launch import Launch, Sockets
 
-DEADLINE_S = 30.0 * PATIENCE
 HERE = Path(__file__).parent
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(HERE), "PYTHONUNBUFFERED": "1"}
 WORDS = " listens at "

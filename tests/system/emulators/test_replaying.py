@@ -10,9 +10,9 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
+from deadlines import DEADLINE_S
 from makers import MAKERS
 from rotation import rotated
-from systems import PATIENCE
 
 from afspm.record.run_json import run_json_or_empty
 from afspm.translator.trace import FILE, TracedExchange, TracedFile, TraceHeader, read_trace
@@ -62,7 +62,7 @@ class Ender(Component):
 def run(folder: Path, command: str, *files: Path) -> tuple[subprocess.CompletedProcess[str], Path]:
     arguments = [*AFSPM, command, *map(str, files), "--runs", str(folder / "runs")]
     try:
-        done = subprocess.run(arguments, capture_output=True, encoding="utf-8", timeout=90.0 * PATIENCE, check=False)
+        done = subprocess.run(arguments, capture_output=True, encoding="utf-8", timeout=DEADLINE_S, check=False)
     except subprocess.TimeoutExpired as error:
         pytest.fail(f"{error}:\n{error.stdout!r}\n{error.stderr!r}")
     runs = sorted((folder / "runs").glob("*-*"))

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from afspm_process import AFSPM
+from deadlines import DEADLINE_S
 from makers import MAKERS
 from numpy.typing import NDArray
-from systems import PATIENCE
 
 ROOT = Path(__file__).parents[3]
 FILES = ROOT / "experiments" / "every_microscope"
-DEADLINE_S = 90.0 * PATIENCE
 NOISE_M = 0.8e-9
 """The rms between two scans of the same place whose lines are not taken at the same moments."""
 OVERLAY = """

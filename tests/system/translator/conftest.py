@@ -12,13 +12,13 @@ from typing import Any
 
 import pytest
 import zmq
+from deadlines import DEADLINE_S
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 
-DEADLINE_S = 30.0
 MESSAGES: dict[str, Any] = {
     "ScopeStateMsg": control_pb2.ScopeStateMsg,
     "ScanParameters2d": scan_pb2.ScanParameters2d,
@@ -161,7 +161,7 @@ class Running:
         return code
 
     def _reap(self) -> None:
-        self.process.wait(10)
+        self.process.wait(DEADLINE_S)
         assert self.process.stdin is not None
         self.process.stdin.close()
 
@@ -177,7 +177,7 @@ class Running:
         """End its standard input, as a parent that goes does; returns the exit code."""
         assert self.process.stdin is not None
         self.process.stdin.close()
-        return self.process.wait(10)
+        return self.process.wait(DEADLINE_S)
 
     def close(self) -> None:
         for peer in self._peers:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import zmq
+from deadlines import DEADLINE_S
 
 from afspm import wire
 from afspm.wire.generated import control_pb2
@@ -44,11 +45,13 @@ def test_slow_answers_come_late(faulty: Any) -> None:
     demand(peer, "late-reply", count=2, duration_s=1.0)
     for _ in range(2):
         began_s = time.monotonic()
-        assert peer.ask_frames(get_speed(), 10)[0] == b"\0"
+        assert peer.ask_frames(get_speed(), DEADLINE_S)[0] == b"\0"
         assert time.monotonic() - began_s >= 1.0
-    began_s = time.monotonic()
-    peer.get("scan-speed")
-    assert time.monotonic() - began_s < 1.0
+    deadline_s = time.monotonic() + DEADLINE_S
+    while time.monotonic() - began_s >= 1.0:  # on a busy computer an answer may be late by itself
+        assert time.monotonic() < deadline_s, "all answers are late"
+        began_s = time.monotonic()
+        peer.get("scan-speed")
 
 
 def test_a_lost_answer_was_carried_out_and_is_given_when_asked_again(faulty: Any) -> None:
@@ -56,7 +59,7 @@ def test_a_lost_answer_was_carried_out_and_is_given_when_asked_again(faulty: Any
     demand(peer, "no-reply")
     scan = [b"\1", control_pb2.ActionMsg(action=START_SCAN).SerializeToString(), b"me/1/scan"]
     assert peer.ask_frames(scan, 0.5) is None
-    assert peer.ask_frames(scan, 10)[0] == b"\0"
+    assert peer.ask_frames(scan, DEADLINE_S)[0] == b"\0"
     heard = peer.until(FREE)
     assert sum(name == "Scan2d" for name, _ in heard) == 5
     assert len(list((faulty.folder / "scans").glob("scan-*.nc"))) == 1
@@ -70,10 +73,10 @@ def test_refusals_end_after_their_number(faulty: Any) -> None:
 
 def test_a_hanging_translator_answers_afterwards(faulty: Any) -> None:
     peer = faulty.peer().ready()
+    began_s = time.monotonic()  # before it begins to hang, which on a busy computer is a while before the question
     demand(peer, "hang", duration_s=0.5)
-    began_s = time.monotonic()
     peer.get("scan-speed")
-    assert time.monotonic() - began_s >= 0.3
+    assert time.monotonic() - began_s >= 0.5
 
 
 def test_a_half_written_file_is_waited_for(faulty: Any) -> None:
@@ -87,7 +90,7 @@ def test_a_half_written_file_is_waited_for(faulty: Any) -> None:
 
 def test_a_scheduled_crash_comes_once(run: Any) -> None:
     running = run({"faults": [{"kind": "crash", "at_s": 1000.0}]})
-    assert running.wait(20) == 1
+    assert running.wait(DEADLINE_S) == 1
     running.start()
     running.peer().ready()
     assert running.process.poll() is None

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import DEADLINE_S
 
 from afspm.wire.generated import control_pb2, feedback_pb2, scan_pb2, spectroscopy_pb2
 
@@ -285,10 +286,10 @@ def test_end_of_the_experiment_stops_the_scan_and_the_translator(run: Any) -> No
     peer.until(SCANNING)
     assert peer.ask(100) == [bytes([OK])]
     assert states(peer.until(FREE)) == [INTERRUPTED, FREE]
-    assert running.wait(20) == 80
+    assert running.wait(DEADLINE_S) == 80
 
 
 def test_settings_that_cannot_be_end_it_for_good_with_a_hint(run: Any) -> None:
     running = run({"drift": {"velocity": [1, 2, 3]}})
-    assert running.wait(20) == 78
+    assert running.wait(DEADLINE_S) == 78
     assert "velocity_m_per_s" in running.log.read_text()

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import zmq
+from deadlines import DEADLINE_S
 
 from afspm import wire
 from afspm.model import ControlRequest, Request, Response, names
@@ -64,7 +65,7 @@ def started(run: Any, identity: str) -> Any:
 
 
 def until_free(asks: Ask) -> Response:
-    deadline_s = time.monotonic() + 30.0
+    deadline_s = time.monotonic() + DEADLINE_S
     while (response := asks(START)).code != 0 and time.monotonic() < deadline_s:
         pass
     return response
@@ -95,7 +96,7 @@ def test_a_translator_by_itself_obeys_the_first_until_that_has_gone(run: Any, as
     assert until_free(first).ok
     assert second(START).code == 1
     first.close()
-    deadline_s = time.monotonic() + 30.0
+    deadline_s = time.monotonic() + DEADLINE_S
     while (response := second(Request(ControlRequest.ACTION, names.STOP_SCAN))).code != 0:
         assert time.monotonic() < deadline_s, response.reason
     said = json.dumps(Path(running.log).read_text())

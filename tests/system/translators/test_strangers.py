@@ -12,11 +12,10 @@ from typing import Any
 
 import pytest
 from afspm_process import AFSPM
+from deadlines import DEADLINE_S
 from makers import MAKERS
 
 from afspm.simulation.emulation.emulator import find_emulator
-
-DEADLINE_S = 90.0
 
 
 def checked(folder: Path, *files: Path) -> dict[str, Any]:

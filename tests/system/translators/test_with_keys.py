@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 from afspm_process import AFSPM
+from deadlines import DEADLINE_S
 
-DEADLINE_S = 60.0
 EXPERIMENT = """
 [clock]
 speed = 60.0

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from deadlines import DEADLINE_S
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError, TransportError
@@ -46,7 +47,7 @@ def test_activity_ends_at_its_time_without_a_request(tmp_path: Path) -> None:
     # a scan of 20 experiment seconds: 20 ms
     with tiny.running(tmp_path, ExperimentClock.starting_now(0.0, speed=1000.0)) as address:
         assert ask(address, "scan") == ["1 scan"]
-        assert written.wait(10.0)
+        assert written.wait(DEADLINE_S)
     assert (tmp_path / "scan.txt").exists()
     assert tiny.rig.scan is not None
     assert tiny.ended[0] >= tiny.rig.scan.end_s
@@ -69,7 +70,7 @@ class WithButton(Tiny):
 
 
 def until(condition: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + 10.0
+    deadline_s = time.monotonic() + DEADLINE_S
     while not condition():
         assert time.monotonic() < deadline_s
         threading.Event().wait(0.01)

@@ -6,6 +6,8 @@ import select
 import socket
 from typing import Any, ClassVar
 
+from deadlines import DEADLINE_S
+
 from afspm.simulation.emulation.emulator import LOOPBACK, Crashed, Emulator
 
 
@@ -66,7 +68,7 @@ def ask(address: str, *lines: str) -> list[str]:
     """Send lines, each after the answer to the previous one; a missing answer is empty."""
     host, port = address.rsplit(":", 1)
     answers = []
-    with socket.create_connection((host, int(port)), timeout=10.0) as client:
+    with socket.create_connection((host, int(port)), timeout=DEADLINE_S) as client:
         for line in lines:
             client.sendall(line.encode() + b"\n")
             answers.append(client.recv(1000).decode().strip())

@@ -100,6 +100,13 @@ def test_second_activity_is_refused(rig: SimulatedInstrument) -> None:
             other()
 
 
+@pytest.mark.parametrize(("what", "named"), [("approach", "busy with an approach"), ("pulse", "busy with a pulse")])
+def test_busy_instrument_names_its_activity(rig: SimulatedInstrument, what: str, named: str) -> None:
+    rig.occupy(what, 1.0, 1000.0)
+    with pytest.raises(InstrumentBusy, match=named):
+        rig.occupy("scan", 1.0, 1000.0)
+
+
 def test_duration_of_a_move_is_proportional_to_its_length(rig: SimulatedInstrument, clock: Any) -> None:
     rig.setup.move_speed_m_s = 1e-6
     rig.move_probe((3e-6, 4e-6), clock.t_s)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.unit.storage.samples import HEIGHT_M, REGION, WHOLE
 
 from afspm.basics.errors import ConfigError, FileError
 from afspm.simulation.surfaces import surface_from
@@ -13,7 +14,6 @@ from afspm.simulation.surfaces.patterns import _frame_edges
 from afspm.simulation.surfaces.picture import read
 
 GENERATED = ["steps", "particles", "stamper", "lattice", "rough", "flat"]
-DATA = Path(__file__).parents[4] / "shared" / "data"
 
 
 def extent_m(kind: str) -> float:
@@ -135,41 +135,32 @@ def test_invalid_surface_file_is_refused(tmp_path: Path) -> None:
         read(tmp_path / "c.sxm")
 
 
-@pytest.mark.parametrize(
-    ("name", "width_m", "shape"),
-    [
-        ("nanonis/ProbeFlow_nanonis.sxm", None, (160, 160)),
-        ("nanonis/A151216.123306-02602.sxm", 2e-9 * 127 / 128, (128, 128)),
-        ("gxsm/gxsm3/scan002-M-Xp-Topo.nc", 40e-9, (30, 40)),
-        ("gxsm/gxsm4/scan002-M-Xp-ZSmTopo.nc", 50e-9, (48, 64)),
-        ("asylum/DTMicroscope_scan_0001.ibw", None, (256, 256)),
-        ("asylum/PZT_final0001.h5", 2e-6, (256, 256)),
-    ],
+IMAGES = (
+    "up.sxm",
+    "scan.ibw",
+    "nsid.h5",
+    "simulated.nc",
+    "gxsm3.nc",
+    "gxsm4.nc",
+    "image.nhf",
+    "image.nid",
+    "image.tiff",
 )
-def test_files_of_real_microscopes_are_read(name: str, width_m: float | None, shape: tuple[int, int]) -> None:
-    path = DATA / name
-    if not path.is_file():
-        pytest.skip(f"{path} is missing")
-    if path.suffix == ".h5" or "gxsm4" in name:
-        pytest.importorskip("h5py")
-    found = read(path)
-    assert found.height_m.shape == shape
-    assert found.size_m is not None
-    assert 1e-9 < found.size_m[0] < 1e-4
-    assert np.ptp(found.height_m) < 1e-5
-    if width_m:
-        assert found.size_m[0] == pytest.approx(width_m)
 
 
-@pytest.mark.parametrize(
-    ("name", "why"),
-    [("asylum/fmt-igor-fd_SiN_FD_plot.ibw", "no heights"), ("gxsm/gxsm3/scan002-Xp-ADC1.nc", "no heights")],
-)
-def test_real_file_without_heights_is_refused(name: str, why: str) -> None:
-    if not (DATA / name).is_file():
-        pytest.skip(f"{DATA / name} is missing")
-    with pytest.raises(FileError, match=why):
-        read(DATA / name)
+@pytest.mark.parametrize("name", IMAGES)
+def test_heights_of_every_format_make_a_surface(name: str, tmp_path: Path) -> None:
+    WHOLE[name](tmp_path / name)
+    found = read(tmp_path / name)
+    assert found.size_m == pytest.approx(REGION.size_m)
+    assert found.height_m.shape == HEIGHT_M.shape
+    np.testing.assert_allclose(np.ptp(found.height_m), np.ptp(HEIGHT_M), rtol=1e-6)
+
+
+def test_file_without_heights_is_refused(tmp_path: Path) -> None:
+    WHOLE["force.ibw"](tmp_path / "force.ibw")
+    with pytest.raises(FileError, match="no heights"):
+        read(tmp_path / "force.ibw")
 
 
 def test_wrong_surface_is_refused_with_the_nearest_name() -> None:

@@ -16,8 +16,10 @@ from afspm import wire
 from afspm.basics.errors import FileError, Refused
 from afspm.basics.exit_codes import ExitCode
 from afspm.model import (
+    ActByHand,
     ControlRequest,
     ControlResponse,
+    MeasurementConditions,
     Region,
     Request,
     Response,
@@ -25,6 +27,7 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
     Spectrum,
+    TipStatus,
     names,
 )
 from afspm.storage.memory import Memory
@@ -89,7 +92,8 @@ class FakeMicroscope(Driver):
         self.state = ScopeState.FREE
         self.values: dict[str, Value] = {
             "X": 0.0, "Y": 0.0, "W": 1000.0, "H": 500.0, "A": 0.0, "NX": 8, "NY": 4, "PX": 0.0, "PY": 0.0,
-            "P": 1.0, "Setpoint": 1.0, "Loop": True, "Speed": 1.0, "Mode": "IV", "Serial": "007", "Bias": 100.0,
+            "P": 1.0, "Setpoint": 1.0, "Loop": True, "Speed": 1.0, "Mode": "IV", "Serial": "007",
+            "Bias": 100.0, "Engaged": True,
         }  # fmt: skip
         self.files: dict[str, list[Scan | Spectrum] | None] = {}
         self.done: list[str] = []
@@ -138,6 +142,8 @@ class FakeMicroscope(Driver):
 
     @action(names.START_SCAN)
     def start_scan(self) -> None:
+        if self.fails is not None:
+            raise self.fails
         self.done.append("scan")
         self.state = ScopeState.SCANNING
 
@@ -175,12 +181,16 @@ def a_scan(channel: str = "Height") -> Scan:
     return Scan(Region((0.0, 0.0), (1e-6, 1e-6)), channel, "m", np.zeros((2, 3)), 5, "one.dat")
 
 
+_BESIDE = (TipStatus, ActByHand, MeasurementConditions)
+
+
 class Bench:
     """A translator on a fake network, with short calls for requests."""
 
     def __init__(self, folder: Path, settings: dict[str, Any] | None = None) -> None:
         self.clock = FakeClock()
         self.folder = folder
+        self.beside: list[TipStatus | ActByHand | MeasurementConditions] = []
         self.microscope = FakeMicroscope(**(settings or {}))
         self.start()
 
@@ -217,9 +227,14 @@ class Bench:
         self.translator.look()
 
     def heard(self) -> list[Any]:
-        """Return the packets since the last call: states by name, other packets by the name of their message."""
+        """Return the packets since the last call: states by name, other packets by the name of their message.
+
+        Those about the tip and the person at the panel are left out: see `beside`.
+        """
         packets, self.port.packets, self.port.kept = self.port.packets, [], []
-        return [thing.state.name if isinstance(thing, ScopeStatus) else name for name, thing, _ in packets]
+        self.beside += [thing for _, thing, _ in packets if isinstance(thing, _BESIDE)]
+        rest = [(name, thing) for name, thing, _ in packets if not isinstance(thing, _BESIDE)]
+        return [thing.state.name if isinstance(thing, ScopeStatus) else name for name, thing in rest]
 
 
 @pytest.fixture

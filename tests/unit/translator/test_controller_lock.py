@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import pytest
+from deadlines import DEADLINE_S
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.exit_codes import ExitCode
@@ -89,7 +90,9 @@ def test_a_run_that_failed_or_was_killed_leaves_nothing_locked(tmp_path: Path, f
         raise ZeroDivisionError
     environment = {**os.environ, "TMPDIR": str(tmp_path), "TEMP": str(tmp_path), "TMP": str(tmp_path),
                    "PROGRAMDATA": str(tmp_path)}  # fmt: skip
-    died = subprocess.run([sys.executable, "-c", DIES_HOLDING, "lab:1"], env=environment, check=False, timeout=60)
+    died = subprocess.run(
+        [sys.executable, "-c", DIES_HOLDING, "lab:1"], env=environment, check=False, timeout=DEADLINE_S
+    )
     assert died.returncode == 1
     assert "the-dead" in next(folder.iterdir()).read_text()
     with commanding("lab:1", "b"):

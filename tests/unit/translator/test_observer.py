@@ -11,7 +11,7 @@ import pytest
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError, InvalidValue
-from afspm.model import ControlRequest, Region, ScanLines, ScopeState, names
+from afspm.model import ControlRequest, Region, ScanLines, ScopeState, ScopeStatus, names
 from afspm.simulation.simulator import Simulator
 from afspm.translator.observer import LiveLines
 
@@ -76,6 +76,19 @@ def test_the_next_scan_begins_with_its_first_line(live: Any, scan: Any) -> None:
     again = published(live)[0]
     assert (again.first_row, len(again.values)) == (0, 1)
     assert again.began_ns == began_ns + 3_000_000_000
+
+
+def test_lines_go_on_after_a_pause(live: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    live.ask(ControlRequest.ACTION, names.START_SCAN)
+    live.there = 3
+    live.look(1.0)
+    [began_ns] = {lines.began_ns for lines in published(live)}
+    with monkeypatch.context() as patch:
+        patch.setattr(live.microscope, "status", lambda: ScopeStatus(ScopeState.SCANNING, paused=True))
+        live.look(5.0)
+    live.there = 5
+    live.look(1.0)
+    assert {(lines.began_ns, lines.first_row, len(lines.values)) for lines in published(live)} == {(began_ns, 3, 2)}
 
 
 def test_restarted_translator_publishes_the_lines_of_a_running_scan_from_its_first(live: Any) -> None:

@@ -29,6 +29,7 @@ from afspm.model import (
     ScanParameters,
     ScopeState,
     ScopeStatus,
+    TipStatus,
     names,
 )
 from afspm.model.events import NO_LONGER_TRUE
@@ -404,7 +405,8 @@ def test_only_fields_in_the_message_are_set(bench: Any) -> None:
 def test_feedback_is_switched_off_and_published(bench: Any) -> None:
     assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False)).code == OK
     assert bench.microscope.values["Loop"] is False
-    assert bench.port.packets[-1][1].on is False
+    assert bench.port.packets[-1][1] == TipStatus(feedback_on=False)
+    assert bench.heard()[-1] == "ZCtrlParameters"
     assert told(bench.ask(PARAM, Parameter("x-feedback-on", "true"))) == ("true", None)
     assert bench.microscope.values["Loop"] is True
 
@@ -920,6 +922,20 @@ def test_setting_lost_with_its_controller_is_carried_out_when_it_is_repeated(ben
     assert bench.ask(PARAM, Parameter("scan-speed"), "me/1/2").payload
 
 
+def test_repeated_action_lost_with_its_controller_is_unknown_and_not_unreachable(bench: Any) -> None:
+    bench.microscope.fails = ControllerLost("reset by peer")
+    lost = bench.ask(ACTION, names.START_SCAN, "me/1/1")
+    assert lost.code == ControlResponse.NO_RESPONSE
+    bench.microscope.fails = None
+    bench.look(after_s=1.0)
+    again = bench.ask(ACTION, names.START_SCAN, "me/1/1")
+    assert (again.code, again.detail) == (ControlResponse.NO_RESPONSE, ResponseDetail.NONE)
+    assert again.reason.startswith(
+        "the controller was lost during this request: it may or may not have been carried out"
+    )
+    assert bench.microscope.done == []
+
+
 def test_scan_that_does_not_end_is_logged_once(bench: Any, scan: Any, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     bench.microscope.values["Speed"] = 0.01
@@ -991,7 +1007,7 @@ def test_after_a_kill_the_last_results_are_published_again_at_the_same_times(ben
     assert after == before
 
 
-POINTS_TO_DIE_AT = 4
+POINTS_TO_DIE_AT = 5
 """One write and three packets; it is killed no more at the point after."""
 
 
@@ -1084,4 +1100,4 @@ def test_times_of_packets_increase_strictly(bench: Any, scan: Any) -> None:
     bench.look(after_s=0.0)
     times = [time_ns for _, _, time_ns in bench.port.packets]
     assert times == sorted(set(times))
-    assert len(times) == 4
+    assert len(times) == 5

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 import zmq
+from deadlines import DEADLINE_S
 
 from afspm.basics.errors import ConfigError
 from afspm.translator.driver_base import ControllerLost
@@ -61,7 +62,7 @@ def test_reply_of_several_frames_closes_the_connection(controller: zmq.Socket[by
     connection.begin("a scan", b"scan")
     who, *_ = controller.recv_multipart()
     controller.send_multipart([who, b"", b"one", b"two"])
-    connection.wait(5.0)
+    connection.wait(DEADLINE_S)
     with pytest.raises(ControllerLost, match="3 frames"):
         connection.reply("a scan", bytes)
     with pytest.raises(ControllerLost, match="was lost"):
@@ -76,7 +77,7 @@ def test_reply_that_can_not_be_decoded_closes_the_connection(controller: zmq.Soc
     connection.begin("a scan", b"scan")
     who, *_ = controller.recv_multipart()
     controller.send_multipart([who, b"", b"?"])
-    connection.wait(5.0)
+    connection.wait(DEADLINE_S)
     with pytest.raises(ControllerLost, match="garbage"):
         connection.reply("a scan", parse)
     with pytest.raises(ControllerLost, match="was lost"):

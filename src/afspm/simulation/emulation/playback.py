@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from afspm.basics.plain_data import Plain
+from afspm.basics.plain_data import Plain, from_json
 from afspm.translator.trace import TracedExchange, TracedFile, TraceLine
 
 _IDS: Final = ("messageID", "id")
@@ -182,7 +182,7 @@ def _json(content: bytes) -> Plain | None:
     if not content.startswith(b"{"):
         return None
     try:
-        found = json.loads(content)
+        found = from_json(content)
     except ValueError:
         return None
     return found if isinstance(found, dict) else None

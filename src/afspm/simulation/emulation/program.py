@@ -13,7 +13,7 @@ from afspm.basics.errors import AfspmError
 from afspm.simulation.activities import ScanActivity, SpectrumActivity
 from afspm.simulation.emulation.pending_writes import PendingWrites
 from afspm.simulation.faults import Faults
-from afspm.simulation.instrument import InstrumentBusy, SimulatedInstrument
+from afspm.simulation.instrument import InstrumentBusy, SimulatedInstrument, busy_with
 
 NamedFile = tuple[str, bytes]
 """The name of a file and its content."""
@@ -175,7 +175,7 @@ class MakerProgram(ABC):
     def _refuse_busy(self) -> None:
         doing = "scan" if self.scanning else self.rig.doing(self.now_s)
         if doing or self._engages:
-            raise InstrumentBusy(f"the instrument is busy with a {doing or 'approach'}")
+            raise busy_with(doing or "approach")
 
     def _begin_scan(self, now_s: float) -> None:
         # with values that can't be scanned, the scan ends as if stopped at the panel

@@ -6,6 +6,7 @@ tip continues, and a measurement has gone on meanwhile.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from importlib.metadata import version
@@ -272,7 +273,19 @@ class Simulator(Driver):
         return ScopeStatus(self._reached(refuses=False).state(self.clock.now_s()))
 
     def next_change_s(self) -> float | None:
-        return None if self._controller is None else self._controller.next_change_s()
+        # neither acts at the panel nor faults: no controller announces them, so polling has to find them
+        return None if self._controller is None else self._controller.instrument.ends_s
+
+    def next_event_s(self) -> float | None:
+        """Return the experiment time of the next event, acts at the panel and faults included; None if unknown.
+
+        Before this time all answers of the driver stay the same, except new lines of a scan, unless a request changes
+        them. This is for benches: a translator that knew this time would not have to poll.
+        """
+        if self._controller is None or self.faults is None or self._controller.instrument.drawing.goes_on:
+            return None
+        times = (self._controller.next_event_s(), self.faults.next_s(self.clock.now_s()))
+        return min((at_s for at_s in times if at_s is not None), default=math.inf)
 
     def get(self, vendor: str) -> Value:
         if vendor == names.CONTROLLER:

@@ -113,7 +113,7 @@ class SimulatedController:
                 self.retract(now_s)
         return _STATES[self.instrument.doing(now_s)]
 
-    def next_change_s(self) -> float | None:
+    def next_event_s(self) -> float | None:
         """Return the time of the next event, without the end of a scan that is being computed; None without events."""
         times = (self._panel_s(), self._files.whole_s(), self.instrument.ends_s)
         return min((at_s for at_s in times if at_s is not None), default=None)
@@ -136,7 +136,7 @@ class SimulatedController:
         ]
 
     def _advance(self, now_s: float) -> None:
-        while (at_s := self.next_change_s()) is not None and at_s <= now_s:
+        while (at_s := self.next_event_s()) is not None and at_s <= now_s:
             if at_s == self._files.whole_s():
                 self._files.complete()
             elif at_s == self._panel_s():

@@ -1,0 +1,304 @@
+"""What a person does at the panel is told as such, and what the run asked for, or nobody knows, is not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from afspm.model import (
+    ActByHand,
+    ControlRequest,
+    ControlResponse,
+    Feedback,
+    MeasurementConditions,
+    PanelAct,
+    ScopeState,
+    ScopeStatus,
+    TipStatus,
+    names,
+)
+
+OK = ControlResponse.SUCCESS
+ACTION, PARAM = ControlRequest.ACTION, ControlRequest.PARAM
+EVIDENCE = "the panel's own button was pressed"
+
+
+@pytest.fixture
+def bench(make_bench: Any) -> Any:
+    made = make_bench({"parameters": {"x-engaged": {"vendor": "Engaged", "type": "bool", "read_only": True}}})
+    made.look()
+    made.heard()
+    made.beside.clear()
+    return made
+
+
+def acts(bench: Any) -> list[PanelAct]:
+    bench.heard()
+    return [one.act for one in bench.beside if isinstance(one, ActByHand)]
+
+
+def begin_scan(bench: Any) -> None:
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+    bench.look()
+
+
+def end_scan(bench: Any, scan: Any) -> None:
+    bench.microscope.files["a"] = [scan()]
+    bench.microscope.state = ScopeState.FREE
+    bench.look()
+
+
+def test_a_value_changed_at_the_panel_is_published_once_with_old_and_new_value(bench: Any) -> None:
+    bench.microscope.values["Setpoint"] = 2.0
+    bench.look()
+    bench.look()
+    assert acts(bench) == [PanelAct.VALUES]
+    (change,) = next(one for one in bench.beside if isinstance(one, ActByHand)).changes
+    assert (change.parameter, float(change.before), float(change.after)) == ("zctrl-setpoint", 1e-9, 2e-9)
+
+
+def test_a_value_set_by_the_run_is_no_act_by_hand(bench: Any) -> None:
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(setpoint=2e-9)).code == OK
+    bench.look()
+    bench.look()
+    assert acts(bench) == []
+
+
+def test_what_changed_while_the_controller_was_lost_is_no_act_by_hand(bench: Any) -> None:
+    bench.microscope.lost = True
+    bench.look()
+    bench.microscope.lost = False
+    bench.microscope.values |= {"Setpoint": 2.0, "Engaged": False}
+    bench.look(5.0)
+    assert acts(bench) == []
+
+
+def test_a_tip_withdrawn_in_a_scan_spoils_it_and_begins_nothing(bench: Any, scan: Any) -> None:
+    begin_scan(bench)
+    bench.microscope.values["Engaged"] = False
+    bench.look()
+    assert acts(bench) == [PanelAct.WITHDRAW]
+    bench.heard()
+    end_scan(bench, scan)
+    assert bench.heard() == ["INTERRUPTED", "FREE"]
+    refused = bench.ask(ACTION, names.START_SCAN)
+    assert refused.code == ControlResponse.NOT_FREE
+    assert "approach at the panel" in refused.reason
+    bench.microscope.values["Engaged"] = True
+    bench.look()
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+
+
+@pytest.mark.parametrize("name", ["Engaged", "Loop"])
+def test_a_scan_is_spoiled_from_its_very_beginning(bench: Any, scan: Any, name: str) -> None:
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+    bench.heard()
+    bench.microscope.values[name] = False
+    bench.look()
+    end_scan(bench, scan)
+    assert bench.heard()[-2:] == ["INTERRUPTED", "FREE"]
+
+
+def test_a_tip_withdrawn_just_before_the_end_of_a_scan_spoils_it(bench: Any, scan: Any) -> None:
+    begin_scan(bench)
+    bench.heard()
+    bench.microscope.values["Engaged"] = False
+    end_scan(bench, scan)
+    assert bench.heard() == ["INTERRUPTED", "FREE"]
+
+
+def test_a_tip_withdrawn_within_the_look_that_shows_the_end_spoils_the_scan(
+    bench: Any, scan: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin_scan(bench)
+    bench.heard()
+    bench.microscope.files["a"] = [scan()]
+    real = bench.microscope.status
+
+    def withdrawn_meanwhile() -> ScopeStatus:  # the values are read before the state
+        bench.microscope.values["Engaged"], bench.microscope.state = False, ScopeState.FREE
+        status: ScopeStatus = real()
+        return status
+
+    monkeypatch.setattr(bench.microscope, "status", withdrawn_meanwhile)
+    bench.look()
+    assert bench.heard() == ["INTERRUPTED", "FREE"]
+    assert acts(bench) == [PanelAct.WITHDRAW]
+
+
+def test_a_tip_withdrawn_just_before_a_start_is_seen_by_the_start(bench: Any) -> None:
+    bench.microscope.values["Engaged"] = False
+    assert bench.ask(ACTION, names.START_SCAN).code == ControlResponse.NOT_FREE
+    assert bench.microscope.done == []
+    assert acts(bench) == [PanelAct.WITHDRAW]
+
+
+def test_a_withdrawal_that_takes_time_gives_one_act(bench: Any) -> None:
+    bench.microscope.state = ScopeState.COARSE_MOTOR
+    bench.look()
+    bench.microscope.values["Engaged"] = False
+    bench.look()
+    bench.microscope.values["Loop"] = False
+    bench.microscope.state = ScopeState.FREE
+    bench.look()
+    bench.look()
+    assert acts(bench) == [PanelAct.WITHDRAW], "the feedback of a withdrawn tip is no act of its own"
+
+
+def test_a_scan_that_a_withdrawal_ends_gives_no_stop_as_well(bench: Any, monkeypatch: Any) -> None:
+    monkeypatch.setattr(bench.microscope, "stopped_by_hand", lambda: EVIDENCE, raising=False)
+    begin_scan(bench)
+    bench.heard()
+    bench.microscope.values["Engaged"] = False
+    bench.microscope.state = ScopeState.INTERRUPTED
+    bench.look()
+    assert acts(bench) == [PanelAct.WITHDRAW]
+
+
+def test_a_tip_that_the_controller_itself_withdrew_is_no_act_by_hand(bench: Any, monkeypatch: Any) -> None:
+    monkeypatch.setattr(bench.microscope, "withdrew_tip", lambda: "the safe tip withdrew it", raising=False)
+    bench.microscope.values["Engaged"] = False
+    bench.look()
+    assert acts(bench) == []
+    refused = bench.ask(ACTION, names.START_SCAN)
+    assert (refused.code, refused.reason) == (ControlResponse.ACTION_ERROR, "the safe tip withdrew it")
+
+
+def test_a_spoiled_scan_stays_spoiled_over_a_restart_of_the_translator(bench: Any, scan: Any) -> None:
+    begin_scan(bench)
+    bench.microscope.values["Engaged"] = False
+    bench.look()
+    bench.microscope.values["Engaged"] = True
+    bench.start()
+    bench.heard()
+    end_scan(bench, scan)
+    assert bench.heard() == ["INTERRUPTED", "FREE"]
+
+
+def test_feedback_switched_off_by_the_run_is_no_act_by_hand(bench: Any, scan: Any) -> None:
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False)).code == OK
+    begin_scan(bench)
+    bench.heard()
+    end_scan(bench, scan)
+    assert bench.heard() == ["Scan2d", "FREE"]
+    assert acts(bench) == []
+
+
+def test_feedback_switched_off_at_the_panel_is_an_act_until_it_is_on_again(bench: Any) -> None:
+    bench.microscope.values["Loop"] = False
+    bench.look()
+    assert acts(bench) == [PanelAct.FEEDBACK_OFF]
+    refused = bench.ask(ACTION, names.START_SCAN)
+    assert refused.code == ControlResponse.NOT_FREE
+    assert "switch it on" in refused.reason
+    bench.microscope.values["Loop"] = True
+    bench.look()
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+
+
+def test_a_tip_withdrawn_by_the_run_is_no_act_by_hand(bench: Any) -> None:
+    assert bench.ask(ACTION, names.RETRACT).code == OK
+    bench.look()  # a slow withdrawal shows at a later look
+    bench.microscope.values["Engaged"] = False
+    bench.look()
+    assert acts(bench) == []
+    refused = bench.ask(ACTION, names.START_SCAN)
+    assert refused.code == ControlResponse.ACTION_ERROR
+    assert "bring it to the sample" in refused.reason
+
+
+def test_a_run_begun_with_a_withdrawn_tip_measures_in_the_air_until_the_tip_was_engaged(
+    bench: Any, scan: Any, caplog: Any
+) -> None:
+    (bench.folder / "translator.json").unlink()
+    bench.microscope.values["Engaged"] = False
+    bench.start()
+    begin_scan(bench)
+    end_scan(bench, scan)
+    assert "Scan2d" in bench.heard()
+    assert "the measurement is in the air" in caplog.text
+    for engaged in (True, False):
+        bench.microscope.values["Engaged"] = engaged
+        bench.look()
+    assert bench.ask(ACTION, names.START_SCAN).code == ControlResponse.NOT_FREE
+
+
+@pytest.mark.parametrize("evidence", [EVIDENCE, ""])
+def test_a_stop_is_by_hand_only_with_evidence(bench: Any, monkeypatch: Any, evidence: str) -> None:
+    monkeypatch.setattr(bench.microscope, "stopped_by_hand", lambda: evidence, raising=False)
+    begin_scan(bench)
+    bench.heard()
+    bench.microscope.state = ScopeState.INTERRUPTED
+    bench.look()
+    assert acts(bench) == ([PanelAct.STOP] if evidence else [])
+
+
+def test_a_stop_after_a_pause_is_by_hand(bench: Any, monkeypatch: Any) -> None:
+    monkeypatch.setattr(bench.microscope, "stopped_by_hand", lambda: EVIDENCE, raising=False)
+    begin_scan(bench)
+    with monkeypatch.context() as paused:
+        paused.setattr(bench.microscope, "status", lambda: ScopeStatus(ScopeState.SCANNING, paused=True))
+        bench.look()
+    bench.microscope.state = ScopeState.INTERRUPTED
+    bench.look()
+    assert acts(bench) == [PanelAct.PAUSE, PanelAct.STOP]
+
+
+def test_a_stop_asked_for_is_not_by_hand(bench: Any, monkeypatch: Any) -> None:
+    monkeypatch.setattr(bench.microscope, "stopped_by_hand", lambda: EVIDENCE, raising=False)
+    begin_scan(bench)
+    assert bench.ask(ACTION, names.STOP_SCAN).code == OK
+    bench.look()
+    assert acts(bench) == []
+
+
+def test_a_stop_of_a_scan_of_before_a_restart_is_unknown(bench: Any, monkeypatch: Any) -> None:
+    begin_scan(bench)
+    bench.start()
+    monkeypatch.setattr(bench.microscope, "stopped_by_hand", lambda: EVIDENCE, raising=False)
+    bench.heard()
+    bench.microscope.state = ScopeState.INTERRUPTED
+    bench.look()
+    assert acts(bench) == []
+
+
+def test_a_scan_begun_at_the_panel_is_published_once_until_the_run_acts(bench: Any, scan: Any) -> None:
+    for number in range(2):
+        bench.microscope.state = ScopeState.SCANNING
+        bench.look()
+        bench.microscope.files[f"{number}"] = [scan()]
+        bench.microscope.state = ScopeState.FREE
+        bench.look()
+    assert acts(bench) == [PanelAct.SCAN]
+
+
+def test_each_scan_has_the_tip_at_its_begin_and_end(bench: Any, scan: Any) -> None:
+    begin_scan(bench)
+    bench.microscope.values["Setpoint"] = 2.0
+    bench.look()
+    end_scan(bench, scan)
+    bench.heard()
+    found = [one for one in bench.beside if isinstance(one, MeasurementConditions)]
+    at_sample = TipStatus(engaged=True, feedback_on=True)
+    assert [(one.filename, one.begin, one.end) for one in found] == [("one.dat", at_sample, at_sample)]
+    assert [act.act for act in found[0].acts] == [PanelAct.VALUES]
+
+
+@pytest.mark.parametrize("shown", [ScopeState.INTERRUPTED, ScopeState.FREE])
+def test_a_scan_that_a_restarted_controller_lost_is_no_act_by_hand(
+    bench: Any, monkeypatch: Any, shown: ScopeState
+) -> None:
+    monkeypatch.setattr(bench.microscope, "stopped_by_hand", lambda: EVIDENCE, raising=False)
+    begin_scan(bench)
+    bench.microscope.lost = True
+    bench.look()
+    bench.microscope.lost = False
+    bench.look(5.0)
+    bench.microscope.state = shown
+    bench.look()
+    bench.microscope.state = ScopeState.FREE
+    for _ in range(20):  # a result is awaited meanwhile
+        bench.look(1.0)
+    assert bench.heard()[-2:] == ["INTERRUPTED", "FREE"]
+    assert acts(bench) == []
