@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
@@ -41,6 +42,19 @@ class _AtLeast:
 Switch = Annotated[bool, _Strict()]
 WholeNumber = Annotated[int, _AtLeast(0)]
 Count = Annotated[int, _AtLeast(1)]
+
+
+def from_json(text: str | bytes | bytearray) -> Any:
+    """Return the value of JSON that another program or person wrote.
+
+    Raises:
+        ValueError: the text is not JSON, or is nested too deeply.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        # A few kilobytes of brackets are enough; a reader that expects ValueError would end with a traceback.
+        raise ValueError("JSON that is nested too deeply") from error
 
 
 def file_key(name: str) -> str:

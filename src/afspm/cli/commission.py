@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -41,6 +42,7 @@ def commission(
     Writes a report for people and programs. Ends with 0 if nothing was wrong.
     """
     from afspm.basics.units import si
+    from afspm.testing.commissioning.procedure import REHEARSAL_PATIENCE
     from afspm.testing.commissioning.procedure import commission as walk
     from afspm.testing.commissioning.report import TRIED_ON
     from afspm.testing.translators import CheckOptions
@@ -48,6 +50,8 @@ def commission(
 
     options = CheckOptions(files, runs=runs, speed=speed, frame_m=si(frame, "m") if frame else None)
     simulated = is_simulated(prepare(options), options)
+    if simulated:
+        options = replace(options, patience=REHEARSAL_PATIENCE)
     terminal = Terminal()
     terminal.show(_INTRODUCTION)
     file = report or Path(f"{files[0].stem}-commissioning.toml")

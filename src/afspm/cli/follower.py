@@ -14,6 +14,7 @@ from afspm.client.experiment_link import ExperimentLink
 from afspm.model import Packet, ProblemNames
 from afspm.record.overview import Overview
 from afspm.record.run_lock import cut_off_message
+from afspm.supervisor.own_runs import own_messages
 from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import open_port
 from afspm.wire.message_types import register_all
@@ -41,7 +42,7 @@ class Follower:
 
     def __init__(self, folder: Path, name: str = "terminal", envelopes: tuple[str, ...] | None = None) -> None:
         guest = guest_of(folder, name)
-        register_all(guest.messages)
+        register_all(own_messages(folder, guest.messages))
         # no socket for requests: a follower sends none, and the scheduler need not know it
         sockets = dataclasses.replace(guest.sockets, control=None)
         envelopes = envelopes or wire.messages_without_values()

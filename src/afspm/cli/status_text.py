@@ -81,7 +81,15 @@ class StatusText:
         if silent_s > OLD_S:
             warning = f"no news for {duration_text(silent_s)}: the scheduler is restarting, or can't be reached"
             lines.append(Text(warning, "bold yellow"))
-        lines += [self._control(), *self._problems(), self._scanning(), *self._progress(), *self._end(), *self._drift()]
+        lines += [
+            self._control(),
+            *self._tip(),
+            *self._problems(),
+            self._scanning(),
+            *self._progress(),
+            *self._end(),
+            *self._drift(),
+        ]
         lines += self._processes()
         lines += self._refusals()
         lines += self._notes()
@@ -117,8 +125,14 @@ class StatusText:
         mode = seen.control.mode.name
         line.append(mode, "bold yellow" if mode == "MANUAL" else "")
         if mode == "MANUAL":
-            return line.append(self._since(seen.timelines.mode.changed_ns))
+            line.append(self._since(seen.timelines.mode.changed_ns))
+            return line.append(f": {seen.by_hand}", "yellow") if seen.by_hand else line
         return line.append(f", {seen.in_control or 'nobody'} is in control{self._since(seen.control_since_ns)}")
+
+    def _tip(self) -> Iterator[Text]:
+        tip = self._seen.tip
+        if tip is not None and tip.by_hand:
+            yield _label("tip").append(f"{tip}; {tip.remedy}" if tip.remedy else str(tip), "yellow")
 
     def _problems(self) -> Iterator[Text]:
         for _, name, span in flagged(self._seen):
@@ -241,6 +255,8 @@ class StatusText:
             "mode": control.mode.name if control else None,
             "holder": control.holder if control else None,
             "since": _iso(seen.control_since_ns),
+            "by_hand": seen.by_hand or None,
+            "tip": None if seen.tip is None else {"engaged": seen.tip.engaged, "feedback_on": seen.tip.feedback_on},
             "problems": [
                 {
                     "number": number,

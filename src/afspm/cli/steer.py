@@ -1,4 +1,4 @@
-"""`afspm pause`, `resume`, `end`, `restart`, `problems` and `note`: a person's actions on a run, in the user's name."""
+"""`afspm pause`, `continue`, `end`, `restart`, `problems` and `note`: actions on a run in the user's name."""
 
 from __future__ import annotations
 
@@ -13,25 +13,37 @@ from afspm.cli.joining import acting, looking
 if TYPE_CHECKING:
     from afspm.model import ControlMode
 
+TIP_UNKNOWN = "the microscope does not report its tip: look whether it is at the sample"
+
 
 def pause(where: Where = RUNS) -> None:
     """Pause a running experiment: MANUAL, so that no component commands the microscope.
 
     A measurement under way is stopped, unless the experiment file says otherwise, and repeated afterwards. Components
-    go on running, and wait. `afspm resume` lets them continue.
+    go on running, and wait. `afspm continue` lets them go on. Pause before you use the microscope's own program.
     """
     from afspm.model import ControlMode
 
-    _set_mode(where, ControlMode.MANUAL, "the experiment is paused (MANUAL); `afspm resume` continues it")
+    _set_mode(where, ControlMode.MANUAL, "the experiment is paused (MANUAL); `afspm continue` lets it go on")
 
 
-def resume(where: Where = RUNS) -> None:
-    """Let a paused experiment continue: AUTOMATED.
+def go_on(
+    where: Where = RUNS,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Don't ask.")] = False,
+) -> None:
+    """Let a paused experiment continue: AUTOMATED, also after a person has acted at the microscope.
 
-    The experiment must be running. After a kill or a power cut, continue it by `afspm run --resume RUN`.
+    Shows why it is paused and how the tip is, and then asks. It is refused while the tip is withdrawn, or the feedback
+    off, by hand. The experiment must be running: after a kill or a power cut use `afspm run --resume RUN`.
     """
     from afspm.model import ControlMode
 
+    with looking(where) as follower:
+        seen = follower.overview
+    if seen.by_hand:
+        typer.echo(f"{seen.by_hand}; now {seen.tip or TIP_UNKNOWN}")
+        if not yes:
+            typer.confirm("Let the run continue?", abort=True)
     _set_mode(where, ControlMode.AUTOMATED, "the experiment goes on (AUTOMATED)")
 
 

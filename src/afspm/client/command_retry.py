@@ -23,6 +23,7 @@ from afspm.model import (
     request_name,
 )
 from afspm.model.microscope_status import feedback_of
+from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
 from afspm.wire.messages import FEEDBACK
 
 PATIENCE_S = 60.0  # real time for the restart of a translator
@@ -30,6 +31,9 @@ RETRY_S = 1.0  # before a repetition, unless a state is published earlier
 STATE_WITHIN_S = 5.0  # before the warning that the microscope has published no state
 CONNECTED_WITHIN_S = 5.0  # before the warning that the scheduler has no connection to the translator (yet)
 SETTLED_WITHIN_S = 2.0  # for the publication of a setting; without a change there is none
+LOST_AFTER_S = 2 * CUT_OFF_SHOWS_WITHIN_S
+"""Real time that a free microscope must stay free until an action counts as not begun, once the translator has answered
+that it never learns the outcome. A controller that is back may begin late: Nanonis moves the tip first, up to 10 s."""
 ASK_FREE_AGAIN_S = 5.0  # in case the state FREE was lost
 ASK_BUSY_AGAIN_S = 25.0  # the same after another state than FREE
 
@@ -150,8 +154,8 @@ class CommandRetry:
 
         Args:
             is_seen: returns whether the effect of the request has been observed, which counts as an answer.
-            is_lost: returns whether the request had no effect; called if the translator still does not know the outcome
-                after `PATIENCE_S`.
+            is_lost: returns whether the request has had no effect so far. It counts as lost if that holds for
+                `LOST_AFTER_S` after the translator has answered that it does not know the outcome.
 
         Returns:
             The answer; NO_RESPONSE only if control was lost before any answer, or if the request `is_lost`.
@@ -168,6 +172,7 @@ class CommandRetry:
         is_repeated = has_warned = False
         self._wait_for_state(give_up_s)
         late_s = link.earlier(CONNECTED_WITHIN_S, give_up_s)
+        idle_until_s: float | None = None
         while True:
             response = link.request(kind, subject, request_id=request_id, until_s=until_s)
             # refused now; an earlier repetition may have been executed
@@ -182,25 +187,30 @@ class CommandRetry:
                 return response
             if is_seen():
                 return Response(ControlResponse.SUCCESS, id=request_id)
-            if link.clock.monotonic_s() >= give_up_s:
-                # the translator has answered, and does not know the outcome: it never will
-                is_final = response.detail is ResponseDetail.NONE and bool(response.reason)
-                is_in_time = until_s is None or link.clock.monotonic_s() < until_s
-                if is_final and is_in_time and is_lost():
-                    return response
+            # a repeated id gets its recorded answer, without a detail: the translator never learns the outcome
+            is_final = response.detail is ResponseDetail.NONE and bool(response.reason)
+            now_s = link.clock.monotonic_s()
+            if not (is_final and is_lost()):
+                idle_until_s = None
+            elif idle_until_s is None:
+                idle_until_s = now_s + LOST_AFTER_S
+            elif now_s >= idle_until_s and (until_s is None or now_s < until_s):
+                return response
+            # a controller that came back late gets the full time, too
+            end_s = give_up_s if idle_until_s is None else max(give_up_s, idle_until_s)
+            end_s = end_s if until_s is None else min(end_s, until_s)
+            if now_s >= end_s:
                 raise NoResponse(
                     f"the microscope does not answer {kind.name}: {response.reason or 'no reason given'}",
                     where=link.name,
                     hint="is its translator running? the request may or may not have been carried out",
                 )
-            if not has_warned and (
-                response.detail is not ResponseDetail.NOT_SENT or link.clock.monotonic_s() >= late_s
-            ):
+            if not has_warned and (response.detail is not ResponseDetail.NOT_SENT or now_s >= late_s):
                 why = response.reason or "no reason given"
                 link.log.warning("the microscope does not answer %s (%s); asking again", kind.name, why)
                 has_warned = True
             is_repeated = True
-            self._wait_for_news(link.earlier(RETRY_S, give_up_s))
+            self._wait_for_news(link.earlier(RETRY_S, end_s))
 
     def get_over(self, kind: ControlRequest, response: Response, states: int, until_s: float | None) -> None:
         """Handle a failed response: wait until the microscope is free, or record a loss of control.

@@ -12,7 +12,7 @@ from pathlib import Path
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError, FileError, NoResponse
 from afspm.basics.launch import Launch, Sockets
-from afspm.basics.plain_data import Plain
+from afspm.basics.plain_data import Plain, from_json
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
 from afspm.model import Frame, ProblemNames, is_process_name
@@ -133,7 +133,7 @@ def _keys_in(folder: Path) -> Plain:
     try:
         text = file.read_bytes()
         require_private(file)
-        return {"keys": json.loads(text)}
+        return {"keys": from_json(text)}
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:

@@ -19,6 +19,7 @@ from afspm.model import (
     HAS_ENDED,
     OTHER_RUN_RESPONSE,
     RELAY_REQUEST,
+    ActByHand,
     ControlRequest,
     ControlState,
     Feedback,
@@ -31,6 +32,7 @@ from afspm.model import (
     ScanParameters,
     ScopeState,
     ScopeStatus,
+    TipStatus,
     request_name,
 )
 from afspm.model.sessions import run_of
@@ -58,6 +60,8 @@ class PublishedState:
         self.scan_parameters: ScanParameters | None = None
         self.feedback: Feedback | None = None
         self.probe_position: ProbePosition | None = None
+        self.tip: TipStatus | None = None
+        self.by_hand: ActByHand | None = None
         self.newest_ns: int | None = None
         self._published: Counter[str] = Counter()
 

@@ -18,6 +18,7 @@ from afspm.model import (
     ProblemNames,
     ScanParameters,
     ScopeState,
+    TipStatus,
 )
 
 
@@ -72,6 +73,12 @@ class ExperimentView:
         """Return the z feedback; None if the microscope has not published it."""
         self._catch_up()
         return self._link.view.feedback
+
+    @property
+    def tip(self) -> TipStatus | None:
+        """Return whether tip and feedback are at work, as the controller reports; None if it has reported nothing."""
+        self._catch_up()
+        return self._link.view.tip
 
     @property
     def probe_position(self) -> ProbePosition | None:

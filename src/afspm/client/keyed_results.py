@@ -14,7 +14,7 @@ from typing import Any
 
 from afspm import wire
 from afspm.basics.errors import FileError, InvalidValue, WireError
-from afspm.basics.plain_data import Plain
+from afspm.basics.plain_data import Plain, from_json
 from afspm.model import LoggedPacket, Note, Packet, Parameter, ScanSet, Spectrum
 from afspm.model.snapshot import to_plain
 from afspm.storage.atomic import OutageLog, write_atomic
@@ -203,7 +203,7 @@ def _read(path: Path) -> tuple[Plain, list[object]]:
             packets = [entry.packet for entry in iter(lambda: read_packet(file), None)]
         if not packets or packets[0].envelope != _HEAD:
             raise ValueError("the file is not a result")
-        head = json.loads(bytes(packets[0].payload))
+        head = from_json(bytes(packets[0].payload))
         if len(packets) != 1 + head["things"]:
             raise ValueError("the file is incomplete")
         return head, [wire.decode(packet.envelope, packet.payload) for packet in packets[1:]]

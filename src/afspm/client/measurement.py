@@ -25,9 +25,10 @@ from afspm.client.experiment_link import ExperimentLink
 from afspm.client.keyed_results import KeyedResults, MeasurementResult, check_key
 from afspm.client.measurement_setup import MeasurementSetup
 from afspm.client.targets import Target, target_from
-from afspm.model import ControlRequest, ControlResponse, Packet, Response, Scan, ScopeState
+from afspm.model import ActByHand, ControlRequest, ControlResponse, Packet, PanelAct, Response, Scan, ScopeState
 from afspm.model.sessions import KEYED
 from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
+from afspm.wire.messages import ACT_BY_HAND
 
 BEGUN_WITHIN_S = 2 * CUT_OFF_SHOWS_WITHIN_S
 """Limit in real time from the accepted action to the published start. The connection may break in between; until a
@@ -79,6 +80,7 @@ class _MeasurementTask:
     failures: int = 0
     interruptions: list[str] = field(default_factory=list)
     watch: _Watch | None = None
+    acts_seen: int = 0
 
     @property
     def request_id(self) -> str:
@@ -211,7 +213,7 @@ class MeasurementRunner:
             self._write_down(task)
         with link.clock.late():
             self._setup.prepare(target, task.key or "", until_s)
-        states = link.view.count("ScopeStateMsg")
+        states, task.acts_seen = link.view.count("ScopeStateMsg"), link.view.count(ACT_BY_HAND.name)
         watch = task.watch = task.watch or _Watch(
             link, target, Cycle(target.busy, target.fits, since_ns=link.view.newest_ns)
         )
@@ -311,18 +313,27 @@ class MeasurementRunner:
             del self._channels[target.what]  # if they are missing again, the microscope no longer records them
             why = f"without {', '.join(sorted(missing))}, which it had before"
         else:
-            why = self._why_failed(target, cycle)
+            why = self._why_failed(task, cycle)
         task.interruptions.append(f"{day_and_time(self._link.clock.now_ns(), UTC)}: {why}")
         if not task.repeat and not self._control.held:
             raise ControlLost(f"{target.what} interrupted: {why}", where=self._link.name)
         self._link.log.warning("%s interrupted: %s; retrying", target.what, why)
-        # lost control is a known reason, and comes back; any other failure must not repeat for a night
-        task.failures = task.failures + 1 if self._control.held else 0
+        # lost control and a person's stop are known reasons; any other failure must not repeat for a night
+        task.failures = task.failures + 1 if self._control.held and not self._stopped_by_hand(task) else 0
         if task.failures >= MOST_FAILURES:
             raise MeasurementFailed(f"the {target.what} failed {task.failures} times: {why}", where=self._link.name)
         return False
 
-    def _why_failed(self, target: Target, cycle: Cycle) -> str:
+    def _stopped_by_hand(self, task: _MeasurementTask) -> ActByHand | None:
+        view = self._link.view
+        act = view.by_hand
+        is_new = view.count(ACT_BY_HAND.name) != task.acts_seen
+        return act if is_new and act is not None and act.act is PanelAct.STOP else None
+
+    def _why_failed(self, task: _MeasurementTask, cycle: Cycle) -> str:
+        target, by_hand = task.target, self._stopped_by_hand(task)
+        if by_hand is not None:
+            return str(by_hand)
         if not self._control.held:
             return f"control was lost: {self._control.why_lost}"
         if cycle.outcome is not CycleOutcome.ANOTHER and self._results.disk_is_full:

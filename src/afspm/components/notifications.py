@@ -17,9 +17,10 @@ END: Final = "end"
 UNSOLVED: Final = "unsolved-problem"
 GIVEN_UP: Final = "given-up"
 CRITICAL: Final = "critical"
+BY_HAND: Final = "by-hand"
 TEST: Final = "test"
 """Occasion of a test message."""
-OCCASIONS: Final = (END, UNSOLVED, GIVEN_UP, CRITICAL)
+OCCASIONS: Final = (END, UNSOLVED, GIVEN_UP, CRITICAL, BY_HAND)
 
 TIMEOUT_S = 10.0  # of one attempt
 FIRST_DELAY_S, LONGEST_DELAY_S = 2.0, 300.0

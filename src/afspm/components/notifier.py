@@ -13,6 +13,7 @@ from afspm.basics.units import Duration
 from afspm.client.component import Component
 from afspm.components import notifications
 from afspm.components.notifications import (
+    BY_HAND,
     CRITICAL,
     GIVEN_UP,
     MOST_TRIES,
@@ -23,7 +24,7 @@ from afspm.components.notifications import (
     Notification,
     Targets,
 )
-from afspm.model import ControlState, LogLines, ProcessCondition, ProcessStates
+from afspm.model import ControlMode, ControlState, JournalEntries, LogLines, ProcessCondition, ProcessStates
 from afspm.model.events import LOGGED_AS
 from afspm.record.run_json import experiment_name
 
@@ -33,7 +34,7 @@ LAST_TRIES = 2  # the end of the experiment does not wait for more
 
 
 class Notifier(Component):
-    """Notifications by command or webhook: a problem stays unsolved, a process is given up or logs CRITICAL.
+    """Notifications by command or webhook: a problem stays unsolved, a process is given up or CRITICAL, a run waits.
 
     [notify] of the experiment file adds this component to an experiment. The component only subscribes, and delays no
     other process. A failed delivery is retried at growing intervals, for about 25 minutes; retries continue after a
@@ -43,12 +44,13 @@ class Notifier(Component):
     Args:
         program: a command with arguments, run in the experiment file's folder; the JSON is on its standard input.
         webhook: address for a POST of the JSON; "$NAME" is taken from the environment.
-        on: occasions: "unsolved-problem", "given-up", "critical"; by default all. ("end" is left to `afspm run`.)
+        on: occasions: "unsolved-problem", "given-up", "critical", "by-hand" (the run waits for a person at the panel);
+            by default all. ("end" is left to `afspm run`.)
         unsolved_after: experiment time after which a flagged problem counts as unsolved.
         folder: working directory of the command; [notify] sets it to the experiment file's folder.
     """
 
-    listens: ClassVar = ("ControlState", "ProcessStates", "LogLines")
+    listens: ClassVar = ("ControlState", "JournalEntries", "ProcessStates", "LogLines")
     notifies: ClassVar[bool] = True
     period_s = 1.0
     period_time: Literal["experiment", "real"] = "real"
@@ -90,6 +92,11 @@ class Notifier(Component):
         if now != before:
             self.memory["flagged"] = now
             self.memory.save()
+
+    def on_journal_entries(self, entries: JournalEntries) -> None:
+        for entry in entries.entries:
+            if entry.mode is ControlMode.MANUAL and entry.reason:
+                self._queue_once(BY_HAND, str(entry.time_ns), f"the run waits for a person: {entry.reason}")
 
     def on_process_states(self, states: ProcessStates) -> None:
         for state in states.processes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import importlib.util
 import inspect
 import sys
@@ -15,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from afspm.basics import entry_points
+from afspm.basics import entry_points, named_imports
 from afspm.basics.errors import ConfigError
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.parts import DECLARED_KEYS
@@ -119,7 +118,9 @@ def load(path: str) -> Any:
     if not module_name or not name:
         raise Unloadable(f"{path!r} is not of the form module.Name")
     try:
-        module = importlib.import_module(module_name)
+        module = named_imports.import_named(module_name, of_process=True)
+    except ConfigError as error:
+        raise Unloadable(error.what, error.hint) from error
     except ModuleNotFoundError as error:
         raise _no_module(module_name, error) from error
     except (Exception, SystemExit) as error:  # the user's module may do anything when imported, even exit
@@ -128,7 +129,9 @@ def load(path: str) -> Any:
 
 
 def find_module(name: str, folders: Sequence[Path]) -> ModuleSpec | None:
-    """Return the spec of a module, installed or in one of the folders; None if not found."""
+    """Return the spec of a module, installed or in one of the folders; None if not found or not trusted."""
+    if not named_imports.may_import(name):  # looking for a module of a package imports the package
+        return None
     with importing_from(folders):
         try:
             return importlib.util.find_spec(name)

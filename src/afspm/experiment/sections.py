@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import is_dataclass
@@ -40,7 +41,10 @@ Orcid = Annotated[str, pydantic.AfterValidator(_checked_orcid)]
 
 
 class Section(pydantic.BaseModel):
-    """Base class of the file's sections: unknown keys are errors."""
+    """Base class of the file's sections: unknown keys are errors.
+
+    Each field of a section read with `parse` has a default, since the defaults take the place of a faulty section.
+    """
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, strict=False)
 
@@ -117,8 +121,8 @@ class NotifySection(Section):
 
     command: tuple[str, ...] = ()
     webhook: str = ""
-    on: tuple[Literal["end", "unsolved-problem", "given-up", "critical"], ...] = (
-        "end", "unsolved-problem", "given-up", "critical",
+    on: tuple[Literal["end", "unsolved-problem", "given-up", "critical", "by-hand"], ...] = (
+        "end", "unsolved-problem", "given-up", "critical", "by-hand",
     )  # fmt: skip
     unsolved_after: PositiveDuration = 900.0
     """Experiment time for which a problem may be flagged before it counts as unsolved."""
@@ -150,7 +154,14 @@ S = TypeVar("S")
 
 
 def parse(kind: type[S], name: str, table: Settings, document: Document) -> S:
-    """Return the section `[name]`, a model or a dataclass; after errors, report them and return the defaults."""
+    """Return the section `[name]`, a model or a dataclass; after errors, report them and return the defaults.
+
+    Raises:
+        TypeError: a field of the class has no default.
+    """
+    if required := _required(kind):
+        # found at the first file, and not only at one with an error in this section
+        raise TypeError(f"{kind.__name__}.{required[0]} needs a default, which takes the place of a faulty [{name}]")
     try:
         return pydantic.TypeAdapter(kind).validate_python(table)
     except pydantic.ValidationError as error:
@@ -164,6 +175,11 @@ def keys_of(kind: type) -> dict[str, object]:
         return {name: field.annotation for name, field in kind.model_fields.items()}
     hints = get_type_hints(kind, include_extras=True)
     return {file_key(name): hint for name, hint in hints.items() if get_origin(hint) is not ClassVar}
+
+
+def _required(kind: type) -> list[str]:
+    parameters = inspect.signature(kind).parameters.values()
+    return [one.name for one in parameters if one.default is one.empty and one.kind is not one.VAR_KEYWORD]
 
 
 def _fields_at(kind: type, location: tuple[str | int, ...]) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ import pydantic
 from afspm.basics import units
 from afspm.basics.addresses import Listens
 from afspm.basics.errors import UnitError
+from afspm.basics.type_aliases import unaliased
 from afspm.experiment import class_loader
 from afspm.experiment.document import Document
 from afspm.experiment.findings import closest, nearest
@@ -199,7 +200,8 @@ def _annotations(component: type) -> Table:
     kinds: Settings = {}
     for init in reversed(_constructors(component)):
         try:
-            kinds |= typing.get_type_hints(init, include_extras=True)
+            hints = typing.get_type_hints(init, include_extras=True)
+            kinds |= {name: unaliased(hint) for name, hint in hints.items()}
         except NameError:
             kinds |= {n: a for n, a in init.__annotations__.items() if not isinstance(a, str)}
     return kinds

@@ -25,8 +25,9 @@ from afspm.record.run_lock import lock_run, quoted, resume_command
 from afspm.storage.atomic import load_checkpoint
 from afspm.storage.packet_log import log_folder, logged_packets
 from afspm.supervisor import run as running
+from afspm.supervisor.own_runs import HOMES
 from afspm.supervisor.ports import require_free
-from afspm.supervisor.run import FILES, HOMES, HOW, ONLY, RUN, WITHOUT, FinishedRun, RunOptions
+from afspm.supervisor.run import FILES, HOW, ONLY, RUN, WITHOUT, FinishedRun, RunOptions
 from afspm.supervisor.run_identity import RunIdentity, new_identity
 from afspm.supervisor.supervision.run_end import EndReason
 from afspm.supervisor.supervisor import TOLERANCE_S

@@ -23,7 +23,7 @@ from afspm.record.run_json import COMPUTER, ENDED, METADATA, PLANNED, REAL_S, ST
 from afspm.record.run_lock import lock_run
 from afspm.storage.disk import run_bounded
 from afspm.storage.packet_log import discard_if_recorded, expect_recorder, log_folder
-from afspm.supervisor import key_handout, post_run, run_folder, run_identity
+from afspm.supervisor import key_handout, own_runs, post_run, run_folder, run_identity
 from afspm.supervisor.log import RunLog
 from afspm.supervisor.ports import FreePorts, new_addresses, require_free
 from afspm.supervisor.post_run import EndedRun
@@ -37,7 +37,7 @@ from afspm.transport.heartbeat import HeartbeatListener
 
 TAKES_WHO_COMES = ""
 """Run identity for a real microscope's translator that is started alone: it obeys any scheduler that connects."""
-RUN, HOW, HOMES, FILES, ONLY, WITHOUT = "run", "how", "homes", "files", "only", "without"
+RUN, HOW, FILES, ONLY, WITHOUT = "run", "how", "files", "only", "without"
 
 # a hanging disk must not keep the supervisor from ending
 WRITTEN_WITHIN_S = 5.0
@@ -123,6 +123,7 @@ def go(
         before = run_json_or_empty(folder)  # empty unless the run is resumed
         files = before.get(FILES) or list(map(str, experiment.files))
         facts = {**run_facts(name, starts, common), **facts_to_resume(experiment, starts, options), FILES: files}
+        facts |= own_runs.signed(folder, [*map(str, experiment.folders)])
         facts[METADATA] = before.get(METADATA) or experiment.resolved.metadata() | dict(options.metadata)
         works = experiment.planned_work().items()
         facts[PLANNED] = before.get(PLANNED) or {name: work and work.as_dict() for name, work in works}
@@ -181,14 +182,13 @@ def addresses_of(starts: Sequence[ProcessStart]) -> dict[str, str]:
 
 
 def facts_to_resume(experiment: Experiment, starts: Sequence[ProcessStart], options: RunOptions) -> dict[str, object]:
-    """Return the entries of run.json that are needed to resume the run, without any other file.
+    """Return the names in run.json that are needed to resume the run.
 
     Implied processes, such as the recorder, are listed by name like all others.
     """
     here = [start.launch.name for start in starts]
     elsewhere = [name for name in experiment.component_names if name not in here]
     return {
-        HOMES: list(map(str, experiment.folders)),
         ONLY: here if options.only else [],
         WITHOUT: elsewhere if options.without and not options.only else [],
     }

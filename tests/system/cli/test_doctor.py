@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import DEADLINE_S
 
 from afspm.transport.keys import generate
 
@@ -47,7 +48,7 @@ def ports(tmp_path: Path) -> dict[str, int]:
 def doctor(folder: Path, *more: str, listen_s: float = 1.0) -> tuple[int, dict[str, Any]]:
     """Return the exit code, and what was said."""
     command = [*AFSPM, "doctor", "experiment.toml", *more, "--json", "--listen", str(listen_s)]
-    told = subprocess.run(command, cwd=folder, capture_output=True, encoding="utf-8", timeout=60)
+    told = subprocess.run(command, cwd=folder, capture_output=True, encoding="utf-8", timeout=DEADLINE_S)
     assert told.stdout, told.stderr
     return told.returncode, json.loads(told.stdout)
 

@@ -11,10 +11,10 @@ import urllib.request
 from pathlib import Path
 
 import pytest
+from deadlines import DEADLINE_S
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a terminal of POSIX")
 AFSPM = (sys.executable, "-m", "afspm")
-DEADLINE_S = 100.0
 EXPERIMENT = """
 [clock]
 speed = 600.0

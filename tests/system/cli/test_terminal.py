@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import DEADLINE_S
 from systems import can_interrupt, interrupt, kill
 from typer.testing import CliRunner
 
@@ -25,7 +26,6 @@ from afspm.record.run_json import latest_run
 
 pytestmark = can_interrupt
 AFSPM = (sys.executable, "-m", "afspm")
-DEADLINE_S = 100.0  # a command or a picture takes long on a computer with much else to do
 EXPERIMENT = """
 name = "night"
 
@@ -126,11 +126,11 @@ def test_status_lists_the_processes(night: Running) -> None:
     assert {"microscope", "scheduler", "series"} <= {one["name"] for one in told["processes"]}
 
 
-def test_pause_and_resume_are_manual_and_automated(night: Running) -> None:
-    assert "afspm resume" in afspm("pause", night.runs).stdout
+def test_pause_and_continue_are_manual_and_automated(night: Running) -> None:
+    assert "afspm continue" in afspm("pause", night.runs).stdout
     paused = night.status()
     assert paused["mode"] == "MANUAL"
-    assert afspm("resume", night.runs).returncode == 0
+    assert afspm("continue", night.runs).returncode == 0
     assert night.until(lambda told: told["mode"] == "AUTOMATED")["problems"] == []
 
 
@@ -164,7 +164,7 @@ def test_watch_without_a_terminal_writes_a_line_whenever_something_changes(night
         assert "AUTOMATED" in watching.stdout.readline()
         assert afspm_here("pause", night.runs).exit_code == 0
         assert any("MANUAL" in line for line in watching.stdout)
-        assert afspm_here("resume", night.runs).exit_code == 0
+        assert afspm_here("continue", night.runs).exit_code == 0
         assert any("AUTOMATED" in line for line in watching.stdout)
     finally:
         watching.kill()
@@ -246,7 +246,7 @@ def test_end_ends_it_and_then_nothing_runs(night: Running) -> None:
     assert afspm("end", "--yes", night.runs).returncode == 0
     night.wait_for(r"everything is in")
     assert night.process.wait(DEADLINE_S) == 0
-    for command in ("status", "watch", "pause", "resume", "problems"):
+    for command in ("status", "watch", "pause", "continue", "resume", "problems"):
         said = afspm_here(command, night.runs)
         assert said.exit_code == NOT_RUNNING, said.stderr
         assert "has ended (" in said.stderr

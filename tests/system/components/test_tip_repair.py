@@ -11,6 +11,7 @@ from datetime import UTC
 from pathlib import Path
 
 import pytest
+from deadlines import DEADLINE_S
 from systems import PATIENCE
 
 from afspm.basics.formatting import day_and_time
@@ -27,7 +28,6 @@ tip_changes = { schedule = [[2700, "double"]], pulse_cures = 0.6 }
 duration = "90 min"
 retakes = 1
 """
-DEADLINE_S = 110 * PATIENCE
 TAKEN = re.compile(r"scan \d+ of \d+(?: again)? at (\S+ \S+) UTC")
 """What the series says of each scan; on a busy computer one may be due before the one before is done."""
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from afspm_process import DEADLINE_S
+from deadlines import DEADLINE_S
 from tests.system.experiment.experiment_lab import AfspmRun
 
 import afspm
@@ -27,7 +27,6 @@ class = "Scheduler"
 """
 SCRIPT = """
 import sys
-import time
 import afspm
 
 with afspm.connect(sys.argv[1], "notebook") as scope:
@@ -36,10 +35,8 @@ with afspm.connect(sys.argv[1], "notebook") as scope:
         scope.scan(region, shape=(64, 64))
     except KeyboardInterrupt:
         print("interrupted", scope.in_control, flush=True)
-    begun_s = time.monotonic()
     scope.set("scan-speed", "50 um/s")
     print("measured", scope.scan(region, shape=(8, 8)).first.shape, flush=True)
-    assert time.monotonic() - begun_s < 30.0
     scope.end_experiment()
 """
 

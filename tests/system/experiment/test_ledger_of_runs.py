@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 from afspm_process import AFSPM
+from deadlines import DEADLINE_S
 from makers import MAKERS
-from systems import PATIENCE
 
 import afspm
 
@@ -37,7 +37,7 @@ def test_ledger_and_report_of_a_run_have_its_treatments(microscope: str, tmp_pat
     file.write_text(EXPERIMENT, encoding="utf-8")
     done = subprocess.run(
         [*AFSPM, "run", str(file), str(MICROSCOPES[microscope]), "--runs", str(tmp_path / "runs")],
-        capture_output=True, encoding="utf-8", timeout=90.0 * PATIENCE, check=False,
+        capture_output=True, encoding="utf-8", timeout=DEADLINE_S, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     with afspm.open_run(tmp_path / "runs") as run:

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import pytest
 from afspm_process import AFSPM
+from deadlines import DEADLINE_S
 from makers import MAKERS
-from systems import PATIENCE
 
 from afspm.model import ControlResponse
 
 FILES = Path(__file__).parents[3] / "experiments" / "every_microscope"
-DEADLINE_S = 90.0 * PATIENCE
 LIMITED = """
 [details]
 component = false

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from afspm_process import AFSPM, DEADLINE_S
+from afspm_process import AFSPM
+from deadlines import DEADLINE_S
 from tests.system.experiment.experiment_lab import Run
 
 SECRET = "T0PSECRET"

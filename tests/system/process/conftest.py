@@ -10,12 +10,11 @@ from pathlib import Path
 from queue import Empty, Queue
 
 import pytest
-from systems import PATIENCE
+from deadlines import DEADLINE_S
 
 from afspm.basics.launch import Launch
 
 HERE = Path(__file__).parent
-PATIENCE_S = 20.0 * PATIENCE
 HOST = [sys.executable, "-m", "afspm.supervisor.host"]
 
 
@@ -51,7 +50,7 @@ class Child:
     def expect(self, text: str) -> str:
         """Return the next line of its standard output, which must begin with `text`."""
         try:
-            line = self.lines.get(timeout=PATIENCE_S)
+            line = self.lines.get(timeout=DEADLINE_S)
         except Empty:
             raise AssertionError(f"no line {text!r} came; {self.errors.decode()}") from None
         assert line.startswith(text), f"{line!r}; {self.errors.decode()}"
@@ -61,10 +60,10 @@ class Child:
         assert self.popen.stdin is not None
         self.popen.stdin.close()
 
-    def exit_code(self, within_s: float = PATIENCE_S) -> int:
+    def exit_code(self, within_s: float = DEADLINE_S) -> int:
         code = self.popen.wait(within_s)
         for reader in self._readers:
-            reader.join(PATIENCE_S)
+            reader.join(DEADLINE_S)
         return code
 
     @property
@@ -73,9 +72,9 @@ class Child:
 
     def close(self) -> None:
         self.popen.kill()
-        self.popen.wait(PATIENCE_S)
+        self.popen.wait(DEADLINE_S)
         for reader in self._readers:
-            reader.join(PATIENCE_S)
+            reader.join(DEADLINE_S)
             # its pipe is not closed then: that would wait for the reader
             assert not reader.is_alive(), "something that it has started was left behind, and holds its output open"
         for pipe in (self.popen.stdin, self.popen.stdout, self.popen.stderr):

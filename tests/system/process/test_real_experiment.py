@@ -20,7 +20,6 @@ from afspm.model import ControlMode, Region, ScopeState
 from afspm.supervisor.ports import FreePorts
 
 SPEED = 300.0
-pytestmark = pytest.mark.timeout(90)
 
 
 class Experiment:

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.system.supervisor.supervisor_lab import DEADLINE_S, QUICK, Running, RunTasks, Terminal
+from deadlines import DEADLINE_S
+from tests.system.supervisor.supervisor_lab import QUICK, Running, RunTasks, Terminal
 
 from afspm.basics.clock import ExperimentClock
 from afspm.supervisor.log import RunLog

@@ -6,11 +6,11 @@ import io
 import sys
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from systems import PATIENCE
+from deadlines import DEADLINE_S
 
 from afspm.basics.launch import Launch
 from afspm.experiment import Role
@@ -19,13 +19,14 @@ from afspm.supervisor.supervision.child import ChildPolicy, RestartPolicy
 from afspm.supervisor.supervision.liveness import LivenessPolicy
 from afspm.supervisor.supervisor import RunOutcome, Supervisor
 
-DEADLINE_S = 20.0 * PATIENCE
 BEAT_S = 0.1
 PEER = Path(__file__).with_name("peer.py")
 QUICK = ChildPolicy(
-    liveness=LivenessPolicy(beat_period_s=0.2, missed_beats=5, start_s=15.0 * PATIENCE, longest_step_s=10.0),
+    liveness=LivenessPolicy(beat_period_s=0.2, missed_beats=50, start_s=120.0, longest_step_s=10.0),
     restart=RestartPolicy(budget=2, first_delay_s=0.05),
 )
+IMPATIENT = replace(QUICK, liveness=replace(QUICK.liveness, missed_beats=10))
+"""For processes that compute for longer than a silence: each second of it is processor time of the tests."""
 
 
 class Terminal(io.TextIOBase):

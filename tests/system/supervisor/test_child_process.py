@@ -12,7 +12,8 @@ from queue import Queue
 from typing import Any
 
 import pytest
-from systems import KILLED, PATIENCE, freeze, not_on_wine
+from deadlines import DEADLINE_S
+from systems import KILLED, freeze, not_on_wine
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.launch import Launch
@@ -21,7 +22,6 @@ from afspm.supervisor.child_output import OutputDropped, OutputLine
 from afspm.supervisor.process import ChildEvent, ChildProcess, Task
 from afspm.supervisor.supervision.supervisor_events import Exited
 
-DEADLINE_S = 15.0 * PATIENCE
 Start = Callable[[str], ChildProcess]
 
 

@@ -9,8 +9,8 @@ import sys
 from queue import Queue
 
 import pytest
+from deadlines import DEADLINE_S
 from systems import KILLED_FROM_OUTSIDE, WINDOWS, kill
-from tests.system.supervisor.supervisor_lab import DEADLINE_S
 
 from afspm.basics.launch import Launch
 from afspm.supervisor.process import GUARD, ChildEvent, ChildProcess, Task

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import DEADLINE_S
 from systems import KILLED_FROM_OUTSIDE, kill
-from tests.system.supervisor.supervisor_lab import BEAT_S, DEADLINE_S, Running, RunTasks, peer
+from tests.system.supervisor.supervisor_lab import BEAT_S, Running, RunTasks, peer
 
 from afspm import wire
 from afspm.basics.clock import ExperimentClock

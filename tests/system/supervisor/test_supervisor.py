@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from systems import KILLED_FROM_OUTSIDE, WINE, freeze, kill, not_on_wine
-from tests.system.supervisor.supervisor_lab import DEADLINE_S, QUICK, RunTasks, peer
+from tests.system.supervisor.supervisor_lab import IMPATIENT, QUICK, RunTasks, peer
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.exit_codes import ExitCode
@@ -71,8 +71,8 @@ def test_process_busy_within_its_step_limit_keeps_running(run_tasks: RunTasks) -
 
 @look_only
 def test_process_that_holds_pythons_lock_within_its_step_limit_keeps_running(run_tasks: RunTasks) -> None:
-    silence_s = QUICK.liveness.silence_s
-    running = run_tasks(peer("a", first="grip", busy_s=1.5 * silence_s, longest_step_s=60.0))
+    busy_s = 1.25 * IMPATIENT.liveness.silence_s
+    running = run_tasks(peer("a", first="grip", busy_s=busy_s, longest_step_s=600.0), policy=IMPATIENT)
     running.terminal.wait_for(" a ", "has let go")
     assert running.stop().reports[0].starts == 1
 
@@ -155,8 +155,8 @@ def test_end_of_the_experiment_also_ends_processes_that_ignore_it(run_tasks: Run
 def test_busy_process_may_finish_after_the_end_of_the_experiment(
     run_tasks: RunTasks, how: str, busy_s: float, last_words: str
 ) -> None:
-    busy = peer("busy", first=how, busy_s=busy_s, longest_step_s=60.0)
-    running = run_tasks(busy, peer("ends", first="exit", code=80))
+    busy = peer("busy", first=how, busy_s=busy_s, longest_step_s=600.0)
+    running = run_tasks(busy, peer("ends", first="exit", code=80), policy=IMPATIENT)
     assert running.outcome().reports[0].starts == 1
     running.terminal.wait_for(" busy ", last_words)
     running.terminal.wait_for("waiting for busy to finish", "Ctrl-C")
@@ -242,7 +242,6 @@ def test_output_of_a_program_in_another_language_is_in_the_log(run_tasks: RunTas
     assert running.outcome().exit_code == 0
     running.terminal.wait_for(" script ", "to stdout")
     running.terminal.wait_for(" script ", "WARNING to stderr")
-    assert running.outcome().duration_s < DEADLINE_S
 
 
 def test_program_without_heartbeats_is_not_killed_for_silence(run_tasks: RunTasks) -> None:

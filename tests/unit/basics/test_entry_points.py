@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from deadlines import DEADLINE_S
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from site_folder import EXAMPLE_MAKER, EXAMPLE_PLUGIN, install
-from systems import PATIENCE
 
 from afspm.basics import entry_points
 from afspm.basics.errors import ConfigError, FileError
@@ -66,9 +66,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def afspm(site: Path, *arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(site)}
     command = [sys.executable, "-m", "afspm", *arguments]
-    return subprocess.run(
-        command, env=environment, cwd=cwd, capture_output=True, encoding="utf-8", timeout=60 * PATIENCE
-    )
+    return subprocess.run(command, env=environment, cwd=cwd, capture_output=True, encoding="utf-8", timeout=DEADLINE_S)
 
 
 def test_an_experiment_file_names_drivers_and_components_of_a_plug_in(site: Path, tmp_path: Path) -> None:
@@ -163,7 +161,7 @@ sys.modules.update(dict.fromkeys({modules}))
 from afspm.basics import entry_points
 print([one for one in entry_points.inventory() if one.package.startswith("afspm ") and one.problem])
 """
-    done = subprocess.run([sys.executable, "-c", look], capture_output=True, encoding="utf-8", timeout=PATIENCE * 60)
+    done = subprocess.run([sys.executable, "-c", look], capture_output=True, encoding="utf-8", timeout=DEADLINE_S)
     assert done.stdout == "[]\n", done.stdout + done.stderr
 
 

@@ -14,9 +14,21 @@ from tests.unit.client.client_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, Lab
 
 from afspm import wire
 from afspm.basics.errors import ControlLost, InvalidValue, NoResponse, Refused
+from afspm.client.command_retry import LOST_AFTER_S, RETRY_S
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
-from afspm.model import RELAY_REQUEST, ControlRequest, ControlResponse, Note, Problem, Request, Response, ScanSet
+from afspm.model import (
+    RELAY_REQUEST,
+    ControlRequest,
+    ControlResponse,
+    Note,
+    Problem,
+    Request,
+    Response,
+    ResponseDetail,
+    ScanSet,
+    ScopeState,
+)
 from afspm.scheduler.control.arbitration import ArbitrationEvent
 
 TILES = [REGION.moved_to((i * 2e-6, 0.0)) for i in range(3)]
@@ -358,6 +370,56 @@ def test_scan_whose_start_was_lost_is_requested_with_another_id(lives: int, tmp_
     assert lab.finished == [REGION]
     assert len(scans.interruptions) == 1
     assert lab.control.holder is None
+
+
+def lose_start(lab: Lab, back_s: float) -> list[tuple[str, float]]:
+    """Lose the controller in the first start of a scan; it is back, and free, at `back_s`.
+
+    Return the id and the time of each request to start, filled as they come.
+    """
+    asked: list[tuple[str, float]] = []
+
+    def loses(request: Request) -> Response | str:
+        if request.subject != "start-scan":
+            return "go on"
+        if not asked:
+            lab._go(ScopeState.UNDEFINED)
+            lab.at(back_s, lambda: lab._go(ScopeState.FREE))
+        asked.append((request.id, lab.clock.passed_s))
+        if request.id != asked[0][0]:
+            return "go on"
+        is_first = len(asked) == 1
+        detail = ResponseDetail.OUTCOME_UNKNOWN if is_first else ResponseDetail.NONE
+        return Response(ControlResponse.NO_RESPONSE, reason="no answer to Scan.Action", detail=detail)
+
+    lab.intercept = loses
+    return asked
+
+
+@pytest.mark.parametrize("back_s", [2.0, 55.0])
+def test_scan_is_started_again_soon_after_a_controller_lost_in_its_start_is_back(back_s: float, tmp_path: Path) -> None:
+    lab = Lab()
+    asked = lose_start(lab, back_s)
+    scope_of(lab, tmp_path, 0).scan(REGION, shape=(8, 8), key="tile")
+    first, *_, (second, again_s) = asked
+    assert second != first[0]
+    assert LOST_AFTER_S <= again_s - first[1] - back_s < LOST_AFTER_S + 2 * RETRY_S
+    assert lab.finished == [REGION]
+
+
+def test_scan_that_begins_late_after_its_controller_is_back_is_not_started_again(tmp_path: Path) -> None:
+    lab = Lab()
+    asked = lose_start(lab, back_s=2.0)
+
+    def begins() -> None:
+        lab._go(ScopeState.SCANNING)
+        lab.publish_scan(REGION)
+        lab._go(ScopeState.FREE)
+
+    lab.at(2.0 + LOST_AFTER_S - 2 * RETRY_S, begins)
+    scans = scope_of(lab, tmp_path, 0).scan(REGION, shape=(8, 8), key="tile")
+    assert [scan.region for scan in scans.values()] == [REGION] * 2
+    assert len({request_id for request_id, _ in asked}) == 1
 
 
 def notes_of(lab: Lab) -> list[Note]:

@@ -27,10 +27,12 @@ from afspm.basics.errors import (
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
 from afspm.model import (
+    ActByHand,
     ControlMode,
     ControlRequest,
     ControlResponse,
     Packet,
+    PanelAct,
     ProbePosition,
     Problem,
     Region,
@@ -266,6 +268,20 @@ def test_repeatedly_stopped_scan_is_given_up(lab: Lab, scope: Scope) -> None:
         lab.at(50.0 * (i + 1), lab.stop)
     with pytest.raises(NoResponse, match="failed 5 times"):
         scope.scan(REGION)
+
+
+def test_scan_that_a_person_stops_is_never_given_up(lab: Lab, scope: Scope) -> None:
+    def stop() -> None:
+        if lab.state is ScopeState.SCANNING:
+            lab.publish(ActByHand(lab.clock.now_ns(), PanelAct.STOP, "seen"))
+            lab.stop()
+
+    for i in range(8):
+        lab.at(50.0 * (i + 1), stop)
+    found = scope.scan(REGION)
+    assert found.region == REGION
+    by_hand = [why for why in found.interruptions if "the measurement was stopped at the microscope (seen)" in why]
+    assert len(by_hand) > 5
 
 
 def test_earlier_packets_are_not_taken_for_the_scan(lab: Lab, scope: Scope) -> None:

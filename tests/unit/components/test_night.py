@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deadlines import DEADLINE_S
 from numpy.typing import NDArray
 from tests.unit.client.client_lab import REGION, Lab, context_of, run
 
@@ -216,7 +217,7 @@ def test_scans_are_taken_in_while_the_drawing_is_loaded(monkeypatch: pytest.Monk
             super().on_scan(scan)
             is_seen.set()
 
-    monkeypatch.setattr(night_figure, "prepare", lambda: seen_while_loading.append(is_seen.wait(5.0)))
+    monkeypatch.setattr(night_figure, "prepare", lambda: seen_while_loading.append(is_seen.wait(DEADLINE_S)))
     lab = _lab()
     lab.at(500.0, lab.parent_goes)
     run(Observed(), lab, tmp_path / "state", run_dir=str(tmp_path))

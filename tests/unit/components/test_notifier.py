@@ -161,6 +161,22 @@ def test_critical_line_is_notified_once(tmp_path: Path, hook: Hook) -> None:
     assert (told["what"], told["text"]) == ("critical", f"recorder: {full[2]}")
 
 
+def test_person_at_the_panel_is_notified_once_and_a_pause_on_request_is_not(tmp_path: Path, hook: Hook) -> None:
+    night = Night(tmp_path, webhook=hook.url)
+    for number, reason in enumerate(("", "the tip was withdrawn at the microscope")):
+        manual = model.JournalEntry(
+            number, "control", "translator", "mode MANUAL", reason=reason, mode=ControlMode.MANUAL
+        )
+        for _ in range(2):  # replayed
+            night.notifier.on_journal_entries(model.JournalEntries((manual,)))
+    night.passes(60)
+    (told,) = hook.got
+    assert (told["what"], told["text"]) == (
+        "by-hand",
+        "the run waits for a person: the tip was withdrawn at the microscope",
+    )
+
+
 def test_ever_new_critical_lines_do_not_fill_the_memory(
     tmp_path: Path, hook: Hook, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deadlines import DEADLINE_S
 
 import afspm
 from afspm import wire
@@ -32,7 +33,6 @@ from afspm.storage.packet_log import LogReader, PacketLog, committed, expect_rec
 from afspm.transport.port import Incoming, ParentGone
 from afspm.transport.process.context import ProcessActivity, ProcessContext
 
-DEADLINE_S = 20.0
 LOSSY = Path(__file__).parents[2] / "support" / "lossy_disk"
 
 

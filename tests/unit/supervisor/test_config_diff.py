@@ -10,8 +10,9 @@ import pytest
 from afspm.basics.errors import ConfigError
 from afspm.experiment import load
 from afspm.supervisor import resume
+from afspm.supervisor.own_runs import HOMES
 from afspm.supervisor.resume import differing
-from afspm.supervisor.run import FILES, HOMES
+from afspm.supervisor.run import FILES
 
 NIGHT = """
 [clock]

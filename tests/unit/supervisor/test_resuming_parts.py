@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import DEADLINE_S
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError
@@ -95,7 +96,7 @@ def test_component_added_at_a_resume_runs_in_that_life(tmp_path: Path) -> None:
 
 def test_all_processes_are_asked_at_once_whether_they_are_gone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """On Windows each refused connection takes seconds, so they are made at the same time."""
-    all_asked = threading.Barrier(12, timeout=10.0)
+    all_asked = threading.Barrier(12, timeout=DEADLINE_S)
 
     def refused(address: tuple[str, int], timeout: float) -> None:
         all_asked.wait()

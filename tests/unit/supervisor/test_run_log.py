@@ -8,6 +8,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from deadlines import DEADLINE_S
 
 from afspm.basics.clock import ExperimentClock
 from afspm.storage import disk
@@ -119,7 +120,7 @@ def test_hanging_disk_delays_nothing_and_is_shown(tmp_path: Path, monkeypatch: p
 
     writing = threading.Thread(target=write, daemon=True)
     writing.start()
-    writing.join(5.0)
+    writing.join(DEADLINE_S)
     assert told.is_set()
     os.close(reader)
     log.close()

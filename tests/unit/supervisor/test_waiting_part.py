@@ -14,7 +14,6 @@ class Waiting(Exception):
     """The first text that the waiting part tells."""
 
 
-@pytest.mark.timeout(20)
 def test_part_whose_key_of_the_scheduler_is_out_of_date_says_that_it_waits() -> None:
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     scheduler = context.socket(zmq.ROUTER)
