@@ -16,6 +16,7 @@ from threading import Condition, Event, Thread
 from typing import IO, Any, ClassVar, Generic, TypeVar
 
 import zmq
+from deadlines import DEADLINE_S
 from tests.plugins.hosts import host
 
 from afspm import wire
@@ -40,7 +41,6 @@ from afspm.simulation.emulation.emulator import Emulator
 from afspm.simulation.faults import Fault
 from afspm.supervisor.ports import FreePorts
 
-DEADLINE_S = 30.0
 PATIENT: Mapping[str, Any] = {"reply_timeout_s": 10.0}
 """As long as a controller on a busy computer may need to answer."""
 
@@ -99,6 +99,10 @@ class Peer:
         value = wire.frames.decode_parameter(response.payload).value
         assert value is not None
         return value
+
+    def has_news(self, within_s: float) -> bool:
+        """Return whether a packet arrives within some real time."""
+        return bool(self._packets.poll(round(1000.0 * within_s)))
 
     def next(self) -> Any:
         """Return the next published packet."""
@@ -243,10 +247,10 @@ class VendorBench(Generic[Emulated]):
         self._controller = stack.enter_context(ExitStack())
         self.start_controller_again()
 
-    def start_controller_again(self) -> None:
-        """Start a new controller at the address of the last one, without its state."""
+    def start_controller_again(self, **settings: Any) -> None:
+        """Start a new controller at the address of the last one, without its state, and with changed settings."""
         self._controller.close()
-        self.emulator = self.emulated(**self._emulator_settings)
+        self.emulator = self.emulated(**{**self._emulator_settings, **settings})
         self.address = self._controller.enter_context(self.emulator.running(self.data, self.clock))
 
     def at_panel(self, do: Callable[[Emulated], object]) -> None:
@@ -386,6 +390,6 @@ def _answer(listener: socket.socket, replies: tuple[bytes, ...], silent: bool) -
         for reply in replies:
             client.recv(1000)
             client.sendall(reply)
-        client.settimeout(10.0)
+        client.settimeout(DEADLINE_S)
         while silent and client.recv(1000):
             pass

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import DEADLINE_S
 from tests.ui.ui_lab import SCREENSHOTS, Night, Opened
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # `benchmarks` has a stage to publish on, which serves here too
@@ -23,7 +24,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if item.path.is_relative_to(here):  # one browser, one experiment: one after the other
             item.add_marker(pytest.mark.xdist_group("ui"))
-            item.add_marker(pytest.mark.timeout(180))
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def opened(browser: Any, request: pytest.FixtureRequest) -> Iterator[Opened]:
         )
         contexts.append(context)
         page = context.new_page()
-        page.set_default_timeout(15_000)
+        page.set_default_timeout(DEADLINE_S * 1000)
         page.on("pageerror", lambda error: wrong.append(str(error)))
         page.on("request", lambda asked: _only_ours(asked.url, url, wrong))
         if person:

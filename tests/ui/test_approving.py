@@ -9,10 +9,11 @@ from typing import Any
 
 import httpx2
 import pytest
+from deadlines import DEADLINE_S
 from mcp import Client
 from mcp.client.streamable_http import streamable_http_client
 from tests.system.agent.agent_lab import SCAN, AgentClient
-from tests.ui.ui_lab import DEADLINE_S, Night, Opened
+from tests.ui.ui_lab import Night, Opened
 
 AGENT = """
 [agent]
@@ -57,7 +58,7 @@ def act(night: Night, doing: Callable[[AgentClient], Awaitable[Any]]) -> Any:
 
     thread = threading.Thread(target=lambda: asyncio.run(whole()))
     thread.start()
-    thread.join(60.0)
+    thread.join(DEADLINE_S)
     return found[0]
 
 
@@ -132,7 +133,6 @@ def test_place_of_a_grant_is_drawn_in_the_picture(night: Night, page: Any, keep:
     night.until(lambda: not approvals(night))
 
 
-@pytest.mark.timeout(240)
 def test_waiting_proposal_is_readable_on_a_phone_and_approved_there(night: Night, opened: Opened, keep: Any) -> None:
     async def propose(agent: AgentClient) -> str:
         proposed = await agent.call("propose", plan=PLAN)
@@ -142,7 +142,7 @@ def test_waiting_proposal_is_readable_on_a_phone_and_approved_there(night: Night
     proposal = act(night, propose)
     page = opened(night.url, person="Ada", width=390, height=844)
     bar = page.locator(".approvals .waits")
-    bar.wait_for(timeout=60_000)
+    bar.wait_for(timeout=DEADLINE_S * 1000)
     text = bar.inner_text()
     assert "agent:claude" in text
     assert "“look”: set tip-bias-voltage to 0.5 V" in text

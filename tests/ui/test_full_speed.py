@@ -1,19 +1,25 @@
-"""At any rate of messages the page shows the newest, and its memory does not grow."""
+"""At any rate of messages the page shows the newest, and its memory does not grow.
+
+How soon a scan is on the page is measured by the benchmark (`benchmarks/dashboard.py`): no verdict depends on speed.
+"""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import pytest
 from benchmarks.dashboard import latency_ms, open_page
 from benchmarks.stage import REGION, Stage, picture
+from deadlines import DEADLINE_S
 
 from afspm.model import LogLine, LogLines, ScanLines, ScopeState, ScopeStatus
 
 MB = 1 << 20
+AT_ONCE = 60
+"""As many scans are published one after the other."""
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +31,7 @@ def stage(browser: Any) -> Iterator[Stage]:
 @pytest.fixture
 def page(browser: Any, stage: Stage) -> Iterator[Any]:
     page = open_page(browser, stage.url)
-    page.set_default_timeout(15_000)
+    page.set_default_timeout(DEADLINE_S * 1000)
     yield page
     page.close()
 
@@ -37,9 +43,15 @@ def heap_bytes(page: Any) -> float:
     return float(session.send("Runtime.getHeapUsage")["usedSize"])
 
 
-def test_a_scan_is_on_the_page_soon(stage: Stage, page: Any) -> None:
-    late_ms = sorted(latency_ms(page, stage, seed) for seed in range(8))
-    assert late_ms[len(late_ms) // 2] < 150.0
+@contextmanager
+def stalled(page: Any) -> Iterator[None]:
+    """Stop a page's script at its next statement, which a message brings; it goes on after the block."""
+    debugger = page.context.new_cdp_session(page)
+    debugger.send("Debugger.enable")
+    debugger.send("Debugger.pause")
+    yield
+    debugger.send("Debugger.resume")
+    debugger.send("Debugger.disable")
 
 
 def test_at_full_speed_the_newest_scan_is_shown_and_others_are_skipped(stage: Stage, page: Any) -> None:
@@ -50,13 +62,14 @@ def test_at_full_speed_the_newest_scan_is_shown_and_others_are_skipped(stage: St
           new MutationObserver(() => window.drawn++).observe(document.querySelector(".picture"), { attributeFilter: ["data-number"] });
         }"""  # noqa: E501
     )
-    end_s = time.monotonic() + 4.0
-    published = 0
-    while time.monotonic() < end_s:
-        last_ns = stage.scan(values)
-        published += 1
-    page.wait_for_function(f"document.querySelector('.picture').dataset.time === '{last_ns}'", timeout=3000)
-    assert 1 <= page.evaluate("window.drawn") < published
+    last_ns = 0
+    with stalled(page):
+        for _ in range(AT_ONCE):
+            last_ns = stage.scan(values)
+    page.wait_for_function(
+        f"document.querySelector('.picture').dataset.time === '{last_ns}'", timeout=DEADLINE_S * 1000
+    )
+    assert 1 <= page.evaluate("window.drawn") < AT_ONCE
 
 
 def test_a_night_of_messages_does_not_grow_the_memory(stage: Stage, page: Any) -> None:
@@ -77,13 +90,12 @@ def test_a_night_of_messages_does_not_grow_the_memory(stage: Stage, page: Any) -
 
 def test_a_stalled_browser_does_not_delay_others(stage: Stage, browser: Any, page: Any) -> None:
     frozen = open_page(browser, stage.url)
-    frozen.evaluate("setTimeout(() => { const end = Date.now() + 6000; while (Date.now() < end); }, 0)")
-    before, end_s = stage.memory_bytes(), time.monotonic() + 5.0
-    late_ms: list[float] = []
-    while time.monotonic() < end_s:
-        late_ms.append(latency_ms(page, stage, len(late_ms)))
-    assert sorted(late_ms)[len(late_ms) // 2] < 300.0
+    frozen.set_default_timeout(DEADLINE_S * 1000)
+    before = stage.memory_bytes()
+    with stalled(frozen):
+        for seed in range(8):
+            latency_ms(page, stage, seed)  # returns once the scan is on the page
     assert stage.memory_bytes() - before < 120 * MB  # scans are kept up to a limit, and nothing else
     last = page.get_attribute(".picture", "data-time")
-    frozen.wait_for_function(f"document.querySelector('.picture').dataset.time === '{last}'", timeout=15_000)
+    frozen.wait_for_function(f"document.querySelector('.picture').dataset.time === '{last}'")
     frozen.close()

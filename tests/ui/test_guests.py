@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from benchmarks.dashboard import open_page
 from benchmarks.stage import REGION, Stage
+from deadlines import DEADLINE_S
 
 from afspm.components.tip_verdict import OF_LINES, LineVerdict, line_verdict_message
 from afspm.model import InstrumentReading, InstrumentReadings, Scan, ScanLines, ScopeState, ScopeStatus
@@ -39,7 +40,7 @@ def stage(browser: Any) -> Iterator[Stage]:
 @pytest.fixture
 def page(browser: Any, stage: Stage) -> Iterator[Any]:
     page = open_page(browser, stage.url)
-    page.set_default_timeout(60_000)
+    page.set_default_timeout(DEADLINE_S * 1000)
     yield page
     page.close()
 

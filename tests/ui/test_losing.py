@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from afspm_process import AFSPM
+from deadlines import DEADLINE_S
 from tests.ui.ui_lab import EXPERIMENT, Night, Opened
 
 from afspm.model import ProcessCondition
@@ -28,7 +29,7 @@ def test_a_killed_dashboard_is_back_at_the_same_address_and_so_is_the_page(
     os.kill(before, signal.SIGKILL)
     page.wait_for_selector("#trouble:has-text('connection to the dashboard is lost')")
     night.until(lambda: night.follower.overview.processes["dashboard"].pid not in (0, before))
-    page.wait_for_selector("#trouble", state="hidden", timeout=40_000)
+    page.wait_for_selector("#trouble", state="hidden")
     page.wait_for_selector("nav.who:has-text('Ada')")  # who has signed in stays so
     page.wait_for_selector("text=is in control")
     # out of the record: it was not there to see that
@@ -44,11 +45,11 @@ def test_old_data_are_marked(night: Night, opened: Opened) -> None:
     for pid in frozen:
         os.kill(pid, signal.SIGSTOP)
     try:
-        page.wait_for_selector("#trouble:has-text('The experiment has been silent for')", timeout=40_000)
+        page.wait_for_selector("#trouble:has-text('The experiment has been silent for')")
     finally:
         for pid in reversed(frozen):
             os.kill(pid, signal.SIGCONT)
-    page.wait_for_selector("#trouble", state="hidden", timeout=40_000)
+    page.wait_for_selector("#trouble", state="hidden")
 
 
 def test_microscope_without_an_answer_does_not_stop_the_page(night: Night, opened: Opened) -> None:
@@ -70,7 +71,7 @@ def test_microscope_without_an_answer_does_not_stop_the_page(night: Night, opene
     assert max(updated_ms) < 4000
     page.click("button:has-text('Hand back')")
     page.wait_for_selector("[data-part=mode]:text-is('AUTOMATED')")
-    page.wait_for_selector("#trouble", state="hidden", timeout=40_000)
+    page.wait_for_selector("#trouble", state="hidden")
 
 
 def test_a_page_that_joined_a_run_shows_a_lost_scheduler(opened: Opened, tmp_path: Path) -> None:
@@ -94,7 +95,9 @@ def test_a_page_that_joined_a_run_shows_a_lost_scheduler(opened: Opened, tmp_pat
         folder = last_word(run, "processes, into")
         page = opened(last_word(start("dashboard", folder, "--port", 0), "the dashboard is at"))
         run.kill()
-        page.wait_for_selector(f"#trouble:has-text('It was cut off; `afspm run --resume {folder}`')", timeout=40_000)
+        page.wait_for_selector(
+            f"#trouble:has-text('It was cut off; `afspm run --resume {folder}`')", timeout=DEADLINE_S * 1000
+        )
 
 
 def test_the_end_needs_confirmation_and_is_shown(night: Night, opened: Opened, keep: object) -> None:
@@ -110,7 +113,7 @@ def test_the_end_needs_confirmation_and_is_shown(night: Night, opened: Opened, k
     page.click("button:has-text('End the experiment')")
     page.click(".question button:has-text('End it')")
     page.click("button:has-text('Yes, end the experiment')")
-    assert night.process.wait(40.0) == 0
+    assert night.process.wait(DEADLINE_S) == 0
     page.wait_for_selector("#trouble:has-text('The experiment has ended')")
     assert page.evaluate("document.querySelector('.steer').inert")
     assert callable(keep)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deadlines import DEADLINE_S
 from tests.ui.ui_lab import Night, Opened
 
 import afspm
@@ -43,11 +44,12 @@ def ended(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ni
             scope.end_experiment()
         night.wait_for(r"the dashboard is at \S+; press Ctrl-C to close it")
         assert not [pid for pid in pids if pid and is_running(pid)], "scheduler, translator and components are gone"
-        page.wait_for_function("window.afspm?.scrubber", timeout=60_000)  # the page that was open is there again
+        # the page that was open is there again
+        page.wait_for_function("window.afspm?.scrubber", timeout=DEADLINE_S * 1000)
         context.close()
         yield night
         night.process.send_signal(signal.SIGINT)
-        assert night.process.wait(20.0) == 0
+        assert night.process.wait(DEADLINE_S) == 0
     finally:
         night.close()
 

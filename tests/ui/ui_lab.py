@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from afspm_process import AfspmProcess
+from deadlines import DEADLINE_S
 
 from afspm import wire
 from afspm.cli.follower import Follower
 from afspm.model import ControlState, JournalEntry, Role, ScopeState
 
-DEADLINE_S = 30.0
 Opened = Callable[..., Any]
 SCREENSHOTS = Path(__file__).parents[2] / "build" / "screenshots"
 
@@ -119,5 +119,5 @@ class Night(AfspmProcess):
         self.follower.close()
         self.process.terminate()
         with suppress(subprocess.TimeoutExpired):
-            self.process.wait(20.0)
+            self.process.wait(DEADLINE_S)
         super().close()

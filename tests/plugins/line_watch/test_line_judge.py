@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 import pytest
@@ -31,8 +33,17 @@ def heights(picture: Picture) -> Heights:
 
 
 def taught(pictures: Sequence[Picture] | None = None) -> LineJudge:
+    return copy.deepcopy(_usual()) if pictures is None else _taught(pictures)
+
+
+@cache
+def _usual() -> LineJudge:
+    return _taught(night())
+
+
+def _taught(pictures: Sequence[Picture]) -> LineJudge:
     judge = LineJudge()
-    for number, picture in enumerate((pictures or night())[:LEARNT]):
+    for number, picture in enumerate(pictures[:LEARNT]):
         judge.learn(heights(picture), HOME, KIND, number * PERIOD_S)
     return judge
 

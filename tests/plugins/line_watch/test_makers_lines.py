@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,13 +15,18 @@ from tests.plugins.nanosurf.nanosurf_bench import Bench as NanosurfBench
 from tests.plugins.vendor_bench import VendorBench, benches, ready
 from tests.unit.client.client_lab import Lab, run
 
+from afspm.basics.clock import Clock
 from afspm.model import Region, Scan, ScanLines, ScopeState, ScopeStatus, names
 from afspm.plugins.line_watch.line_judge import FEWEST_PAIRS
 from afspm.plugins.line_watch.line_watch import LineWatch
+from afspm.simulation.activities import ScanActivity
+from afspm.simulation.emulation.emulator import Emulator
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]  # six scans each, at the pace of a controller
+pytestmark = [pytest.mark.slow]  # six scans each, at the pace of a controller
 
 REGION, SHAPE = Region((0.0, 0.0), (1e-6, 1e-6)), (64, 64)
+CHANGED_LINE, HELD_LINE = 32, 60
+PUBLISHED = 52  # lines: translators leave out the newest ones
 LEARNT = FEWEST_PAIRS + 1
 Packets = list[ScanLines | Scan]
 
@@ -61,20 +66,20 @@ def test_changed_tip_stops_the_scan_of_a_maker_and_a_good_scan_goes_on(
     ready(peer, REGION, SHAPE)
     assert peer.set(names.SCAN_SPEED, 3, "um/s").ok
 
-    def scanned() -> Packets:
+    def scanned(*, held: bool = True) -> Packets:
         response = peer.act(names.START_SCAN)
         assert response.ok, response.reason
-        return [
-            one
-            for one in [*peer.until(ScopeState.SCANNING), *peer.until(ScopeState.FREE)]
-            if isinstance(one, ScanLines | Scan) and one.channel in maker.channels
-        ]
+        packets = peer.until(is_scanning)
+        if held:
+            packets += peer.until(has_published(PUBLISHED, maker.channels, packets))
+            made.at_panel(partial(release_scan, made.clock))
+        packets += peer.until(ScopeState.FREE)
+        return [one for one in packets if isinstance(one, ScanLines | Scan) and one.channel in maker.channels]
 
-    scanned()  # Gxsm publishes no lines of the first one: only its file has the names of the channels
+    scanned(held=False)  # Gxsm publishes no lines of the first one: only its file has the names of the channels
+    made.at_panel(hold_scans)
     night = [scanned() for _ in range(LEARNT + 1)]
-    # on a busy computer the scan begins later, and more of it is with the changed tip
-    half_s = (ended_ns(night[-1]) - began_ns(night[-1])) / 2e9
-    made.at_panel(lambda emulator: emulator.rig.world.change_tip("double", made.clock.now_s() + half_s))
+    made.at_panel(partial(change_tip_in_scans, "double"))
     changed = scanned()
 
     lab = Lab("line_watch")
@@ -97,7 +102,49 @@ def began_ns(packets: Packets) -> int:
     return found
 
 
-def ended_ns(packets: Packets) -> int:
-    found = next(one.time_ns for one in packets if isinstance(one, Scan))
-    assert found is not None
-    return found
+def is_scanning(packet: object) -> bool:
+    return isinstance(packet, ScopeStatus) and packet.state is ScopeState.SCANNING
+
+
+def has_published(lines: int, channels: tuple[str, ...], before: Sequence[object]) -> Callable[[object], bool]:
+    """Return a condition that holds once as many lines of each channel have come."""
+    come = dict.fromkeys(channels, 0)
+
+    def see(packet: object) -> bool:
+        if isinstance(packet, ScanLines) and packet.channel in come:
+            come[packet.channel] += len(packet.values)
+        return min(come.values()) >= lines
+
+    for packet in before:
+        see(packet)
+    return see
+
+
+def hold_scans(emulator: Emulator) -> None:
+    """Let each scan wait before its last lines: a busy translator publishes none after the end of a scan."""
+    start = emulator.rig.start_scan
+
+    def start_and_hold(now_s: float) -> ScanActivity:
+        scan = start(now_s)
+        scan.pause(now_s + HELD_LINE * scan.line_s)
+        return scan
+
+    vars(emulator.rig).update(start_scan=start_and_hold)
+
+
+def release_scan(clock: Clock, emulator: Emulator) -> None:
+    scan = emulator.rig.scan
+    assert scan is not None
+    assert scan.paused_since_s is not None
+    scan.resume(max(scan.paused_since_s, clock.now_s()))
+
+
+def change_tip_in_scans(flaw: str, emulator: Emulator) -> None:
+    """Let the tip change at the same line of each scan, however late the scan begins."""
+    start = emulator.rig.start_scan
+
+    def start_and_change(now_s: float) -> ScanActivity:
+        emulator.rig.world.change_tip(flaw, now_s + CHANGED_LINE * emulator.rig.setup.line_s)
+        return start(now_s)
+
+    vars(emulator.rig).update(start_scan=start_and_change)

@@ -134,3 +134,13 @@ def test_trial_of_the_connection_names_what_answers_instead_of_a_server(
             Instrument(f"secop://{address}", {"cryo.t": "tt"}).try_connection()
         done.result(10.0)
     assert error.value.where == address
+
+
+@pytest.mark.parametrize("levels", [200, 50_000])
+def test_nested_json_of_a_server_does_not_end_the_component(cryo: Cryo, levels: int) -> None:
+    cryo.answers.append("update tt:value " + "[" * levels + "]" * levels)
+    cryo.later(0.5)
+    assert cryo.reports[-1].readings[0].value is None
+    assert "this is no SECoP server" in cryo.reports[-1].readings[0].reason
+    cryo.later(10.0)
+    assert cryo.reports[-1].readings[0].value == pytest.approx(cryo.cryostat.value_k, abs=0.1)

@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from deadlines import DEADLINE_S
 
 from afspm.model import ControlResponse, InstrumentOrder, InstrumentReading, Parameter
 from afspm.plugins.secop.instrument import LineSocket
@@ -32,7 +33,7 @@ class Magnet:
         return self.tesla
 
     def set_field(self, tesla: float) -> None:
-        assert self.let_go.wait(60)
+        assert self.let_go.wait(DEADLINE_S)
         if tesla == 0.25:
             raise OSError("quench")
         self.tesla = tesla
@@ -64,7 +65,7 @@ class SecopBench:
         return {one.name: one for one in self.client.readings(time.monotonic())}
 
     def until(self, holds: Callable[[], object]) -> None:
-        until_s = time.monotonic() + 60
+        until_s = time.monotonic() + DEADLINE_S
         while not holds():
             assert time.monotonic() < until_s
             self.pump()
@@ -141,6 +142,6 @@ def test_reset_connection_is_no_error_of_the_server() -> None:
         client = socket.create_connection(server.server_address)
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # close() sends a reset
         client.close()
-        assert is_over.wait(60)
+        assert is_over.wait(DEADLINE_S)
         server.shutdown()
     assert not errors

@@ -64,6 +64,13 @@ def test_failed_simulation_is_not_shown_as_harmless() -> None:
     assert "the tip changes 2 times" in simulated(changes)
 
 
+@pytest.mark.parametrize("text", ["no JSON", "[" * 100_000, "7"])
+def test_unreadable_proposal_is_shown_without_an_error(text: str) -> None:
+    assert title(replace(proposal(), plan=text)) == ""
+    assert waiting(replace(proposal(), plan=text))[1] == f"proposes {PLAN.id}"
+    assert waiting(proposal(text))[2] == "Not simulated: the preflight can't be read."
+
+
 def test_approval_in_force_shows_its_person_and_its_end() -> None:
     plan = Approval("agent:claude", "abc", "dashboard:Ada", 0, steps_left=3)
     agent, what, details = in_force(plan)

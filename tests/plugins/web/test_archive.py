@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from afspm import wire
 from afspm.basics.clock import ExperimentClock
@@ -134,7 +133,6 @@ def test_a_silent_run_is_reported_with_its_known_reason() -> None:
         assert trouble(watch) == f"The experiment has been silent for 1 min 00 s: this page is that old.{told}"
 
 
-@pytest.mark.timeout(60)
 def test_eight_hours_of_messages_take_bounded_memory() -> None:
     """A line a second in two channels, a scan every 5 minutes, states, log and journal: 200 000 messages."""
     watch, region = Watch(ExperimentClock.real()), Region((0.0, 0.0), (1e-6, 1e-6))

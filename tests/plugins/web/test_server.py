@@ -16,6 +16,7 @@ from typing import Any
 from urllib.request import Request, urlopen
 
 import pytest
+from deadlines import DEADLINE_S
 
 from afspm.basics.errors import ConfigError
 from afspm.plugins.web import server as web_server
@@ -53,12 +54,12 @@ def test_a_client_that_trusts_the_certificate_connects_encrypted(certificate: Pa
     server.start()
     try:
         trusting = ssl.create_default_context(cafile=certificate)
-        with urlopen(url, context=trusting, timeout=10.0) as answer:
+        with urlopen(url, context=trusting, timeout=DEADLINE_S) as answer:
             assert answer.read() == b"https"
         with pytest.raises(OSError, match="certificate verify failed"):
-            urlopen(url, context=ssl.create_default_context(), timeout=10.0)
+            urlopen(url, context=ssl.create_default_context(), timeout=DEADLINE_S)
         with pytest.raises(OSError, match=r"closed connection|reset"):
-            urlopen(url.replace("https", "http"), timeout=10.0)
+            urlopen(url.replace("https", "http"), timeout=DEADLINE_S)
     finally:
         server.stop()
 
@@ -77,7 +78,7 @@ def test_a_forged_header_is_not_taken_as_the_client_s_address() -> None:
             url_of("127.0.0.1", bound.getsockname()[1], encrypted=False),
             headers={"X-Forwarded-For": "10.9.8.7", "X-Forwarded-Proto": "https"},
         )
-        with urlopen(forged, timeout=10.0) as answer:
+        with urlopen(forged, timeout=DEADLINE_S) as answer:
             assert answer.read() == b"127.0.0.1"
     finally:
         server.stop()
@@ -189,7 +190,7 @@ def test_endless_tls_handshakes_do_not_block_other_clients_and_end_in_time(certi
     try:
         silent += (socket.create_connection(address) for _ in range(2 * web_server.MOST_UNFINISHED))
         trusting = ssl.create_default_context(cafile=certificate)
-        with urlopen(url_of(*address, encrypted=True), context=trusting, timeout=10.0) as answer:
+        with urlopen(url_of(*address, encrypted=True), context=trusting, timeout=DEADLINE_S) as answer:
             assert answer.read() == b"https"
         assert all(closes(one) for one in silent[: web_server.MOST_UNFINISHED])  # of too many the oldest
         assert closes(silent[-1])

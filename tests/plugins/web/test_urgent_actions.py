@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, cast
 
 import pytest
+from deadlines import DEADLINE_S
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.launch import Launch
@@ -13,8 +14,6 @@ from afspm.model import ControlResponse, Response, ScopeState, ScopeStatus, name
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.persons import Persons
 from afspm.plugins.web.watch import Watch
-
-SOON_S = 5.0
 
 
 class BusyMicroscope:
@@ -58,38 +57,38 @@ def persons(link: BusyMicroscope, monkeypatch: pytest.MonkeyPatch) -> Persons:
 def test_stop_ends_the_waits_of_earlier_scans(persons: Persons, link: BusyMicroscope) -> None:
     waiting = [persons.submit("Ada", lambda one: one.act_when_free(names.START_SCAN)) for _ in range(2)]
     stopped = persons.submit("Ada", lambda one: one.act(names.STOP_SCAN), urgent=True)
-    assert stopped.result(SOON_S).ok
-    assert [one.result(SOON_S).code for one in waiting] == [ControlResponse.NOT_FREE] * 2
+    assert stopped.result(DEADLINE_S).ok
+    assert [one.result(DEADLINE_S).code for one in waiting] == [ControlResponse.NOT_FREE] * 2
     assert link.asked[-1] == names.STOP_SCAN
 
 
 def test_urgent_action_of_another_person_ends_no_wait(persons: Persons, link: BusyMicroscope) -> None:
     waiting = persons.submit("Ada", lambda one: one.act_when_free(names.START_SCAN))
-    assert persons.submit("Max", lambda one: one.act(names.STOP_SCAN), urgent=True).result(SOON_S).ok
+    assert persons.submit("Max", lambda one: one.act(names.STOP_SCAN), urgent=True).result(DEADLINE_S).ok
     with pytest.raises(TimeoutError):
         waiting.result(0.2)
-    assert persons.submit("Ada", lambda one: one.act(names.STOP_SCAN), urgent=True).result(SOON_S).ok
-    assert waiting.result(SOON_S).code == ControlResponse.NOT_FREE
+    assert persons.submit("Ada", lambda one: one.act(names.STOP_SCAN), urgent=True).result(DEADLINE_S).ok
+    assert waiting.result(DEADLINE_S).code == ControlResponse.NOT_FREE
 
 
 def test_scan_after_an_urgent_action_waits_again(persons: Persons, link: BusyMicroscope) -> None:
-    assert persons.submit("Ada", lambda one: one.act(names.STOP_SCAN), urgent=True).result(SOON_S).ok
+    assert persons.submit("Ada", lambda one: one.act(names.STOP_SCAN), urgent=True).result(DEADLINE_S).ok
     waiting = persons.submit("Ada", lambda one: one.act_when_free(names.START_SCAN))
     with pytest.raises(TimeoutError):
         waiting.result(0.2)
-    persons.submit("Ada", lambda one: one.act(names.STOP_SCAN), urgent=True).result(SOON_S)
+    persons.submit("Ada", lambda one: one.act(names.STOP_SCAN), urgent=True).result(DEADLINE_S)
 
 
 def test_renewal_is_carried_out_while_a_scan_waits_which_then_waits_on(persons: Persons, link: BusyMicroscope) -> None:
     waiting = persons.submit("Ada", lambda one: one.act_when_free(names.START_SCAN))
     for lease_s in (60.0, 61.0):
-        assert persons.submit("Ada", lambda one, s=lease_s: one.renew(s), meanwhile=True).result(SOON_S).ok  # type: ignore[misc]
+        assert persons.submit("Ada", lambda one, s=lease_s: one.renew(s), meanwhile=True).result(DEADLINE_S).ok  # type: ignore[misc]
     assert link.asked == [60.0, 61.0]
     with pytest.raises(TimeoutError):
         waiting.result(0.2)
-    assert persons.submit("Ada", lambda one: one.act(names.STOP_SCAN), urgent=True).result(SOON_S).ok
+    assert persons.submit("Ada", lambda one: one.act(names.STOP_SCAN), urgent=True).result(DEADLINE_S).ok
 
 
 def test_renewal_is_carried_out_where_nothing_waits(persons: Persons, link: BusyMicroscope) -> None:
-    assert persons.submit("Ada", lambda one: one.renew(60.0), meanwhile=True).result(SOON_S).ok
+    assert persons.submit("Ada", lambda one: one.renew(60.0), meanwhile=True).result(DEADLINE_S).ok
     assert link.asked == [60.0]

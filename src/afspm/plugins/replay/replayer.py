@@ -50,7 +50,7 @@ class Replayer:
         self._published = PublishedHistory(clock)
         self._wake_up: WakeUp[None] = WakeUp()
         try:
-            self._publisher = Publisher(self._network, publish, self._published)
+            self._publisher = Publisher(self._network, publish, self._published, log)
             self._router = Router(self._network, serve, log, clock)
         except TransportError:
             self.close()

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from itertools import chain
+
+from afspm.basics.plain_data import from_json
 
 IDENTIFY, DESCRIBE, ACTIVATE = "*IDN?", "describe", "activate"
 LONGEST = 1 << 20
 """The greatest length of a line in bytes; a longer line is not SECoP."""
+_MOST_NESTED = 64
+# SECoP's own structures have a depth of about ten. Below Python's limit a value could be read, and not be printed.
 
 
 @dataclass(frozen=True)
@@ -58,10 +63,20 @@ def parse(line: str) -> SecopLine | None:
     if not action:
         return None
     try:
-        data = json.loads(text) if text else None
+        data = from_json(text) if text else None
     except ValueError:
         return None
-    return SecopLine(action, specifier, data)
+    return None if _is_nested_deeper(data, _MOST_NESTED) else SecopLine(action, specifier, data)
+
+
+def _is_nested_deeper(data: object, levels: int) -> bool:
+    here = [data]
+    for _ in range(levels):
+        holders = [one.values() if isinstance(one, dict) else one for one in here if isinstance(one, dict | list)]
+        here = list(chain.from_iterable(holders))
+        if not here:
+            return False
+    return True
 
 
 def number_in(value: object) -> float | None:

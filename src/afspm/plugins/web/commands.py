@@ -207,12 +207,13 @@ def _run_as_guest(folder: Path, dashboard: Dashboard, name: str) -> int:
     from afspm.basics.clock import ExperimentClock
     from afspm.client.connect import guest_of
     from afspm.record.run_json import STATE_DIR
+    from afspm.supervisor.own_runs import own_messages
     from afspm.transport.process.context import ProcessActivity, ProcessContext, new_session
     from afspm.transport.zmq_port import open_port
     from afspm.wire.message_types import register_all
 
     launch = guest_of(folder, name)
-    register_all(launch.messages)
+    register_all(own_messages(folder, launch.messages))
     launch = dataclasses.replace(launch, run_dir=str(folder), state_dir=str(folder / STATE_DIR))
     clock = ExperimentClock.from_dict(launch.clock)
     port = open_port(launch, clock)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -15,13 +14,14 @@ from typing import TextIO, TypeAlias
 from afspm.basics.clock import NS_PER_S, utc_time
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.basics.formatting import duration_text
-from afspm.basics.plain_data import Plain, PlainMapping
+from afspm.basics.plain_data import Plain, PlainMapping, from_json
 from afspm.experiment.toml_writer import dumps
 from afspm.plugins.what_if.what_if import changed_experiment
 from afspm.record.report import story
 from afspm.record.report.story import RunStory
 from afspm.record.run import Run, open_run
-from afspm.record.run_json import ENDED, run_json_or_empty
+from afspm.record.run_json import ENDED, EXPERIMENT_FILE, run_json_or_empty
+from afspm.supervisor.own_runs import own_homes
 from afspm.supervisor.run import RunOptions
 from afspm.supervisor.run import run as run_experiment
 
@@ -68,19 +68,34 @@ def rerun(
         runs: parent folder of the new run.
 
     Raises:
-        InvalidValue: the run was not simulated, has not ended, or a change is not a table of settings.
+        InvalidValue: the run was not made by this user in this folder, was not simulated, has not ended, or a change is
+            not a table of settings.
         ConfigError: the changed experiment has errors.
     """
     with open_run(run) as record, TemporaryDirectory(prefix="afspm-what-if-") as made:
         facts = run_json_or_empty(record.folder)
+        homes = _own_homes(record.folder)
         _require_simulated(record, facts)
         overlay = Path(made) / "changed.toml"
         overlay.write_text(_overlay(changes, facts), encoding="utf-8")
-        experiment = changed_experiment(record.folder, *_files(changes), overlay)
+        files = _files(changes)
+        experiment = changed_experiment(
+            record.folder, [*homes, *(file.resolve().parent for file in files)], *files, overlay
+        )
         speed = facts.get("clock", {}).get("speed")
         ended = run_experiment(experiment, RunOptions(runs=runs, speed=speed, report=False), terminal)
         with open_run(ended.folder) as again:
             return Outcomes(ended.folder, _rows(record, again), _lasted_alike(record, again, speed))
+
+
+def _own_homes(folder: Path) -> list[Path]:
+    if (homes := own_homes(folder)) is None:
+        raise InvalidValue(
+            "this run is not known as one of yours, and to run it again starts the programs that it names",
+            where=str(folder),
+            hint=f"if you trust them: afspm run {folder / EXPERIMENT_FILE}",
+        )
+    return homes
 
 
 def _require_simulated(record: Run, facts: PlainMapping) -> None:
@@ -130,7 +145,7 @@ def _truth(folder: Path) -> list[Plain]:
     with suppress(OSError):
         for text in (folder / _TRUTH).read_text(encoding="utf-8").splitlines():
             with suppress(ValueError):
-                line = json.loads(text)
+                line = from_json(text)
                 lines[line["n"]] = line
     return list(lines.values())
 

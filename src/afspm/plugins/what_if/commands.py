@@ -54,6 +54,10 @@ def what_if(
     runs: Annotated[Path, typer.Option("--runs", metavar="DIR", help="Where --closed makes the new runs.")] = Path(
         "runs"
     ),
+    import_from: Annotated[
+        list[Path] | None,
+        opt("Import classes from this folder, too; may be repeated.", "--import-from", metavar="DIR", file_okay=False),
+    ] = None,
     as_json: Annotated[bool, opt("For programs.", "--json")] = False,
     page: Annotated[
         Path | None, opt("Write the result as one HTML page, too.", "--page", metavar="FILE", dir_okay=False)
@@ -72,7 +76,7 @@ def what_if(
         differs = [_rerun(folder, changes, runs) for folder in folders]
         code = DIFFERS if any(differs) else 0
     else:
-        code = _replay(folders, changes, names_in(component), page, as_json=as_json)
+        code = _replay(folders, changes, names_in(component), page, import_from or [], as_json=as_json)
     if code:
         raise typer.Exit(code)
 
@@ -116,7 +120,13 @@ def _require_page(page: Path, *, closed: bool) -> None:
 
 
 def _replay(
-    folders: list[Path], changes: GivenChanges, only: tuple[str, ...], target: Path | None, *, as_json: bool
+    folders: list[Path],
+    changes: GivenChanges,
+    only: tuple[str, ...],
+    target: Path | None,
+    import_from: list[Path],
+    *,
+    as_json: bool,
 ) -> int:
     from afspm.plugins.what_if.page import DifferencePage
     from afspm.plugins.what_if.what_if import what_if
@@ -124,7 +134,7 @@ def _replay(
     page, differs, is_whole = DifferencePage(changes), False, True
     for folder in folders:
         try:
-            result = what_if(folder, changes, only=only)
+            result = what_if(folder, changes, only=only, import_from=import_from)
         except AfspmError as error:
             if len(folders) == 1:
                 raise

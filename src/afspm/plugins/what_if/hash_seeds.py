@@ -12,7 +12,6 @@ from pathlib import Path
 from afspm.client import port_log
 from afspm.plugins.what_if import component_replay
 from afspm.plugins.what_if.port_replay import read_lives
-from afspm.plugins.what_if.recorded_packets import recorded_packets
 from afspm.record.run import open_run
 
 _SEEDS = ("1", "2")
@@ -25,8 +24,9 @@ def hazards(run: Path, name: str) -> list[str]:
 
     Empty if they do not, or if a replay fails.
     """
-    command = [sys.executable, "-c", f"from {__name__} import main; main()", str(run), name]
-    path = os.pathsep.join([os.getcwd(), *filter(None, sys.path)])  # noqa: PTH109 - "" in sys.path means this folder
+    command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()", str(run), name]
+    # the same modules as here; "" means the current folder, from which nothing else is imported
+    path = os.pathsep.join(one or str(Path.cwd()) for one in sys.path)
     lines = []
     for seed in _SEEDS:
         try:
@@ -59,7 +59,7 @@ def main() -> None:
     run, name = sys.argv[1:]
     with open_run(run) as record:
         lives = read_lives(port_log.log_path(record.folder, name))
-        made = component_replay.replay(lives, recorded_packets(record), record.folder)
+        made = component_replay.replay(lives, record.packet_lookup(), record.folder)
     for one in made.now:
         value = one.value if isinstance(one.value, bytes) else one.value.encode()
         sys.stdout.write(f"{one.message} {one.key} {zlib.crc32(value)} {one.packet} {one.life}\n")

@@ -179,8 +179,9 @@ class HazardGuard:
 
     def _forbid(self, what: str) -> None:
         place = _place(sys._getframe(1), through_afspm=True)
-        if place == "" and threading.current_thread() in _threads:  # the library at work for the component
-            place = f"in the thread {threading.current_thread().name}"
+        if place == "":  # the library at work for the component
+            is_own = threading.current_thread() in _threads
+            place = f"in the thread {threading.current_thread().name}" if is_own else "through its settings"
         if place:
             self.seen.setdefault(f"{what} ({place})")
             self.forbidden = self.forbidden or what

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC
 from pathlib import Path
@@ -14,6 +15,7 @@ from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import ConfigError, FileError, InvalidValue
 from afspm.basics.formatting import day_and_time, duration_text
 from afspm.basics.launch import Launch
+from afspm.basics.named_imports import trusting_only
 from afspm.client import port_log
 from afspm.client.component import Component
 from afspm.experiment import Experiment
@@ -26,14 +28,13 @@ from afspm.plugins.what_if import component_replay, hash_seeds, scheduler_replay
 from afspm.plugins.what_if.alignment import Difference
 from afspm.plugins.what_if.component_replay import ComponentReplay
 from afspm.plugins.what_if.port_replay import Life, PacketOf, read_lives
-from afspm.plugins.what_if.recorded_packets import recorded_packets
 from afspm.plugins.what_if.scheduler_replay import SchedulerReplay
 from afspm.record.run import Run, open_run
 from afspm.record.run_json import EXPERIMENT_FILE, run_json_or_empty
 from afspm.scheduler import step_log
 from afspm.storage.line_log import REQUESTS_FOLDER, read_lines
+from afspm.supervisor.own_runs import own_homes
 from afspm.supervisor.ports import FreePorts
-from afspm.supervisor.run import HOMES
 from afspm.transport.process.loading import find_class, load
 
 _SHIFTED_S = 1.0
@@ -188,7 +189,9 @@ class WhatIf:
         return one and replace(one, component=self.scheduler_name)
 
 
-def what_if(run: str | Path, changes: Changes = None, *, only: Collection[str] = ()) -> WhatIf:
+def what_if(
+    run: str | Path, changes: Changes = None, *, only: Collection[str] = (), import_from: Sequence[str | Path] = ()
+) -> WhatIf:
     """Replay a recorded run with changed components, and compare their outputs with the recorded outputs.
 
         r = afspm.what_if("runs/night-12", {"classifier": {"sigmas": 4.0}})
@@ -198,11 +201,16 @@ def what_if(run: str | Path, changes: Changes = None, *, only: Collection[str] =
     The run must have been recorded with `[record] requests = true`. Nothing outside a temporary folder is written. A
     process that can't be replayed is listed in `unread`, unless it was changed or chosen by `only`.
 
+    Classes are imported from the folders of the experiment files only if this user has made the run, in this folder.
+    Of any other run, classes are imported that installed packages declare for afspm, that the caller has imported
+    already, or that are in `import_from`.
+
     Args:
         run: folder of the run.
         changes: new settings or another class, by the name of a component; or an experiment file that overrides the
             run's. None: only the installed version differs.
         only: names of processes to replay; empty: all.
+        import_from: folders with trusted modules.
 
     Raises:
         FileError: the run has no recorded requests, those of a changed or chosen process can't be read, or the
@@ -210,9 +218,9 @@ def what_if(run: str | Path, changes: Changes = None, *, only: Collection[str] =
         ConfigError: a changed or chosen component can't be created, or a name is unknown.
         InvalidValue: a change is neither settings nor a class.
     """
-    with open_run(run) as record, importing_from(_homes(record.folder, *_files(changes))):
+    with open_run(run) as record, _trusted(record.folder, import_from, *_files(changes)) as homes:
         logs = _logs(record.folder)
-        changed, untried = _changed(record.folder, changes, logs)
+        changed, untried = _changed(record.folder, changes, logs, homes)
         unknown = {*(changes if isinstance(changes, Mapping) else ()), *only} - logs.keys()
         if unknown:
             raise ConfigError(
@@ -223,7 +231,7 @@ def what_if(run: str | Path, changes: Changes = None, *, only: Collection[str] =
         result = WhatIf(record.folder, left_out=_without_log(record, logs), simulated=record.simulated)
         result.untried = untried
         result.subscribed = _subscribed(record)
-        packet_of = recorded_packets(record)
+        packet_of = record.packet_lookup()
         for name, path in sorted(logs.items()):
             if only and name not in only:
                 result.left_out[name] = "only others were chosen"
@@ -295,7 +303,7 @@ def _replay(
 
 def _unrecorded(class_path: str) -> str:
     try:
-        class_ = find_class(class_path, "")
+        class_ = find_class(class_path, "", of_process=True)
     except ConfigError:  # the replay has the error, unless the change gives another class
         return ""
     return next((why for mark, why in _UNRECORDED.items() if getattr(class_, mark, False)), "")
@@ -335,18 +343,20 @@ def _is_component(part: object) -> bool:
     return isinstance(part, dict) and bool(part.get("component"))
 
 
-def _changed(folder: Path, changes: Changes, logs: Mapping[str, Path]) -> tuple[dict[str, Changed], dict[str, str]]:
+def _changed(
+    folder: Path, changes: Changes, logs: Mapping[str, Path], homes: Sequence[Path]
+) -> tuple[dict[str, Changed], dict[str, str]]:
     # the changes by name, and for each change that is not tried its reason
     if changes is None:
         return {}, {}
     if isinstance(changes, str | Path):
-        return _changed_by_file(folder, Path(changes), logs)
+        return _changed_by_file(folder, Path(changes), logs, homes)
     found: dict[str, Changed] = {}
     for name, change in changes.items():
         if isinstance(change, type):
             found[name] = (None, _made_by(change))
         elif isinstance(change, Mapping):
-            settings = {**_settings(logs[name]), **_in_si(folder, name, change)} if name in logs else change
+            settings = {**_settings(logs[name]), **_in_si(folder, name, change, homes)} if name in logs else change
             found[name] = (settings, None)
         else:
             raise InvalidValue(
@@ -355,7 +365,7 @@ def _changed(folder: Path, changes: Changes, logs: Mapping[str, Path]) -> tuple[
     return found, {}
 
 
-def _in_si(folder: Path, name: str, change: Mapping[str, object]) -> Mapping[str, object]:
+def _in_si(folder: Path, name: str, change: Mapping[str, object], homes: Sequence[Path]) -> Mapping[str, object]:
     # texts may have units, as in an experiment file
     if not ('"' in json.dumps([*change.values()], default=repr) and (folder / EXPERIMENT_FILE).is_file()):
         return change
@@ -365,7 +375,7 @@ def _in_si(folder: Path, name: str, change: Mapping[str, object]) -> Mapping[str
             overlay.write_text(dumps({name: dict(change)}), encoding="utf-8")
         except (TypeError, ValueError):  # an object, for a class of the caller
             return change
-        starts = changed_experiment(folder, overlay).launches(take_address=FreePorts().address)
+        starts = changed_experiment(folder, homes, overlay).launches(take_address=FreePorts().address)
     settings = next((one.launch.settings for one in starts if one.launch.name == name), {})
     return {key: settings.get(key, value) for key, value in change.items()}
 
@@ -386,10 +396,12 @@ def _launch(path: Path) -> Launch:
     raise FileError("has no beginning of a life", where=str(path))
 
 
-def _changed_by_file(folder: Path, file: Path, logs: Mapping[str, Path]) -> tuple[dict[str, Changed], dict[str, str]]:
+def _changed_by_file(
+    folder: Path, file: Path, logs: Mapping[str, Path], homes: Sequence[Path]
+) -> tuple[dict[str, Changed], dict[str, str]]:
     if not file.is_file():
         raise FileError("there is no such file", where=str(file))
-    experiment = changed_experiment(folder, file)
+    experiment = changed_experiment(folder, homes, file)
     found: dict[str, Changed] = {}
     for start in experiment.launches(take_address=FreePorts().address):
         launch = start.launch
@@ -401,7 +413,7 @@ def _changed_by_file(folder: Path, file: Path, logs: Mapping[str, Path]) -> tupl
         if (launch.class_, json.dumps(launch.settings)) == (before.class_, json.dumps(before.settings)):
             continue
         found[launch.name] = (launch.settings, _loaded_as(launch.class_))
-    untried = _untried(changed_experiment(folder), experiment, found, logs)
+    untried = _untried(changed_experiment(folder, homes), experiment, found, logs)
     if untried and not found:  # without an error this would look as if the change made no difference
         raise ConfigError(
             "nothing that this file changes can be tried: "
@@ -450,20 +462,36 @@ def _loaded_as(class_path: str) -> component_replay.Make:
     return lambda launch: load(replace(launch, class_=class_path))
 
 
-def changed_experiment(folder: Path, *files: Path) -> Experiment:
+def changed_experiment(folder: Path, homes: Sequence[Path], *files: Path) -> Experiment:
     """Return the experiment of a run, with overriding files applied.
+
+    Args:
+        homes: folders in which classes are found; at least one.
 
     Raises:
         ConfigError: the experiment has errors.
     """
-    experiment = load_expanded(folder / EXPERIMENT_FILE, _homes(folder, *files), *files)
+    experiment = load_expanded(folder / EXPERIMENT_FILE, homes, *files)
     experiment.require_valid()
     return experiment
 
 
-def _homes(folder: Path, *files: Path) -> list[Path]:
-    # as in the run, the user's classes are found beside the experiment files
-    return [*map(Path, run_json_or_empty(folder).get(HOMES, [])), *(file.resolve().parent for file in files)]
+@contextmanager
+def _trusted(folder: Path, import_from: Sequence[str | Path], *files: Path) -> Iterator[list[Path]]:
+    # yields the folders in which classes are found
+    given = [Path(path).resolve() for path in import_from]
+    if missing := [path for path in given if not path.is_dir()]:
+        raise FileError("there is no such folder", where=str(missing[0]), hint="see --import-from")
+    own = own_homes(folder)
+    if own is not None:  # as in the run, the user's classes are found beside the experiment files
+        homes = [*own, *(file.resolve().parent for file in files), *given]
+        with importing_from(homes):
+            yield homes
+        return
+    with TemporaryDirectory(prefix="afspm-what-if-") as empty:  # without any folder, the run folder would be one
+        homes = given or [Path(empty)]
+        with importing_from(homes), trusting_only(homes):
+            yield homes
 
 
 def _files(changes: Changes) -> list[Path]:

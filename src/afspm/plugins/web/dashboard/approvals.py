@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from functools import partial
 from html import escape
@@ -15,7 +14,7 @@ from afspm.basics.plain_data import Plain
 from afspm.model import Approval, Frame, Grant, Proposal, names
 from afspm.model.events import PERSON
 from afspm.plugins.agent.approval import of_plan, of_table, simulated
-from afspm.plugins.agent.plan import plan_of
+from afspm.plugins.agent.plan import plan_of, title_of
 from afspm.plugins.agent.untrusted import escaped
 from afspm.plugins.web.dashboard.actions import ActionResult
 from afspm.plugins.web.dashboard.steering_session import SteeringSession, ask_in_dialog, button
@@ -134,10 +133,7 @@ def grant_of(table: Mapping[str, object], facts: Plain) -> Grant:
 
 def title(proposal: Proposal) -> str:
     """Return the plan's title, escaped; empty if the plan has none."""
-    try:
-        return escaped(str(json.loads(proposal.plan)["title"]))
-    except (ValueError, KeyError, TypeError):
-        return ""
+    return escaped(title_of(proposal.plan))
 
 
 def reviewed(proposal: Proposal) -> tuple[Grant, list[str]]:

@@ -11,7 +11,17 @@ from html import escape
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.formatting import day_and_time, duration_text, time_of_day, typeset_area
-from afspm.model import ControlMode, Feedback, JournalEntry, LogLine, Note, ProcessCondition, ProcessState, Region
+from afspm.model import (
+    ControlMode,
+    Feedback,
+    JournalEntry,
+    LogLine,
+    Note,
+    ProcessCondition,
+    ProcessState,
+    Region,
+    TipStatus,
+)
 from afspm.model.events import PERSON
 from afspm.plugins.web.dashboard.charts import Chart, drift_chart
 from afspm.plugins.web.dashboard.flags import Flag, flags
@@ -70,6 +80,8 @@ class Content:
     unheard: Mapping[str, int] = field(default_factory=dict)
     log: tuple[LogLine, ...] = ()
     is_manual: bool = False
+    by_hand: str = ""
+    tip: TipStatus | None = None
     adjustable: tuple[str, ...] = ()
     set_ns: Mapping[str, int] = field(default_factory=dict)
     feedback: Feedback | None = None
@@ -140,6 +152,8 @@ class Contents:
                 unheard=silent,
                 log=tuple(overview.log),
                 is_manual=control is not None and control.mode is ControlMode.MANUAL,
+                by_hand=overview.by_hand,
+                tip=overview.tip,
                 adjustable=self._adjustable,
                 set_ns=dict(overview.set_ns),
                 feedback=overview.readings.feedback,

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from afspm.basics.plain_data import from_json
 from afspm.storage.atomic import replace_file
 
 if TYPE_CHECKING:
@@ -113,6 +114,6 @@ def _read(file: Path | None) -> _Kept:
     if file is None:
         return _Kept()
     try:
-        return _Kept(**json.loads(file.read_bytes()))
+        return _Kept(**from_json(file.read_bytes()))
     except (OSError, ValueError, TypeError):
         return _Kept()  # missing or damaged: every person signs in again

@@ -34,7 +34,7 @@ class ModeButtons:
         self._manual = self._automated = None
         if session.signed_in:
             self._manual = button("Take over: MANUAL", lambda: self._set(ControlMode.MANUAL), "primary")
-            self._automated = button("Hand back: AUTOMATED", lambda: self._set(ControlMode.AUTOMATED), "primary")
+            self._automated = button("Hand back: AUTOMATED", self._hand_back, "primary")
             self._automated.set_visibility(False)
 
     def show(self) -> None:
@@ -46,9 +46,18 @@ class ModeButtons:
     def _set(self, mode: ControlMode) -> None:
         self._session.do(lambda a: a.set_mode(mode), urgent=True)
 
+    async def _hand_back(self) -> None:
+        content = self._session.content
+        if content.by_hand:
+            tip = content.tip or "the microscope does not report its tip"
+            text = f"{content.by_hand[:1].upper()}{content.by_hand[1:]}. Now {tip}. Components will measure again."
+            if not await asked("Let the run continue?", text, "Continue"):
+                return
+        self._set(ControlMode.AUTOMATED)
+
 
 class ProblemBar:
-    """A line for each flagged problem, with advice and a button to clear the problem."""
+    """A line for each flagged problem, with advice and a button to clear it, and for a person at the microscope."""
 
     def __init__(self, session: SteeringSession) -> None:
         self._session = session
@@ -57,13 +66,17 @@ class ProblemBar:
         self._box.set_visibility(False)
 
     def show(self) -> None:
-        flags, may = self._session.content.problems, self._session.may_steer
-        if (flags, may) == self._shown:
+        content, may = self._session.content, self._session.may_steer
+        flags, by_hand, remedy = content.problems, content.by_hand, content.tip.remedy if content.tip else ""
+        if (flags, may, by_hand, remedy) == self._shown:
             return
-        self._shown = (flags, may)
-        self._box.set_visibility(bool(flags))
+        self._shown = (flags, may, by_hand, remedy)
+        self._box.set_visibility(bool(flags or by_hand))
         self._box.clear()
         with self._box:
+            if by_hand:
+                with ui.element("div").classes("flag"):
+                    ui.html(_by_hand_html(by_hand, remedy), sanitize=False)
             for flag in flags:
                 with ui.element("div").classes("flag"):
                     ui.html(_flag_html(flag), sanitize=False)
@@ -79,6 +92,14 @@ class ProblemBar:
             self._session.do(lambda a: a.clear(numbers[0]))
         else:
             self._session.do(lambda a: a.clear_all(numbers))
+
+
+def _by_hand_html(by_hand: str, remedy: str) -> str:
+    advice = f"{remedy}; then hand back." if remedy else "Nothing is sent to the microscope until you hand back."
+    return (
+        f'<b data-part="by-hand">A person is at the microscope</b> <small>{escape(by_hand)}</small>'
+        f'<span class="advice">{escape(advice[:1].upper() + advice[1:])}</span>'
+    )
 
 
 def _flag_html(flag: Flag) -> str:
