@@ -65,11 +65,16 @@ def test_release_moves_fragments_into_the_changelog(tool: ModuleType, tmp_path: 
     (tmp_path / "CHANGELOG.md").write_text("# Changelog\n\n## [0.1.0] - 2026-11-24\n\n- First.\n", encoding="utf-8")
     for name, text in {"README.md": "page", "film.record.md": "- Film.\n", "a.drift.md": "- A.\n- B.\n"}.items():
         (tmp_path / "changes" / name).write_text(text, encoding="utf-8")
-    tool.main("0.2.0", date(2027, 3, 1), tmp_path)
+    project = tmp_path / "pyproject.toml"
+    project.write_text('[project]\nversion = "0.1.0"\n', encoding="utf-8")
+    with pytest.raises(SystemExit, match=r"has version 0\.1\.0 already; raise that of"):
+        tool.main(date(2027, 3, 1), tmp_path)
+    project.write_text('[project]\nversion = "0.2.0"\n', encoding="utf-8")
+    tool.main(date(2027, 3, 1), tmp_path)
     assert (tmp_path / "CHANGELOG.md").read_text(encoding="utf-8") == (
         "# Changelog\n\n## [0.2.0] - 2027-03-01\n\n### Drift\n\n- A.\n- B.\n\n### Record\n\n- Film.\n\n"
         "## [0.1.0] - 2026-11-24\n\n- First.\n"
     )
     assert [file.name for file in (tmp_path / "changes").iterdir()] == ["README.md"]
     with pytest.raises(SystemExit, match="no fragments"):
-        tool.main("0.3.0", date(2027, 4, 1), tmp_path)
+        tool.main(date(2027, 4, 1), tmp_path)

@@ -7,7 +7,7 @@ import builtins
 import keyword
 import re
 import sys
-from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import afspm
@@ -15,6 +15,7 @@ from afspm.basics import entry_points
 
 ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "src" / "afspm"
+WORD = re.compile(r"[A-Za-z_]\w*")
 QUOTED = re.compile(r"(?<!`)`([A-Za-z_][\w.]*)(?:\([^`]*\))?`(?!`)")
 FILES = [file for file in sorted(SOURCE.rglob("*.py")) if "generated" not in file.parts]
 MODULES = {".".join(file.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__") for file in FILES}
@@ -26,42 +27,50 @@ FOREIGN = frozenset(
 PUBLIC = frozenset(afspm.__all__) | {group.removeprefix("afspm.") for group in entry_points.GROUPS}
 
 
-def _identifiers(tree: ast.Module) -> Iterator[str]:
-    for node in ast.walk(tree):
-        match node:
-            case ast.Name(id=name) | ast.Attribute(attr=name) | ast.arg(arg=name) | ast.alias(name=name):
-                yield from name.split(".")
-            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
-                yield name
-            case ast.keyword(arg=str(name)):
-                yield name
+@dataclass
+class Names:
+    """The names in the package's modules.
 
+    Attributes:
+        identifiers: the identifiers, with the names of the modules.
+        words: these, with every word of plain strings (keys of tables, names of messages) and of other files.
+        quoted: the back-quoted names of docstrings, each with its place.
+    """
 
-def _words(tree: ast.Module) -> Iterator[str]:
-    """Yield every word of the plain strings of a module (keys of tables, names of messages)."""
-    docstrings = {id(node) for node in _docstring_nodes(tree)}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
-            yield from re.findall(r"[A-Za-z_]\w*", node.value)
+    identifiers: set[str]
+    words: set[str]
+    quoted: list[tuple[str, str]]
 
+    @classmethod
+    def of_package(cls) -> Names:
+        found = cls({*dir(builtins), *keyword.kwlist, *EXTERNAL}, set(FOREIGN), [])
+        for file in FILES:
+            found._add(file)
+        for other in (*(ROOT / "proto").rglob("*.proto"), *SOURCE.rglob("*.toml"), ROOT / "pyproject.toml"):
+            found.words.update(WORD.findall(other.read_text(encoding="utf-8")))
+        found.words |= found.identifiers
+        return found
 
-def _docstring_nodes(tree: ast.Module) -> Iterator[ast.Constant]:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
-            yield node.value
-
-
-def _known() -> tuple[set[str], set[str]]:
-    """Return the identifiers of the package with the names of its modules, and these with all other words."""
-    identifiers, words = {*dir(builtins), *keyword.kwlist, *EXTERNAL}, set(FOREIGN)
-    for file in FILES:
-        tree = ast.parse(file.read_text(encoding="utf-8"))
-        identifiers.update(_identifiers(tree), file.relative_to(SOURCE).with_suffix("").parts)
-        words.update(_words(tree))
-    others = [*(ROOT / "proto").rglob("*.proto"), *SOURCE.rglob("*.toml"), ROOT / "pyproject.toml"]
-    for other in others:
-        words.update(re.findall(r"[A-Za-z_]\w*", other.read_text(encoding="utf-8")))
-    return identifiers, identifiers | words
+    def _add(self, file: Path) -> None:
+        # one walk for all, and a node's docstring comes before the strings in it: parsing takes long enough
+        docstrings = set()
+        self.identifiers.update(file.relative_to(SOURCE).with_suffix("").parts)
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            match node:
+                case ast.Name(id=name):
+                    self.identifiers.add(name)
+                case ast.Attribute(attr=name) | ast.arg(arg=name) | ast.alias(name=name):
+                    self.identifiers.update(name.split("."))
+                case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+                    self.identifiers.add(name)
+                case ast.keyword(arg=str(name)):
+                    self.identifiers.add(name)
+                case ast.Expr(value=ast.Constant(value=str(text)) as docstring):
+                    docstrings.add(docstring)
+                    place = f"{file.relative_to(ROOT)}:{docstring.lineno}"
+                    self.quoted += [(place, name.rstrip(".")) for name in QUOTED.findall(text)]
+                case ast.Constant(value=str(text)) if node not in docstrings:
+                    self.words.update(WORD.findall(text))
 
 
 def _is_there(name: str, identifiers: set[str], words: set[str]) -> bool:
@@ -87,14 +96,9 @@ def _resolves(path: str) -> bool:
 
 
 def test_quoted_names_in_docstrings_exist() -> None:
-    identifiers, words = _known()
-    missing = []
-    for file in FILES:
-        tree = ast.parse(file.read_text(encoding="utf-8"))
-        for node in _docstring_nodes(tree):
-            missing += [
-                f"{file.relative_to(ROOT)}:{node.lineno}: `{name}`"
-                for name in QUOTED.findall(str(node.value))
-                if not _is_there(name.rstrip("."), identifiers, words)
-            ]
+    names = Names.of_package()
+    missing = [
+        f"{place}: `{name}`" for place, name in names.quoted if not _is_there(name, names.identifiers, names.words)
+    ]
+    assert names.quoted
     assert not missing, "\n".join(missing)

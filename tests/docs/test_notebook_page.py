@@ -6,18 +6,16 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
 from afspm_process import AFSPM
+from deadlines import DEADLINE_S
 from tests.docs.test_snippets import FILE_NAME, ROOT, snippets
 
 import afspm
 from afspm.model import ScopeState
 
 PAGE = ROOT / "docs" / "how-to" / "use-a-notebook.md"
-DEADLINE_S = 60.0
 
 
-@pytest.mark.timeout(120)
 def test_the_script_of_the_page_measures_and_ends_the_experiment(tmp_path: Path) -> None:
     for snippet in snippets(PAGE):
         if name := FILE_NAME.match(snippet.text):

@@ -38,6 +38,10 @@ FOUND = re.compile(rf"\b({'|'.join(WORDS)})\b", re.IGNORECASE)
 IN_A_NAME = re.compile(rf"(?<=_)({'|'.join(word.replace(' ', '_') for word in WORDS)})(?=_|$)")
 EXPRESSION = re.compile(r"\{[^{}]*\}")  # of an f-string
 MARKER = re.compile(r"(?:#|<!--) word: ([\w, ]+)")
+REMEDY = (
+    '\nWrite the noun, or a verb that fits data: the table under "How we write" in CONTRIBUTING.md has examples. '
+    "A line that needs the word ends with `# word: ` and the word, a line of a page with `<!-- word: ` and the word."
+)
 # code blocks, code in a line, and the addresses of links
 NOT_PROSE = re.compile(r"^(```|~~~).*?^\1|`[^`\n]*`|\]\([^)]*\)", re.MULTILINE | re.DOTALL)
 
@@ -67,8 +71,9 @@ def _unmarked(line: str, pattern: re.Pattern[str], whole_line: str) -> list[str]
     return [word for word in pattern.findall(line) if word.lower().replace("_", " ") not in allowed]
 
 
-def _report(file: Path, number: int, words: list[str]) -> list[str]:
-    return [f"{file.relative_to(ROOT).as_posix()}:{number}: {', '.join(words)}"] if words else []
+def _report(file: Path, number: int, words: list[str], line: str) -> list[str]:
+    place = f"{file.relative_to(ROOT).as_posix()}:{number}"
+    return [f"{place}: avoid {', '.join(map(repr, words))} in: {line.strip()}"] if words else []
 
 
 def in_source(file: Path) -> list[str]:
@@ -76,7 +81,7 @@ def in_source(file: Path) -> list[str]:
     lines = source.splitlines()
     found = []
     for number, text in _sentences(source):
-        found += _report(file, number, _unmarked(MARKER.sub("", text), FOUND, lines[number - 1]))
+        found += _report(file, number, _unmarked(MARKER.sub("", text), FOUND, lines[number - 1]), lines[number - 1])
     return found
 
 
@@ -85,7 +90,7 @@ def in_page(file: Path) -> list[str]:
     prose = NOT_PROSE.sub(lambda match: "\n" * match[0].count("\n"), page)
     found = []
     for number, line in enumerate(prose.splitlines(), 1):
-        found += _report(file, number, _unmarked(MARKER.sub("", line), FOUND, line))
+        found += _report(file, number, _unmarked(MARKER.sub("", line), FOUND, line), line)
     return found
 
 
@@ -95,23 +100,24 @@ def in_test_names(file: Path) -> list[str]:
     found = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.name.startswith("test_"):
-            found += _report(file, node.lineno, _unmarked(node.name, IN_A_NAME, lines[node.lineno - 1]))
+            line = lines[node.lineno - 1]
+            found += _report(file, node.lineno, _unmarked(node.name, IN_A_NAME, line), line)
     return found
 
 
 def test_source_is_free_of_the_words() -> None:
     found = [line for file in _python("src") for line in in_source(file)]
-    assert not found, "\n".join(found)
+    assert not found, "\n".join(found) + REMEDY
 
 
 def test_pages_are_free_of_the_words() -> None:
     found = [line for file in _pages() for line in in_page(file)]
-    assert not found, "\n".join(found)
+    assert not found, "\n".join(found) + REMEDY
 
 
 def test_names_of_tests_are_free_of_the_words() -> None:
     found = [line for file in _python("tests") for line in in_test_names(file)]
-    assert not found, "\n".join(found)
+    assert not found, "\n".join(found) + REMEDY
 
 
 def test_words_are_found_in_each_kind_of_text() -> None:

@@ -36,7 +36,7 @@ from afspm.model import (
 )
 from afspm.plugins.agent.approval import fresh, of_plan
 from afspm.plugins.agent.plan import plan_of
-from tests.simulation.agent_rig import ADA, AGENT, STOP, UM, AgentRig, AgentViolation, facts
+from tests.simulation.agent_rig import ADA, AGENT, STOP, STOPS, UM, AgentRig, AgentViolation, facts
 
 _TEXTS = (
     "0 nm",
@@ -73,6 +73,7 @@ class Attack:
         self.proposals: list[str] = []
         self.calls = 0
         self._raw = 0
+        self._spent: list[str] = []
 
     async def steps(self, count: int) -> None:
         """Make calls of tools and raw requests, among events of other peers."""
@@ -201,18 +202,29 @@ class Attack:
     def _raw_request(self) -> None:
         rig, chance = self.rig, self.random
         kind, subject = self._wish()
-        id_ = chance.choice(
-            (f"{AGENT}/{rig.life}/raw{self.calls}", f"{AGENT}/{rig.life}/raw{chance.randint(0, 50)}", "")
-        )
+        new = f"{AGENT}/{rig.life}/raw{self.calls}"
+        # an id that was spent, with another request: also after a restart, when fewer are known
+        id_ = chance.choice((*[new] * 6, chance.choice(self._spent[-6:] or [""]), ""))
         try:
-            rig.link(AGENT).request(kind, subject, request_id=id_)
+            answer = rig.link(AGENT).request(kind, subject, request_id=id_)
         except (ValueError, TypeError, OverflowError):  # it can't even be encoded
             return
+        if answer.ok and id_ == new and kind not in (ControlRequest.REQUEST_CTRL, ControlRequest.RELEASE_CTRL):
+            self._spent.append(id_)
 
     def _wish(self) -> tuple[int, Any]:
         chance = self.random
         if self.rig.core.control.holder != AGENT and chance.random() < 0.5:
             return int(ControlRequest.REQUEST_CTRL), 0
+        held = self.rig.watchman.plan
+        if held is not None and self.rig.core.control.holder == AGENT and chance.random() < 0.3:
+            if chance.random() < 0.3:
+                return int(ControlRequest.ACTION), chance.choice(STOPS)
+            known = self.rig.place.proposals.get(held.grant.plan)  # its steps: in turn, again, or one left out
+            steps = plan_of(known.plan).requests(self.rig.place.frame) if known else []
+            if steps:
+                planned = steps[(held.step + chance.choice((-1, 0, 0, 1))) % len(steps)]
+                return planned.kind, planned.subject
         if self.rig.place.proposals and chance.random() < 0.3:  # a step of a plan: again, early, or of another plan
             newest = list(self.rig.place.proposals.values())[-3:]
             planned = chance.choice(plan_of(chance.choice(newest).plan).requests(self.rig.place.frame))

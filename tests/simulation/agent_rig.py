@@ -119,7 +119,7 @@ class Watchman:
         self.stopped = False
         self.lease_s = 60.0
         self.alive_s = -math.inf
-        self.seen: dict[str, tuple[int, bytes, str]] = {}
+        self.seen: dict[str, tuple[int, bytes, str, int]] = {}
         self.started_ns: list[int] = []
         self.checked = 0
         self.disturbed_ns = 0
@@ -169,9 +169,15 @@ class Watchman:
             self.plan.step += 1
         else:
             self._within_grant(request)
-        self.seen[request.id] = (request.kind, request.payload, by)
+        self.seen[request.id] = (request.kind, request.payload, by, rig.now_ns)
         if subject == names.START_SCAN:
             self.started_ns.append(rig.now_ns)
+
+    def may_arrive_again(self, request: Request) -> None:
+        """Raise AgentViolation if an id of the last hour, known to scheduler and microscope, is of another request."""
+        known = self.seen.get(request.id)
+        if known is not None and self._rig.now_ns - known[3] < 3600 * 10**9:
+            self._must(known[:2] == (request.kind, request.payload), "an id with another content", request)
 
     def not_done(self, request: Request) -> None:
         """Take back a request that the microscope refused."""
@@ -207,6 +213,9 @@ class Watchman:
     def _within_grant(self, request: Request) -> None:
         held = self.grant
         self._must(held is not None and held.until_ns > self._rig.now_ns, "there is no approval", request)
+        plan = self.plan
+        is_between = plan is not None and 0 < plan.step < len(plan.grant.steps) and plan.until_ns > self._rig.now_ns
+        self._must(not is_between, "between two steps of a plan", request)
         assert held is not None
         grant, subject = held.grant, request.subject
         if request.kind == ControlRequest.ACTION:
@@ -327,7 +336,8 @@ class AgentRig:
             self.watch, _PatientBell(self.clock), Archive(None), measurements, self, Frame.TIP,
             experiment="rig", simulated=True, run_dir=run_dir,
         )  # fmt: skip
-        self.tools = AgentTools(self.place, _NoPreflight(), "claude")
+        self.twin = _NoPreflight()
+        self.tools = AgentTools(self.place, self.twin, "claude")
         self.links: dict[str, _Link] = {}
         self.connections: dict[str, int] = {}
         self.newest = 0
@@ -491,9 +501,12 @@ class AgentRig:
         if is_command:
             self.effects.append(f"{request.id} {request.kind} {request.subject}")
         known = self.done.get(request.id) if request.id else None
-        if known is None:
-            if is_agent and is_command:
+        if is_agent and is_command:
+            if known is None:
                 self.watchman.may_arrive(request)
+            else:
+                self.watchman.may_arrive_again(request)
+        if known is None:
             known = self._execute(request)
             if request.id:
                 self.done[request.id] = known

@@ -283,7 +283,15 @@ class Impostor(Client):
 
 
 class Operator(Client):
-    """A person who takes over from time to time."""
+    """A person who takes over from time to time.
+
+    Attributes:
+        put_right: sees to the microscope before the run continues; None: nobody acts at its panel.
+        sees_to_it: the chance that this person does so.
+    """
+
+    put_right: Callable[[], None] | None = None
+    sees_to_it = 1.0
 
     def behave(self) -> Doing:
         while True:
@@ -294,6 +302,9 @@ class Operator(Client):
 
     def automated(self) -> Doing:
         while True:
+            # one who does not see to the microscope is refused, where the controller shows the reason
+            if self.put_right is not None and self.timeline.chance(self.sees_to_it):
+                self.put_right()
             response = yield from self.ask(ControlRequest.SET_CONTROL_MODE, int(ControlMode.AUTOMATED))
             if response.code == _OK:
                 return
@@ -317,6 +328,8 @@ class Person(Operator):
             yield from self.until(self._is_called)
             yield from self.sleep(self.some(self.comes_s))
             yield from self.see_to_tip()
+            if self.put_right is not None and self.control.mode is ControlMode.MANUAL:
+                yield from self.automated()
 
     def see_to_tip(self) -> Doing:
         for problem in set(self.for_people).intersection(self.control.problems):
@@ -324,7 +337,8 @@ class Person(Operator):
             yield from self.ask(ControlRequest.RMV_EXP_PRBLM, int(problem))
 
     def _is_called(self) -> bool:
-        return not set(self.for_people).isdisjoint(self.control.problems)
+        gave_up = self.put_right is not None and self.control.mode is ControlMode.MANUAL
+        return gave_up or not set(self.for_people).isdisjoint(self.control.problems)
 
 
 class Dawn(Person):
@@ -370,6 +384,26 @@ class Stranger(Client):
             yield from self.sleep(self.some(600.0))
             kind, subject = self.timeline.random.choice(self.requests)
             yield from self.ask(kind, subject)
+
+
+class Babbler(Client):
+    """Sends frames that are no request."""
+
+    def behave(self) -> Doing:
+        while True:
+            yield from self.sleep(self.some(600.0))
+            if self._line is not None and self._line.up:
+                self._scheduler.take(self._scheduler.peer_sent, self._line, self._frames())
+
+    def _frames(self) -> list[bytes]:
+        return self.timeline.random.choice(
+            (
+                [b"\xff"],
+                [b"\x01", b"\xff\xff", f"{self.identity}/x-1/1".encode()],
+                [b"", b"", b"", b""],
+                [bytes([ControlRequest.END_EXPERIMENT])] * 4,
+            )
+        )
 
 
 class Teller(Client):

@@ -14,6 +14,7 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
+from afspm.model.events import SUPERVISOR, component_of
 from afspm.testing.components.memory_network import ControlLine, Feed, Weather
 from afspm.testing.components.scheduler_host import SchedulerHost
 from afspm.testing.components.simulated_process import Process, ProcessTimer
@@ -89,6 +90,7 @@ class Client(Process):
     def connect(self) -> None:
         """Open the connection for requests."""
         self._line = ControlLine(self.timeline, self._weather, self, self._scheduler, self.identity)
+        self._line.owner = component_of(self.identity if self.identity.startswith(SUPERVISOR) else self.name)
 
     def ended(self) -> None:
         if self._line is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,14 +23,14 @@ from afspm.plugins.drift.scheduler.messages import (
 from afspm.plugins.drift.scheduler.sample_frame import SampleFrame
 from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings, RescanRule
 from afspm.plugins.drift.trackers.paper import PaperForecast
-from afspm.scheduler.events import Delegate, Effect, Publish
+from afspm.scheduler.events import Effect, Publish
 from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.testing.components.scheduler_host import SchedulerHost
 from afspm.testing.components.simulated_time import START_S
 from tests.simulation.codec import TableCodec
 from tests.simulation.invariants import InvariantViolated
 from tests.simulation.microscope import SHAPE, FakeMicroscope, FakeScan, Habits
-from tests.simulation.night import Night, Plan
+from tests.simulation.night import Night, NightCodec, Plan
 
 WANTED = Region((0.0, 0.0), (2e-6, 2e-6))
 LONGEST_S = 2.0
@@ -55,7 +55,7 @@ class PlacedScan(FakeScan):
     """As it was published."""
 
 
-class DriftTable(TableCodec):
+class DriftTable(NightCodec):
     """A substitute for the wire format that knows places."""
 
     def decode_packet(self, message: str, payload: bytes | memoryview) -> Any:
@@ -110,12 +110,15 @@ class PlayedWorker:
     def __init__(self, night: DriftNight) -> None:
         self._night = night
         self._life = 0
+        self._reports: list[WorkerReport] = []
+        self.wake: Callable[[], None] = lambda: None
         self.registered = 0
         self.failed = 0
 
     def take(self, job: object) -> None:
         if isinstance(job, StartWorker):
             self._life += 1
+            self._reports.clear()
             self._say(Forecasted(self._night.known))
         else:
             assert isinstance(job, ScanJob), "nothing is handed over"
@@ -156,13 +159,19 @@ class PlayedWorker:
         )  # fmt: skip
 
     def _say(self, said: WorkerReport) -> None:
-        host: SchedulerHost | None = getattr(self._night, "scheduler", None)
-        if host is not None:
-            host.later(0.3 * self._night.timeline.random.random(), self._arrive, host, self._life, said)
+        self._night.scheduler.later(0.3 * self._night.timeline.random.random(), self._arrive, self._life, said)
 
-    def _arrive(self, host: SchedulerHost, life: int, said: WorkerReport) -> None:
+    def _arrive(self, life: int, said: WorkerReport) -> None:
         if life == self._life:
-            host.reported(said)
+            self._reports.append(said)
+            self.wake()
+
+    def reports(self) -> Iterator[WorkerReport]:
+        while self._reports:
+            yield self._reports.pop(0)
+
+    def close(self) -> None:
+        """Do nothing: the worker ends with the scheduler's life."""
 
 
 class DriftNight(Night):
@@ -182,7 +191,8 @@ class DriftNight(Night):
         self.published = 0
         self.worker = PlayedWorker(self)
         super().__init__(plan)
-        self.scheduler.journal.writes_ahead = True  # where a scan lies is not found out twice
+        self.scheduler.worker = self.worker
+        self.scheduler.unsynced_s = 0.0  # where a scan lies is not found out twice
         self._carried_out = self.invariants.carried_out
         self.invariants.carried_out = self.carried_out  # type: ignore[method-assign]
 
@@ -199,9 +209,7 @@ class DriftNight(Night):
 
     def carried_out(self, host: SchedulerHost, effect: Effect) -> None:
         self._carried_out(host, effect)
-        if isinstance(effect, Delegate):
-            self.worker.take(effect.job)
-        elif isinstance(effect, Publish):
+        if isinstance(effect, Publish):
             self._look_at(effect.packet)
 
     def _look_at(self, packet: Packet) -> None:

@@ -9,14 +9,17 @@ from collections.abc import Sequence
 
 from afspm.basics.errors import AfspmError
 from afspm.model import (
+    ActByHand,
     ControlMode,
     ControlRequest,
     ControlResponse,
     Packet,
+    PanelAct,
     Parameter,
     Request,
     Response,
     ScopeState,
+    TipStatus,
     names,
 )
 from afspm.scheduler.control.arbitration import ArbitrationState
@@ -25,6 +28,7 @@ from afspm.scheduler.events import (
     Effect,
     Forward,
     Input,
+    PacketIn,
     Publish,
     Replay,
     ReplayRequested,
@@ -38,7 +42,8 @@ from afspm.testing.components.scheduler_host import SchedulerHost
 from afspm.testing.components.simulated_time import SimulatedTime
 from tests.simulation.client import Client
 from tests.simulation.codec import TableCodec
-from tests.simulation.microscope import FakeMicroscope
+from tests.simulation.microscope import GARBLED, FakeMicroscope
+from tests.simulation.panel import PAUSING
 from tests.simulation.tip_safety import TipSafety
 from tests.simulation.within_limits import WithinLimits
 from tests.simulation.written import Written
@@ -49,8 +54,8 @@ _NOT_FREE = int(ControlResponse.NOT_FREE)
 _COUNTED = frozenset({names.START_SCAN, names.START_SPEC, names.PULSE})
 _TRACE = 60
 _SLACK_S = 1.0
-NAME_TAKEN = "each needs a name of its own"
-"""Part of the refusal that is not an answer to the request, but to whoever sent it."""
+OF_THE_SENDER = ("each needs a name of its own", "this is the key of")
+"""Parts of refusals that are answers to the sender, and not to the request."""
 
 
 class InvariantViolated(AfspmError):
@@ -60,7 +65,14 @@ class InvariantViolated(AfspmError):
 
 
 class Invariants:
-    """Observes the scheduler, the microscope and all components of one simulated night."""
+    """Observes the scheduler, the microscope and all components of one simulated night.
+
+    Attributes:
+        has_keys: see `Plan.keys`.
+        panel_is_manned: whether a person acts at the panel of the microscope.
+        handed_over: whether the microscope belongs to that person now.
+        acts: how many acts gave the microscope to that person.
+    """
 
     def __init__(
         self, timeline: SimulatedTime, settings: SchedulerSettings, microscope: FakeMicroscope, codec: TableCodec
@@ -86,13 +98,16 @@ class Invariants:
         self._parameters: dict[tuple[str, str], str] = {}
         self._codec = codec
         self.times_are_certain = self.memory_is_certain = True
+        self.has_keys = self.panel_is_manned = self.handed_over = False
+        self.acts = 0
         self._open: dict[tuple[str, str], tuple[float, int]] = {}
         self._definite: dict[tuple[str, str], int] = {}
-        self._life = 0
+        self._life = self._losses = 0
+        self._mode, self._tip = ControlMode.AUTOMATED, TipStatus()
         self._checked: ArbitrationState | None = None
         self._saved_control: ArbitrationState | None = None
         self._saved_state: SavedState | None = None
-        self.written = Written(timeline, codec, self._must, NAME_TAKEN)
+        self.written = Written(timeline, codec, self._must, OF_THE_SENDER)
         microscope.on_executed = self.executed
 
     def forgets(self) -> None:
@@ -104,11 +119,14 @@ class Invariants:
 
     def carried_out(self, host: SchedulerHost, effect: Effect) -> None:
         """Check an effect before it is carried out."""
+        self._count_losses(host)
         self.written.carried_out(host, effect)
         if self._life != host.life:
             self._life = host.life
             self._open.clear()  # what its former life had taken in is asked again
             self._definite.clear()
+            for packet, *_ in host.core.cached():  # written in a former life that died before it published
+                self._published.setdefault(packet.time_ns or 0, (packet.envelope, packet.payload))
         if isinstance(effect, SaveState):
             return
         if isinstance(effect, Reply):
@@ -121,8 +139,14 @@ class Invariants:
         if isinstance(effect, Reply) or (isinstance(effect, Publish) and effect.source_ns is None):
             self._saved(host)
 
+    def _count_losses(self, host: SchedulerHost) -> None:
+        if self._losses != host.disk.losses:
+            self._losses = host.disk.losses
+            self.forgets()
+
     def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:
         """Check the state after a step."""
+        self._count_losses(host)
         self.checks += 1
         self._scheduler_since_s = host.since_s
         self._note(event, effects)
@@ -137,10 +161,36 @@ class Invariants:
                 del self._open[key]
         if isinstance(event, ReplayRequested):
             self._replayed(host, event, effects)
+        self._panel(host, event, effects)
         self._control(host)
         self._presence(host)
         self._lease(host)
         self._answered_in_time(host)
+
+    def _panel(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:
+        # the microscope belongs to a person who acts at its panel, until a person lets the run continue
+        control = host.core.control
+        if control.mode is not ControlMode.MANUAL:
+            goes_on = self._mode is ControlMode.MANUAL and isinstance(event, RequestIn)
+            self._must(not (goes_on and self._tip.remedy), f"the run goes on: {self._tip.remedy}")
+            self.handed_over = False
+        elif self._mode is not ControlMode.MANUAL and isinstance(event, PacketIn):
+            self.handed_over, self.acts = True, self.acts + 1
+        self._mode = control.mode
+        if not self.panel_is_manned or not isinstance(event, PacketIn):
+            return
+        if not any(isinstance(one, Publish) and one.packet.payload == event.packet.payload for one in effects):
+            return  # it came twice
+        thing = self._codec.decode_packet(event.header.message, event.packet.payload)
+        if isinstance(thing, ActByHand):
+            is_repeated = self._settings.control.stopped_by_hand == "repeat" and thing.act is PanelAct.STOP
+            pauses = thing.act in PAUSING and not is_repeated
+            outside = any(float(one.after) > 10.0 for one in thing.changes if one.parameter == names.TIP_BIAS_VOLTAGE)
+            taken = control.mode is ControlMode.MANUAL or not (pauses or outside)
+            self._must(taken, f"{thing}, and the run goes on")
+        if isinstance(thing, TipStatus):
+            self._tip = thing
+            self._must(not thing.remedy or control.mode is ControlMode.MANUAL, f"{thing.by_hand}, and the run goes on")
 
     def _control(self, host: SchedulerHost) -> None:
         control = host.core.control
@@ -233,7 +283,7 @@ class Invariants:
         if name is not None and response.id and response.code == _SUCCESS:
             value = self._codec.decode_parameter(response.payload)
             self._must(value is not None and value.name == name, f"{key} asked for {name}, and was answered {value}")
-        if response.id and response.code != _NO_RESPONSE and NAME_TAKEN not in response.reason:
+        if response.id and response.code != _NO_RESPONSE and not any(why in response.reason for why in OF_THE_SENDER):
             before = self._definite.setdefault(key, response.code)
             self._must(before == response.code, f"{key} was answered {before}, and now {response.code}")
             action = self._actions.get(key)
@@ -260,6 +310,9 @@ class Invariants:
     def _forward(self, host: SchedulerHost, effect: Forward) -> None:
         request = effect.request
         name = request.id.split("/")[0]
+        if (self.handed_over or host.core.state.panel.why) and request.kind in _FORWARDED and not _is_get(request):
+            may = name in (self._settings.rules.roles.operate or ())
+            self._must(may, f"{request.subject} is sent to a microscope at which a person works")
         if request.kind in _FORWARDED and request.id and not _is_get(request):
             holder, rules = host.core.control.holder, self._settings.rules
             adjusts = isinstance(request.subject, Parameter) and request.subject.name in rules.adjustable
@@ -286,6 +339,7 @@ class Invariants:
         # in order, and no packet under two times, which would make it two packets
         packet, source_ns = effect.packet, effect.source_ns
         assert packet.time_ns is not None
+        self._must(packet.payload != GARBLED, f"an unreadable {packet.envelope} is published")
         if source_ns is not None and self.times_are_certain:
             first_ns = self._by_source.setdefault(source_ns, packet.time_ns)
             self._must(first_ns == packet.time_ns, f"{packet.envelope} is published at {first_ns} and {packet.time_ns}")
@@ -295,8 +349,10 @@ class Invariants:
             self._must(same or not self.times_are_certain, f"two packets at {packet.time_ns}")
             return  # again after a kill, at its first time
         self._published[packet.time_ns] = (packet.envelope, packet.payload)
+        # a life that was killed before it published a packet has given it its time, and the translator may be slow
+        was_given = source_ns is not None and packet.time_ns < self._timeline.at_ns(self._scheduler_since_s)
         self._must(
-            packet.time_ns > self._last_ns or not self.memory_is_certain,
+            packet.time_ns > self._last_ns or was_given or not self.memory_is_certain,
             f"{packet.envelope} is published at {packet.time_ns}, after {self._last_ns}",
         )
         self._last_ns = packet.time_ns
@@ -334,6 +390,7 @@ class Invariants:
         """Check that an impostor is not obeyed while the owner of the name is connected."""
         if client.identity == client.name or response.code != _SUCCESS:
             return
+        self._must(not self.has_keys, f"{client.name} was obeyed as {client.identity}, whose key it has not")
         owner = next((c for c in self.components if c.name == client.identity), None)
         if owner is None or not owner.alive or owner.frozen:
             return

@@ -6,13 +6,18 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from afspm import wire
 from afspm.basics.errors import InvalidValue
+from afspm.basics.exit_codes import ExitCode
 from afspm.basics.plain_data import Plain
 from afspm.model import (
+    ActByHand,
+    ChangedValue,
     ControlRequest,
     ControlResponse,
     Feedback,
     Packet,
+    PanelAct,
     Parameter,
     PositionChange,
     ProbePosition,
@@ -23,6 +28,7 @@ from afspm.model import (
     ScanParameters,
     ScopeState,
     ScopeStatus,
+    TipStatus,
     names,
 )
 from afspm.testing.components.memory_network import ControlLine, Feed, Subscribers
@@ -30,11 +36,14 @@ from afspm.testing.components.simulated_process import Process
 from afspm.testing.components.simulated_time import SimulatedTime, Timer
 from afspm.translator.requests import RequestOutcomes
 from tests.simulation.codec import TableCodec
+from tests.simulation.panel import MakerPanel
 
 CHANNELS = ("Height", "Height_Retrace")
 _STARTS = {names.START_SCAN: ScopeState.SCANNING, names.START_SPEC: ScopeState.SPEC}
 _STOPS = {names.STOP_SCAN: ScopeState.SCANNING, names.STOP_SPEC: ScopeState.SPEC}
 _HISTORY = 200
+GARBLED = b"\xff"
+"""The payload of a packet that the scheduler can't read."""
 SHAPE = (4, 4)
 WHILE_BUSY = frozenset({names.ZCTRL_SETPOINT})
 """The parameters that may be set during a scan."""
@@ -76,6 +85,7 @@ class Habits:
         tip_breaks: the chance that a scan damages the tip.
         clock_error_s: of its clock; may decrease.
         retracts: whether it has an action that withdraws the tip.
+        garbles: the chance that an unreadable packet goes before a packet.
     """
 
     service_s: float = 0.02
@@ -86,6 +96,7 @@ class Habits:
     tip_breaks: float = 0.1
     clock_error_s: float = 0.0
     retracts: bool = True
+    garbles: float = 0.0
 
 
 class FakeMicroscope(Process):
@@ -94,9 +105,13 @@ class FakeMicroscope(Process):
     Attributes:
         executed: how often each command (client's id, or scheduler's number, and kind) was executed, over all restarts.
         scans_done: over all restarts.
+        closed: how often the scheduler has closed the translator at the end.
         feedback_on, tip_is_away, region, probe_m, values: of the controller, which outlives its translator.
         on_changed: called with a parameter, its former value and its new one.
+        on_closed: called when the scheduler closes the translator.
         on_placed: called after the scan's region or the probe was set.
+        turned: settings that a person changed, and the run has not set since.
+        panel: the maker's panel, if a person acts there; then the translator refuses a start with a withdrawn tip.
     """
 
     region = Region((0.0, 0.0), (1e-6, 1e-6))
@@ -108,11 +123,14 @@ class FakeMicroscope(Process):
         self.on_executed: Callable[[Request], None] = lambda request: None
         self.on_changed: Callable[[str, float, float], None] = lambda name, before, now: None
         self.on_placed: Callable[[], None] = lambda: None
+        self.on_closed: Callable[[], None] = lambda: None
         self.probe_m = (0.0, 0.0)
         self.values = {names.TIP_BIAS_VOLTAGE: 1.0, names.ZCTRL_SETPOINT: 1.0, names.MOVE_SPEED: 1e-6}
-        self.scans_done = 0
+        self.scans_done = self.closed = 0
         self.tip_is_good = True
         self.feedback_on, self.tip_is_away = True, False
+        self.panel: MakerPanel | None = None
+        self.turned: set[str] = set()
         self._codec = codec
         self._kept: Plain = {}  # on its disk
         self._newest_ns = 0
@@ -128,6 +146,9 @@ class FakeMicroscope(Process):
         self._queue: deque[tuple[ControlLine, Request, int]] = deque()
         self._serving = False
         self._scan: Timer | None = None
+        self._ends_s = 0.0
+        self._left_s: float | None = None
+        self._is_requested = self._is_spoiled = False
 
     def begin(self) -> None:
         self._forget()
@@ -137,6 +158,7 @@ class FakeMicroscope(Process):
         self._publish("ScanParameters2d", ScanParameters(self.region, SHAPE))
         self._publish("ProbePosition", ProbePosition(self.probe_m))
         self._publish("ZCtrlParameters", self._feedback())
+        self._publish_tip()
         self._publish_state(self.state)
 
     def _feedback(self) -> Feedback:
@@ -152,6 +174,11 @@ class FakeMicroscope(Process):
             self._lines.remove(line)
 
     def peer_asked(self, line: ControlLine, request: Request, number: int) -> None:
+        if request.kind == wire.CLOSE[0]:
+            self.closed += 1
+            self.on_closed()
+            self.kill(ExitCode.ENDED)
+            return
         self._queue.append((line, request, number))
         self._serve()
 
@@ -219,11 +246,16 @@ class FakeMicroscope(Process):
         adjusts = isinstance(subject, Parameter) and subject.name in WHILE_BUSY
         if self.state is not ScopeState.FREE and not adjusts:
             return ControlResponse.NOT_FREE
+        if subject in _STARTS and (refusal := self._refusal_without_tip()) is not None:
+            return refusal
         if request.id:
             self.executed[request.id, request.kind] += 1
+        if subject in _STARTS and self.panel is not None and self.panel.start_engages:
+            self.tip_is_away = False
         self.on_executed(request)
         if subject in _STARTS:
             self._begin(_STARTS[subject])
+            self._is_requested = True
         elif subject == names.PULSE:
             self.tip_is_good = self.tip_is_good or self.timeline.chance(0.7)
         elif subject == names.RETRACT:
@@ -252,7 +284,10 @@ class FakeMicroscope(Process):
                 self._move_probe(float(text) if is_x else x_m, y_m if is_x else float(text))
             case Parameter(value=str(text)) if subject.name in self.values:
                 before, self.values[subject.name] = self.values[subject.name], float(text)
-                self.on_changed(subject.name, before, float(text))
+                if subject.name in self.turned:  # of a knob turned a moment ago the run may not know yet
+                    self.turned.remove(subject.name)
+                else:
+                    self.on_changed(subject.name, before, float(text))
                 if subject.name == names.ZCTRL_SETPOINT:
                     self._publish("ZCtrlParameters", self._feedback())
         return ControlResponse.SUCCESS
@@ -284,20 +319,143 @@ class FakeMicroscope(Process):
     def approach(self) -> None:
         """Bring the tip back to the surface, as a person does at the controller's panel."""
         self.tip_is_away = False
+        self._kept["by_hand"] = ""
         self._switch_feedback(on=True)
+        if self.alive:
+            self._publish_tip()
 
     def _switch_feedback(self, *, on: bool) -> None:
         self.feedback_on = on
         if self.alive:
             self._publish("ZCtrlParameters", self._feedback())
 
+    def _refusal_without_tip(self) -> ControlResponse | None:
+        if self.panel is None:
+            return None
+        if self._tip().remedy:
+            return ControlResponse.NOT_FREE
+        is_away = self.tip_is_away and self.panel.shows_tip and not self.panel.start_engages
+        return ControlResponse.ACTION_ERROR if is_away else None
+
+    # --- a person at its panel; the translator sees it while it is there ---
+
+    def act_by_hand(self, what: str) -> None:
+        """Do one of `panel.ACTS`, as far as it is possible now."""
+        assert self.panel is not None
+        if what in ("stop", "stop and scan"):
+            self._stop_by_hand()
+        if what in ("scan", "stop and scan") and self.alive and self.state is ScopeState.FREE:
+            self._tell(PanelAct.SCAN)
+            self._begin(ScopeState.SCANNING)
+        elif what in ("pause", "pause for ever"):
+            self._pause_by_hand()
+        elif what == "withdraw":
+            self._withdraw_by_hand()
+        elif what == "feedback off" and self.panel.shows_feedback:
+            self._feedback_off_by_hand()
+        elif what == "bias":
+            self._turn_by_hand(names.TIP_BIAS_VOLTAGE, self.timeline.random.choice((1.0, 2.0, 12.0)))
+        elif what == "setpoint":
+            self._turn_by_hand(names.ZCTRL_SETPOINT, self.timeline.random.uniform(0.5, 2.0))
+
+    def go_on_by_hand(self) -> None:
+        """Let a paused scan go on."""
+        left_s, self._left_s = self._left_s, None
+        if left_s is not None and self.alive:
+            self._publish_state(self.state)
+            self._wait_for_end(left_s)
+
+    def put_right(self) -> None:
+        """Do what a person does before the run continues: approach, set back, let a paused scan go on."""
+        self.go_on_by_hand()
+        if self.values[names.TIP_BIAS_VOLTAGE] > 10.0:
+            self._turn_by_hand(names.TIP_BIAS_VOLTAGE, 1.0)
+        self.approach()
+
+    def _stop_by_hand(self) -> None:
+        assert self.panel is not None
+        if not self.alive or self._scan is None:
+            return
+        if self.panel.stop_withdraws:
+            self._move_away()
+        if self._is_requested and self.panel.shows_stop:
+            self._tell(PanelAct.STOP)
+        self._interrupt()
+
+    def _withdraw_by_hand(self) -> None:
+        assert self.panel is not None
+        is_of_run = self._scan is not None and self._is_requested
+        if not self.alive or self.tip_is_away or not (is_of_run or self.panel.shows_tip):
+            return  # nobody of the run could know
+        self._move_away()
+        if self.panel.shows_tip:
+            self._tell(PanelAct.WITHDRAW)
+        if self._scan is None:
+            return
+        self._is_spoiled = True
+        if self.panel.withdrawal_ends_scan or not self.panel.shows_tip:
+            self._stop_by_hand()
+
+    def _move_away(self) -> None:
+        assert self.panel is not None
+        self.tip_is_away = True
+        if self.panel.shows_tip:
+            self._kept["by_hand"] = "the tip was withdrawn"
+            self._publish_tip()
+
+    def _feedback_off_by_hand(self) -> None:
+        if not self.alive or not self.feedback_on or self.tip_is_away:
+            return
+        self._kept["by_hand"] = "the feedback was switched off"
+        self._is_spoiled = self._scan is not None
+        self._switch_feedback(on=False)
+        self._tell(PanelAct.FEEDBACK_OFF)
+        self._publish_tip()
+
+    def _pause_by_hand(self) -> None:
+        if not self.alive or self._scan is None or self.state is not ScopeState.SCANNING:
+            return
+        self._left_s = max(0.0, self._ends_s - self.timeline.monotonic_s())
+        self._scan.cancel()
+        self._scan = None
+        self._tell(PanelAct.PAUSE)
+        self._publish("ScopeStateMsg", ScopeStatus(self.state, paused=True))
+
+    def _turn_by_hand(self, name: str, value: float) -> None:
+        if not self.alive:
+            return
+        self.turned.add(name)
+        before, self.values[name] = self.values[name], value  # within limits or not: the person is right
+        if name == names.ZCTRL_SETPOINT:
+            self._publish("ZCtrlParameters", self._feedback())
+        self._tell(PanelAct.VALUES, ChangedValue(name, repr(before), repr(value)))
+
+    def _tell(self, act: PanelAct, *changes: ChangedValue) -> None:
+        self._publish("ActByHand", ActByHand(self.timeline.now_ns(), act, "seen", changes))
+
+    def _tip(self) -> TipStatus:
+        panel = self.panel or MakerPanel()
+        engaged = not self.tip_is_away if panel.shows_tip else None
+        return TipStatus(engaged, self.feedback_on if panel.shows_feedback else None, self._kept.get("by_hand", ""))
+
+    def _publish_tip(self) -> None:
+        if self.panel is not None:
+            self._publish("TipStatus", self._tip())
+
     def _begin(self, state: ScopeState) -> None:
+        self._is_requested = self._is_spoiled = False
         self._publish_state(state)
-        takes_s = self.timeline.real_s(self.habits.scan_s * (0.5 + self.timeline.random.random()))
-        self._scan = self.later(takes_s, self._done, state)
+        self._wait_for_end(self.timeline.real_s(self.habits.scan_s * (0.5 + self.timeline.random.random())))
+
+    def _wait_for_end(self, left_s: float) -> None:
+        self._ends_s = self.timeline.monotonic_s() + left_s
+        self._scan = self.later(left_s, self._done, self.state)
 
     def _done(self, state: ScopeState) -> None:
         self._scan = None
+        if self._is_spoiled or (self.panel is not None and self.timeline.chance(self.panel.ends_scans)):
+            self._interrupt()
+            return
         self.scans_done += 1
         if self.timeline.chance(self.habits.tip_breaks):
             self.tip_is_good = False
@@ -311,6 +469,7 @@ class FakeMicroscope(Process):
         if self._scan is not None:
             self._scan.cancel()
             self._scan = None
+        self._left_s = None
         self._publish_state(ScopeState.INTERRUPTED)
         self._publish_state(ScopeState.FREE)
 
@@ -323,7 +482,12 @@ class FakeMicroscope(Process):
     def _publish(self, message: str, thing: object) -> None:
         time_ns = self.timeline.now_ns() + round(self.habits.clock_error_s * 1e9)
         self._newest_ns = max(time_ns, self._newest_ns + 1)
-        packet = Packet(message, self._codec.encode(thing), self._newest_ns)
+        if self.timeline.chance(self.habits.garbles):
+            self._send(Packet(message, GARBLED, self._newest_ns))
+            self._newest_ns += 1
+        self._send(Packet(message, self._codec.encode(thing), self._newest_ns))
+
+    def _send(self, packet: Packet) -> None:
         self._history.append(packet)
         self._subscribers.publish(packet)
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-from afspm.model import Packet, PacketHeader, Region, ScopeState, names
+from afspm.model import PacketHeader, Region, ScopeState, names
 from afspm.model.microscope_status import FEEDBACK_OFF
 from afspm.scheduler.control.arbitration import Cause, RoleTable, Rules
 from afspm.scheduler.publishing.envelopes import Envelopes
@@ -25,6 +25,7 @@ from tests.simulation.codec import TableCodec
 from tests.simulation.invariants import Invariants, InvariantViolated
 from tests.simulation.keeper import Keeper
 from tests.simulation.microscope import FakeMicroscope, FakeScan, Habits
+from tests.simulation.panel import ACTS, PANELS
 
 _CALM = 0.15
 """The last part of a night, in which nothing bad happens any more and all must come right again."""
@@ -60,13 +61,25 @@ CAST = {
     "burster": behaviours.Burster,
     "adjuster": behaviours.Adjuster,
     "forgetful": behaviours.Forgetful,
+    "babbler": behaviours.Babbler,
 }
-_TROUBLE = ("greedy", "crasher", "impostor", "operator", "stranger", "careless", "burster", "adjuster", "forgetful")
+_TROUBLE = (
+    "greedy",
+    "crasher",
+    "impostor",
+    "operator",
+    "stranger",
+    "careless",
+    "burster",
+    "adjuster",
+    "forgetful",
+    "babbler",
+)
 _ALWAYS = ("experiment", "classifier", "corrector", "feedback", "person")
 _PEOPLE = ("operator", "person", "dawn")
-_JOURNAL_S = 0.1
+_UNSYNCED_S = 0.1
 _SLOWEST_S = 8.0
-"""Packets that are published before the journal is written must be few enough for a restart to remember."""
+"""Packets that are published before they are on the disk must be few enough for a restart to remember."""
 _LONGEST_SILENCE_S = 8.0
 """Heartbeats of the network find a half-open connection by then."""
 
@@ -86,8 +99,12 @@ class Plan:
         doubles: the chance that a request arrives twice.
         hangs, loses_answer: see `Habits`.
         dies_in_step: see `SchedulerHost`.
-        retracts: see `Habits`.
+        retracts, garbles: see `Habits`.
+        keys: each peer has a key, so that no other one can use its name.
         ends: the experiment is ended in the morning, at any state; if not, all components must recover.
+        panel: the maker of a microscope at whose panel a person acts; empty: nobody does.
+        acts: how often that person acts, an hour.
+        repeats: whether a measurement that was stopped by hand is taken again.
     """
 
     seed: int
@@ -103,7 +120,12 @@ class Plan:
     dies_in_step: float = 0.0
     stop_when: tuple[Cause, ...] = (Cause.PROBLEM, Cause.MANUAL, Cause.DEAD, Cause.IDLE)
     retracts: bool = True
+    garbles: float = 0.0
+    keys: bool = False
     ends: bool = False
+    panel: str = ""
+    acts: float = 2.0
+    repeats: bool = False
 
     @property
     def length_s(self) -> float:
@@ -154,8 +176,66 @@ def plan(seed: int, hours: float = 8.0) -> Plan:
         dies_in_step=chance.choice((0.0, 0.0005)) if bad else 0.0,
         stop_when=chance.choice(((), (Cause.PROBLEM,), tuple(Cause))),
         retracts=chance.random() < 0.8,
+        garbles=chance.choice((0.0, 0.02)) if bad else 0.0,
+        keys=chance.random() < 0.5,
         ends=chance.random() < 0.25,
     )
+
+
+_FEW = ("experiment", "classifier", "corrector", "feedback", "person")
+
+
+def bad_night(seed: int) -> Plan:
+    """Return a night with many faults; in some nights also a greedy client."""
+    away = [Fault("outage", "experiment", (seed % 10) / 10.0, 60.0)]
+    drawn = plan(seed, hours=4.0)
+    if seed % 4 == 3:  # few others and slow, so that control stays where it is
+        drawn = replace(drawn, hours=8.0, speed=60.0, cast=(*_FEW, "greedy"), lease_s=900.0)
+        away += [Fault("outage", holder, ((seed + place) % 10) / 10.0, 60.0) for place, holder in enumerate(_FEW)]
+    if seed % 4 == 1:  # one whose tip is often in danger, at a microscope that can't always withdraw it
+        cast = (*_FEW, "careless", "stranger")
+        drawn = replace(drawn, cast=cast, ends=True, retracts=seed != 13, speed=60.0)
+    if seed % 4 == 2:  # clients that do not wait for answers, and one that repeats ids
+        drawn = replace(drawn, cast=(*_FEW, "burster", "adjuster", "forgetful"))
+        away += [Fault("storm", "experiment", 0.2, 100.0)]  # packets arrive after answers to later requests
+    there = ("scheduler", "translator", *drawn.cast)
+    faults = (*(fault for fault in drawn.faults if fault.whom in there), *away)
+    slow = replace(drawn, speed=drawn.speed / 2.0)  # in more real time more connections come and go
+    return replace(slow, faults=faults, dies_in_step=0.003, doubles=0.1, hangs=0.005)
+
+
+FINDERS = [
+    *map(bad_night, (9, 14, 11, 5, 13, 6, 0, 3)),
+    *(
+        Plan(5, 2.0, cast=("experiment", "person", "careless"), lease_s=None, ends=True, faults=faults)
+        # they end while the tip is in danger, the first while the translator does not answer
+        for faults in ((Fault("freeze", "translator", 0.98, 14.0),), ())
+    ),
+]
+"""The nights in which all mutants of the scheduler are found, those that find most first.
+
+A change of the code changes the nights. If `test_mutants` misses a mutant afterwards, add a night that finds it.
+"""
+
+
+_PANEL_NIGHTS = [
+    Plan(seed, 4.0, cast=(*_FEW, "operator", "stranger", *more), panel=maker, acts=6.0, repeats=seed == 3)
+    for seed, (maker, more) in enumerate(
+        (("nanonis", ()), ("asylum", ("careless",)), ("gxsm", ()), ("nanosurf", ("careless",)), ("park", ()))
+    )
+]
+
+
+def panel_night(seed: int) -> Plan:
+    """Return a night with a person at the panel of a maker, and with all kinds of faults."""
+    maker = tuple(PANELS)[seed % len(PANELS)]
+    # where the controller does not show the tip, to repeat is to measure in the air
+    repeats = PANELS[maker].shows_tip and seed % 4 == 3
+    return replace(plan(seed, hours=4.0), panel=maker, acts=(2.0, 10.0)[seed % 2], repeats=repeats)
+
+
+PANEL_NIGHTS = [*_PANEL_NIGHTS, panel_night(91), panel_night(140)]
+"""One night for each maker, with a person at its panel; in two more the scheduler's own actions wait meanwhile."""
 
 
 @dataclass
@@ -169,6 +249,18 @@ class Outcome:
     given_up: list[str] = field(default_factory=list)
 
 
+class NightCodec(TableCodec):
+    """A table that knows the headers of scans."""
+
+    def header(self, envelope: str, payload: bytes | memoryview) -> PacketHeader:
+        thing = self.decode(payload)
+        if isinstance(thing, FakeScan):
+            size_m = 2e-6 if thing.number % 2 else 5e-8
+            kind = "IV" if envelope == "Spec1d" else None
+            return PacketHeader(envelope, thing.channel, (size_m, size_m), kind)
+        return PacketHeader(envelope)
+
+
 class Night:
     """One night, ready to be run."""
 
@@ -177,18 +269,21 @@ class Night:
         self.timeline = timeline = SimulatedTime(plan.seed, plan.speed)
         self.weather = Weather(doubles=plan.doubles)
         self.codec = self.make_codec()
-        habits = Habits(hangs=plan.hangs, loses_answer=plan.loses_answer, retracts=plan.retracts)
+        habits = Habits(hangs=plan.hangs, loses_answer=plan.loses_answer, retracts=plan.retracts, garbles=plan.garbles)
         self.microscope = self.make_microscope(habits)
         self.settings = _settings(plan)
         self.invariants = Invariants(timeline, self.settings, self.microscope, self.codec)
+        self.invariants.has_keys = plan.keys
         self.scheduler = SchedulerHost(
             timeline,
             self.weather,
             self.settings,
             self.codec,
-            self._header,
+            self.codec,
             self.invariants,
             dies_in_step=plan.dies_in_step,
+            unsynced_s=_UNSYNCED_S,
+            has_keys=plan.keys,
             make_core=self.make_core(),
         )
         self.scheduler.translator = (self.microscope, self.microscope)
@@ -199,9 +294,35 @@ class Night:
                 person.approach = self.microscope.approach
         self.keeper = Keeper(timeline, [self.microscope, self.scheduler, *self.components.values()], _policy())
         self.teller = self._teller()
+        if plan.panel:
+            self._seat_a_person()
+
+    def _seat_a_person(self) -> None:
+        # at the panel of the microscope; those who let the run continue put it right first
+        self.microscope.panel = PANELS[self.plan.panel]
+        self.invariants.panel_is_manned = True
+        for person in (self.dawn, *self.components.values()):
+            if isinstance(person, behaviours.Operator):
+                person.put_right = self.microscope.put_right
+                person.sees_to_it = 0.7 if self.microscope.panel.shows_tip else 1.0
+        self._next_act()
+
+    def _next_act(self) -> None:
+        chance, length_s = self.timeline.random, self.plan.length_s
+        mean_s = self.timeline.real_s(3600.0 / self.plan.acts)
+        at_s = self.timeline.monotonic_s() + chance.expovariate(1.0 / mean_s)
+        if at_s < length_s:
+            self.timeline.at(at_s, self._act, ())
+
+    def _act(self) -> None:
+        what = self.timeline.random.choice(ACTS)
+        self.microscope.act_by_hand(what)
+        if what == "pause":
+            self.timeline.after(self.timeline.real_s(60.0), self.microscope.go_on_by_hand)
+        self._next_act()
 
     def make_codec(self) -> TableCodec:
-        return TableCodec()
+        return NightCodec()
 
     def make_microscope(self, habits: Habits) -> FakeMicroscope:
         return FakeMicroscope(self.timeline, self.codec, habits)
@@ -232,14 +353,6 @@ class Night:
         teller.processes, teller.restart = self.keeper.states, self.keeper.restart
         teller.start()
         return teller
-
-    def _header(self, packet: Packet) -> PacketHeader:
-        thing = self.codec.decode(packet.payload)
-        if isinstance(thing, FakeScan):
-            size_m = 2e-6 if thing.number % 2 else 5e-8
-            kind = "IV" if packet.envelope == "Spec1d" else None
-            return PacketHeader(packet.envelope, thing.channel, (size_m, size_m), kind)
-        return PacketHeader(packet.envelope)
 
     def run(self) -> Outcome:
         """Run the night.
@@ -302,8 +415,8 @@ class Night:
         elif fault.what == "full disk":
             self._full_disk(fault.for_s)
         elif fault.what == "slow disk":
-            self.scheduler.journal.delay_s = min(fault.for_s, _SLOWEST_S)
-            self.timeline.after(fault.for_s, setattr, self.scheduler.journal, "delay_s", _JOURNAL_S)
+            self.scheduler.disk.delay_s = min(fault.for_s, _SLOWEST_S)
+            self.timeline.after(fault.for_s, setattr, self.scheduler.disk, "delay_s", 0.0)
         elif fault.what == "clock":
             self.invariants.times_are_certain = False
             self.microscope.habits.clock_error_s = self.timeline.random.choice((-100.0, 0.0, 100.0, 10_000.0))
@@ -348,6 +461,8 @@ class Night:
             if component.banned:
                 component.kill()
         self.scheduler.banned = self.microscope.banned = False
+        if self.plan.panel:
+            self.timeline.after(_SETTLED_S, self.microscope.put_right)
 
     def _come_right(self, scans: int) -> None:
         # in calm weather the experiment goes on, and each component has all cached packets
@@ -368,6 +483,8 @@ class Night:
         self.timeline.run_until(self.plan.length_s + _ENDED_S)
         if self.scheduler.alive or not self.scheduler.core.control.ended:
             self.invariants.fail("the experiment does not end")
+        if self.invariants.tip.must_close and not self.microscope.closed:
+            self.invariants.fail("the translator was not closed at the end")
         return self._outcome(0)
 
 
@@ -393,7 +510,9 @@ def _settings(plan: Plan) -> SchedulerSettings:
             RoleTable(end_experiment=("dawn",), set_mode=_PEOPLE, clear_problems=_PEOPLE, operate=("adjuster",)),
             adjustable=frozenset({names.ZCTRL_SETPOINT}),
         ),
-        control=ControlSettings(lease_s=plan.lease_s, grace_s=10.0),
+        control=ControlSettings(
+            lease_s=plan.lease_s, grace_s=10.0, stopped_by_hand="repeat" if plan.repeats else "pause"
+        ),
         watchdog=watchdog,
         limits=limits,
         envelopes=Envelopes(),

@@ -8,8 +8,7 @@ from afspm.plugins.what_if.scheduler_replay import MakeCore
 from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.scheduler.state import SchedulerState
 from afspm.scheduler.step_log import RecordedCore, Restored, Step
-from tests.simulation.night import Night, _settings
-from tests.simulation.test_mutants import _bad_night
+from tests.simulation.night import Night, _settings, bad_night
 
 
 class RecordedNight(NamedTuple):
@@ -21,7 +20,7 @@ class RecordedNight(NamedTuple):
 
 def recorded(seed: int) -> RecordedNight:
     """Run a night with many faults, and return its steps."""
-    night = Night(_bad_night(seed))
+    night = Night(bad_night(seed))
     settings, cores = _settings(night.plan), list[RecordedCore]()
     made = RecordedNight([], [])
 

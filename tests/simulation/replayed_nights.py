@@ -1,8 +1,8 @@
 """`make replay-nights NIGHTS=200 SEED=0`: nights with kills, replayed without a change.
 
 Each seed gives a night of components with kills at random calls, and a night of the scheduler with all faults of
-`test_mutants`. Prints a line for each night that differs, and the totals; exits with 1 if any does. Two hundred seeds
-take about an hour of one core.
+`night.bad_night`. Prints a line for each night that differs, and the totals; exits with 1 if any does. Two hundred
+seeds take about an hour of one core.
 """
 
 from __future__ import annotations

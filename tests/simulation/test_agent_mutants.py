@@ -16,14 +16,15 @@ from afspm.scheduler.control.arbitration import ArbitrationEvent, Rules
 from afspm.scheduler.control.holder_timeout import Lease
 from afspm.scheduler.requests import approvals
 from afspm.scheduler.safety import parameter_values
-from afspm.scheduler.safety.grants import GrantBook, GrantChecker, HeldGrant
-from afspm.scheduler.state import SchedulerState
+from afspm.scheduler.safety.grants import GrantChecker, HeldGrant
+from afspm.scheduler.saved_state import SavedState
+from afspm.scheduler.scheduler_core import SchedulerCore
 from tests.simulation.agent_attacks import Attack
-from tests.simulation.agent_rig import AgentViolation
+from tests.simulation.agent_rig import STOPS, AgentViolation
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 Patch = pytest.MonkeyPatch
-ATTACKS, CALLS = 60, 250
+ATTACKS, CALLS = 200, 250
 
 
 def _nothing(*args: Any, **given: Any) -> str:
@@ -41,6 +42,15 @@ def grant_is_not_checked_on_set(patch: Patch) -> None:
 
 def any_request_is_the_next_step(patch: Patch) -> None:
     patch.setattr(GrantChecker, "_refused_by_plan", _nothing)
+
+
+def stop_is_a_step_of_a_plan(patch: Patch) -> None:
+    real = GrantChecker._refused_by_plan
+
+    def refused(self: GrantChecker, held: HeldGrant, request: Request, *rest: Any) -> str:
+        return "" if request.subject in STOPS else real(self, held, request, *rest)
+
+    patch.setattr(GrantChecker, "_refused_by_plan", refused)
 
 
 def approved_plan_is_reusable(patch: Patch) -> None:
@@ -89,8 +99,13 @@ def uses_are_not_counted(patch: Patch) -> None:
 
 
 def uses_are_not_saved(patch: Patch) -> None:
-    real = SchedulerState.saved_parts
-    patch.setattr(SchedulerState, "saved_parts", lambda self: tuple(p for p in real(self) if type(p) is not GrantBook))
+    real = SchedulerCore.restore
+
+    def restore(self: SchedulerCore, saved: SavedState) -> None:
+        unused = {name: replace(one, used={}) for name, one in saved.grants.grants.items()}
+        real(self, replace(saved, grants=replace(saved.grants, grants=unused)))
+
+    patch.setattr(SchedulerCore, "restore", restore)
 
 
 def revoking_has_no_effect(patch: Patch) -> None:
@@ -159,6 +174,7 @@ def stop_leaves_the_others_in_control(patch: Patch) -> None:
 MUTANTS: list[Callable[[Patch], None]] = [
     grant_is_not_checked_on_set,
     any_request_is_the_next_step,
+    stop_is_a_step_of_a_plan,
     approved_plan_is_reusable,
     interrupted_plan_goes_on,
     approvals_survive_manual_and_problems,

@@ -8,18 +8,23 @@ from dataclasses import replace
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from rotation import rotated
+from rotation import ALL, rotated
 
 from afspm.model import ProcessCondition
 from tests.simulation import long_run
-from tests.simulation.night import CAST, FAULTS, Fault, Night, Plan, plan
+from tests.simulation.night import CAST, FAULTS, FINDERS, PANEL_NIGHTS, Fault, Night, Plan, panel_night, plan
 
 _ALIVE = ProcessCondition.ALIVE
 ALL_SEEDS = [range(first, first + 5) for first in range(0, 150, 5)]
-"""A few thousand experiment hours, a fifth of them at each commit; more: python -m tests.simulation.long_run."""
+"""A few thousand experiment hours, a thirtieth of them at each commit; more: python -m tests.simulation.long_run."""
 
 
-@pytest.mark.parametrize("seeds", rotated(ALL_SEEDS, 5), ids=lambda seeds: f"seeds-{seeds.start}-{seeds.stop - 1}")
+@pytest.mark.parametrize("night", FINDERS, ids=lambda night: f"seed-{night.seed}-{len(night.faults)}-faults")
+def test_every_invariant_holds_in_the_nights_that_find_every_mutant(night: Plan) -> None:
+    Night(night).run()
+
+
+@pytest.mark.parametrize("seeds", rotated(ALL_SEEDS, 30), ids=lambda seeds: f"seeds-{seeds.start}-{seeds.stop - 1}")
 def test_every_invariant_holds_in_many_nights(seeds: range) -> None:
     for seed in seeds:
         Night(plan(seed)).run()
@@ -96,19 +101,34 @@ _faults = st.builds(
 )
 
 
-@pytest.mark.timeout(600)  # twenty nights, on a busy computer
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@pytest.mark.slow
+@settings(max_examples=40 if ALL else 10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 2**32),
     faults=st.lists(_faults, max_size=12),
     impostor=st.booleans(),
     lease_s=st.sampled_from([None, 900.0]),
     dies_in_step=st.sampled_from([0.0, 0.002]),
+    keys=st.booleans(),
 )
 def test_no_schedule_of_faults_breaks_an_invariant(
-    seed: int, faults: list[Fault], impostor: bool, lease_s: float | None, dies_in_step: float
+    seed: int, faults: list[Fault], impostor: bool, lease_s: float | None, dies_in_step: float, keys: bool
 ) -> None:
     cast = tuple(name for name in CAST if lease_s is not None or name != "greedy")
     faults = [fault for fault in faults if fault.whom in ("scheduler", "translator", *cast)]
-    made = Plan(seed, hours=2.0, speed=200.0, cast=cast, impostor=impostor, lease_s=lease_s)
+    made = Plan(seed, hours=2.0, speed=200.0, cast=cast, impostor=impostor, lease_s=lease_s, keys=keys, garbles=0.01)
     Night(replace(made, faults=tuple(faults), dies_in_step=dies_in_step, doubles=0.05)).run()
+
+
+@pytest.mark.parametrize("night", PANEL_NIGHTS, ids=lambda night: f"{night.panel}-{night.seed}")
+def test_nothing_is_sent_to_a_microscope_at_whose_panel_a_person_works(night: Plan) -> None:
+    made = Night(night)
+    made.run()
+    assert made.invariants.acts
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seeds", rotated([range(first, first + 10) for first in range(0, 200, 10)], 10))
+def test_nothing_is_sent_to_a_person_at_the_panel_in_nights_with_all_faults(seeds: range) -> None:
+    for seed in seeds:
+        Night(panel_night(seed)).run()

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 from afspm.model import ControlMode, ControlRequest, Parameter, Problem, Request, names
 from afspm.scheduler.control.arbitration import ArbitrationState
-from afspm.scheduler.events import Effect, Input, Kill, Log, Reply, RequestIn
+from afspm.scheduler.events import Effect, Input, Kill, Log, PacketIn, Reply, RequestIn
 from afspm.scheduler.publishing.event_log import SCHEDULER
 from afspm.scheduler.settings import SchedulerSettings
 from afspm.testing.components.scheduler_host import SchedulerHost
@@ -27,6 +27,8 @@ class TipSafety:
     Attributes:
         retractions: how often the scheduler withdrew the tip.
         dangers: how often a tip was unattended in danger.
+        is_safe_at_the_end: what the scheduler knew of the tip when it ended the experiment; False before.
+        must_close: True if the translator must have been closed after the end: it was there, and the tip safe.
 
     Args:
         must: raises a violation if a condition does not hold.
@@ -51,7 +53,10 @@ class TipSafety:
         self._safe_since_s = self._ended_s = -1.0
         self.retractions = 0
         self.dangers = 0
+        self.is_safe_at_the_end = self.must_close = False
+        microscope.on_closed = self._closed
         self.memory_is_certain = True
+        self._by_hand = False
         self._life = 0
 
     def disturbed(self, for_s: float) -> None:
@@ -65,6 +70,7 @@ class TipSafety:
             self._unattended = self._unattended and self.memory_is_certain
         self._forget_told()
         before, after = self._before, host.core.control
+        self._by_hand = isinstance(event, PacketIn) and after.mode is ControlMode.MANUAL
         if after is not before:
             self._changed(before, after, _who(event, effects))
             self._before = after
@@ -76,7 +82,13 @@ class TipSafety:
                 self._ends(host, tip_is_safe=effect.tip_is_safe)
         self._look(host)
 
+    def _closed(self) -> None:
+        # a translator that is closed does not retract by itself: with a tip in danger it must be left to its parent
+        self._must(self.is_safe_at_the_end, "the translator was closed with the tip in danger")
+
     def _ends(self, host: SchedulerHost, *, tip_is_safe: bool) -> None:
+        self.is_safe_at_the_end = tip_is_safe
+        self.must_close = tip_is_safe and not self._is_disturbed(host)
         # the experiment waits for the tip, and logs an end with the tip in danger
         microscope, now_s = self._microscope, self._timeline.monotonic_s()
         if not (self._unattended and microscope.endangers_tip and microscope.habits.retracts):
@@ -103,7 +115,7 @@ class TipSafety:
 
     def _roles(self, before: ArbitrationState, after: ArbitrationState, who: str) -> None:
         roles = self._settings.rules.roles
-        if after.mode is not before.mode:
+        if after.mode is not before.mode and not self._by_hand:
             self._must(who in (roles.set_mode or ()), f"{who or 'nobody'} switched the mode")
         if after.ended and not before.ended:
             self._ended_s = self._timeline.monotonic_s()
@@ -145,8 +157,11 @@ class TipSafety:
         if subject == names.RETRACT and not request.id:
             self.retractions += 1
         if request.kind == ControlRequest.ACTION and subject in (names.START_SCAN, names.START_SPEC):
-            away = self._microscope.tip_is_away and self._timeline.monotonic_s() > self._disturbed_until_s
-            self._must(not away, "a measurement was begun with the tip withdrawn")
+            panel = self._microscope.panel  # where it does not show the tip, a person may let the run continue too soon
+            shows_tip = panel is None or panel.shows_tip
+            away = shows_tip and self._microscope.tip_is_away and self._timeline.monotonic_s() > self._disturbed_until_s
+            # what the disk had not taken when the scheduler was killed is forgotten, a retraction too
+            self._must(not (away and self.memory_is_certain), "a measurement was begun with the tip withdrawn")
         if isinstance(subject, Parameter) and subject.value is not None:
             self._within_limits(subject)
         limit = self._settings.limits.actions.get(str(subject)) if request.kind == ControlRequest.ACTION else None

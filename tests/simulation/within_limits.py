@@ -74,7 +74,9 @@ class WithinLimits:
             return
         before_ns, id_ = self._used.get(action, (0, ""))
         self._used[action] = (now_ns, request.id)
-        is_over = now_ns - before_ns >= limit.interval_s * 1e9
+        # one that was refused, since a person scans, is no use
+        was_done = self._microscope.executed[id_, request.kind] > 0
+        is_over = now_ns - before_ns >= limit.interval_s * 1e9 or not was_done
         self._must(is_over or id_ == request.id or not self.memory_is_certain, f"{action} is sent again too soon")
 
     def _contains(self, region: Region) -> bool:

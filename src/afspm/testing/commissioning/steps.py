@@ -16,7 +16,7 @@ from afspm.model import ControlRequest, Feedback, RegionChange, Scan, ScanParame
 from afspm.record.drawing import raster
 from afspm.testing.commissioning.guide import Guide
 from afspm.testing.commissioning.progress import CommissioningStep
-from afspm.testing.conformance import Declined, Skipped, expect
+from afspm.testing.conformance import Declined, Lost, Skipped, expect
 from afspm.testing.translators.checks import frames, picture, scans
 from afspm.testing.translators.measuring import SCAN_S, FrameSetting, Taken, number
 
@@ -200,7 +200,8 @@ def _scan(guide: Guide) -> str:
     elif taken.expected_s is not None:
         wanted = f"a scan of about {taken.expected_s:.3g} s, by its speed"
         # the program's own delay is real time; in experiment time it is longer if the clock runs faster
-        own_s = max(2.0 * _NOTICED_S, guide.program_s / guide.kit.client.clock.real_s(1.0))
+        client = guide.kit.client
+        own_s = max(2.0 * _NOTICED_S, guide.program_s / client.clock.real_s(1.0)) * client.patience
         most_s = 1.5 * taken.expected_s + own_s
         expect(free_s - begin_s <= most_s, wanted, f"{_lasted(guide, free_s - begin_s)} until its end was noticed")
     channels = ", ".join(one.channel for one in taken.scans)
@@ -282,6 +283,9 @@ def _stop_at_panel(guide: Guide) -> str:
         raise Skipped("not stopped at the panel")
     client.wait_state(ScopeState.FREE, mark, client.real_s(60.0))
     client.settled(mark)
+    while to_do := client.continue_run(_LOST_S):
+        if guide.prompts.text(f"{to_do}. Then press Enter (u: leave it)").strip():
+            raise Lost(to_do)
     return "noticed"
 
 
@@ -291,6 +295,7 @@ def _stop_at_panel(guide: Guide) -> str:
     "The tip stays as it is.",
     "Restore the connection, and see that nothing runs at the panel.",
     after=("stop",),
+    needs_panel=True,
     operations=(LOSS,),
 )
 def _connection(guide: Guide) -> str:

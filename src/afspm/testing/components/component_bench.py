@@ -5,11 +5,13 @@ from __future__ import annotations
 import copy
 import logging
 import re
+import weakref
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 from afspm import wire
 from afspm.basics.errors import ConfigError
@@ -23,7 +25,6 @@ from afspm.experiment.class_loader import ComponentDeclaration
 from afspm.model import (
     ControlMode,
     ControlRequest,
-    ControlResponse,
     ControlState,
     Packet,
     ProblemNames,
@@ -41,7 +42,8 @@ from afspm.scheduler.step_log import RecordedCore, StepLog
 from afspm.scheduler.wire_codec import WireCodec
 from afspm.simulation.simulator import Simulator
 from afspm.testing.components.bench_cast import BenchCast, cast_of
-from afspm.testing.components.hosted_processes import ComponentProcess, TranslatorProcess
+from afspm.testing.components.bench_microscope import BenchMicroscope, BenchTranslator, Polls, polls_from
+from afspm.testing.components.hosted_processes import BlockingProcess, ComponentProcess, TranslatorProcess
 from afspm.testing.components.memory_network import ControlLine, Weather
 from afspm.testing.components.scheduler_host import SchedulerHost
 from afspm.testing.components.simulated_process import Process
@@ -77,9 +79,8 @@ class Bench:
         seed: the same seed gives the same run.
         dies_in_call: the chance that the component is killed at a call to the network.
         keeps_requests: keep inputs and requests in `folder`, as `[record] requests = true` does.
-
-    Attributes:
-        packets: all packets that the scheduler published, oldest first.
+        polls: "all": the translator polls the microscope as often as in an experiment, ten times as slow; by default
+            the polls that can find nothing are skipped, and the packets are the same.
     """
 
     def __init__(
@@ -94,6 +95,7 @@ class Bench:
         seed: int = 1,
         dies_in_call: float = 0.0,
         keeps_requests: bool = False,
+        polls: Polls | Literal[""] = "",
     ) -> None:
         name = re.sub(r"(?<!^)(?=[A-Z])", "_", type(component).__name__).lower()
         if name in (others or {}):
@@ -122,7 +124,7 @@ class Bench:
             ),
             Simulator, given,
         )  # fmt: skip
-        self._set_up(cast, folder, seed, dies_in_call)
+        self._set_up(cast, folder, seed, dies_in_call, polls)
 
     @classmethod
     def of(
@@ -134,6 +136,7 @@ class Bench:
         folder: Path | None = None,
         seed: int = 1,
         dies_in_call: float = 0.0,
+        polls: Polls | Literal[""] = "",
     ) -> Bench:
         """Return a bench with the components, the scheduler and the simulated microscope of an experiment file.
 
@@ -143,33 +146,31 @@ class Bench:
             overlays: experiment files that override the first.
             component: name of the component under test; by default the only component with a plan of its own.
             without: names of components to leave out, such as web pages and programs in other languages.
-            folder, seed, dies_in_call: as for a bench of one component.
+            folder, seed, dies_in_call, polls: as for a bench of one component.
 
         Raises:
             ConfigError: the file has errors, or a part of it can't run on the bench.
         """
         bench = cls.__new__(cls)
-        bench._set_up(cast_of(file, *overlays, component=component, without=without), folder, seed, dies_in_call)
+        cast = cast_of(file, *overlays, component=component, without=without)
+        bench._set_up(cast, folder, seed, dies_in_call, polls)
         return bench
 
-    def _set_up(self, cast: BenchCast, folder: Path | None, seed: int, dies_in_call: float) -> None:
-        self._temporary = TemporaryDirectory(prefix="afspm-bench-") if folder is None else None
-        self.folder = Path(self._temporary.name) if self._temporary else Path(folder or "")
+    def _set_up(self, cast: BenchCast, folder: Path | None, seed: int, dies_in_call: float, polls: str) -> None:
+        temporary = TemporaryDirectory(prefix="afspm-bench-", ignore_cleanup_errors=True) if folder is None else None
+        self.folder = Path(temporary.name) if temporary else Path(folder or "")
         self.name = cast.name
         if taken := {"translator", "scheduler", "person"} & cast.components.keys():
             raise ConfigError(f"a component has the name {min(taken)!r}, which the bench uses", hint="rename it")
-        self.packets: list[Packet] = []
+        self._published = _PublishedPackets()
         self._lives = {name: _Life() for name in cast.components}
         self._problems = ProblemNames(cast.scheduler_launch.problems)
         self._time = time = SimulatedTime(seed)
         weather = Weather()
-        self._scheduler = SchedulerHost(
-            time, weather, cast.scheduler.settings(self._context(cast)), WireCodec(),
-            lambda one: wire.header(one.envelope, one.payload), self, make_core=lambda: self._core(cast),
-        )  # fmt: skip
-        self._scheduler.journal.writes_ahead = True
-        self._microscope = _SimulatedMicroscope(cast.simulator, cast.microscope)
-        self._translator = _BenchTranslator(time, self._microscope.switched_on, self.folder)
+        scheduler = _SchedulerOfCast(cast, time, self.folder)
+        self._scheduler = scheduler.hosted(time, weather, self._published)
+        self._microscope = BenchMicroscope(cast.simulator, cast.microscope)
+        self._translator = BenchTranslator(time, self._microscope, self.folder, polls_from(polls))
         self._scheduler.translator = (self._translator, self._translator)
         self._components = {
             name: self._process(name, one, cast.launches[name], dies_in_call if name == self.name else 0.0)
@@ -177,6 +178,7 @@ class Bench:
         }
         publishing = [self._components[name] for name, one in cast.components.items() if one.publishes]
         for hosted in self._components.values():
+            hosted.published = self._published.all.append
             hosted.publishers = [one for one in publishing if one is not hosted]
         self._person = _Person(time, weather, self._scheduler)
         self._processes: dict[str, Process] = {
@@ -186,24 +188,14 @@ class Bench:
             **self._components,
         }
         self._running = False
+        self._plans = 0
+        self._planned: dict[int, tuple[Callable[..., None], tuple[object, ...]]] = {}
         for process in self._processes.values():
-            process.exited = lambda code, process=process: self._exited(process, code)  # type: ignore[misc]
+            process.exited = partial(_exited, process)
             process.start()
-
-    def _context(self, cast: BenchCast) -> ProcessContext:
-        launch = replace(cast.scheduler_launch, state_dir=str(self.folder), run_dir=str(self.folder))
-        log, activity = logging.getLogger("afspm.scheduler"), ProcessActivity(self._time)
-        return ProcessContext(launch, self._time, open_port=_no_port, log=log, activity=activity)
-
-    def _core(self, cast: BenchCast) -> SchedulerCore:
-        context = self._context(cast)
-        coordinates = cast.scheduler.coordinates(context, in_process=True)
-        if hasattr(self, "_scheduler"):  # else the host makes a core before its first life
-            self._scheduler.worker = coordinates.worker
-        parts = (cast.scheduler.settings(context), WireCodec(), coordinates.frame)
-        if not context.launch.keeps_requests:
-            return SchedulerCore(*parts)
-        return RecordedCore(*parts, keep=StepLog.of_run(context.launch, context.log).keep)
+        # The threads hold their processes, and no process holds the bench: so it is collected, and ends the threads.
+        self._ending = weakref.finalize(self, _end, [*self._components.values(), self._translator], temporary)
+        self._ending.atexit = False
 
     def _process(self, name: str, component: Component, launch: Launch, dies_in_call: float) -> ComponentProcess:
         life = self._lives[name]
@@ -238,9 +230,21 @@ class Bench:
 
     def at(self, when: Time, do: Callable[..., None], *args: object) -> None:
         """Call `do(*args)` at an experiment time since the start: `bench.at("20 min", bench.kill)`."""
-        self._time.at(max(_seconds(when), self.now_s), do, args)
+        # kept here, since `do` often holds the bench, and the threads hold the timeline
+        number = self._plans = self._plans + 1
+        self._planned[number] = (do, args)
+        self._time.at(max(_seconds(when), self.now_s), _do_planned, (weakref.ref(self), number))
+
+    def close(self) -> None:
+        """End the threads of the bench, and delete its temporary folder; the results remain.
+
+        Without this call the same happens once the bench is collected as garbage.
+        """
+        self._ending()
 
     def _go_to(self, until_s: float) -> None:
+        if not self._ending.alive:
+            raise ConfigError("the bench was closed", where="Bench.run")
         self._running = True
         try:
             self._time.run_until(until_s)
@@ -303,6 +307,19 @@ class Bench:
     # --- results ---
 
     @property
+    def packets(self) -> list[Packet]:
+        """All packets that the scheduler published, among them the translator's, oldest first."""
+        return self._published.of_scheduler
+
+    def published(self, message: str) -> list[Any]:
+        """Return all published messages of a name, oldest first: `bench.published("ScanLines")`.
+
+        They come from the scheduler, which passes on the translator's, and from all components.
+        """
+        found = (one for one in self._published.all if wire.message_of(one.envelope) == message)
+        return [wire.decode(message, one.payload) for one in found]
+
+    @property
     def scans(self) -> list[ScanSet]:
         """All scans that were published, each with its channels."""
         found: dict[str, list[Scan]] = {}
@@ -341,22 +358,72 @@ class Bench:
         """Names of the problems that are flagged."""
         return tuple(map(self._problems.name, self.control_state.problems))
 
-    # --- for the processes ---
+
+class _PublishedPackets:
+    """The packets of a bench: those of the scheduler, and all in their order."""
+
+    def __init__(self) -> None:
+        self.of_scheduler: list[Packet] = []
+        self.all: list[Packet] = []
 
     def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:
-        """Observe a step of the scheduler; see `StepObserver`."""
+        """Observe a step of the scheduler; see `StepChecker`."""
 
     def carried_out(self, host: SchedulerHost, effect: Effect) -> None:
         """Keep each packet that the scheduler publishes."""
         if isinstance(effect, Publish):
-            self.packets.append(effect.packet)
+            self.of_scheduler.append(effect.packet)
+            self.all.append(effect.packet)
 
-    def _exited(self, process: Process, code: int) -> None:
-        if code in (ExitCode.DONE, ExitCode.ENDED) or process.banned:
-            return
-        if isinstance(process, (ComponentProcess, TranslatorProcess)) and isinstance(process.ended_with, Exception):
-            return  # `run` raises it
-        self._time.after(_RESTART_S, process.start)
+
+class _SchedulerOfCast:
+    """The scheduler of a cast, with a new core in each life."""
+
+    def __init__(self, cast: BenchCast, time: SimulatedTime, folder: Path) -> None:
+        self._scheduler = cast.scheduler
+        launch = replace(cast.scheduler_launch, state_dir=str(folder), run_dir=str(folder))
+        log, activity = logging.getLogger("afspm.scheduler"), ProcessActivity(time)
+        self._context = ProcessContext(launch, time, open_port=_no_port, log=log, activity=activity)
+        self._host: SchedulerHost | None = None
+
+    def hosted(self, time: SimulatedTime, weather: Weather, published: _PublishedPackets) -> SchedulerHost:
+        self._host = SchedulerHost(
+            time, weather, self._scheduler.settings(self._context), WireCodec(),
+            wire, published, make_core=self._core,
+        )  # fmt: skip
+        return self._host
+
+    def _core(self) -> SchedulerCore:
+        context = self._context
+        coordinates = self._scheduler.coordinates(context, in_process=True)
+        if self._host is not None:  # else the host makes a core before its first life
+            self._host.worker = coordinates.worker
+        parts = (self._scheduler.settings(context), WireCodec(), coordinates.frame)
+        if not context.launch.keeps_requests:
+            return SchedulerCore(*parts)
+        return RecordedCore(*parts, keep=StepLog.of_run(context.launch, context.log).keep)
+
+
+def _do_planned(bench: weakref.ref[Bench], number: int) -> None:
+    if (found := bench()) is not None:
+        do, args = found._planned.pop(number)
+        do(*args)
+
+
+def _exited(process: Process, code: int) -> None:
+    if code in (ExitCode.DONE, ExitCode.ENDED) or process.banned:
+        return
+    if isinstance(process, (ComponentProcess, TranslatorProcess)) and isinstance(process.ended_with, Exception):
+        return  # `run` raises it
+    process.timeline.after(_RESTART_S, process.start)
+
+
+def _end(processes: Sequence[BlockingProcess], temporary: TemporaryDirectory[str] | None) -> None:
+    # called by the garbage collector in any thread, which must not wait
+    for process in processes:
+        process.abandon()
+    if temporary is not None:
+        temporary.cleanup()
 
 
 class _Life:
@@ -374,50 +441,8 @@ class _RaisingLoop(ComponentLoop):
         raise error
 
 
-class _SimulatedMicroscope:
-    """The simulated microscope over all lives of its translator, each with a new simulator."""
-
-    def __init__(self, simulator: type[Simulator], settings: PlainMapping) -> None:
-        self._class = type(f"Bench{simulator.__name__}", (_DrawsInItsThread, simulator), {})
-        self._settings = copy.deepcopy(dict(settings))
-
-    def switched_on(self) -> Simulator:
-        made: Simulator = self._class(**copy.deepcopy(self._settings))
-        self._simulator = made
-        return made
-
-    def change_tip(self, condition: str, now_s: float) -> None:
-        self._simulator.change_tip(condition)
-        # a translator that is killed before it saves has the change in its next life, too
-        changes = dict(self._settings.get("tip_changes") or {})
-        changes["schedule"] = [*changes.get("schedule", ()), [now_s, condition]]
-        self._settings["tip_changes"] = changes
-
-
-class _DrawsInItsThread:
-    def run_drawing(self, work: Callable[[], None]) -> None:
-        work()  # in the thread of the bench: the same seed gives the same run
-
-
 def _no_port(heard: tuple[str, ...] | None = None) -> Port:
     raise AssertionError("the scheduler of a bench has no port")
-
-
-class _BenchTranslator(TranslatorProcess):
-    """A translator that refuses requests on demand. Pending refusals survive a kill."""
-
-    def __init__(self, *args: Any, **settings: Any) -> None:
-        super().__init__(*args, **settings)
-        self.refusals: dict[str, tuple[int, str]] = {}
-
-    def peer_asked(self, line: ControlLine, request: Request, number: int) -> None:
-        subject = getattr(request.subject, "name", request.subject)
-        left, reason = self.refusals.get(subject, (0, "")) if isinstance(subject, str) else (0, "")
-        if left and request.kind != ControlRequest.ACTION_SUPPORT:
-            self.refusals[subject] = (left - 1, reason)
-            line.answer(Response(int(ControlResponse.FAILURE), b"", reason, request.id), number)
-        else:
-            super().peer_asked(line, request, number)
 
 
 class _Person(Process):

@@ -50,10 +50,12 @@ class BlockingProcess(Process):
 
     Attributes:
         ended_with: the last end of the code by itself: an exit code or an exception; None without one.
+        wait_s: duration of the last wait with a time limit.
     """
 
     def __init__(self, timeline: SimulatedTime, name: str, *, dies_in_call: float = 0.0) -> None:
         super().__init__(timeline, name)
+        self.wait_s = 0.0
         self.dies_in_call = dies_in_call
         self.ended_with: int | BaseException | None = None
         self._baton: Baton | None = None
@@ -74,10 +76,24 @@ class BlockingProcess(Process):
         if baton is not None and not baton.over:
             baton.kill()
 
+    def abandon(self) -> None:
+        """End the process's thread, at the end of the simulation."""
+        if self._baton is not None:
+            self._baton.abandon()
+
     def arrived(self) -> None:
         """Wake the process's code if it waits for a message."""
         if self._waits:
             self._go_on()
+
+    def timed_out(self) -> None:
+        """Wake the process's code at the end of its wait."""
+        self._go_on()
+
+    def wait_again(self, timeout_s: float) -> None:
+        """Let the wait of the process's code end in `timeout_s`."""
+        self.wait_s = timeout_s
+        self._waiting_for = self.later(timeout_s, self.timed_out)
 
     def _go_on(self) -> None:
         self._forget_timer()
@@ -103,7 +119,7 @@ class BlockingProcess(Process):
         assert self._baton is not None
         self._waits = True
         if timeout_s is not None:
-            self._waiting_for = self.later(timeout_s, self._go_on)
+            self.wait_again(timeout_s)
         self._baton.wait()
 
     def may_die(self) -> None:
@@ -135,6 +151,7 @@ class ComponentProcess(BlockingProcess):
 
     Attributes:
         publishers: other components whose packets the component receives directly.
+        published: called with each packet of the component.
     """
 
     def __init__(
@@ -152,6 +169,7 @@ class ComponentProcess(BlockingProcess):
         super().__init__(timeline, name, dies_in_call=dies_in_call)
         self._launch = launch or Launch(name)
         self.publishers: list[ComponentProcess] = []
+        self.published: Callable[[Packet], None] = lambda packet: None
         self._weather = weather
         self._scheduler = scheduler
         self._make = make
@@ -256,6 +274,7 @@ class ComponentProcess(BlockingProcess):
     def publish(self, envelope: str, payload: bytes) -> None:
         self.may_die()
         packet = self._published.stamp(envelope, payload)
+        self.published(packet)
         self._subscribers.publish(packet)
 
     def send(self, frames: Sequence[bytes]) -> None:
@@ -310,7 +329,13 @@ class TranslatorProcess(BlockingProcess):
     Args:
         make: creates the driver for each life.
         folder: folder for the translator's memory, and its run folder.
+
+    Attributes:
+        translator, memory: of the present life, once its code runs.
     """
+
+    translator: Translator
+    memory: Memory
 
     def __init__(
         self,
@@ -331,9 +356,10 @@ class TranslatorProcess(BlockingProcess):
         self._answering: tuple[ControlLine, int] | None = None
 
     def body(self) -> int:
-        memory = Memory(self._folder / "translator.json")
-        log = logging.getLogger("afspm.translator")
-        return Translator(self._make(), MemoryServerPort(self), memory, TranslatorRun(self._folder), log).run()
+        self.memory = memory = Memory(self._folder / "translator.json")
+        log, run = logging.getLogger("afspm.translator"), TranslatorRun(self._folder)
+        self.translator = translator = Translator(self._make(), MemoryServerPort(self), memory, run, log)
+        return translator.run()
 
     # --- what comes ---
 

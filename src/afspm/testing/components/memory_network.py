@@ -89,6 +89,7 @@ class ControlLine:
 
     Attributes:
         name: the name that the client uses.
+        owner: the owner of the client's key; "": the client itself.
 
     Args:
         doubling: whether requests may arrive twice, as from a client that retries early.
@@ -110,6 +111,7 @@ class ControlLine:
         self._client = client
         self._server = server
         self.name = name
+        self.owner = ""
         self._there: Pipe | None = None
         self._back: Pipe | None = None
         self._closed = False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 import random
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -47,6 +48,7 @@ class SimulatedTime:
         self._time_s = 0.0
         self._order = 0
         self._moving = 0
+        self._until_s = -math.inf
         self._coming: list[tuple[float, int, Timer]] = []
 
     # --- the clock ---
@@ -105,9 +107,31 @@ class SimulatedTime:
 
     def run_until(self, time_s: float) -> None:
         """Run all events up to `time_s`, and advance to this time."""
-        while self._coming and self._coming[0][0] <= time_s:
-            self.step()
+        self._until_s = time_s
+        try:
+            while (next_s := self._next_s()) is not None and next_s <= time_s:
+                self.step()
+        finally:
+            self._until_s = -math.inf
         self._time_s = max(self._time_s, time_s)
+
+    def advance(self, delay_s: float) -> bool:
+        """Advance by `delay_s` without an event, if no event comes until then and `run_until` goes that far.
+
+        Returns:
+            whether time has advanced: then a call planned by `after` would come now, before any other.
+        """
+        time_s = self._time_s + delay_s
+        next_s = self._next_s()
+        if not self._time_s < time_s <= self._until_s or (next_s is not None and next_s <= time_s):
+            return False
+        self._time_s, self._moving = time_s, 0
+        return True
+
+    def _next_s(self) -> float | None:
+        while self._coming and self._coming[0][2].cancelled:
+            heapq.heappop(self._coming)
+        return self._coming[0][0] if self._coming else None
 
     def chance(self, probability: float) -> bool:
         return self.random.random() < probability

@@ -13,6 +13,7 @@ from afspm.basics.clock import Clock
 from afspm.basics.errors import ExperimentEnded, NoResponse, WireError
 from afspm.client.experiment_link import ExperimentLink
 from afspm.model import (
+    ControlMode,
     ControlRequest,
     ControlResponse,
     Packet,
@@ -154,14 +155,18 @@ class CheckClient:
         link: connection to the scheduler; may still be connecting.
         direct: connection to the translator, bypassing the scheduler's own refusals; None: use `link` instead.
         lost: returns a description of the ended processes, after a link reports the end of the parent.
+        patience: a factor of all limits in real time: above 1 where the microscope is simulated on a busy computer.
 
     Attributes:
         observations: all publications.
         at_start: the publications until control was granted, before the first request to the microscope.
     """
 
-    def __init__(self, link: ExperimentLink, direct: ExperimentLink | None, lost: Callable[[], str]) -> None:
+    def __init__(
+        self, link: ExperimentLink, direct: ExperimentLink | None, lost: Callable[[], str], patience: float = 1.0
+    ) -> None:
         self._link = link
+        self.patience = patience
         self._direct = direct or link
         self._lost = lost
         self.clock: Clock = link.clock
@@ -180,13 +185,14 @@ class CheckClient:
             Lost: the microscope is missing, or control was not granted.
         """
         try:
-            self.wait(lambda: self._link.connected and self._link.is_caught_up(), STARTED_S, _ANSWERS)
+            started_s = STARTED_S * self.patience
+            self.wait(lambda: self._link.connected and self._link.is_caught_up(), started_s, _ANSWERS)
             self.wait(
                 lambda: self.observations.newest(ScopeStatus) is not None,
-                STARTED_S,
+                started_s,
                 "a ScopeStateMsg of the translator",
             )
-            self.wait(lambda: self.state is not ScopeState.UNDEFINED, STARTED_S, "a connection to the controller")
+            self.wait(lambda: self.state is not ScopeState.UNDEFINED, started_s, "a connection to the controller")
         except Failed as failure:
             raise Lost(str(failure)) from failure
         response = self._request_over(self._link, ControlRequest.REQUEST_CTRL, 0)
@@ -206,6 +212,21 @@ class CheckClient:
             if self.clock.monotonic_s() >= until_s:
                 raise Lost(f"control was refused: {answer_in_words(response)}")
             self.quiet()
+
+    def continue_run(self, within_s: float) -> str:
+        """Let the run continue after an act at the panel, which has taken control away, and request control again.
+
+        Returns:
+            what a person has to do at the panel first; empty: the run continues.
+
+        Raises:
+            Lost: control is not granted within `within_s` real seconds.
+        """
+        response = self._request_over(self._link, ControlRequest.SET_CONTROL_MODE, int(ControlMode.AUTOMATED))
+        if not response.ok:
+            return answer_in_words(response)
+        self.regain_control(within_s)
+        return ""
 
     def end(self) -> None:
         """Release control."""
@@ -244,11 +265,12 @@ class CheckClient:
 
     def _request_over(self, link: ExperimentLink, kind: ControlRequest, subject: object) -> Response:
         self._heed()
+        within_s = ANSWERED_S * self.patience
         try:
             with self._alive():
-                response = link.request(kind, subject, until_s=link.until(ANSWERED_S))
+                response = link.request(kind, subject, until_s=link.until(within_s))
         except NoResponse:
-            raise Failed(f"an answer to REQ_{kind.name}", f"none within {ANSWERED_S:g} s") from None
+            raise Failed(f"an answer to REQ_{kind.name}", f"none within {within_s:g} s") from None
         self._stirred |= response.ok and not _only_asks(kind, subject)
         return response
 
@@ -282,8 +304,9 @@ class CheckClient:
         mark = self.observations.mark()
         self._wait(done, within_s, expected, mark)
 
-    def wait_state(self, state: ScopeState, mark: int, within_s: float = NOTICED_S) -> None:
-        """Wait until a state is published after `mark`."""
+    def wait_state(self, state: ScopeState, mark: int, within_s: float | None = None) -> None:
+        """Wait until a state is published after `mark`; None: as long as the effect of a request may take."""
+        within_s = NOTICED_S * self.patience if within_s is None else within_s
         self._wait(lambda: self.observations.has_state(state, mark), within_s, f"SS_{state.name}", mark)
 
     def _wait(self, done: Callable[[], bool], within_s: float, expected: str, mark: int) -> None:
@@ -318,7 +341,7 @@ class CheckClient:
 
     def real_s(self, experiment_s: float) -> float:
         """Return the longest real time for an experiment time, plus a delay for the publication."""
-        return self.clock.real_s(experiment_s) + NOTICED_S
+        return self.clock.real_s(experiment_s) + NOTICED_S * self.patience
 
     def come_to_rest(self) -> None:
         """Stop a running scan or spectrum, and wait until the microscope is free.

@@ -244,7 +244,8 @@ class CheckMeasurements:
 
     def begin_long_scan(self, frame: FrameSetting) -> int:
         """Start a scan long enough for other requests; return the mark before it."""
-        self.prepare(frame, max(SCAN_S, LONG_REAL_S / self.client.clock.real_s(1.0)))
+        long_real_s = LONG_REAL_S * self.client.patience
+        self.prepare(frame, max(SCAN_S, long_real_s / self.client.clock.real_s(1.0)))
         return self._begin(names.START_SCAN, ScopeState.SCANNING)
 
     def prepare(self, frame: FrameSetting, lasts_s: float) -> float | None:

@@ -66,6 +66,7 @@ class CheckOptions:
         speed: experiment seconds per real second, for a simulated microscope.
         only: parts of the names of the checks; empty: all.
         frame_m: the side of a square about the centre of the set frame, never left by checks; None: the set frame.
+        patience: a factor of all limits in real time.
     """
 
     files: Sequence[Path]
@@ -74,6 +75,7 @@ class CheckOptions:
     speed: float = SPEED
     only: Collection[str] = ()
     frame_m: float | None = None
+    patience: float = 1.0
 
 
 @dataclass
@@ -192,7 +194,7 @@ def _client(
         stack.callback(port.close)
     processes.start(starts)
     links = [_link(port, own, _logger(log)) for port in ports]
-    client = CheckClient(links[0], links[1] if len(links) > 1 else None, lambda: processes.ended)
+    client = CheckClient(links[0], links[1] if len(links) > 1 else None, lambda: processes.ended, options.patience)
     try:
         client.begin()
     except Lost as lost:
