@@ -5,26 +5,29 @@ PYTHON ?= python3
 BIN := .venv/bin
 DEMO := .venv/.demo
 TEST := .venv/.test
-SETUP := .venv/.made
+DEV := .venv/.dev
 
-.PHONY: demo demo-drift dev test test-all test-apart mutants test-samples coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
-.PHONY: test-nexus test-tiled check bench bench-drift soak chaos simulate replay-nights power-cut docs changelog clean
+.PHONY: demo demo-drift dev test test-times test-all test-apart test-lowest mutants test-samples coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
+.PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift soak chaos simulate replay-nights power-cut docs release-check test-plug-ins changelog clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
 
+# a stamp that is there is only out of date: bringing .venv up to date takes seconds, however large it is
+SETTING_UP = $(if $(wildcard $@),Updating,Setting up)
+
 $(DEMO): $(SOURCES)
-	@echo "Setting up .venv: 360 MB …"
+	@echo "$(SETTING_UP) .venv: 360 MB …"
 	@$(PYTHON) tools/bootstrap.py demo
 	@touch $@
 
 $(TEST): $(SOURCES)
-	@echo "Setting up .venv for the tests: 650 MB, with a chromium 810 MB …"
+	@echo "$(SETTING_UP) .venv for the tests: 650 MB, with a chromium 810 MB …"
 	@$(PYTHON) tools/bootstrap.py test
 	@touch $(DEMO) $@
 
-$(SETUP): $(SOURCES)
-	@echo "Setting up .venv with all tools: 900 MB …"
+$(DEV): $(SOURCES)
+	@echo "$(SETTING_UP) .venv with all tools: 900 MB …"
 	@$(PYTHON) tools/bootstrap.py all
 	@touch $(DEMO) $(TEST) $@
 
@@ -47,8 +50,15 @@ PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest
 COLLECTED := .venv/.tests-collected
 POWER_CUT := tests/system/record/test_power_cut.py
 QUICK := tests/unit tests/simulation tests/plugins tests/docs $(addprefix tests/system/,scheduler supervisor process)
+# Its processor time is printed at the end: make test MOST_TIME=1.5 fails above 1.5 times the limit in tools/processor_time.py
+MOST_TIME ?=
+TIMED = PYTHONDONTWRITEBYTECODE= $(BIN)/python tools/processor_time.py $(addprefix --fail-above=,$(MOST_TIME)) $(BIN)/pytest
 test: $(COLLECTED)
-	@$(PYTEST) -n $(TESTS_AT_A_TIME) --dist worksteal -m "not slow" $(QUICK)
+	@$(TIMED) -n $(TESTS_AT_A_TIME) --dist worksteal -m "not slow" $(TABLE) $(QUICK)
+
+## the same, with the processor time of each folder and the most expensive tests
+test-times: TABLE := --processor-times
+test-times: test
 
 ## the rest: whole experiments, samples, snippets of the docs, faults of controllers, mutants. What is APART, or needs more
 ## (root, compilers, an hour), has a target of its own, below
@@ -68,11 +78,16 @@ test-apart: $(COLLECTED)
 
 # asserts are rewritten once, not by each of the processes that run tests; what can't be collected fails there
 $(COLLECTED): $(TEST) $(shell find tests -name '*.py')
-	@ls -d tests/*/ | PYTHONDONTWRITEBYTECODE= xargs -P 2 -n 1 $(BIN)/pytest --collect-only -qq > /dev/null 2>&1; touch $@
+	@ls -d tests/*/ | grep -v real_data | PYTHONDONTWRITEBYTECODE= xargs -P 2 -n 1 $(BIN)/pytest --collect-only -qq > /dev/null 2>&1; touch $@
 
 ## decisions broken on purpose, each of which the simulated nights have to find; prints how many they found
 mutants: $(TEST)
 	@AFSPM_CASES=all $(PYTEST) -n 2 $(addprefix tests/simulation/,test_mutants.py test_what_if.py test_agent_mutants.py)
+
+## the tests of units and plug-ins with the lowest versions of all dependencies, in build/lowest-env: needs Python 3.11
+LOWEST ?= tests/unit tests/plugins
+test-lowest:
+	@$(PYTHON) tools/lowest_versions.py -n $(TESTS_AT_A_TIME) --dist worksteal -m "not slow" $(LOWEST)
 
 ## every sample in experiments/, shortened, to its end
 test-samples: $(TEST)
@@ -86,12 +101,13 @@ coverage: $(TEST)
 
 ## the dashboard in a real browser (Debian's chromium, or another: AFSPM_CHROMIUM=/path); screenshots in build/screenshots
 test-ui: $(TEST)
-	@$(BIN)/pytest tests/ui
+	@$(PYTHON) tools/bootstrap.py browser
+	@$(BIN)/pytest --must-run tests/ui
 
 ## the gateway: against its own OpenAPI description (schemathesis, 25 MB), in several languages, with twenty clients
 test-gateway: $(TEST)
 	@$(PYTHON) tools/bootstrap.py gateway
-	@AFSPM_SCHEMATHESIS_S=240 $(BIN)/pytest tests/system/gateway
+	@AFSPM_SCHEMATHESIS_S=240 $(BIN)/pytest --must-run tests/system/gateway
 
 ## each base operation of every translator: the simulated microscope's, the image's, and those of emulated controllers
 TRANSLATORS ?= $(wildcard experiments/every_microscope/[is]*.toml src/afspm/plugins/*/emulated.toml)
@@ -99,7 +115,8 @@ test-translators: $(TEST)
 	@printf '%s\n' $(TRANSLATORS) | xargs -P 4 -I FILE $(BIN)/afspm test-translator FILE \
 	  --frame "500 nm" --runs build/translators
 
-## build the clients in other languages, and judge each by `afspm test-client`; what is not installed is skipped: CLIENTS=rust
+## build the clients in other languages, and judge each by `afspm test-client`: CLIENTS=rust. Clients whose compilers are
+# missing are skipped with the packages to install; if all are, it fails
 CLIENTS ?=
 test-clients: $(TEST)
 	@$(BIN)/python tools/test_clients.py $(CLIENTS)
@@ -115,7 +132,16 @@ test-windows: $(TEST)
 
 ## an experiment on four hosts (network namespaces: on Linux, as root) over links that are slow, lossy, cut and gone
 test-hosts: $(TEST)
-	@$(BIN)/pytest -n 2 tests/system/hosts
+	@$(BIN)/pytest --must-run -n 2 tests/system/hosts
+
+## files of real microscopes, which are not in the repository, beside the record of what is in them: AFSPM_DATA=/path/to/data
+# (default: shared/data beside this folder)
+real-data: $(TEST)
+	@$(BIN)/pytest -n 2 --dist worksteal tests/real_data
+
+## that record, written again after an intended change
+real-data-record: $(TEST)
+	@$(BIN)/python tests/real_data/record.py
 
 ## the files of runs, with the validator of NeXus
 test-nexus: $(TEST)
@@ -126,20 +152,30 @@ test-tiled: test-nexus
 	@$(PYTHON) tools/serve_with_tiled.py
 
 ## everything for those who change afspm: the environment, and the hooks that check each commit
-dev: $(SETUP)
+dev: $(DEV)
 	@$(BIN)/pre-commit install
 
-## style, spelling, types, and which package imports which
-check: $(SETUP)
+## the message classes of src/afspm/wire/generated, compiled after a change in proto/
+messages: $(TEST)
+	@echo "The message classes are up to date: src/afspm/wire/generated"
+
+## style, spelling, types, which package imports which, and the workflows
+check: $(DEV)
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
 	@$(BIN)/codespell
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
+	@$(BIN)/zizmor --quiet --no-progress --offline --strict-collection --persona pedantic .github
 
-## speed, beside bare pyzmq: a table, and build/bench.json
+## speed, beside bare pyzmq and beside the last landed run: a table, and build/bench.json. LAND=1 lands this run's ratios
 bench: $(TEST)
-	@$(BIN)/python -m benchmarks
+	@$(BIN)/python -m benchmarks $(if $(LAND),--land)
+
+## two commits, measured in turn on this computer: make bench-compare BEFORE=main~5 AFTER=HEAD NAMES="control_round_trip"
+AFTER ?= HEAD
+bench-compare: $(TEST)
+	@$(BIN)/python -m benchmarks.compare $(BEFORE) --after $(AFTER) $(NAMES)
 
 ## drift: errors of the estimates beside the theoretical bound, and build/bench-drift.json: make bench-drift QUICK=1
 bench-drift: $(TEST)
@@ -174,13 +210,22 @@ CUTS ?= 100
 power-cut: $(TEST)
 	@$(BIN)/python tests/system/record/power_cut.py --cuts $(CUTS) --seed $(SEED)
 
+## all that can be tried before a release, without publishing anything: distributions, metadata, contents, installations
+release-check: $(TEST)
+	@$(PYTHON) tools/bootstrap.py release
+	@$(BIN)/python tools/release_check.py
+
+## packages from outside the tree beside the wheel: a maker, a component, the templates of `afspm new`
+test-plug-ins:
+	@$(PYTHON) tools/release_check.py build plug-ins
+
 ## the documentation as a site with search: build/site/index.html. A broken link fails
 docs:
 	@$(PYTHON) tools/build_docs.py
 
-## the news fragments of changes/, moved into CHANGELOG.md: make changelog VERSION=0.2.0
+## the news fragments of changes/, moved into CHANGELOG.md under the version of pyproject.toml
 changelog: $(TEST)
-	@$(BIN)/python tools/changelog.py $(VERSION)
+	@$(BIN)/python tools/changelog.py
 
 clean:
 	rm -rf .venv build runs

@@ -1,4 +1,9 @@
-"""`python -m benchmarks [--short] [NAME …]`: measures (default: everything), prints a table, writes build/bench.json.
+"""`python -m benchmarks [--short] [--land] [NAME …]`: measures, prints a table, writes build/bench.json.
+
+Without names everything is measured; `--short` tries each row once, and its figures mean nothing.
+
+Beside each ratio stands the one of the last landed run (benchmarks/landed.json), which `--land` replaces. A measurement
+that lacks a program or package is listed with its remedy, and the others go on.
 
 Exits with 1 where a target was missed, and with 3 where a measurement failed.
 """
@@ -11,11 +16,13 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
+from benchmarks import landed
 from benchmarks.effort import SHORT, VARIABLE
-from benchmarks.rows import MEASUREMENTS, Failure, Measurement, Row
+from benchmarks.rows import MEASUREMENTS, Failure, Measurement, Missing, NotMeasured, Row, measurement
 
 MODULES = (
     "codec",
@@ -32,47 +39,82 @@ MODULES = (
     "dashboard",
 )
 RESULT = Path("build/bench.json")
+OPTIONS = {"--short", "--land"}
 
 
 def main(arguments: list[str]) -> int:
-    names = {name for name in arguments if name != "--short"}
-    if len(names) < len(arguments):
+    options, names = {one for one in arguments if one.startswith("--")}, {*arguments}
+    names -= options
+    if "--short" in options:
         os.environ[VARIABLE] = SHORT  # read where a measurement is imported
-    for module in MODULES:
-        importlib.import_module(f"benchmarks.{module}")
-    if unknown := names - MEASUREMENTS.keys():
-        print(f"there is no measurement {sorted(unknown)}; there are {sorted(MEASUREMENTS)}", file=sys.stderr)
+    _register()
+    if unknown := (names - MEASUREMENTS.keys()) | (options - OPTIONS):
+        known = f"measurements {sorted(MEASUREMENTS)} and options {sorted(OPTIONS)}"
+        print(f"there is no {', '.join(sorted(unknown))}; there are {known}", file=sys.stderr)
         return 2
-    rows: list[Row | Failure] = []
-    print(f"{'':58} {'ours':>10} {'bare':>10} {'ratio':>7}  target", flush=True)
+    before = landed.read()
+    measured: dict[str, list[Row]] = {}
+    found: list[Row | Failure | Missing] = []
+    print(f"{'':58} {'ours':>10} {'bare':>10} {'ratio':>7} {'landed':>7}  target", flush=True)
     for name, measure in MEASUREMENTS.items():
         if not names or name in names:
-            for row in _measured(name, measure):
-                rows.append(row)
-                print(_line(row), flush=True)
+            for row in _measured(name, measure, before.get(name, {})):
+                found.append(row)
+                if isinstance(row, Row):
+                    measured.setdefault(name, []).append(row)
+                print(_line(row, before.get(name, {})), flush=True)
     RESULT.parent.mkdir(exist_ok=True)
-    RESULT.write_text(json.dumps([row.to_json() for row in rows], indent=1) + "\n", encoding="utf-8")
-    if any(isinstance(row, Failure) for row in rows):
+    RESULT.write_text(json.dumps([row.to_json() for row in found], indent=1) + "\n", encoding="utf-8")
+    for missing in (row for row in found if isinstance(row, Missing)):
+        print(f"not measured: {missing.name}: {missing.reason}")
+    failed = {row.name for row in found if isinstance(row, Failure)}
+    if "--land" in options:
+        landed.write({name: rows for name, rows in measured.items() if name not in failed})
+    if failed:
         return 3
-    return 0 if all(isinstance(row, Row) and row.met for row in rows) else 1
+    return 0 if all(row.met for row in found if isinstance(row, Row)) else 1
 
 
-def _measured(name: str, measure: Measurement) -> Iterator[Row | Failure]:
+def _register() -> None:
+    for module in MODULES:
+        try:
+            importlib.import_module(f"benchmarks.{module}")
+        except ImportError as error:  # it needs a package of an extra: its measurements are listed, and the others made
+            measurement(partial(_lacks, error), module)
+
+
+def _lacks(error: ImportError) -> Iterator[Row]:
+    raise _remedy(error)
+    yield  # makes this a generator, as every measurement is
+
+
+def _remedy(error: ImportError) -> NotMeasured:
+    return NotMeasured(f"{error.name or error} is not installed", "run `python tools/bootstrap.py test`")
+
+
+def _measured(name: str, measure: Measurement, landed_rows: Mapping[str, float]) -> Iterator[Row | Failure | Missing]:
     try:
         yield from measure()
+    except NotMeasured as error:
+        yield Missing(name, str(error), tuple(landed_rows))
+    except ImportError as error:
+        yield Missing(name, str(_remedy(error)), tuple(landed_rows))
     except Exception as error:  # a failed measurement of any kind must not lose the others
         traceback.print_exc()
         yield Failure(name, f"{type(error).__name__}: {error}")
 
 
-def _line(row: Row | Failure) -> str:
+def _line(row: Row | Failure | Missing, landed_rows: Mapping[str, float]) -> str:
     if isinstance(row, Failure):
         return f"{row.name:58} FAILED: {row.error}"
+    if isinstance(row, Missing):
+        return f"{row.name:58} NOT MEASURED: {row.reason}" + "".join(f"\n  {name}" for name in row.rows)
     sign = "<=" if row.better == "low" else ">="
     bare = "" if row.bare is None else f"{row.bare:.4g}"
+    earlier = f"{landed_rows[row.name]:.2f}" if row.name in landed_rows else ""
     mark = "" if row.met else "  MISSED"
     name = f"{row.name} [{row.unit}]"
-    return f"{name:58} {row.ours:>10.4g} {bare:>10} {row.ratio:>7.2f}  {sign} {row.target:g}{mark}"
+    return f"{name:58} {row.ours:>10.4g} {bare:>10} {row.ratio:>7.2f} {earlier:>7}  {sign} {row.target:g}{mark}"
 
 
 if __name__ == "__main__":

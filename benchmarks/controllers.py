@@ -1,13 +1,17 @@
-"""The time that translators of vendors' controllers add to a request: everything except the wait for the controller.
+"""The time of a request to translators of vendors' controllers.
 
-The emulated controllers are processes of their own, and their time is not counted.
+Where the maker has a Python client, a plain script with this client does the same work at an emulated controller of its
+own, and the row is the ratio of both, the waits for the controllers included. Elsewhere the row is the time that the
+translator adds: everything except the wait for the controller.
 """
 
 from __future__ import annotations
 
+import itertools
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial, wraps
 from pathlib import Path
 from statistics import median
@@ -24,11 +28,19 @@ from afspm.translator.translator import Translator, TranslatorRun
 from afspm.translator.zmq_connection import ZmqConnection
 from afspm.transport.port import RequestReceived, Served
 from benchmarks.effort import effort
+from benchmarks.plain_clients import ASKED, CLIENTS, FRAME, SET, Work
 from benchmarks.processes import CLOCK, Roles, roles
-from benchmarks.rows import Row, measurement
+from benchmarks.rows import Row, alternate, measurement
 
 REQUESTS = effort(200, 2)
+PAIRS = effort(100, 2)
 AT_MOST_MS = 1.0
+AT_MOST_TIMES = {
+    "nanonis": {ASKED: 1.5, SET: 4.5, FRAME: 4.0},
+    "park": {ASKED: 2.5, SET: 6.0, FRAME: 12.0},
+}
+"""Beside a script with the maker's client. A translator asks more than the script: for the state before it sets, and
+afterwards for each value that may have changed with it."""
 WAITS = ((Receiver, "some"), (ZmqConnection, "_await_reply"))
 """The classes and their methods that wait for the answer of a controller, over TCP and over ZeroMQ."""
 VENDORS = {
@@ -37,7 +49,8 @@ VENDORS = {
     if f"{name}Emulator" in entry_points.names(entry_points.EMULATORS)
 }
 """The drivers of the emulated controllers, by the names of the emulators."""
-FRAME = ScanParameters(Region((1e-7, -5e-8), (4e-7, 3e-7), 0.1), (48, 64), "m")
+_REGION = Region((1e-7, -5e-8), (4e-7, 3e-7), 0.1)
+FRAMES = (ScanParameters(_REGION, (48, 64), "m"), ScanParameters(_REGION.moved_to((0.0, 0.0)), (48, 64), "m"))
 
 
 class Waiting:
@@ -103,42 +116,71 @@ def translator(vendor: str, processes: Roles, folder: Path, port: Answers) -> Tr
     return made
 
 
-def own_s(made: Translator, port: Answers, waiting: Waiting, request: Request) -> float:
-    """Return the time from a request to its answer, minus the wait for the controller."""
+@dataclass(frozen=True)
+class Took:
+    """The time from a request to its answer, with the wait for the controller and without."""
+
+    whole_s: float
+    own_s: float
+
+
+def took(made: Translator, port: Answers, waiting: Waiting, request: Request) -> Took:
     frames = wire.encode_request(request)
     waiting.s, began = 0.0, perf_counter()
     made.handle(RequestReceived(frames))
     response = wire.decode_response(port.last)
     assert response.ok, response.reason
-    return port.at_s - began - port.waited_s
+    whole_s = port.at_s - began
+    return Took(whole_s, whole_s - port.waited_s)
 
 
 def controller(vendor: str) -> Iterator[Row]:
     bias = [Parameter(names.TIP_BIAS_VOLTAGE, text, "V") for text in ("0.1", "0.2")]
     speed = [Parameter(names.SCAN_SPEED, text, "m/s") for text in ("1e-6", "2e-6")]
-    frames = [FRAME, ScanParameters(FRAME.region.moved_to((0.0, 0.0)), FRAME.shape, "m")]  # type: ignore[union-attr]
     port = Answers(waiting := Waiting())
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
-        made = translator(vendor, stack.enter_context(roles()), folder, port)
+        processes = stack.enter_context(roles())
+        made = translator(vendor, processes, folder, port)
         stack.callback(made.driver.close)
         for wait in WAITS:
             stack.enter_context(waiting.counted(*wait))
+        plain: Work = {}
+        if client := CLIENTS.get(vendor):
+            address = processes.start("emulator", vendor=vendor, folder=str(folder / "plain"))
+            plain = stack.enter_context(client(address, FRAMES))
         asked = [Parameter(names.SCAN_SPEED, None, None)]
         set_ = bias if names.TIP_BIAS_VOLTAGE in made.driver.table else speed
+        numbers = itertools.count()
         for what, kind, subjects in (
-            ("a value asked for", ControlRequest.PARAM, asked),
-            ("a value set", ControlRequest.PARAM, set_),
-            ("a frame set", ControlRequest.SET_SCAN_PARAMS, frames),
+            (ASKED, ControlRequest.PARAM, asked),
+            (SET, ControlRequest.PARAM, set_),
+            (FRAME, ControlRequest.SET_SCAN_PARAMS, FRAMES),
         ):
-            times = []
-            for number in range(REQUESTS):
+
+            def ours(what: str = what, kind: int = kind, subjects: Sequence[Any] = subjects) -> Took:
+                number = next(numbers)
                 request = Request(kind, subjects[number % len(subjects)], id=f"{what}/{number}")
-                times.append(own_s(made, port, waiting, request))
+                found = took(made, port, waiting, request)
                 while made.driver.status().state is not ScopeState.FREE:
                     pass
                 made.look()
-            yield Row(f"{vendor}'s translator, {what}", "ms", median(times) * 1e3, None, AT_MOST_MS)
+                return found
+
+            name = f"{vendor}'s translator, {what}"
+            if not plain:
+                own_ms = median(ours().own_s for _ in range(REQUESTS)) * 1e3
+                yield Row(name, "ms", own_ms, None, AT_MOST_MS)
+                continue
+
+            def bare(work: Callable[[int], object] = plain[what]) -> float:
+                number, began = next(numbers), perf_counter()
+                work(number)
+                return perf_counter() - began
+
+            whole_s, bare_s = alternate(lambda ours=ours: ours().whole_s, bare, PAIRS)  # type: ignore[misc]
+            target = AT_MOST_TIMES[vendor][what]
+            yield Row(f"{name}, beside the maker's client", "ms", whole_s * 1e3, bare_s * 1e3, target)
 
 
 for _vendor in VENDORS:  # one that fails leaves the others to be measured

@@ -19,7 +19,7 @@ from urllib.error import URLError
 from benchmarks.control import Client
 from benchmarks.effort import effort
 from benchmarks.processes import roles
-from benchmarks.rows import Row, measurement
+from benchmarks.rows import NotMeasured, Row, measurement
 from benchmarks.stage import Stage, picture
 
 SIDE, TIMES = 512, effort(12, 3)
@@ -33,8 +33,6 @@ MS_PER_NS = 1e-6
 def dashboard() -> Iterator[Row]:
     """Measure from the publication of a scan until the browser has drawn it; both use the clock of one computer."""
     with _browser() as browser, Stage() as stage:
-        if browser is None:
-            return
         page = open_page(browser, stage.url)
         late_ms = [latency_ms(page, stage, seed) for seed in range(TIMES)][2:]
         yield Row(f"scan of {SIDE}² on the page after its publication", "ms", statistics.median(late_ms), None, 150.0)
@@ -121,16 +119,12 @@ def cpu_s(pid: int) -> float:
 
 @contextmanager
 def _browser() -> Iterator[Any]:
-    # None without a browser
     program = os.environ.get("AFSPM_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
-    try:
-        from playwright.sync_api import sync_playwright
-    except ImportError:
-        program = None
     if program is None:
-        print("the dashboard is not measured: no chromium, or no playwright, is found")
-        yield None
-        return
+        remedy = "install it (`apt install chromium`), or name it (AFSPM_CHROMIUM=/path)"
+        raise NotMeasured("no chromium is found", remedy)
+    from playwright.sync_api import sync_playwright
+
     with sync_playwright() as playwright:
         started = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
         yield started

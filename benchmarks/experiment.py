@@ -21,7 +21,7 @@ import zmq
 import afspm
 from afspm.basics.errors import RequestError
 from benchmarks.effort import effort
-from benchmarks.rows import Row, measurement
+from benchmarks.rows import NotMeasured, Row, measurement
 
 DEADLINE_S = 30.0
 STARTS = KILLS = ENDS = effort(5, 1)
@@ -116,10 +116,14 @@ def running() -> Iterator[Running]:
             run.close()
 
 
+def _needs_signals() -> None:
+    if sys.platform == "win32":
+        raise NotMeasured("Windows has no signals that kill or freeze a process")
+
+
 @measurement
 def start_up() -> Iterator[Row]:
-    if sys.platform == "win32":
-        return
+    _needs_signals()
     yield Row("afspm run to the first ScopeState", "s", statistics.median(map(_start_s, range(STARTS))), None, 2.0)
 
 
@@ -141,8 +145,7 @@ def _start_s(_: int) -> float:
 
 @measurement
 def recovery() -> Iterator[Row]:
-    if sys.platform == "win32":
-        return
+    _needs_signals()
     with running() as run:
         run.wait_for(r"watcher .*knows the state")
         took_s = [_component_back_s(run) for _ in range(KILLS)]
@@ -182,8 +185,7 @@ def _back_s(name: str) -> float:
 
 @measurement
 def ending() -> Iterator[Row]:
-    if sys.platform == "win32":
-        return
+    _needs_signals()
     took_s = [_end_s(deaf=False) for _ in range(ENDS)]
     yield Row("Ctrl-C until all has ended", "s", statistics.median(took_s), None, 2.0)
     took_s = [_end_s(deaf=True) for _ in range(ENDS)]
@@ -204,7 +206,7 @@ def _end_s(*, deaf: bool) -> float:
 @measurement
 def idle() -> Iterator[Row]:
     if not Path("/proc/self/stat").exists():
-        return
+        raise NotMeasured("the processor time of other processes is read from /proc, which Linux alone has")
     with running() as run:
         run.wait_for(r"watcher .*knows the state")
         pids = [run.process.pid, *run.pids.values()]

@@ -69,6 +69,36 @@ class Failure:
         return {"name": self.name, "error": self.error, "met": False}
 
 
+class NotMeasured(Exception):
+    """A measurement lacks a program or package.
+
+    Args:
+        reason: the missing part.
+        remedy: how to get the missing part; empty if there is no way.
+    """
+
+    def __init__(self, reason: str, remedy: str = "") -> None:
+        super().__init__(f"{reason}; {remedy}" if remedy else reason)
+
+
+@dataclass(frozen=True)
+class Missing:
+    """A measurement that can't be made on this computer.
+
+    Attributes:
+        name: of the measurement.
+        reason: the missing part, and how to get it.
+        rows: names of the rows that it yielded in the landed run.
+    """
+
+    name: str
+    reason: str
+    rows: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, object]:
+        return {"name": self.name, "not_measured": self.reason, "rows": list(self.rows)}
+
+
 Measurement = Callable[[], Iterator[Row]]
 M = TypeVar("M", bound=Measurement)
 MEASUREMENTS: dict[str, Measurement] = {}

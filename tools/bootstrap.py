@@ -1,7 +1,8 @@
 """Make the environment .venv from the lock file, with nothing but Python 3.11 or later.
 
 Run by the Makefile: `python3 tools/bootstrap.py demo` (what a plain install holds), `test` (and what the tests need),
-`all` (and the tools of `make check`), `gateway` (what judges the gateway) or `coverage`. Each adds to what is there.
+`all` (and the tools of `make check`), `browser` (what drives one), `gateway` (its judge), `coverage` or `release` (what
+judges the distributions). Each adds to what is there.
 """
 
 from __future__ import annotations
@@ -30,12 +31,15 @@ def main(wanted: str) -> None:
     if is_new or wanted == "demo":
         _compile()
     if wanted != "demo":
+        if wanted == "browser" and not _has_browser():
+            sys.exit("no chromium is found: `apt install chromium`, or AFSPM_CHROMIUM=/path says where one is")
         groups = ["test", *(["browser"] if _has_browser() else []), *(["check"] if wanted == "all" else [])]
-        groups += [wanted] if wanted in ("coverage", "gateway") else []
-        _sync(*(f"--group={group}" for group in ["pip", *groups]), *(f"--extra={extra}" for extra in _extras()))
+        groups += [wanted] if wanted in ("coverage", "gateway", "release") else []
+        _sync(*(f"--group={group}" for group in ["pip", *groups]), *(f"--extra={extra}" for extra in extras()))
 
 
-def _extras() -> list[str]:
+def extras() -> list[str]:
+    """Return the extras that are installed for the tests."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     return sorted(project["optional-dependencies"].keys() - NOT_TESTED)
 
@@ -109,7 +113,9 @@ def _make_venv() -> None:
 
 def _wanted(arguments: list[str]) -> str:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("wanted", nargs="?", default="all", choices=("demo", "test", "all", "gateway", "coverage"))
+    parser.add_argument(
+        "wanted", nargs="?", default="all", choices=("demo", "test", "all", "gateway", "coverage", "release")
+    )
     return str(parser.parse_args(arguments).wanted)
 
 

@@ -1,4 +1,4 @@
-"""Moves the news fragments into the changelog: `python tools/changelog.py VERSION`.
+"""Moves the news fragments into the changelog, under the version of pyproject.toml: `python tools/changelog.py`.
 
 changes/README.md describes the fragments.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import sys
+import tomllib
 from collections.abc import Iterator
 from datetime import UTC, date, datetime
 from pathlib import Path
@@ -53,13 +54,16 @@ def section(files: list[Path], version: str, day: date) -> str:
     return "\n".join(parts) + "\n"
 
 
-def main(version: str, day: date, root: Path = ROOT) -> None:
+def main(day: date, root: Path = ROOT) -> None:
+    version = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     files = fragments(root / "changes")
     wrong = [error for file in files for error in errors(file)]
     if wrong or not files:
         sys.exit("\n".join(wrong) or "there are no fragments in changes/")
     changelog = root / "CHANGELOG.md"
     before, heading, after = changelog.read_text(encoding="utf-8").partition("## [")
+    if after.startswith(f"{version}]"):
+        sys.exit(f"CHANGELOG.md has version {version} already; raise that of pyproject.toml: uv version --bump minor")
     text = before + section(files, version, day) + heading + after
     changelog.write_text(text, encoding="utf-8", newline="\n")
     for file in files:
@@ -67,4 +71,4 @@ def main(version: str, day: date, root: Path = ROOT) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], datetime.now(UTC).date())
+    main(datetime.now(UTC).date())

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from afspm.basics import entry_points
-from afspm.testing.commissioning.procedure import commission
+from afspm.testing.commissioning.procedure import REHEARSAL_PATIENCE, commission
 from afspm.testing.commissioning.report import InstrumentReport
 from afspm.testing.translators import CheckOptions
 
@@ -28,7 +28,7 @@ class NoPanel:
         return True
 
     def text(self, question: str) -> str:
-        return "u" if "(u:" in question else ""
+        return ""
 
     def choose(self, question: str, options: Sequence[str], default: str = "") -> str:
         return default
@@ -40,7 +40,8 @@ def main(names: Sequence[str]) -> None:
         if folder is None or not (folder / "emulated.toml").exists():
             continue
         file = folder / "reports/emulator.toml"
-        options = CheckOptions([folder / "emulated.toml"], runs=ROOT / "build/commissioning")
+        runs = ROOT / "build/commissioning"
+        options = CheckOptions([folder / "emulated.toml"], runs=runs, patience=REHEARSAL_PATIENCE)
         result = commission(options, NoPanel(), file, "emulator")
         sys.stdout.write(f"{name}: {'passed' if result.passed else 'NOT AS IT SHOULD BE'} {result.lost}\n")
         report = InstrumentReport.read(file)

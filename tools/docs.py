@@ -106,6 +106,7 @@ def _done(do: arbitration.ControlChange) -> str:
         arbitration.ControlChange.FLAG: "the problem is flagged",
         arbitration.ControlChange.UNFLAG: "the flag is removed",
         arbitration.ControlChange.SET_MODE: "the mode is set",
+        arbitration.ControlChange.PAUSE: "the mode is MANUAL",
         arbitration.ControlChange.END: "the experiment ends",
     }[do]
 

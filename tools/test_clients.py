@@ -1,7 +1,8 @@
 """Builds and judges the clients in other languages: `make test-clients`, or one of them with CLIENTS=rust.
 
-Each folder in `clients/` has a `conformance.toml`: the programs that it `needs`, what to `install` if they are missing,
-the commands that `build` and test it, and its conformance `programs`, each of which is judged by `afspm test-client`.
+Each folder in `clients/` has a `conformance.toml`: the programs that it `needs`, the `headers` with their compilers,
+what to `install` if they are missing, the commands that `build` and test it, and its conformance `programs`, each of
+them judged by `afspm test-client`.
 Its `samples` are laid over `experiments/other_language/experiment.toml`, and run.
 """
 
@@ -36,7 +37,11 @@ def main(names: list[str]) -> int:
     say("")
     for name, outcome in found.items():
         say(f"{name:12} {outcome or 'as it should be'}")
-    return sum(bool(outcome) and not outcome.startswith("SKIPPED") for outcome in found.values())
+    skipped = [outcome for outcome in found.values() if outcome.startswith("SKIPPED")]
+    if len(skipped) == len(found):
+        say("no client was judged: install what is named above")
+        return len(skipped)
+    return sum(bool(outcome) for outcome in found.values()) - len(skipped)
 
 
 def judged(file: Path) -> str:
@@ -44,6 +49,8 @@ def judged(file: Path) -> str:
     client, folder = tomllib.loads(file.read_text(encoding="utf-8")), file.parent
     say(f"\n== {folder.name}")
     missing = [program for program in client["needs"] if shutil.which(program) is None]
+    if not missing:
+        missing = [header for header, compiler in client.get("headers", {}).items() if not has(header, compiler)]
     if missing:
         return f"SKIPPED: there is no {' and no '.join(missing)} on this computer; install {client['install']}"
     for command in client["build"]:
@@ -53,6 +60,12 @@ def judged(file: Path) -> str:
     wrong = [name for name, command in client["programs"].items() if not passes(name, command, folder)]
     wrong += [file for file in client.get("samples", {}).values() if not runs_to_its_end(file)]
     return f"not as it should be: {', '.join(wrong)}" if wrong else ""
+
+
+def has(header: str, compiler: str) -> bool:
+    """Return whether a compiler finds a header of a library."""
+    command = [compiler, "-fsyntax-only", "-include", header, "-x", "c++" if "++" in compiler else "c", os.devnull]
+    return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
 def passes(name: str, command: list[str], folder: Path) -> bool:
