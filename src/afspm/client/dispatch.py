@@ -14,6 +14,7 @@ from afspm.wire.messages import CONTROL_STATE
 
 if TYPE_CHECKING:
     from afspm.basics.clock import Clock
+    from afspm.client.experiment_link import PublishedState
     from afspm.client.scope import Scope
     from afspm.storage.memory import Memory
 
@@ -91,11 +92,15 @@ class MessageDispatcher:
     def wants_anything(self) -> bool:
         return any(map(self._wants_message, wire.known_messages()))
 
-    def give(self, packet: Packet) -> None:
-        """Call the handlers for a packet; an unreadable packet is logged and dropped."""
+    def give(self, packet: Packet, view: PublishedState) -> None:
+        """Call the handlers for a packet; an unreadable packet is logged and dropped.
+
+        Args:
+            view: knows the roles of channels.
+        """
         try:
             message = wire.message_of(packet.envelope)
-            thing = wire.decode(message, packet.payload)
+            thing = view.with_roles(wire.decode(message, packet.payload))
         except WireError as error:
             self._log.warning("a packet can't be read: %s", error)
             return

@@ -88,11 +88,11 @@ class Events(Iterator[PublishedEvent]):
         if packet is None:
             return None
         try:
-            message = wire.decode(wire.message_of(packet.envelope), packet.payload)
+            decoded = wire.decode(wire.message_of(packet.envelope), packet.payload)
         except WireError as error:
             self._link.log.warning("a packet can't be read: %s", error)
             return None
-        return PublishedEvent(packet.envelope, message, packet.time_ns)
+        return PublishedEvent(packet.envelope, self._link.view.with_roles(decoded), packet.time_ns)
 
     def close(self) -> None:
         """Drop all waiting messages, and stop collecting new ones."""

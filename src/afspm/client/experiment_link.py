@@ -20,6 +20,7 @@ from afspm.model import (
     OTHER_RUN_RESPONSE,
     RELAY_REQUEST,
     ActByHand,
+    ChannelRoles,
     ControlRequest,
     ControlState,
     Feedback,
@@ -29,6 +30,8 @@ from afspm.model import (
     Request,
     Response,
     ResponseDetail,
+    Scan,
+    ScanLines,
     ScanParameters,
     ScopeState,
     ScopeStatus,
@@ -62,6 +65,7 @@ class PublishedState:
         self.probe_position: ProbePosition | None = None
         self.tip: TipStatus | None = None
         self.by_hand: ActByHand | None = None
+        self.channels = ChannelRoles()
         self.newest_ns: int | None = None
         self._published: Counter[str] = Counter()
 
@@ -73,6 +77,10 @@ class PublishedState:
         """Store `thing`, published as the message `message`."""
         setattr(self, wire.declaration(message).attribute, thing)
         self._published[message] += 1
+
+    def with_roles(self, thing: Any) -> Any:
+        """Return a scan, or lines of one, with the roles of its channel; any other thing unchanged."""
+        return self.channels.shown(thing) if isinstance(thing, Scan | ScanLines) else thing
 
     def take_time(self, time_ns: int | None) -> None:
         """Update `newest_ns` with the time of a packet from the scheduler."""

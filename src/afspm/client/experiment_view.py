@@ -11,6 +11,7 @@ from afspm.basics.errors import AfspmError, ExperimentEnded, InvalidValue
 from afspm.client.events import Events
 from afspm.client.experiment_link import ExperimentLink
 from afspm.model import (
+    ChannelRoles,
     ControlMode,
     ControlState,
     Feedback,
@@ -79,6 +80,12 @@ class ExperimentView:
         """Return whether tip and feedback are at work, as the controller reports; None if it has reported nothing."""
         self._catch_up()
         return self._link.view.tip
+
+    @property
+    def channels(self) -> ChannelRoles:
+        """Return the microscope's channels by their roles; empty if it has declared none."""
+        self._catch_up()
+        return self._link.view.channels
 
     @property
     def probe_position(self) -> ProbePosition | None:

@@ -8,14 +8,14 @@ import re
 import zlib
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from afspm import wire
 from afspm.basics.errors import FileError, InvalidValue, WireError
 from afspm.basics.plain_data import Plain, from_json
-from afspm.model import LoggedPacket, Note, Packet, Parameter, ScanSet, Spectrum
+from afspm.model import LoggedPacket, Note, Packet, Parameter, Scan, ScanSet, Spectrum
 from afspm.model.snapshot import to_plain
 from afspm.storage.atomic import OutageLog, write_atomic
 from afspm.storage.disk import is_full
@@ -144,14 +144,21 @@ class KeyedResults:
                 f"the key {key!r} was used for another measurement in this run: {head['plan']}",
                 hint="give each measurement its own key",
             )
-        return MeasurementResult(things, head["interruptions"])
+        return MeasurementResult([_with_roles(one, head) for one in things], head["interruptions"])
 
     def fulfil(self, key: str, plan: Plain, result: MeasurementResult) -> None:
         """Save the result of the intended measurement. If the disk is full, a restarted component measures again."""
         path, is_kept = self._path(key), False
         if path is not None:
             things = [wire.encode(thing) for thing in result.things]
-            head = {"key": key, "plan": plan, "interruptions": result.interruptions, "things": len(things)}
+            roles = {one.channel: one.roles for one in result.things if isinstance(one, Scan)}
+            head = {
+                "key": key,
+                "plan": plan,
+                "interruptions": result.interruptions,
+                "things": len(things),
+                "roles": roles,
+            }
             parts: list[bytes | memoryview] = []
             for name, payload in [(_HEAD, json.dumps(head).encode()), *things]:
                 parts += [head_of(LoggedPacket(Packet(name, payload), None, 0)), payload]
@@ -195,6 +202,11 @@ def check_key(key: str) -> str:
     if not isinstance(key, str) or not key or len(key.encode()) > LONGEST_KEY or "/" in key or not key.isprintable():
         raise InvalidValue(f"{key!r} can't be a key", hint=f"1 to {LONGEST_KEY} printable characters without '/'")
     return key
+
+
+def _with_roles(thing: object, head: Plain) -> object:
+    roles = head.get("roles", {})
+    return replace(thing, roles=tuple(roles.get(thing.channel, ()))) if isinstance(thing, Scan) else thing
 
 
 def _read(path: Path) -> tuple[Plain, list[object]]:

@@ -149,7 +149,7 @@ class ComponentLoop:
     def _handle_backlog(self, at_most: float = float("inf")) -> None:
         while at_most > 0 and (packet := self._backlog.take()) is not None:
             with self._handler():
-                self._dispatcher.give(packet)
+                self._dispatcher.give(packet, self._link.view)
             at_most -= 1
 
     def _handle_rest(self, within_s: float) -> None:

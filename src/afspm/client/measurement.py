@@ -62,7 +62,8 @@ class _Watch:
             if name == "ScopeStateMsg":
                 self.cycle.on_state(self._link.view.state, packet.time_ns)
             elif name == self._message:
-                self.cycle.on_result(wire.decode(name, packet.payload), packet.time_ns)
+                found = self._link.view.with_roles(wire.decode(name, packet.payload))
+                self.cycle.on_result(found, packet.time_ns)
         except WireError as error:
             self._link.log.warning("a %s can't be read: %s", packet.envelope, error)
 

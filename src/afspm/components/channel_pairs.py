@@ -35,7 +35,7 @@ class ChannelPairing:
     """A collector of channels until trace and retrace of one scan are there.
 
     Args:
-        channel, retrace_channel: names of the height channels; the second is empty if retrace is not recorded.
+        channel, retrace_channel: the height channels, by role or name; the second is empty if retrace is not recorded.
     """
 
     def __init__(self, channel: str, retrace_channel: str) -> None:
@@ -48,9 +48,10 @@ class ChannelPairing:
 
     def add(self, scan: Scan) -> HeightPair | None:
         """Add a channel; return the pair once trace and retrace are there."""
-        if scan.channel not in (self._channel, self._retrace_channel) or not scan.values.size:
+        wanted = next((one for one in self.channels if one and scan.is_of(one)), None)
+        if wanted is None or not scan.values.size:
             return None
-        self._seen[scan.channel] = scan
+        self._seen[wanted] = scan
         trace, retrace = self._seen.get(self._channel), self._seen.get(self._retrace_channel)
         if trace is None or (self._retrace_channel and (retrace is None or not _belong_together(trace, retrace))):
             return None
@@ -62,7 +63,7 @@ class MissingChannels:
     """A monitor that logs one error if a required channel is missing from the first `ENOUGH_SCANS` scans.
 
     Args:
-        channels: names of the required channels; empty names are ignored.
+        channels: the required channels, by role or name; empty names are ignored.
     """
 
     def __init__(self, channels: Collection[str], log: logging.Logger) -> None:
@@ -72,7 +73,7 @@ class MissingChannels:
         self._log = log
 
     def see(self, scan: Scan) -> None:
-        self._missing.discard(scan.channel)
+        self._missing = {channel for channel in self._missing if not scan.is_of(channel)}
         if not self._missing:
             return
         self._others[scan.channel] = None

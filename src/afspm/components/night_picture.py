@@ -12,7 +12,17 @@ from afspm.basics.plain_data import Plain
 from afspm.client.component import Component
 from afspm.components import tip_verdict
 from afspm.components.line_file import LineFile
-from afspm.model import ControlEvent, ControlState, JournalEntries, RescanKind, Scan, ScopeState, ScopeStatus
+from afspm.model import (
+    TOPOGRAPHY,
+    ChannelName,
+    ControlEvent,
+    ControlState,
+    JournalEntries,
+    RescanKind,
+    Scan,
+    ScopeState,
+    ScopeStatus,
+)
 from afspm.model.problems import CONDITIONS
 from afspm.record.night_record import NightRecord, control_entry, mark_entry, scan_entry
 
@@ -24,7 +34,7 @@ class NightPicture(Component):
     once, so that the picture is the same after a kill and restart.
 
     Args:
-        channel: shown channel of each scan.
+        channel: shown channel of each scan, by role or name.
         file: the picture's name in the run folder.
         title: title above the picture.
     """
@@ -32,7 +42,7 @@ class NightPicture(Component):
     file_suffix: ClassVar[str] = ""
     listens: ClassVar = ("",)  # also the journal, which names the problems of conditions
 
-    def __init__(self, channel: str = "Height", file: str = "night.png", title: str = "") -> None:
+    def __init__(self, channel: ChannelName = TOPOGRAPHY, file: str = "night.png", title: str = "") -> None:
         self.channel, self.file, self.title = channel, file, title
         self._control: ControlState | None = None
         self._begin: tuple[int | None, str | None] = (None, None)
@@ -57,7 +67,7 @@ class NightPicture(Component):
             self._add({"kind": "interrupted", "time_ns": self._packet_ns()})
 
     def on_scan(self, scan: Scan) -> None:
-        if scan.channel == self.channel and scan.values.size:
+        if scan.is_of(self.channel) and scan.values.size:
             start_ns, holder = self._begin
             self._add(scan_entry(scan, scan.time_ns or self._packet_ns(), start_ns, holder))
             self._begin = (None, None)

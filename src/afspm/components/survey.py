@@ -20,7 +20,17 @@ from afspm.components.planned_scans import FRAME, Pixels, checked_parameters, pa
 from afspm.components.scan_plan import ScanPlan
 from afspm.components.surveying.record import Outcome, SurveyRecord, Visit
 from afspm.components.surveying.targets import Target, find_particles, lowest_beside, nearest
-from afspm.model import Region, RegistrationOutcome, Scan, ScanParameters, ScanSet, names, registration_summary
+from afspm.model import (
+    HEIGHT,
+    ChannelName,
+    Region,
+    RegistrationOutcome,
+    Scan,
+    ScanParameters,
+    ScanSet,
+    names,
+    registration_summary,
+)
 from afspm.model.geometry import XY
 from afspm.model.planned_work import PlannedWork, planned_rounds
 from afspm.record.drift_mapping import drift_knowledge
@@ -57,7 +67,7 @@ class Survey(Component):
         pixels: (columns, rows) of the survey. By default 128, or, up to 512, the number at which a zoom is 20 pixels of
             the survey wide: with fewer, drift between survey and zoom may not be followed.
         zoom_pixels: (columns, rows) of each zoom.
-        channel: channel in which targets are found.
+        channel: channel in which targets are found, by role or name.
         min_height: least height of a particle above the ground around it; by default six times the noise.
         separation: least distance of two particles, else only the higher counts; by default half a zoom.
         targets: a function of yours that finds targets instead of particles, e.g. "my_module.corners": it gets the
@@ -87,7 +97,7 @@ class Survey(Component):
         angle: Angle = 0.0,
         pixels: Pixels | None = None,
         zoom_pixels: Pixels = (128, 128),
-        channel: str = "Height",
+        channel: ChannelName = HEIGHT,
         min_height: Length | None = None,
         separation: Length | None = None,
         targets: str | None = None,

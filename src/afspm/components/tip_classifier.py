@@ -10,7 +10,7 @@ from afspm.client.component import Component
 from afspm.components import tip_verdict
 from afspm.components.channel_pairs import ChannelPairing, HeightPair, MissingChannels
 from afspm.components.tip_judge import Opinion, TipJudge, TipTolerance, Verdict, VerdictCounter
-from afspm.model import ControlState, Scan
+from afspm.model import HEIGHT, HEIGHT_RETRACE, ChannelName, ControlState, Scan
 
 ARRIVES_WITHIN_S = 600.0  # experiment time from the end of a scan to its arrival
 _SCORES = {Opinion.GOOD: tip_verdict.GOOD, Opinion.BAD: tip_verdict.BAD, Opinion.UNCLEAR: tip_verdict.UNCLEAR}
@@ -25,7 +25,7 @@ class TipClassifier(Component):
     published as a `SpatialROIWithScoreList` (1 good, 0.5 unclear, 0 bad); scans for the reference have no verdict.
 
     Args:
-        channel: channel of the heights.
+        channel: channel of the heights, by role or name.
         retrace_channel: channel of their retrace; empty if not recorded (then debris is not detected).
         reference_scans: number of scans of each kind for the reference.
         flag_after: bad scans in a row until the problem is flagged.
@@ -44,8 +44,8 @@ class TipClassifier(Component):
 
     def __init__(
         self,
-        channel: str = "Height",
-        retrace_channel: str = "Height Retrace",
+        channel: ChannelName = HEIGHT,
+        retrace_channel: ChannelName = HEIGHT_RETRACE,
         reference_scans: int = 4,
         flag_after: int = 1,
         clear_after: int = 1,

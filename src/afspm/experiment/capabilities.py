@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from afspm.basics.errors import AfspmError, Refused
 from afspm.experiment.toml_lines import Table
-from afspm.model import Parameter, names
+from afspm.model import ChannelRoles, Parameter, names
 
 if TYPE_CHECKING:
     from afspm.translator.parameters import ParameterTable
@@ -22,12 +22,14 @@ class MicroscopeCapabilities:
         parameters: SI unit of each parameter; None: the unit depends on the operating mode.
         sets: parameters that an action of the experiment file sets, by the action's name.
         table: the microscope's parameter table.
+        channels: the channels that the microscope may have, by their roles.
     """
 
     actions: frozenset[str]
     parameters: Mapping[str, str | None]
     sets: Mapping[str, tuple[Parameter, ...]]
     table: ParameterTable
+    channels: ChannelRoles
 
     def refuses(self, parameter: Parameter) -> str:
         """Return the reason of the microscope to refuse a value; empty for a valid value or an unknown parameter."""
@@ -50,11 +52,14 @@ def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None
     added = settings.get("actions") or {}
     actions = {mark.name for mark in marks if mark is not None} | set(added)
     try:
+        channels = microscope.channels_of(settings)
         table = microscope.parameter_table(microscope.rows(settings))
         sets = {name: _set_by(what, table) for name, what in added.items()}
     except (AfspmError, AttributeError):
         return None  # the check of its settings reports the error in the table
-    return MicroscopeCapabilities(frozenset(actions), {name: table[name].si_unit for name in table}, sets, table)
+    return MicroscopeCapabilities(
+        frozenset(actions), {name: table[name].si_unit for name in table}, sets, table, channels
+    )
 
 
 def _set_by(action: object, table: ParameterTable) -> tuple[Parameter, ...]:

@@ -27,7 +27,7 @@ from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedPro
 from afspm.experiment.sections import parse, read_sections
 from afspm.experiment.toml_lines import Table
 from afspm.experiment.wiring_classes import BoundSocket
-from afspm.model import HIGHEST_PROBLEM, STOPPED_BY_AGENT, PacketHeader, Parameter, ProblemNames, Role
+from afspm.model import HIGHEST_PROBLEM, STOPPED_BY_AGENT, ChannelRoles, PacketHeader, Parameter, ProblemNames, Role
 from afspm.scheduler.publishing.envelopes import CacheSettings, Envelopes
 
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
@@ -146,11 +146,21 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
             _report_errors_inside(process, process.component, resolved)
         else:
             _resolve_plan(process, process.component, resolved, has)
+        if has is not None:
+            _check_channels(process, process.component, document, has.channels)
     speeds = [plan.scan_speed_m_s for plan in resolved.plans.values()]
     usual_m_s = next((speed for speed in speeds if speed is not None), None)
     for name, plan in resolved.plans.items():
         if what := planned_measurements.too_slow(plan, usual_m_s):
             resolved.warning(f"[{name}] {what}", name, "every", hint="rounds that come too late are left out")
+
+
+def _check_channels(process: ResolvedProcess, component: type, document: Document, there: ChannelRoles) -> None:
+    for path, channel in settings.channels(component, process.settings):
+        if reason := there.refuses(channel):
+            what = f"[{process.name}] {'.'.join(path)}: {reason}"
+            hint = f"it has {there.described()}; [microscope.channels] names others"
+            document.error(what, process.name, *path, hint=hint)
 
 
 def _cache_section(table: Table, document: Document) -> CacheSettings:

@@ -24,6 +24,7 @@ from afspm.experiment.document import Document
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.validation_messages import report
+from afspm.model.channels import NamesChannel
 
 # units of the annotations in basics.units, tried in this order
 _ANNOTATED = ("m", "s", "rad", "V", "A", "m/s", "Hz")
@@ -96,6 +97,29 @@ def listening(component: type, settings: Table) -> Iterator[tuple[str, str, bool
                 continue
             if (address := mark.address(everything.get(name), everything)) is not None:
                 yield name, address, mark.keyed
+
+
+def channels(component: type, settings: Table) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yield the path in the settings, and the role or name, of each channel that a component needs."""
+    everything = {**{name: default_of(component, name) for name in _parameters(component)}, **settings}
+    for name, annotation in _annotations(component).items():
+        value = everything.get(name)
+        if _names_channel(annotation) and isinstance(value, str):
+            yield (name,), value
+        elif isinstance(value, Mapping) and (inner := _dataclass_of(annotation)) is not None:
+            for key, kind in typing.get_type_hints(inner, include_extras=True).items():
+                if _names_channel(kind) and isinstance(value.get(key), str):
+                    yield (name, key), value[key]
+
+
+def _names_channel(annotation: Any) -> bool:
+    inside = (*getattr(annotation, "__metadata__", ()), *typing.get_args(annotation))
+    return any(isinstance(one, NamesChannel) or _names_channel(one) for one in inside)
+
+
+def _dataclass_of(annotation: Any) -> type | None:
+    those = (annotation, *typing.get_args(annotation))
+    return next((one for one in those if isinstance(one, type) and is_dataclass(one)), None)
 
 
 def jsonable(value: object, folder: Path) -> Any:

@@ -16,6 +16,7 @@ a name (`sessions`), which scheduler a translator obeys (`fencing`), and that a 
 
 from __future__ import annotations
 
+from afspm.model.channels import HEIGHT, HEIGHT_RETRACE, TOPOGRAPHY, ChannelName, ChannelRoles, both_ways, of_role
 from afspm.model.events import (
     ControlEvent,
     HasTime,
@@ -85,6 +86,8 @@ __all__ = [
     "CLOCK_REQUEST",
     "GRANT_REQUEST",
     "HAS_ENDED",
+    "HEIGHT",
+    "HEIGHT_RETRACE",
     "HIGHEST_PROBLEM",
     "LEASE_AT_ONCE_S",
     "LEASE_REQUEST",
@@ -93,11 +96,14 @@ __all__ = [
     "RELAY_REQUEST",
     "RESTART_REQUEST",
     "STOPPED_BY_AGENT",
+    "TOPOGRAPHY",
     "WAIT_FOR_CONTROL",
     "ActByHand",
     "Approval",
     "Approvals",
     "ChangedValue",
+    "ChannelName",
+    "ChannelRoles",
     "ControlEvent",
     "ControlMode",
     "ControlRequest",
@@ -154,10 +160,12 @@ __all__ = [
     "ShapeChange",
     "Spectrum",
     "TipStatus",
+    "both_ways",
     "component_of",
     "instrument_of",
     "is_of_instrument",
     "is_process_name",
+    "of_role",
     "registration_summary",
     "request_name",
 ]

@@ -103,6 +103,7 @@ class Scan:
         time_ns: end of the scan, ns since the Unix epoch; None if unknown.
         filename: the controller's own file; empty without a file.
         pixels: (rows, columns) of a scan without values; None if unknown.
+        roles: what the channel measures, as the microscope's driver declares: "height", "height, retrace", "current" …
     """
 
     region: Region
@@ -112,6 +113,7 @@ class Scan:
     time_ns: int | None = None
     filename: str = ""
     pixels: tuple[int, int] | None = None
+    roles: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.values.ndim != 2:
@@ -138,6 +140,10 @@ class Scan:
     def time(self) -> datetime | None:
         """Return the end of the scan, UTC; None if unknown."""
         return None if self.time_ns is None else utc_time(self.time_ns)
+
+    def is_of(self, channel: str) -> bool:
+        """Return whether a channel, given by its name or role, is this one."""
+        return channel == self.channel or channel in self.roles
 
     @property
     def lines_missing(self) -> int:
@@ -278,7 +284,7 @@ class Scan:
 
 
 class ScanSet(Mapping[str, Scan]):
-    """All channels of one scan: `scans["Height"]`, or `.first` for the channel published first.
+    """All channels of one scan: `scans["height"]`, by role or by the maker's name, or `.first`, published first.
 
     Attributes:
         interruptions: time and reason of each interruption before the scan succeeded, as text, oldest first.
@@ -311,9 +317,13 @@ class ScanSet(Mapping[str, Scan]):
         return self.first.time_ns
 
     def __getitem__(self, channel: str) -> Scan:
-        if channel not in self._scans:
-            raise NoSuchItem(f"no channel {channel!r}; there are {', '.join(self._scans)}")
-        return self._scans[channel]
+        of_role = (scan for scan in self._scans.values() if channel in scan.roles)
+        if (found := self._scans.get(channel) or next(of_role, None)) is None:
+            there = (
+                f"{scan.channel} ({' and '.join(scan.roles)})" if scan.roles else name for name, scan in self.items()
+            )
+            raise NoSuchItem(f"no channel {channel!r}; there are {', '.join(there)}")
+        return found
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._scans)
@@ -348,6 +358,7 @@ class ScanLines:
         first_row: index in the whole scan of the first of these rows.
         values: [rows, columns], y and x ascending, independent of the scan direction.
         began_ns: start of the scan, ns since the Unix epoch; the same for all its lines.
+        roles: as of a `Scan`.
     """
 
     region: Region
@@ -357,6 +368,7 @@ class ScanLines:
     first_row: int
     values: NDArray[np.float64]
     began_ns: int | None = None
+    roles: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         rows, columns = self.shape
@@ -365,6 +377,10 @@ class ScanLines:
             raise InvalidValue(
                 f"lines of shape {self.values.shape} from row {self.first_row} on are none of a scan of {self.shape}"
             )
+
+    def is_of(self, channel: str) -> bool:
+        """Return whether a channel, given by its name or role, is this one."""
+        return channel == self.channel or channel in self.roles
 
     def into(self, picture: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
         """Return a picture of the whole scan with these lines in it; rows not yet scanned are NaN.

@@ -15,7 +15,7 @@ from afspm.basics.clock import Clock
 from afspm.basics.errors import AfspmError, ConfigError, InvalidValue, Refused
 from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.basics.units import Duration, PollPeriod
-from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model import ChannelRoles, ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.translator.parameters import ParameterTable, Value
 from afspm.translator.polling import EAGER_S
 from afspm.translator.setting_groups import SettingsGroup
@@ -163,6 +163,7 @@ class DriverBase(ABC):
 
     Args:
         parameters: rows added to the table or changed in it by the experiment file.
+        channels: names of channels by role, in place of those in `channel_roles`, and under "other" those without one.
         actions: generic actions added by the experiment file: `{name = {set = {<parameter> = <value>}}}` sets
             parameters, `{name = {command = "<text>"}}` sends a text to the controller (`command`); an action may have
             both keys. With `for = "50 ms"` the microscope is busy for this time, and then the former values are
@@ -190,10 +191,13 @@ class DriverBase(ABC):
         groups: the parameters that the controller has in a form that a table can't describe.
         lacking: actions that this controller turned out not to have, with the reason; set it when connecting.
         memory: a dict of JSON values, saved with every executed request and every result, and restored after a restart.
-        common: the settings above except `parameters`, as given.
+        channels: the channels that the microscope may have, by their roles.
+        common: the settings above except `parameters` and `channels`, as given.
     """
 
     parameters_file: ClassVar[Path]
+    channel_roles: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({})
+    """The maker's names of channels by role, as in `Scan.channel`; under "other" those without a role."""
     translated: ClassVar[Collection[str]] = ()
     """The parameters that `read` and `write` of the class translate, rather than `get` and `set` by a row."""
     eager_poll_s: ClassVar[float] = EAGER_S
@@ -231,6 +235,7 @@ class DriverBase(ABC):
         self,
         *,
         parameters: Mapping[str, Mapping[str, object]] | None = None,
+        channels: Mapping[str, str | list[str]] | None = None,
         actions: Mapping[str, Mapping[str, object]] | None = None,
         poll_period_s: PollPeriod = 0.1,
         result_timeout_s: Duration = 10.0,
@@ -240,6 +245,7 @@ class DriverBase(ABC):
         if live_lines_s is not None and type(self).lines is DriverBase.lines:
             raise ConfigError(f"{type(self).__name__} does not publish lines of a running scan", where="live_lines_s")
         self.table = self.parameter_table(parameters or {})
+        self.channels = self.channels_of({"channels": channels})
         self.common = CommonSettings(dict(actions or {}), poll_period_s, result_timeout_s, live_lines_s, trace)
         self.adjustable: frozenset[str] = frozenset()
         self.prove: Callable[[], None] = _prove_nothing
@@ -267,6 +273,20 @@ class DriverBase(ABC):
         """
         table = ParameterTable.from_toml(cls.parameters_file)
         return table.extended(changed, where="the experiment file", translated=cls.translated)
+
+    @classmethod
+    def declared_channels(cls, settings: PlainMapping) -> ChannelRoles:
+        """Return the channels that a microscope of this kind may have with these settings."""
+        return ChannelRoles.declared(cls.channel_roles)
+
+    @classmethod
+    def channels_of(cls, settings: PlainMapping) -> ChannelRoles:
+        """Return the channels that the microscope may have, with those that the experiment file names.
+
+        Raises:
+            ConfigError: the file names a role that there is not.
+        """
+        return cls.declared_channels(settings).changed(settings.get("channels") or {})
 
     @classmethod
     def introductions(cls) -> Callable[[str], Introduction] | None:

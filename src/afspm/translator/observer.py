@@ -14,6 +14,7 @@ from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import AfspmError
 from afspm.model import (
     ActByHand,
+    ChannelRoles,
     ControlRequest,
     MeasurementConditions,
     PanelAct,
@@ -67,6 +68,7 @@ class Observer:
         self.values: dict[str, Value] = {}
         self.panel = PanelWatch(state.kept, driver.table, driver.is_last_written)
         self._published_tip: TipStatus | None = None
+        self._published_channels: ChannelRoles | None = None
         self._began_with: TipStatus | None = None
         self._acts: list[ActByHand] = []
         self._others_told = False
@@ -254,6 +256,13 @@ class Observer:
             self._port.publish(*wire.encode(act), self._state.stamp()[0])
         self._publish_tip()
 
+    def _publish_channels(self) -> None:
+        # at constant height another channel shows the surface
+        channels = self._driver.channels.with_topography(feedback_on=setting_groups.feedback(self.values).on)
+        if channels not in (self._published_channels, ChannelRoles()):
+            self._published_channels = channels
+            self._port.publish(*wire.encode(channels), self._state.stamp()[0])
+
     def _publish_tip(self) -> None:
         tip = self.panel.tip
         if tip not in (self._published_tip, TipStatus()):
@@ -305,7 +314,8 @@ class Observer:
         """Publish the present settings and the published state again, for a newly connected scheduler."""
         for thing in setting_groups.messages(self.values).values():
             self.publish(thing)
-        self._published_tip = None
+        self._published_tip = self._published_channels = None
+        self._publish_channels()
         self._publish_tip()
         published = self._state.sequence.published
         if published.state is not ScopeState.UNDEFINED:
@@ -332,6 +342,7 @@ class Observer:
         values, old = self._read(), self.values
         self._take_in(values)
         if announce or values != old:
+            self._publish_channels()
             before = setting_groups.messages(old)
             for name, thing in setting_groups.messages(values).items():
                 if name in announce or before.get(name) != thing:

@@ -16,7 +16,15 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from afspm import model
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import InvalidValue
-from afspm.wire.generated import control_pb2, feedback_pb2, grants_pb2, instruments_pb2, journal_pb2, panel_pb2
+from afspm.wire.generated import (
+    channels_pb2,
+    control_pb2,
+    feedback_pb2,
+    grants_pb2,
+    instruments_pb2,
+    journal_pb2,
+    panel_pb2,
+)
 from afspm.wire.messages import parse
 from afspm.wire.split import Buffer
 
@@ -313,7 +321,18 @@ ACT_BY_HAND = MessageMapping(
     changes=_each("changes", _CHANGED_VALUE),
 )
 _TIP = FieldMapping("", TIP_STATUS.to_wire, TIP_STATUS.from_wire)
+CHANNEL_ROLES = MessageMapping(
+    model.ChannelRoles,
+    channels_pb2.ChannelRoles,
+    names=FieldMapping(
+        "roles",
+        lambda of_roles: [channels_pb2.ChannelRole(role=role, names=names) for role, names in of_roles.items()],
+        lambda roles: {_needed("a channel's role")(one.role): tuple(one.names) for one in roles},
+    ),
+    others=FieldMapping("others", from_wire=tuple),
+)
 MAPPINGS: tuple[MessageMapping[Any], ...] = (
+    CHANNEL_ROLES,
     TIP_STATUS,
     ACT_BY_HAND,
     MessageMapping(

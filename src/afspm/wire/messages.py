@@ -27,6 +27,7 @@ from afspm.basics.errors import InvalidValue, WireError
 from afspm.model import ControlRequest, Role
 from afspm.wire.generated import (
     analysis_pb2,
+    channels_pb2,
     control_pb2,
     drift_pb2,
     feedback_pb2,
@@ -202,6 +203,15 @@ TIP_STATUS: Final = MessageDeclaration(
     event="tip",
     in_past=True,
 )
+CHANNEL_ROLES: Final = MessageDeclaration(
+    type=channels_pb2.ChannelRoles,
+    kind=MessageKind.STATE,
+    source=Role.TRANSLATOR,
+    always=False,
+    history=10,  # one from before each cached scan
+    attribute="channels",
+    in_past=True,
+)
 ACT_BY_HAND: Final = MessageDeclaration(
     type=panel_pb2.ActByHand,
     kind=MessageKind.STATE,
@@ -309,7 +319,7 @@ TIP_VERDICT: Final = MessageDeclaration(
 )
 
 _MODULES = (
-    analysis_pb2, control_pb2, drift_pb2, feedback_pb2, geometry_pb2, grants_pb2, instruments_pb2,
+    analysis_pb2, channels_pb2, control_pb2, drift_pb2, feedback_pb2, geometry_pb2, grants_pb2, instruments_pb2,
     journal_pb2, lines_pb2, panel_pb2, scan_pb2, spectroscopy_pb2,
 )  # fmt: skip
 # collected by their class, so that no declaration above can be forgotten

@@ -75,7 +75,7 @@ def test_a_declared_message_reaches_the_handler_of_a_component(tilt: MessageDecl
 
     dispatcher = MessageDispatcher(Watcher(), Component, None, logging.getLogger("watcher"))
     assert dispatcher.wants(packet(tilt, 1))
-    dispatcher.give(packet(tilt, 1))
+    dispatcher.give(packet(tilt, 1), PublishedState())
     assert received == [0.5]
 
 

@@ -22,7 +22,7 @@ from typing import Any, ClassVar, Final
 
 from afspm.basics.errors import ConfigError, Refused
 from afspm.basics.units import Duration, PollPeriod
-from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.asylum.activity import FORCE, AsylumActivity
 from afspm.plugins.asylum.link import Link
 from afspm.plugins.asylum.result_files import AsylumFiles
@@ -44,6 +44,21 @@ _AT_FIRST: Final[dict[str, Value]] = {
 _SPOTS: Final = ("image", "scanner", "none")
 _NAME: Final = "[A-Za-z][A-Za-z0-9_]{0,16}"
 """Form of the base names that Asylum takes; Asylum appends a number of four digits."""
+_CHANNELS: Final = both_ways(
+    {
+        "height": ["Height"],
+        "current": ["Current"],
+        "amplitude": ["Amplitude", "Amplitude1"],
+        "phase": ["Phase", "Phase1"],
+        "deflection": ["Deflection"],
+        "frequency shift": ["Frequency"],
+        "friction": ["Lateral"],
+        "potential": ["Potential"],
+        "other": ["ZSensor", "Amplitude2", "Phase2", "UserIn0", "UserIn1", "UserIn2"],
+    },
+    "{}Trace",
+    "{}Retrace",
+)
 
 
 class Asylum(Driver):
@@ -63,6 +78,7 @@ class Asylum(Driver):
 
     parameters_file = Path(__file__).with_name("parameters.toml")
     translated = (*NAMES, *POSITION, *_AT_FIRST, FEEDBACK_ON, names.ENGAGED, names.CONTROLLER)
+    channel_roles = _CHANNELS
     maker: ClassVar[str] = "Oxford Instruments Asylum Research"
     software: ClassVar[str] = "Asylum Research in Igor Pro"
     max_pixels: ClassVar[int] = 8192 * 8192

@@ -18,7 +18,7 @@ from afspm.basics.errors import AfspmError, FileError
 from afspm.basics.formatting import counted
 from afspm.client.component import Component
 from afspm.components.line_file import LineFile, csv_line
-from afspm.model import RegistrationOutcome
+from afspm.model import HEIGHT, ChannelName, RegistrationOutcome, of_role
 from afspm.plugins.drift.record import COLUMNS as RECORD
 from afspm.record.drift_mapping import drift_at
 
@@ -139,7 +139,7 @@ class DriftPictures(DriftTable):
     are drawn, too. Scans are read from the files that the microscope saves.
 
     Args:
-        channel: channel of the compared scans.
+        channel: channel of the compared scans, by role or name; None: the one that the scheduler compares.
         estimator: name of the estimator for the comparison.
         features: an estimator that matches features, for the figure of matches; by default "brief" where
             `afspm[features]` is installed.
@@ -153,7 +153,7 @@ class DriftPictures(DriftTable):
 
     def __init__(
         self,
-        channel: str = "Height",
+        channel: ChannelName | None = None,
         estimator: str = "least-squares",
         features: str | None = None,
         title: str = "",
@@ -187,6 +187,8 @@ class DriftPictures(DriftTable):
 
     def on_drift_mapping(self, message: DriftMapping) -> None:
         super().on_drift_mapping(message)
+        if message.channel:
+            self.memory["channel"] = message.channel
         self._known_scans.setdefault(message.filename, TabledScan(message.filename, message.correcting))
         tabled, newest = list(self._known_scans.values()), list(self._known_scans).index(message.filename)
         for _, start, stop in parts(tabled):
@@ -304,10 +306,12 @@ class DriftPictures(DriftTable):
         from afspm.storage.formats import read
 
         content = read(tabled.file)
-        for scan in content.scans:
-            if scan.channel == self.channel:
-                return drift_scan(scan, content)
-        raise FileError(f"has no channel {self.channel!r}", where=tabled.file)
+        channel = self.channel or self.memory.get("channel", HEIGHT)
+        scan = of_role(map(self.scope.channels.shown, content.scans), channel)
+        if scan is None:
+            there = ", ".join(one.channel for one in content.scans)
+            raise FileError(f"has no channel {channel!r}, but {there}", where=tabled.file)
+        return drift_scan(scan, content)
 
     def _tabled_scans(self) -> list[TabledScan]:
         path = Path(self.run_dir) / self.file

@@ -25,7 +25,7 @@ from typing import Any, ClassVar, Final
 
 from afspm.basics.errors import ConfigError, Refused
 from afspm.basics.units import Duration
-from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.gxsm import bridge
 from afspm.plugins.gxsm.activity import SHOWS_S, ConnectedGxsm, GxsmActivity, Saving
 from afspm.plugins.gxsm.hardware import (
@@ -60,6 +60,19 @@ from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
 
 _AT_FIRST: Final[dict[str, Value]] = {names.SPEC_KIND: "IV", names.PULSE_VOLTAGE: 4.0, names.PULSE_DURATION: 0.1}
 _SAVERS: Final = ("afspm", "gxsm")
+_CHANNELS: Final = both_ways(
+    {
+        "height": ["ZS-Topo", "Topo"],
+        "current": ["I-Tunnel"],
+        "amplitude": ["Ampl"],
+        "phase": ["Phase"],
+        "frequency shift": ["dFreq"],
+        "excitation": ["Exec"],
+        "other": [f"ADC{number}" for number in range(8)] + [f"MIX{number}" for number in range(4)],
+    },
+    "{}",
+    "{} Backward",
+)
 
 
 class Gxsm(Driver):
@@ -81,6 +94,7 @@ class Gxsm(Driver):
 
     parameters_file = Path(__file__).with_name("parameters.toml")
     translated = (*FRAME, *POSITION, FEEDBACK_ON, names.CONTROLLER, *_AT_FIRST)
+    channel_roles = _CHANNELS
     maker: ClassVar[str] = "Gxsm project"
     software: ClassVar[str] = "Gxsm"
     max_pixels: ClassVar[int] = 8192 * 8192

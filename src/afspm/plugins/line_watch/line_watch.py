@@ -15,7 +15,17 @@ from afspm.client.component import Component
 from afspm.client.events import Events, PublishedEvent
 from afspm.components import tip_verdict
 from afspm.components.channel_pairs import ChannelPairing, HeightPair, MissingChannels
-from afspm.model import ControlState, Feedback, Scan, ScanLines, ScopeState, ScopeStatus
+from afspm.model import (
+    HEIGHT,
+    HEIGHT_RETRACE,
+    ChannelName,
+    ControlState,
+    Feedback,
+    Scan,
+    ScanLines,
+    ScopeState,
+    ScopeStatus,
+)
 from afspm.plugins.line_watch.line_judge import Alarm, AlarmLevel, Kind, LineJudge, ScanJudge, confidence
 from afspm.plugins.line_watch.registration import Array
 from afspm.wire.messages import SpatialROIWithScoreList
@@ -121,7 +131,7 @@ class LineWatch(Component):
     (the `TipClassifier`) finds when the tip is good again.
 
     Args:
-        channel: channel of the heights.
+        channel: channel of the heights, by role or name.
         retrace_channel: channel of their retrace; empty if not recorded.
         action: "look" only publishes the verdict, for a person; "stop" also flags the problem, so that the scan is
             stopped. In simulated nights 8.8 % of the good scans with harmless changes were stopped without need, and 18
@@ -137,8 +147,8 @@ class LineWatch(Component):
 
     def __init__(
         self,
-        channel: str = "Height",
-        retrace_channel: str = "Height Retrace",
+        channel: ChannelName = HEIGHT,
+        retrace_channel: ChannelName = HEIGHT_RETRACE,
         action: Literal["stop", "look"] = "look",
         problem: str = "tip-shape-changed",
     ) -> None:
@@ -193,7 +203,8 @@ class LineWatch(Component):
             finished.is_trusted = finished.is_whole  # also of a test scan that ends a repair
 
     def on_scan_lines(self, lines: ScanLines) -> None:
-        if lines.channel not in self.channels:
+        channel = next((one for one in self.channels if lines.is_of(one)), None)
+        if channel is None:
             return
         try:
             values = lines.values * convert(1.0, lines.unit, "m")
@@ -204,7 +215,7 @@ class LineWatch(Component):
             self._begin(lines)
         running = self._lines
         assert running is not None
-        picture = running.pictures.setdefault(lines.channel, np.full(lines.shape, np.nan))
+        picture = running.pictures.setdefault(channel, np.full(lines.shape, np.nan))
         if picture.shape != lines.shape:
             return  # of a scan whose lines carry no time
         picture[lines.first_row : lines.first_row + len(values)] = values

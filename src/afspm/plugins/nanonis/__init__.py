@@ -23,7 +23,7 @@ from typing import Any, ClassVar, Final
 
 from afspm.basics.errors import ConfigError, FileError, Refused
 from afspm.basics.units import Duration
-from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.nanonis import fetched, geometry, parameter_groups, protocol, z_controller
 from afspm.plugins.nanonis.activity import SAFE_TIP, WITHDRAWING, NanonisActivity
 from afspm.plugins.nanonis.result_files import NanonisFiles
@@ -55,6 +55,19 @@ _BY_VALUE: Final = (
 )
 _GROUPS: Final = (*_BY_VALUE, geometry.Probe, parameter_groups.FeedbackOn, parameter_groups.TipState)
 _TRANSLATED: Final = tuple(name for group in _GROUPS for name in group.names)
+_CHANNELS: Final = both_ways(
+    {
+        "height": ["Z"],
+        "current": ["Current"],
+        "amplitude": ["Amplitude", "OC_M1_Amplitude"],
+        "phase": ["Phase", "OC_M1_Phase"],
+        "frequency shift": ["OC_M1_Freq._Shift", "Frequency_Shift"],
+        "excitation": ["Excitation", "OC_M1_Excitation"],
+        "other": ["Bias", "LI_Demod_1_X", "LI_Demod_1_Y", "LI_Demod_2_X", "LI_Demod_2_Y"],
+    },
+    "{} Forward",
+    "{} Backward",
+)
 
 
 class Nanonis(Driver):
@@ -74,6 +87,7 @@ class Nanonis(Driver):
 
     parameters_file = Path(__file__).with_name("parameters.toml")
     translated = (*_TRANSLATED, *_AT_FIRST, names.CONTROLLER)
+    channel_roles = _CHANNELS
     maker: ClassVar[str] = "SPECS Zurich"
     software: ClassVar[str] = "Nanonis"
     max_pixels: ClassVar[int] = 8192 * 8192

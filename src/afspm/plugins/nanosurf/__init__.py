@@ -19,7 +19,7 @@ from typing import Any, ClassVar, Final
 from afspm.basics.errors import ConfigError, Refused
 from afspm.basics.plain_data import PlainMapping
 from afspm.basics.units import Duration, PollPeriod
-from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.nanosurf import commands
 from afspm.plugins.nanosurf.activity import FORCE, NanosurfFiles, ScanTime, StudioActivity
 from afspm.plugins.nanosurf.link import Link, StudioError
@@ -34,6 +34,19 @@ _AT_FIRST: Final[dict[str, Value]] = {names.SCAN_DIRECTION: names.UP, names.SPEC
 _STORAGE: Final = "data.storage"
 _ONE_FRAME: Final = 1
 _NEW_FILE: Final = 1
+_CHANNELS: Final = both_ways(
+    {
+        "height": ["Height", "Topography", "Z-Axis"],
+        "current": ["Current", "Tip Current"],
+        "amplitude": ["Amplitude"],
+        "phase": ["Phase"],
+        "deflection": ["Deflection"],
+        "friction": ["Friction force"],
+        "other": ["Z-Axis Sensor", "Frequency Shift"],
+    },
+    "{} Forward",
+    "{} Backward",
+)
 
 
 class Nanosurf(Driver):
@@ -52,6 +65,7 @@ class Nanosurf(Driver):
 
     parameters_file = Path(__file__).with_name("parameters.toml")
     translated = (*FrameSettings.names, *Slopes.names, *POSITION, *_AT_FIRST, names.CONTROLLER)
+    channel_roles = _CHANNELS
     maker: ClassVar[str] = "Nanosurf"
     software: ClassVar[str] = "Nanosurf Studio"
     max_pixels: ClassVar[int] = 8192 * 8192

@@ -21,7 +21,7 @@ from afspm.basics.errors import ConfigError, Refused
 from afspm.basics.formatting import lengths_text
 from afspm.basics.plain_data import PlainMapping
 from afspm.basics.units import Duration, Length, PollPeriod
-from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.park.activity import STOP, STOP_CURVE, SmartScanActivity
 from afspm.plugins.park.link import Link, SmartScanError
 from afspm.plugins.park.result_files import SETTLE_S, ParkFiles
@@ -37,6 +37,19 @@ _SCANNING: Final = TRUE | {"scanning", "running"}
 _IDLE: Final = FALSE | {"idle", "ready", "done", "stopped"}
 _AT_FIRST: Final[dict[str, Value]] = {names.SPEC_KIND: "force"}
 _FOLDER: Final = "dataLocation.baseDir"
+_CHANNELS: Final = both_ways(
+    {
+        "height": ["Height", "Z Height", "Topography"],
+        "current": ["Current"],
+        "amplitude": ["Amplitude", "NCM Amplitude"],
+        "phase": ["Phase", "NCM Phase"],
+        "frequency shift": ["Frequency Shift", "NCM Frequency"],
+        "friction": ["Lateral Force"],
+        "other": ["Z Drive", "Error Signal"],
+    },
+    "{} Forward",
+    "{} Backward",
+)
 
 
 class Park(Driver):
@@ -53,6 +66,7 @@ class Park(Driver):
 
     parameters_file = Path(__file__).with_name("parameters.toml")
     translated = (*FrameSettings.names, *Gains.names, *POSITION, *_AT_FIRST, names.CONTROLLER)
+    channel_roles = _CHANNELS
     maker: ClassVar[str] = "Park Systems"
     software: ClassVar[str] = "SmartScan"
     max_pixels: ClassVar[int] = 8192 * 8192

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, ClassVar, Final, TypeVar
 from afspm.basics.errors import AfspmError, ConfigError, ErrorCollector, Refused
 from afspm.basics.plain_data import PlainMapping
 from afspm.basics.units import Duration, PollPeriod
-from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model import ChannelRoles, ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.simulation import World
 from afspm.simulation.background import in_background
 from afspm.simulation.faults import INSTRUMENT_FAULTS, Fault, Faults
@@ -108,6 +108,7 @@ class Simulator(Driver):
         fault_action: enable the action "x-fault", which triggers faults on demand.
         panel: actions of a person at the controller's panel, each a table of `at_s` with `set` or `action`.
         parameters: rows added to the table of parameters, or changed in it.
+        channels: names of channels by role.
         actions: generic actions added: `{name = {set = {<parameter> = <value>}}}`.
         poll_period_s: interval between reads of the state, in real seconds, while nothing is due.
         result_timeout_s: longest delay of the file after the end of a scan or spectrum.
@@ -143,6 +144,7 @@ class Simulator(Driver):
         fault_action: bool = False,
         panel: list[Table] | None = None,
         parameters: Rows | None = None,
+        channels: Mapping[str, str | list[str]] | None = None,
         actions: Rows | None = None,
         poll_period_s: PollPeriod = 0.25,
         result_timeout_s: Duration = 10.0,
@@ -185,6 +187,7 @@ class Simulator(Driver):
                 result_timeout_s=result_timeout_s,
                 live_lines_s=live_lines_s,
             )
+            self.channels = self.channels_of({**self._world_settings, "channels": channels})
             if not fault_action:
                 self.table = self.table.without(_FAULT_PARAMETERS)
             if loop is not None:  # an invalid feedback leaves the unit of the setpoint unknown
@@ -215,6 +218,16 @@ class Simulator(Driver):
     def technique(cls, settings: PlainMapping) -> str:
         loop = _loop_of(settings)
         return "" if loop is None else "STM" if loop.mode == "current" else "AFM"
+
+    @classmethod
+    def declared_channels(cls, settings: PlainMapping) -> ChannelRoles:
+        loop = _loop_of(settings)
+        names = {"height": ["Height"], "height, retrace": ["Height Retrace"], "current": ["Current"]}
+        if loop is not None and loop.mode == "amplitude":
+            names |= {"amplitude": ["Amplitude"], "phase": ["Phase"]}
+        if loop is not None and (loop.mode == "frequency-shift" or (loop.mode == "current" and loop.qplus)):
+            names |= {"frequency shift": ["Frequency Shift"]}
+        return ChannelRoles.declared(names)
 
     @classmethod
     def rows(cls, settings: PlainMapping) -> Rows:

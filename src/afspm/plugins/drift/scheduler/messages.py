@@ -148,7 +148,9 @@ class RescanWanted:
 class DriftCodec(PlaceCodec, Protocol):
     """Part of the wire format that drift compensation needs."""
 
-    def encode_mapping(self, registered: Registered, filename: str, center_m: XY, *, correcting: bool) -> bytes:
+    def encode_mapping(
+        self, registered: Registered, filename: str, center_m: XY, *, correcting: bool, channel: str | None
+    ) -> bytes:
         """Return the DriftMapping of a scan as the payload of a packet; `center_m` is in tip coordinates."""
 
     def encode_rescan(self, wanted: RescanWanted) -> bytes:

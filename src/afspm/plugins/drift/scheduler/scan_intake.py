@@ -19,6 +19,7 @@ from afspm.basics.formatting import lengths_text
 from afspm.basics.frozen import replace
 from afspm.basics.plain_data import Plain
 from afspm.model import (
+    ChannelRoles,
     Frame,
     Packet,
     PacketHeader,
@@ -81,6 +82,7 @@ def take_packet(draft: DriftDraft, event: PacketIn) -> None:
 
     A late or repeated channel of a settled scan passes with the mapping of that scan.
     """
+    _note_roles(draft, event)
     if (before := draft.gate.held) is not None:
         draft.gate = draft.gate.keep(event)
         _find_channel(draft, before, event)
@@ -104,6 +106,13 @@ def take_packet(draft: DriftDraft, event: PacketIn) -> None:
     _find_channel(draft, held, event)
 
 
+def _note_roles(draft: DriftDraft, event: PacketIn) -> None:
+    if event.header.message == "ChannelRoles":
+        roles = draft.env.codec.decode_packet(event.header.message, event.packet.payload)
+        if isinstance(roles, ChannelRoles):
+            draft.gate = replace(draft.gate, roles=roles)
+
+
 def _find_channel(draft: DriftDraft, held: HeldScan, event: PacketIn) -> None:
     # a state other than SCANNING ends a scan that has no channel to register
     if held.asked:
@@ -115,8 +124,7 @@ def _find_channel(draft: DriftDraft, held: HeldScan, event: PacketIn) -> None:
     if message == "ScopeStateMsg":
         status = codec.decode_packet(message, event.packet.payload)
         if isinstance(status, ScopeStatus) and status.state is not ScopeState.SCANNING:
-            channel = draft.gate.channel or "in a unit of length"
-            _give_up(draft, held.key, f"without the channel {channel} it can't be used for drift", "WARNING")
+            _give_up(draft, held.key, f"{draft.gate.lacking()}: it can't be used for drift", "WARNING")
     elif message == "Scan2d":
         scan = codec.decode_packet(message, event.packet.payload)
         if not isinstance(scan, Scan) or not scan.values.size or scan_key(scan, event.packet) != held.key:
@@ -287,7 +295,9 @@ def _announce(
     draft.tally = draft.tally.add(report.outcome)
     # at the middle of the scan, as the scan itself is published
     corrects = draft.forecast.corrects(draft.env.settings, report.time_s)
-    payload = draft.env.codec.encode_mapping(report, filename, center_m, correcting=corrects)
+    payload = draft.env.codec.encode_mapping(
+        report, filename, center_m, correcting=corrects, channel=draft.gate.channel
+    )
     draft.outputs.append(Announced(MAPPING, payload, before_ns))
 
 

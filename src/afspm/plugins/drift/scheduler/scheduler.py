@@ -105,7 +105,9 @@ class DriftWireCodec(WireCodec):
         of = "ProbePosition" if message in ("Spec1d", "ProbePosition") else "ScanParameters2d"
         return wire.relocated(message, payload, wire.place_in(of, told))
 
-    def encode_mapping(self, registered: Registered, filename: str, center_m: XY, *, correcting: bool) -> bytes:
+    def encode_mapping(
+        self, registered: Registered, filename: str, center_m: XY, *, correcting: bool, channel: str | None
+    ) -> bytes:
         return DriftMapping(
             timestamp=timestamp(round(registered.time_s * NS_PER_S)),
             matrix=_flat(registered.matrix[:2]),
@@ -123,6 +125,7 @@ class DriftWireCodec(WireCodec):
             rescan=registered.rescan,
             outcome=int(registered.outcome),  # type: ignore[arg-type]
             failures=len(registered.failures),
+            channel=channel,
         ).SerializeToString()
 
     def encode_rescan(self, wanted: RescanWanted) -> bytes:

@@ -10,6 +10,7 @@ from typing import ClassVar, Literal
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.basics.plain_data import Plain
 from afspm.basics.units import Duration, Length
+from afspm.model import ChannelName
 
 _STRICT = {"extra": "forbid"}
 
@@ -54,7 +55,8 @@ class DriftCompensationSettings:
 
     Attributes:
         estimator, tracker: a name, or a table with the name as its `class` and with its settings.
-        channel: channel of the scans that are compared; None: the first published channel in a unit of length.
+        channel: channel of the scans that are compared, by role or name; None: the topography, or where the microscope
+            declares no roles, the first published channel in a unit of length.
         correct: whether components use sample coordinates; otherwise drift is only tracked and published.
         correct_after: time since the start of the experiment, s, before which `correct` has no effect.
         rescan: rule for requesting rescans.
@@ -69,7 +71,7 @@ class DriftCompensationSettings:
 
     estimator: str | Plain = "least-squares"
     tracker: str | Plain = "bank"
-    channel: str | None = None
+    channel: ChannelName | None = None
     correct: bool = True
     correct_after: Duration = 0.0
     rescan: RescanRule = field(default_factory=RescanRule)

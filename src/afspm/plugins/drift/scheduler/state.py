@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, fields
 from afspm.basics.frozen import replace
 from afspm.basics.plain_data import Plain
 from afspm.basics.units import same_kind
-from afspm.model import Scan
+from afspm.model import TOPOGRAPHY, ChannelRoles, Scan
 from afspm.model.geometry import XY
 from afspm.plugins.drift.mapping import Mapping as DriftMapping
 from afspm.plugins.drift.scheduler.messages import DriftCodec, Matrix, Registered, ScanJob
@@ -104,10 +104,15 @@ class ScanGate:
     Attributes:
         waiting: held inputs, oldest first.
         settled: mappings of the latest published scans, by key; None for a scan published unchanged.
-        channel: channel used for registration; None: not chosen yet, the first channel in a unit of length.
+        wanted: name or role of the channel for registration; None: the topography, or where the microscope declares
+            no roles, the first channel in a unit of length.
+        channel: name of the channel used for registration; None: not chosen yet.
+        roles: the microscope's channels by their roles.
     """
 
+    wanted: str | None = None
     channel: str | None = None
+    roles: ChannelRoles = field(default_factory=ChannelRoles)
     held: HeldScan | None = None
     waiting: tuple[Waits, ...] = ()
     settled: Mapping[str, Matrix | None] = field(default_factory=dict)
@@ -129,9 +134,22 @@ class ScanGate:
         return replace(self, held=None, waiting=())
 
     def with_channel_of(self, scan: Scan) -> ScanGate:
-        """Return the gate with this scan's channel chosen, if none is chosen yet and the unit is a length."""
-        is_chosen = self.channel is not None or not same_kind(scan.unit, "m")
-        return self if is_chosen else replace(self, channel=scan.channel)
+        """Return the gate with this scan's channel chosen, if none is chosen yet and it is the wanted one.
+
+        The choice is final: at constant height, a scan of the current can't be compared with earlier ones of heights.
+        """
+        if self.channel is not None:
+            return self
+        wanted = self.wanted or (TOPOGRAPHY if self.roles.names else None)
+        fits = same_kind(scan.unit, "m") if wanted is None else self.roles.shown(scan).is_of(wanted)
+        return replace(self, channel=scan.channel) if fits else self
+
+    def lacking(self) -> str:
+        """Return which channel the held scan lacks, and which channels it has."""
+        wanted = self.channel or self.wanted or (TOPOGRAPHY if self.roles.names else "in a unit of length")
+        channels = (one.header.channel for one in self.waiting if isinstance(one, PacketIn))
+        there = ", ".join(dict.fromkeys(channel for channel in channels if channel))
+        return f"without the channel {wanted} among {there}"
 
 
 @dataclass(frozen=True)
@@ -208,7 +226,7 @@ class DriftState:
 
     @classmethod
     def initial(cls, settings: DriftCompensationSettings) -> DriftState:
-        return cls(gate=ScanGate(settings.channel), duties=Duties(started=settings.at_start == "nothing"))
+        return cls(gate=ScanGate(wanted=settings.channel), duties=Duties(started=settings.at_start == "nothing"))
 
 
 @dataclass(frozen=True)
@@ -233,7 +251,7 @@ class SavedDrift:
         return DriftState(
             places=self.places.restored(codec),
             forecast=self.forecast,
-            gate=ScanGate(settings.channel or self.channel, settled=self.settled),
+            gate=ScanGate(settings.channel, None if settings.channel else self.channel, settled=self.settled),
             tally=self.tally,
             duties=self.duties,
         )
