@@ -11,6 +11,7 @@ import re
 import sys
 import typing
 from collections.abc import Callable, Iterator
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ import state_diagram
 from afspm import Component, wire
 from afspm.basics import entry_points
 from afspm.basics.units import Unit
-from afspm.model import Role
+from afspm.model import ChannelRoles, Role
+from afspm.model.channels import ROLES
 from afspm.scheduler.control import arbitration
 from afspm.scheduler.control.arbitration import RoleTable
 from afspm.scheduler.publishing.envelopes import CacheRule, CacheSettings
@@ -28,6 +30,7 @@ from afspm.scheduler.safety.limits import Limit
 from afspm.scheduler.settings import ControlSettings
 from afspm.simulation.drift import Relaxation
 from afspm.simulation.faults import Fault
+from afspm.simulation.feedback import MODES
 from afspm.simulation.simulator import FAULT_KINDS, Simulator
 from afspm.simulation.simulator.controller import PanelEvent
 from afspm.simulation.surfaces import KINDS
@@ -79,6 +82,19 @@ def controllers() -> str:
         is_emulated = emulated in entry_points.names(entry_points.EMULATORS)
         shown = f"`{emulated}`, [emulated.toml](../../{(folder / 'emulated.toml').relative_to(ROOT).as_posix()})"
         lines.append(f"| {class_.maker} | {class_.software} | `{driver}` | {readme} | {shown if is_emulated else ''} |")
+    return "\n".join(lines) + "\n"
+
+
+def channels() -> str:
+    """The table of roles: each maker's own names of its channels."""
+    drivers = {driver: entry_points.load(entry_points.DRIVERS, driver) for driver in _makers()}
+    every = {name: one.declared_channels({}) for name, one in drivers.items() if not one.simulated}
+    simulated = (Simulator.declared_channels({"feedback": {"mode": mode}}) for mode in MODES)
+    every["Simulator"] = reduce(lambda some, more: ChannelRoles({**some.names, **more.names}), simulated)
+    lines = ["| role | " + " | ".join(f"`{driver}`" for driver in every) + " |", "| --- " * (len(every) + 1) + "|"]
+    for role in (one for one in ROLES if any(one in of.names for of in every.values())):
+        cells = [", ".join(of.names.get(role, ())) for of in every.values()]
+        lines.append("| " + " | ".join([role, *cells]) + " |")
     return "\n".join(lines) + "\n"
 
 
@@ -315,6 +331,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "transition-table": transition_table,
     "instruments": instruments,
     "controllers": controllers,
+    "channels": channels,
     "components": component_pages,
     "simulator": simulator_page,
     "python-api": python_api.python_api,

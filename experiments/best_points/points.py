@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from afspm import Component, Region, wire
+from afspm import ChannelName, Component, Region, wire
 from afspm.basics.units import Length
 
 MESSAGE = "SpatialPointWithScoreList"
@@ -14,11 +14,11 @@ class RandomPoints(Component):
     listens = ("Scan2d",)
     publishes = (MESSAGE,)
 
-    def __init__(self, points: int = 20, around: Length = 400e-9, channel: str = "Height"):
+    def __init__(self, points: int = 20, around: Length = 400e-9, channel: ChannelName = "height"):
         self.points, self.around, self.channel = points, around, channel
 
     def on_scan(self, scan):
-        if scan.channel != self.channel or min(scan.region.size_m) <= self.around:
+        if not scan.is_of(self.channel) or min(scan.region.size_m) <= self.around:
             return  # a narrow one
         message = wire.message_type(MESSAGE)(channel=scan.channel)
         message.timestamp.FromNanoseconds(scan.time_ns)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from afspm import Component
+from afspm import ChannelName, Component
 
 
 class Sharpness(Component):
@@ -10,11 +10,11 @@ class Sharpness(Component):
 
     listens = ("Scan2d",)
 
-    def __init__(self, threshold: float = 0.8, channel: str = "Height"):
+    def __init__(self, threshold: float = 0.8, channel: ChannelName = "height"):
         self.threshold, self.channel = threshold, channel
 
     def on_scan(self, scan):
-        if scan.channel == self.channel:
+        if scan.is_of(self.channel):
             sharpness = float(np.percentile(np.abs(np.diff(scan.values, axis=1)), 99))  # how steep the edges are
             first = self.memory.setdefault("first", sharpness)
             self.memory.save()

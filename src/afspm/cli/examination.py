@@ -78,6 +78,9 @@ def _file(experiment: Experiment) -> Iterator[Diagnosis]:
         yield Diagnosis("file", Severity.ERROR, str(one.place), one.what, one.hint)
     if not errors:
         yield diagnosis.fine("file", str(experiment.files[0]), "nothing wrong")
+        for translator in experiment.resolved.with_role(Role.TRANSLATOR):
+            if (has := translator.capabilities()) is not None:
+                yield diagnosis.fine("channels", translator.name, f"it may have {has.channels.described()}")
 
 
 def _keys(experiment: Experiment) -> Iterator[Diagnosis]:

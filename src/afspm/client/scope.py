@@ -168,7 +168,7 @@ class Scope(ExperimentView):
 
             with scope.sweep({"zctrl-setpoint": ["50 pA", "100 pA"], "scan-speed": ["1 um/s", "2 um/s"]}) as points:
                 for point in points:
-                    print(point.values, point.scans["Height"].values.std())
+                    print(point.values, point.scans["height"].values.std())
 
         Control is kept over all points. If control is lost, to a tip repair for instance, the parameters of the present
         point are set again, and the point is measured again. When the block ends, even by an error, the parameters are

@@ -88,6 +88,10 @@ class ChannelRoles:
         roles = self.of(measured.channel)
         return replace(measured, roles=roles) if roles else measured
 
+    def topography_first(self, channels: Iterable[str]) -> tuple[str, ...]:
+        """Return channels as they are shown: that of the topography first, the others in their order."""
+        return tuple(sorted(channels, key=lambda channel: TOPOGRAPHY not in self.of(channel)))
+
     def refuses(self, channel: str) -> str:
         """Return why the microscope cannot have a channel, by its role or name; empty for one that it may have."""
         known = {*self.names, *self.all_names()} | ({TOPOGRAPHY} if HEIGHT in self.names else set())

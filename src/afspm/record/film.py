@@ -159,7 +159,7 @@ def film_of(
 
     Args:
         rows: the scans, in the order of the film; of interrupted scans, the measured lines are shown.
-        channel: the shown channel; None: the first channel of the first scan.
+        channel: the shown channel, by name or role; None: the first channel of the first scan.
         drift: the result of `recorded_drift`; None: read from the run.
 
     Raises:
@@ -169,20 +169,20 @@ def film_of(
     if len(rows) < 2:
         raise InvalidValue(f"a film needs two scans of one place, not {len(rows)}")
     drift = recorded_drift(run) if drift is None else drift
-    chosen = channel or rows[0].channels[0][0]
     places = [_place(row, drift) for row in rows]
     for row, place in zip(rows, places, strict=True):
         if not _is_same_place(places[0], place):
             raise InvalidValue(f"scans {rows[0].number} and {row.number} are of different places", hint="choose others")
-    taken = [_values(run, row, chosen) for row in rows]
+    scans = [_scan(run, row, channel or rows[0].channels[0][0]) for row in rows]
+    taken = [np.asarray(scan.values, dtype=np.float64) for scan in scans]
     window, (height, width) = places[0], taken[0].shape
     pixels_m = window.pixels_m((height, width))
     frames = np.stack([_sampled(flattened(one), place, pixels_m) for one, place in zip(taken, places, strict=True)])
     moved = np.array([_drift_at(row, drift) for row in rows]) if drift else np.zeros((len(rows), 2))
     return Film(
         frames=frames,
-        channel=chosen,
-        unit=dict(rows[0].channels)[chosen],
+        channel=scans[0].channel,
+        unit=scans[0].unit,
         numbers=tuple(row.number for row in rows),
         times_ns=tuple(row.time_ns for row in rows),
         window=window,
@@ -246,11 +246,11 @@ def _is_same_place(first: Region, second: Region) -> bool:
     return max(apart) <= _MOST_OFFSET and max(sizes) <= _SIZE_TOLERANCE and turned <= _TURN_TOLERANCE_RAD
 
 
-def _values(run: RecordedScans, row: ScanRow, channel: str) -> Array:
+def _scan(run: RecordedScans, row: ScanRow, channel: str) -> Scan:
     scans = run.scan(row)
     if channel not in scans:
         raise InvalidValue(f"scan {row.number} has no channel {channel!r}", hint=f"there are {', '.join(scans)}")
-    return np.asarray(scans[channel].values, dtype=np.float64)
+    return scans[channel]
 
 
 def _sampled(values: Array, place: Region, pixels_m: tuple[Array, Array]) -> Array:

@@ -11,7 +11,7 @@ from typing import Any
 
 from afspm import wire
 from afspm.basics.clock import iso_utc
-from afspm.model import Packet, ProblemNames, Scan, ScopeState
+from afspm.model import TOPOGRAPHY, Packet, ProblemNames, Scan, ScopeState
 from afspm.record import nexus_writer, provenance
 from afspm.record.journal import SCHEDULER
 from afspm.record.nexus_writer import FileProvenance
@@ -119,6 +119,7 @@ class MeasuredFiles:
         self, scans: Sequence[Scan], time_ns: int, stood: ControlAtStart, published_ns: int, *, interrupted: bool
     ) -> int:
         filename = scans[0].filename if scans else ""
+        scans = sorted(scans, key=lambda scan: TOPOGRAPHY not in scan.roles)  # programs open the first
         number, name = self._next(SCANS, time_ns)
         facts = {**self._facts, **stood.facts(self._problems), "number": number, "interrupted": interrupted}
         filenames = {scan.filename for scan in scans}  # some controllers write a file for each channel

@@ -93,6 +93,7 @@ def _scans(file: h5py.File, about: Plain) -> list[Scan]:
             hdf5.array(data[channel["field"]]),
             channel["time_ns"],
             about["filename"],
+            roles=tuple(channel.get("roles", ())),
         )
         for channel in about["channels"]
     ]

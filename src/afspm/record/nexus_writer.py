@@ -68,7 +68,7 @@ def encode_scan(scans: Sequence[Scan], circumstances: FileProvenance) -> bytes:
         "angle_rad": region.angle_rad,
         "frame": region.frame.value,
         "channels": [
-            {"name": scan.channel, "unit": scan.unit, "field": name, "time_ns": scan.time_ns}
+            {"name": scan.channel, "unit": scan.unit, "field": name, "time_ns": scan.time_ns, "roles": scan.roles}
             for scan, name in zip(scans, fields, strict=True)
         ],
     }

@@ -14,6 +14,7 @@ from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import WireError
 from afspm.model import (
     Approvals,
+    ChannelRoles,
     ControlEvent,
     ControlMode,
     ControlRequest,
@@ -197,6 +198,7 @@ class Overview:
         self.control: ControlState | None = None
         self.readings = Readings()
         self.tip: TipStatus | None = None
+        self.channels = ChannelRoles()
         self.processes: dict[str, ProcessState] = {}
         self.instruments: dict[str, ReadingCurve] = {}
         self.progress_reports: dict[str, Progress] = {}
@@ -382,6 +384,9 @@ class Overview:
 
     def _on_tip_status(self, status: TipStatus, time_ns: int) -> None:
         self.tip = status
+
+    def _on_channel_roles(self, roles: ChannelRoles, time_ns: int) -> None:
+        self.channels = roles
 
     def _on_scan_lines(self, lines: ScanLines, time_ns: int) -> None:
         if self.running is not None:

@@ -60,7 +60,7 @@ def open_run(path: str | Path = "runs") -> Run:
     """Open the record of a run, also of a running or killed one.
 
         run = afspm.open_run("runs/tip_repair-20261120-040000")
-        run.scan(-1)["Height"].to_xarray()
+        run.scan(-1)["height"].to_xarray()
         run.scans.to_xarray()
         [entry.reason for entry in run.refusals]
 

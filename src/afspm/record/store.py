@@ -18,6 +18,7 @@ from typing import TypeVar
 from afspm import wire
 from afspm.basics.errors import WireError
 from afspm.model import (
+    ChannelRoles,
     ControlResponse,
     Frame,
     JournalEntries,
@@ -94,6 +95,7 @@ class RecordStore:
         self._files = MeasuredFiles(self._folder, self._journal, about.facts, about.problems)
         self._gathering = ScanAssembler(provenance.last_state(self._journal))
         self._is_corrected = provenance.is_corrected(self._journal)
+        self._roles = ChannelRoles()
         for name, value in about.facts.items():
             self.note(name, value)
 
@@ -176,10 +178,12 @@ class RecordStore:
             raise
 
     def _take(self, packet: Packet, source: str) -> None:
+        message, thing = _read(packet)
+        if isinstance(thing, ChannelRoles) and source == SCHEDULER:
+            self._roles = thing
         # packets come again after a restart, from the log and from the scheduler's cache
         if self.has(packet):
             return
-        message, thing = _read(packet)
         if message == "DriftMapping" and source == SCHEDULER:
             # published right before its scan; correction may begin during a run
             self._is_corrected = provenance.corrects(thing)
@@ -233,8 +237,8 @@ class RecordStore:
         return self._about.frame if self._is_corrected else Frame.TIP
 
     def _placed(self, image: Image) -> Image:
-        # the wire format does not carry the frame
-        frame = self._frame
+        # the wire format does not carry frame and roles
+        image, frame = self._roles.shown(image), self._frame
         return image if frame is Frame.TIP else replace(image, region=replace(image.region, frame=frame))
 
     def _add_entries(self, entries: JournalEntries) -> None:

@@ -37,6 +37,7 @@ from afspm.model import (
     Spectrum,
 )
 from afspm.scheduler.control import arbitration as a
+from afspm.simulation.simulator import Simulator
 from afspm.transport.port import (
     CaughtUp,
     ControlConnected,
@@ -116,6 +117,7 @@ class Lab:
         self.most_at_once: int | None = None
         self.open = True
         self.connect()
+        self.publish(Simulator.declared_channels({"feedback": {"mode": "amplitude"}}).with_topography(feedback_on=True))
         self.publish(ScopeStatus(self.state))
         self.publish(self.parameters)
         self.publish(self.position)

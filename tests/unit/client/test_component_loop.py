@@ -159,7 +159,13 @@ def test_other_messages_come_by_their_name_or_to_on_message() -> None:
     others = Others()
     run(others, lab)
     assert others.named == [("FeedbackAnalysis_fine", 0.25)]
-    assert others.rest == ["ScopeStateMsg", "ScanParameters2d", "ProbePosition", "SpatialPointWithScoreList"]
+    assert others.rest == [
+        "ChannelRoles",
+        "ScopeStateMsg",
+        "ScanParameters2d",
+        "ProbePosition",
+        "SpatialPointWithScoreList",
+    ]
 
 
 def test_only_the_envelopes_subscribed_to_are_handled() -> None:

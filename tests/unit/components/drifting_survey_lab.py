@@ -71,9 +71,7 @@ class DriftingLab(Lab):
             self._register(region, shape, upwards=False)
         scan, said = self._register(region, shape, upwards=True)
         file = f"scan-{len(self.registrations)}.nc"
-        payload = DriftWireCodec().encode_mapping(
-            said, file, scan.region.center_m, correcting=True, channel=scan.channel
-        )
+        payload = DriftWireCodec().encode_mapping(said, file, scan.region.center_m, correcting=True, channel="Height")
         self.publish(wire.decode("DriftMapping", payload))
         there = said.mapping.to_sample(scan.region)
         self.publish(Scan(there, "Height", "m", scan.values, self.clock.now_ns(), file))

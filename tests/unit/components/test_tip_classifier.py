@@ -186,5 +186,5 @@ def test_missing_channel_is_logged_once(caplog: pytest.LogCaptureFixture) -> Non
     lab.at(2000.0, lab.kill)
     run(classifier(), lab)
     (told,) = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
-    assert "no channel Height and Height Retrace" in told
+    assert "no channel height and height, retrace" in told
     assert "They have Z Forward, Z Backward" in told

@@ -36,6 +36,7 @@ AS_MODEL = {
     "Approvals",
     "Proposal",
     "TipStatus",
+    "ChannelRoles",
     "ActByHand",
     "MeasurementConditions",
 }

@@ -26,7 +26,7 @@ class CorralEnvironment:
 
         def scan(x_m: float, y_m: float, size_m: float, pixels: int) -> dict[str, object]:
             taken = scope.scan(Region((x_m, y_m), (size_m, size_m)), shape=(pixels, pixels))
-            return {"time_ns": str(taken.time_ns), "height_m": taken["Height"].values.tolist()}
+            return {"time_ns": str(taken.time_ns), "height_m": taken["height"].values.tolist()}
 
         def spectrum(x_m: float, y_m: float, kind: str = "IV") -> dict[str, object]:
             taken = scope.spectrum((x_m, y_m), kind=kind)

@@ -157,7 +157,7 @@ class Evidence:
         return [row for row in self.spectra if row.time_ns in cites]
 
     def heights(self, row: ScanRow) -> Scan:
-        return self.run.scan(row)["Height"]
+        return self.run.scan(row)["height"]
 
     def curve(self, row: SpectrumRow) -> Spectrum:
         return self.run.spectrum(row)

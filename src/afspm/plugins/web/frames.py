@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.model import Region, Scan, ScanLines
+from afspm.model import ChannelRoles, Region, Scan, ScanLines
 
 MEMORY_BYTES = 192 << 20
 MOST_CHANNELS = 64
@@ -59,10 +59,14 @@ class FrameStore:
 
     Args:
         memory_bytes: bound for all finished frames together, and again for all partial frames together.
+
+    Attributes:
+        roles: the microscope's channels by their roles.
     """
 
     def __init__(self, memory_bytes: int = MEMORY_BYTES) -> None:
         self.kept_bytes = 0
+        self.roles = ChannelRoles()
         self._memory_bytes = memory_bytes
         self._number = 0
         self._newest: dict[str, ChannelFrame] = {}
@@ -72,8 +76,8 @@ class FrameStore:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The channels in the order of their first appearance."""
-        return tuple(self._newest)
+        """The channels: that of the topography first, the others in the order of their first appearance."""
+        return self.roles.topography_first(self._newest)
 
     def take_scan(self, scan: Scan, time_ns: int) -> None:
         """Add a finished channel. A scan without values, or not newer than the present frame, is ignored.
@@ -148,7 +152,8 @@ class FrameStore:
         return self._kept.get((time_ns, channel))
 
     def _of(self, channel: str | None) -> ChannelFrame | None:
-        return next(iter(self._newest.values()), None) if channel is None else self._newest.get(channel)
+        wanted = next(iter(self.channels), "") if channel is None else channel
+        return self._newest.get(wanted)
 
     def _changed_row(self, began_ns: int | None) -> int | None:
         is_of_it = self._changed is not None and began_ns is not None and self._changed[0] == began_ns

@@ -13,7 +13,7 @@ import numpy as np
 
 from afspm.basics.clock import Clock
 from afspm.components.tip_verdict import OF_LINES, read_line_verdict
-from afspm.model import ProblemNames, Scan, ScanLines, ScopeState, Spectrum
+from afspm.model import ChannelRoles, ProblemNames, Scan, ScanLines, ScopeState, Spectrum
 from afspm.model.line_levelling import Array
 from afspm.plugins.web.frames import FrameStore
 from afspm.record.expected_end import Plans, expected_end_ns
@@ -119,6 +119,8 @@ class Watch:
                 self.frames.take_scan(thing, time_ns)
             elif isinstance(thing, ScanLines):
                 self.frames.take_lines(thing)
+            elif isinstance(thing, ChannelRoles):
+                self.frames.roles = thing
             elif isinstance(thing, Spectrum):
                 self.spectra.take(thing, time_ns)
             elif message == OF_LINES and (verdict := read_line_verdict(thing)) is not None:

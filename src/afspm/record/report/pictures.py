@@ -12,7 +12,7 @@ import numpy as np
 
 from afspm.basics import entry_points
 from afspm.basics.errors import AfspmError
-from afspm.model import ControlMode, ControlState, ScanSet, names
+from afspm.model import TOPOGRAPHY, ControlMode, ControlState, ScanSet, names
 from afspm.model.line_levelling import flattened
 from afspm.record.bad_scans import bad_scans
 from afspm.record.drawing.image_html import Shown, shown
@@ -121,7 +121,9 @@ def is_topography(channel: str) -> bool:
 
 
 def topography(scans: ScanSet) -> str:
-    """Return the displayed channel of a scan: the first with a name like a height, else the first of all."""
+    """Return the displayed channel of a scan: the topography, else one with a name like a height, else the first."""
+    if TOPOGRAPHY in scans:
+        return scans[TOPOGRAPHY].channel
     return next((c for name in _TOPOGRAPHY for c in scans if c.lower().startswith(name)), scans.first.channel)
 
 

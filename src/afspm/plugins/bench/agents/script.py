@@ -102,7 +102,7 @@ class Script:
     def field(self, pixels: int = 256) -> tuple[list[analysis.Peak], ScanSet]:
         scans = self.scan((0.0, 0.0), self.given["size_m"], pixels)
         with self.session.thinking():
-            return analysis.peaks_of(scans["Height"], least_m=9e-9, apart_m=30e-9), scans
+            return analysis.peaks_of(scans["height"], least_m=9e-9, apart_m=30e-9), scans
 
     def find_highest(self) -> None:
         peaks, _ = self.field()
@@ -111,7 +111,7 @@ class Script:
 
     def find_flat(self) -> None:
         _, scans = self.field()
-        height = scans["Height"]
+        height = scans["height"]
         xy, _ = analysis.flattest(analysis.above_ground(height.values), height.region, self.given["square_m"])
         self.report("done", {"x": xy[0], "y": xy[1]})
 
@@ -136,13 +136,13 @@ class Script:
     # --- measure ---
 
     def measure_lattice(self) -> None:
-        found = [analysis.lattice_constant(self.scan((x, 0.0), 8e-9, 256)["Height"]) for x in (0.0, 30e-9)]
+        found = [analysis.lattice_constant(self.scan((x, 0.0), 8e-9, 256)["height"]) for x in (0.0, 30e-9)]
         value = sum(one for one, _ in found) / len(found)
         spread = abs(found[0][0] - found[1][0]) / 2
         self.report("done", {"constant": self.number(value, max(0.005 * value, spread))})
 
     def measure_step(self) -> None:
-        found = [analysis.step_height(self.scan((x, 0.0), self.given["size_m"], 192)["Height"]) for x in (0.0, 900e-9)]
+        found = [analysis.step_height(self.scan((x, 0.0), self.given["size_m"], 192)["height"]) for x in (0.0, 900e-9)]
         value = sum(one for one, _ in found) / len(found)
         spread = abs(found[0][0] - found[1][0]) / 2
         self.report("done", {"height": self.number(value, max(0.008 * value, spread))})
@@ -158,7 +158,7 @@ class Script:
         first = self.scan((0.0, 0.0), self.given["size_m"], 128)
         self.sleep_until(40.0)
         last = self.scan((0.0, 0.0), self.given["size_m"], 128)
-        dx, dy = analysis.shift_m(first["Height"], last["Height"])
+        dx, dy = analysis.shift_m(first["height"], last["height"])
         assert first.time_ns is not None
         assert last.time_ns is not None
         seconds = (last.time_ns - first.time_ns) * 1e-9
@@ -177,7 +177,7 @@ class Script:
             found = self.scan(at, given["size_m"], given["pixels"])
             with self.session.thinking():
                 first = first or found
-                dx, dy = analysis.shift_m(first["Height"], found["Height"])
+                dx, dy = analysis.shift_m(first["height"], found["height"])
                 at, last_s = (at[0] + dx, at[1] + dy), now_s
                 velocity = (at[0] / now_s, at[1] / now_s) if number else velocity
         self.report("done")
@@ -197,7 +197,7 @@ class Script:
             with self.scope.control(), self.session.thinking():
                 found = self.scope.scan(Region(at, (400e-9, 400e-9)), shape=(64, 64))
                 # the followed particle is far higher than its neighbours
-                tall = [one for one in analysis.peaks_of(found["Height"]) if one.height_m > 50e-9]
+                tall = [one for one in analysis.peaks_of(found["height"]) if one.height_m > 50e-9]
                 top = analysis.near(tall, at, 120e-9)
                 at = top.xy_m if top else at
                 self.spectrum(at, given["kind"])
@@ -211,7 +211,7 @@ class Script:
                 assert found.time_ns is not None
                 now_s = found.time_ns * 1e-9
                 if before is not None:
-                    dx, dy = analysis.shift_m(before["Height"], found["Height"])
+                    dx, dy = analysis.shift_m(before["height"], found["height"])
                     dx, dy = (
                         dx + found.region.center_m[0] - before.region.center_m[0],
                         (dy + found.region.center_m[1] - before.region.center_m[1]),
@@ -248,7 +248,7 @@ class Script:
         given = self.given
         scans = self.scan(given["center"], given["size_m"], given["pixels"])
         with self.session.thinking():
-            height, retrace = scans["Height"], scans["Height Retrace"]
+            height, retrace = scans["height"], scans["Height Retrace"]
             return judge.judge(height.values, retrace.values, height.region).opinion
 
     def treat(self, what: str, strength: float) -> None:

@@ -179,7 +179,7 @@ class ChannelNames(FrameStore):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        return tuple(self._names)
+        return self.roles.topography_first(self._names)
 
     def take_scan(self, scan: Scan, time_ns: int) -> None:
         self._names[scan.channel] = None

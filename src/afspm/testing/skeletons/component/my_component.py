@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from afspm import Component, Scan
+from afspm import ChannelName, Component, Scan
 
 
 class MyComponent(Component):
     """A component that logs the roughness of each scan, and at the end the roughest scan.
 
     Args:
-        channel: the evaluated channel.
+        channel: the evaluated channel, by its role, the same on every microscope, or by its maker's name.
     """
 
     listens = ("Scan2d",)
 
-    def __init__(self, channel: str = "Height") -> None:
+    def __init__(self, channel: ChannelName = "height") -> None:
         self.channel = channel
 
     def on_scan(self, scan: Scan) -> None:
-        if scan.channel != self.channel:
+        if not scan.is_of(self.channel):
             return
         if scan.time_ns and scan.time_ns <= self.memory.get("newest_ns", -1):
             return  # handled before a restart: the cached scans arrive again

@@ -10,7 +10,7 @@ from afspm.testing import Bench
 
 def test_my_component_notes_every_scan_once_also_after_a_kill() -> None:
     series = ScanSeries((1e-6, 1e-6), pixels=(16, 16), every=600.0, scans=3)
-    bench = Bench(MyComponent(channel="Height"), others={"series": series}, microscope={"surface": "steps"})
+    bench = Bench(MyComponent(channel="height"), others={"series": series}, microscope={"surface": "steps"})
     bench.at("15 min", bench.kill)
     bench.run(until="1 h")
     assert len(bench.scans) == 3

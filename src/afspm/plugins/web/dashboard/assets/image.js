@@ -18,6 +18,7 @@ export class ImageView {
     this.view = { u: 0, v: 0, zoom: 1 };
     this.tool = "look";
     this.pinned = this.wanted = null;
+    this.hasChosenChannel = false;
     this.bar = new Image();
     this.bar.onload = () => this.draw();
     this.pictures = new Pictures((head, bitmap) => this.show(head, bitmap), (text) => this.say(text));
@@ -54,7 +55,7 @@ export class ImageView {
     this.fetch();
   }
 
-  /** Offer these channels; the chosen channel stays, if it is among them. */
+  /** Offer these channels; one that a person has chosen stays, if it is among them, else the first is shown. */
   setChannels(channels) {
     if (channels.join("\n") !== this.#channels().join("\n")) this.#offer(channels);
   }
@@ -176,8 +177,9 @@ export class ImageView {
   #offer(channels) {
     const select = this.find("channel"), before = select.value;
     select.replaceChildren(...[...new Set(channels)].map((name) => new Option(name, name)));
-    if (channels.includes(before)) select.value = before;
-    else if (!this.pinned && channels.length) this.fetch();
+    const keeps = (this.pinned || this.hasChosenChannel) && channels.includes(before);
+    if (keeps) select.value = before;
+    else if (!this.pinned && select.value !== before) this.fetch();
   }
 
   /** Fit the canvas beside the facts; on a phone, where the page scrolls, only to the width. */
@@ -370,6 +372,7 @@ export class ImageView {
   #listen() {
     for (const name of ["channel", "levelling", "contrast", "palette"]) {
       this.find(name).addEventListener("change", () => {
+        if (name === "channel") this.hasChosenChannel = true;
         if (name === "channel" && this.pinned) this.pinned = { ...this.pinned, channel: this.find("channel").value };
         this.fetch();
       });

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -26,6 +26,7 @@ class MyScope(Driver):
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
+    channel_roles: ClassVar = {"height": ("Height",)}  # your names of the channels, for components of any maker
     simulated = True  # remove this line for a real microscope: its time is real, and its tip can break
 
     def __init__(self, *, address: str = "127.0.0.1:5000", **settings: Any) -> None:
