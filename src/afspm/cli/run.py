@@ -26,6 +26,7 @@ _QUESTIONS: Final = {
     "probe": "Probe, as `afspm probes` lists it",
     "technique": "Technique (STM, STS or AFM)",
 }
+_SIMULATOR, _PAPERS_METHOD = "simulator", "paper"
 _TIP_REPAIR_NIGHT = "A simulated night of eight hours: the tip changes three times, and is repaired. Two minutes."
 _DRIFT_NIGHT = "A simulated night of eighteen hours on a sample that drifts by micrometres. Three to five minutes."
 
@@ -179,6 +180,9 @@ def _answer(name: str, text: str, known: str) -> str:
 
 def demo(
     drift: Annotated[bool, typer.Option("--drift", help="The night on a sample that drifts.")] = False,
+    on: Annotated[
+        str, typer.Option("--on", help="With --drift: another microscope, e.g. asylum: an emulated controller.")
+    ] = "",
     runs: Runs = RUNS,
     dashboard: Annotated[bool, typer.Option("--dashboard", help="Show it in the browser, too.")] = False,
 ) -> None:
@@ -186,9 +190,20 @@ def demo(
 
     Nothing but afspm is needed. The night leaves a folder with its scans, a picture and `report.html`.
     """
+    files = [_sample("tip_repair") / "experiment.toml"] if not drift else _drift_night(on or _SIMULATOR)
+    if on and not drift:
+        raise ConfigError("--on chooses the microscope of the night with --drift", hint="add --drift")
     typer.echo(_DRIFT_NIGHT if drift else _TIP_REPAIR_NIGHT)
     typer.echo(f"It leaves a folder in {runs}, with report.html. Ctrl-C ends it early.")
-    run([_sample("drift_night" if drift else "tip_repair") / "experiment.toml"], runs=runs, dashboard=dashboard)
+    run(files, runs=runs, dashboard=dashboard)
+
+
+def _drift_night(microscope: str) -> list[Path]:
+    night = _sample("drift_night") / "experiment.toml"
+    there = sorted(file.stem for file in night.parent.glob("*.toml") if file.stem not in (night.stem, _PAPERS_METHOD))
+    if microscope not in there:
+        raise ConfigError(f"there is no night on {microscope!r}", where="--on", hint=f"one of {', '.join(there)}")
+    return [night, night.with_name(f"{microscope}.toml")]
 
 
 def _sample(name: str) -> Path:

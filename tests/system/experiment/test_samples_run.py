@@ -86,6 +86,7 @@ pixels = [64, 64]
 [scheduler.drift]
 correct_after = "15 min"
 """
+NIGHT = "drift_night/experiment.toml"
 TABLE = '[drift_table]\ncomponent = true\nclass = "DriftTable"\n'
 SHORT_SERIES = '[experiment]\nevery = "6 min"\nscans = 7\n'
 
@@ -95,8 +96,8 @@ SHORT_SERIES = '[experiment]\nevery = "6 min"\nscans = 7\n'
 @pytest.mark.parametrize(
     ("files", "quicker", "pixels"),
     [
-        (("drift_night/experiment.toml",), SHORT_NIGHT + TABLE, 1.0),
-        (("drift_night/experiment.toml", "drift_night/paper.toml"), SHORT_NIGHT + TABLE, 2.0),
+        ((NIGHT, "drift_night/simulator.toml"), SHORT_NIGHT + TABLE, 1.0),
+        ((NIGHT, "drift_night/simulator.toml", "drift_night/paper.toml"), SHORT_NIGHT + TABLE, 2.0),
         (("paper_form/drift.toml",), SHORT_SERIES + TABLE, 1.0),
     ],
     ids=["drift_night", "drift_night-paper", "published"],

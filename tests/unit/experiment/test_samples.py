@@ -17,7 +17,9 @@ WITHOUT_A_MICROSCOPE = "every_microscope"  # its second file has it
 SECOND_FILES = sorted(p.name for p in (EXPERIMENTS / WITHOUT_A_MICROSCOPE).glob("*.toml") if p.stem != "experiment")
 SECOND_FILES += [str(maker.emulated) for maker in MAKERS.values()]
 NAMES = sorted(folder.name for folder in EXPERIMENTS.iterdir() if (folder / "experiment.toml").exists())
-SAMPLES: list[tuple[str, ...]] = [(name,) for name in NAMES if name != WITHOUT_A_MICROSCOPE]
+OF_DRIFT = [f"{name}.toml" for name in ("simulator", *(name.lower() for name in MAKERS))]
+SAMPLES: list[tuple[str, ...]] = [(name,) for name in NAMES if name not in (WITHOUT_A_MICROSCOPE, "drift_night")]
+SAMPLES += [("drift_night", second) for second in OF_DRIFT]
 SAMPLES += [("best_points", "drift.toml")]
 SAMPLES += [(WITHOUT_A_MICROSCOPE, second) for second in SECOND_FILES]
 
@@ -74,7 +76,7 @@ def test_paper_s_form_and_short_form_are_the_same_experiment() -> None:
 
 
 def test_the_paper_s_drift_method_has_the_values_of_its_table() -> None:
-    experiment = sample("drift_night", "paper.toml")
+    experiment = sample("drift_night", "simulator.toml", "paper.toml")
     assert experiment.check() == []
     drift, series = (experiment.resolved.processes[name].settings for name in ("scheduler", "series"))
     ransac = {"transform": "translation", "residual_threshold": 0.05, "iterations": 100, "tighten": False}
