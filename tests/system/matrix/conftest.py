@@ -1,0 +1,5 @@
+from __future__ import annotations
+
+from tests.system.experiment.conftest import afspm_run
+
+__all__ = ["afspm_run"]

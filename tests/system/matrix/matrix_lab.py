@@ -1,0 +1,120 @@
+"""The matrix of components and instruments: the jobs, what proves each, and the recorded outcomes.
+
+A job is an experiment file without a microscope; a maker's own file, or the simulator's, is laid over it, and nothing
+else. `make test-matrix` runs all of them, and writes `matrix.toml` again.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from makers import MAKERS
+from tests.system.experiment.experiment_lab import AfspmRun
+
+import afspm
+from afspm.experiment import load
+
+HERE = Path(__file__).parent
+RECORD = HERE / "matrix.toml"
+JOBS = HERE / "jobs"
+EXPERIMENTS = HERE.parents[2] / "experiments"
+SECOND_FILES = {"simulator": EXPERIMENTS / "every_microscope" / "simulator.toml"} | {
+    name: maker.emulated for name, maker in MAKERS.items()
+}
+DONE = "done"
+Proof = Callable[[AfspmRun], bool]
+
+
+def scans(at_least: int) -> Proof:
+    """Return a proof: so many scans are in the record."""
+
+    def proof(run: AfspmRun) -> bool:
+        with afspm.open_run(run.folder) as record:
+            return len([one for one in record.scans if not one.interrupted]) >= at_least
+
+    return proof
+
+
+def spectra(at_least: int) -> Proof:
+    """Return a proof: so many spectra are in the record."""
+
+    def proof(run: AfspmRun) -> bool:
+        with afspm.open_run(run.folder) as record:
+            return len(record.spectra) >= at_least
+
+    return proof
+
+
+def file(name: str) -> Proof:
+    """Return a proof: the run has left a file."""
+    return lambda run: any(run.folder.glob(name))
+
+
+def said(name: str, text: str) -> Proof:
+    """Return a proof: a process has said something."""
+    return lambda run: bool(run.said(rf"\b{name} +.*{text}"))
+
+
+PROOFS: Mapping[str, Mapping[str, Proof]] = {
+    "series": {
+        "Scheduler": scans(4),
+        "ScanSeries": scans(4),
+        "TipClassifier": said("tip_classifier", "good|bad|unclear"),
+        "NightPicture": file("night.png"),
+        "Metadata": file("metadata.csv"),
+        "LogCollector": file("log*.txt"),
+        "Recorder": file("journal.sqlite"),
+        "Dashboard": said("dashboard", "http"),
+        "Gateway": said("gateway", "http"),
+    },
+    "list": {"ScanList": scans(2)},
+    "grid": {"RegionGrid": scans(2)},
+    "sweep": {"Sweep": scans(2)},
+    "drift": {
+        "DriftCompensatedScheduler": scans(4),
+        "Rescanner": scans(5),
+        "DriftTable": file("drift_table.csv"),
+        "DriftPictures": file("drift_offset.png"),
+    },
+    "curves": {"SpectroscopyGrid": spectra(2)},
+    "adaptive": {"Adaptive": file("map.csv")},
+    "survey": {"Survey": file("survey.csv")},
+    "lines": {"LineWatch": scans(4)},
+    "feedback": {
+        "FeedbackAnalysis": said("analysis", "."),
+        "FeedbackTuner": said("tuner", "integral gain"),
+    },
+    "repair": {"TipCorrector": said("tip_corrector", "pulse|repaired|good")},
+    "agent": {"Agent": spectra(1)},
+}
+"""What proves, for each job, that each of its components has done it."""
+ELSEWHERE = {
+    "Instrument": "speaks to another instrument, not to the microscope",
+    "Notifier": "speaks to a person, not to the microscope",
+    "TraceReplay": "stands in for a controller",
+    "PublishedScheduler": "is the mediator of the published implementation",
+    "PublishedPeers": "serves peers of the published implementation",
+    "PublishedTranslator": "stands in for a driver",
+    "SimulatedPublishedTranslator": "stands in for a driver",
+}
+"""Components that have no job here, and why."""
+CELLS = [(job, instrument) for job in PROOFS for instrument in SECOND_FILES]
+
+
+def files(job: str, instrument: str) -> tuple[Path, Path]:
+    """Return the files of a cell."""
+    return JOBS / f"{job}.toml", SECOND_FILES[instrument]
+
+
+def refusal(job: str, instrument: str) -> str:
+    """Return why `afspm check` refuses a job on an instrument; empty if it does not."""
+    errors = [one.what for one in load(*files(job, instrument)).check() if one.is_error]
+    return re.sub(r", which \[microscope\] .*", "", errors[-1]) if errors else ""
+
+
+def recorded() -> dict[str, dict[str, str]]:
+    """Return the recorded outcomes, by job and instrument."""
+    return tomllib.loads(RECORD.read_text(encoding="utf-8")) if RECORD.exists() else {}

@@ -1,0 +1,26 @@
+"""Writes tests/system/matrix/matrix.toml from the outcomes of `make test-matrix`: `python tools/matrix.py FOLDER`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+RECORD = Path(__file__).parents[1] / "tests" / "system" / "matrix" / "matrix.toml"
+HEAD = "# By job and instrument: done, or why `afspm check` refuses it. Written by `make test-matrix`.\n"
+
+
+def main(folder: Path) -> None:
+    outcomes: dict[str, dict[str, str]] = {}
+    for file in sorted(folder.glob("*.json")):
+        job, instrument, outcome = json.loads(file.read_text(encoding="utf-8"))
+        outcomes.setdefault(job, {})[instrument] = outcome
+    tables = (
+        f"\n[{job}]\n" + "".join(f"{instrument} = {json.dumps(outcome)}\n" for instrument, outcome in of_job.items())
+        for job, of_job in outcomes.items()
+    )
+    RECORD.write_text(HEAD + "".join(tables), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
