@@ -159,7 +159,7 @@ dev: $(DEV)
 messages: $(TEST)
 	@echo "The message classes are up to date: src/afspm/wire/generated"
 
-## style, spelling, types, which package imports which, and the workflows
+## style, spelling, types, which package imports which, the workflows, and the answers of drivers to the quality scale
 check: $(DEV)
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
@@ -167,6 +167,7 @@ check: $(DEV)
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
 	@$(BIN)/zizmor --quiet --no-progress --offline --strict-collection --persona pedantic .github
+	@$(BIN)/python tools/quality.py
 
 ## speed, beside bare pyzmq and beside the last landed run: a table, and build/bench.json. LAND=1 lands this run's ratios
 bench: $(TEST)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import python_api
+import quality
 import state_diagram
 
 from afspm import Component, wire
@@ -332,6 +333,8 @@ PARTS: dict[str, Callable[[], str]] = {
     "instruments": instruments,
     "controllers": controllers,
     "channels": channels,
+    "quality": quality.scale_tables,
+    "quality-rules": quality.rules_table,
     "components": component_pages,
     "simulator": simulator_page,
     "python-api": python_api.python_api,

@@ -164,7 +164,7 @@ def faults(listed: Mapping[str, Any], files: list[str], found: list[str], versio
         re.sub(rf"^{re.escape(source)}(?=/|$)", target, name)
         for source, target in listed["folders"].items()
         for name in files
-        if name == source or name.startswith(f"{source}/")
+        if (name == source or name.startswith(f"{source}/")) and PurePosixPath(name).name not in listed["left_out"]
     }
     protos = [PurePosixPath(name).stem for name in files if name.startswith("proto/") and name.endswith(".proto")]
     for folder, names in listed["made"].items():

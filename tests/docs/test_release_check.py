@@ -15,10 +15,11 @@ ROOT = Path(__file__).parents[2]
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 LISTED: dict[str, Any] = {
     "suffixes": [".py", ".pyi"],
+    "left_out": ["quality.toml"],
     "folders": {"src/lab": "lab", "proto": "lab/proto", "LICENSE": "LICENSE"},
     "made": {"lab/generated": ["{proto}_pb2.py"], "lab-{version}.dist-info": ["RECORD"]},
 }
-TRACKED = ["src/lab/a.py", "src/laboratory/b.py", "LICENSE", "tests/test_a.py"]
+TRACKED = ["src/lab/a.py", "src/lab/quality.toml", "src/laboratory/b.py", "LICENSE", "tests/test_a.py"]
 WHOLE = ["lab/a.py", "LICENSE", "lab-1.0.dist-info/RECORD"]
 
 
@@ -34,12 +35,13 @@ def test_whole_distribution_has_no_fault(tool: ModuleType) -> None:
 
 
 def test_missing_foreign_and_doubled_files_are_faults(tool: ModuleType) -> None:
-    found = ["lab/a.py", "lab/a.py", "LICENSE", "lab/__pycache__/a.pyc", "build/site/index.html"]
+    found = ["lab/a.py", "lab/a.py", "lab/quality.toml", "LICENSE", "lab/__pycache__/a.pyc", "build/site/index.html"]
     listed = {**LISTED, "suffixes": [".py", ""]}
     assert list(tool.faults(listed, TRACKED, found, "1.0")) == [
         "missing: lab-1.0.dist-info/RECORD",
         "not in the list: build/site/index.html",
         "not in the list: lab/__pycache__/a.pyc",
+        "not in the list: lab/quality.toml",
         "2 times: lab/a.py",
     ]
 

@@ -21,6 +21,8 @@ from afspm.basics.launch import Launch, Sockets
 from afspm.plugins.asylum import Asylum
 from afspm.plugins.gxsm import Gxsm
 from afspm.plugins.nanonis import Nanonis
+from afspm.plugins.nanosurf import Nanosurf
+from afspm.plugins.park import Park
 from afspm.simulation.simulator import Simulator
 from afspm.translator import controller_lock
 from afspm.translator.controller_lock import ControllerTaken, commanding
@@ -151,6 +153,8 @@ def test_each_driver_has_the_address_of_its_controller_and_a_simulated_one_has_n
     assert Asylum(address="tcp://lab:5555").controller_at == "tcp://lab:5555"
     assert Nanonis(address="lab:6501,6502").controller_at == "lab:6501,6502"
     assert Gxsm(address="lab:65431").controller_at == "lab:65431"
+    assert Nanosurf(address="lab:33030").controller_at == "lab:33030"
+    assert Park(address="tcp://lab:5581").controller_at == "tcp://lab:5581"
     assert Simulator().controller_at == ""
     with commanding("", "a"), commanding("", "b"):
         assert not list(tmp_path.iterdir())
