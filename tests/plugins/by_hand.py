@@ -58,6 +58,16 @@ def act_all(peer: Peer, *actions: tuple[str, ScopeState]) -> None:
         peer.until(state)
 
 
+def act_all_to_their_end(peer: Peer, *actions: tuple[str, ScopeState]) -> list[Any]:
+    """Ask for actions, each after the end of the one before; return the packets of the last."""
+    received: list[Any] = []
+    for action, state in actions:
+        response = peer.act_once_free(action)
+        assert response.ok, (action, response.reason)
+        received = peer.until(state) + peer.until(ScopeState.FREE)
+    return received
+
+
 def slow_scan(made: VendorBench[Any], speed_m_s: float = 1e-10, **settings: Any) -> Peer:
     """Start a translator and a scan that takes longer than any test."""
     peer = small(made, **settings)

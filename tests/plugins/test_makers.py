@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.plugins.by_hand import acts
 from tests.plugins.vendor_bench import TURNED, VendorBench, benches, ready, scanned, scans, small, states
 
-from afspm.model import ControlResponse, ScopeState, names
+from afspm.model import ControlResponse, PanelAct, ScopeState, names
 
 FREE = ScopeState.FREE
 Make = Callable[..., VendorBench[Any]]
@@ -151,6 +152,7 @@ def test_scan_from_the_panel_is_published(maker: Maker, bench: Make) -> None:
     made.at_panel(lambda emulator: maker.start(emulator, made.clock.now_s()))
     received = peer.until(FREE)
     assert states(received) == ["SCANNING", "FREE"]
+    assert acts(received) == [PanelAct.SCAN]
     assert scans(received)
     for region in {scan.region for scan in scans(received)}:  # Nanonis has a float32 of each length
         assert (*region.center_m, *region.size_m) == pytest.approx((*TURNED.center_m, *TURNED.size_m), rel=1e-6)

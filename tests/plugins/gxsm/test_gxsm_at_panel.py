@@ -6,11 +6,11 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from tests.plugins.by_hand import acts
+from tests.plugins.by_hand import act_all, acts, set_all
 from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_until_line, until
 from tests.plugins.vendor_bench import Peer, ready, scanned, scans, states
 
-from afspm.model import ActByHand, PanelAct, Region, ScopeState, ScopeStatus, names
+from afspm.model import ActByHand, ControlRequest, PanelAct, ProbePosition, Region, ScopeState, ScopeStatus, names
 
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE
@@ -257,3 +257,28 @@ def test_scan_begun_at_the_panel_is_by_hand_and_published(bench: Make) -> None:
     received += peer.until(FREE)
     assert acts(received) == [PanelAct.SCAN]
     assert scans(received)
+
+
+def test_own_requests_are_no_acts_by_hand(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    values = {
+        names.TIP_BIAS_VOLTAGE: 0.2,
+        names.SCAN_SPEED: 3e-6,
+        names.ZCTRL_IGAIN: 20.0,
+        names.ZCTRL_SETPOINT: 0.75e-9,
+        names.SCAN_ANGLE: 12.3456789,
+        names.SCAN_SIZE_X: 7.654321e-7,
+    }
+    set_all(peer, values)
+    assert peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((100e-9, 0.0))).ok
+    act_all(
+        peer,
+        (names.START_SCAN, ScopeState.SCANNING),
+        (names.START_SPEC, ScopeState.SPEC),
+        (names.PULSE, ScopeState.BUSY_PARAM),
+        (names.START_SCAN, ScopeState.SCANNING),
+    )
+    assert scans(peer.until(FREE))
+    made.kill()
+    assert "by hand" not in made.log_text()

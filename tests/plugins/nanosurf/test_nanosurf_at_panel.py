@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 from deadlines import DEADLINE_S
-from tests.plugins.by_hand import acts
+from tests.plugins.by_hand import act_all_to_their_end, acts, set_all
 from tests.plugins.nanosurf.nanosurf_bench import Bench
-from tests.plugins.vendor_bench import TURNED, Peer, ready, scans, small, states
+from tests.plugins.vendor_bench import TURNED, Peer, moved, ready, scans, small, states
 
 from afspm.model import ActByHand, PanelAct, Region, Scan, ScopeState, names
 from afspm.plugins.nanosurf.activity import NanosurfFiles
@@ -231,3 +231,28 @@ def test_scan_begun_at_the_panel_is_by_hand_and_published(bench: Make) -> None:
     received = peer.until(FREE)
     assert acts(received) == [PanelAct.SCAN]
     assert scans(received)
+
+
+def test_own_requests_are_no_acts_by_hand(bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    values = {
+        names.ZCTRL_IGAIN: 1500.0,
+        names.ZCTRL_SETPOINT: 0.65,
+        names.SCAN_SPEED: 3e-6,
+        names.SCAN_ANGLE: 12.3456789,
+        names.SCAN_SIZE_X: 7.654321e-7,
+    }
+    set_all(peer, values)
+    moved(peer, 100e-9, 0.0)
+    received = act_all_to_their_end(
+        peer,
+        (names.START_SCAN, ScopeState.SCANNING),
+        (names.START_SPEC, ScopeState.SPEC),
+        (names.RETRACT, ScopeState.COARSE_MOTOR),
+        (names.ENGAGE, ScopeState.COARSE_MOTOR),
+        (names.START_SCAN, ScopeState.SCANNING),
+    )
+    assert scans(received)
+    made.kill()
+    assert "by hand" not in made.log_text()

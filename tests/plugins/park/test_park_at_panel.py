@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import pytest
 from tests.plugins.by_hand import (
+    act_all_to_their_end,
     acts,
     require_no_result_of_a_moved_frame,
     require_spoiled_by,
@@ -140,17 +141,14 @@ def test_own_requests_are_no_acts_by_hand(bench: Make) -> None:
     }
     set_all(peer, values)
     moved(peer, 100e-9, 0.0)
-    received: list[Any] = []
-    for action, state in (
+    received = act_all_to_their_end(
+        peer,
         (names.START_SCAN, ScopeState.SCANNING),
         (names.START_SPEC, ScopeState.SPEC),
         (names.RETRACT, ScopeState.COARSE_MOTOR),
         (names.ENGAGE, ScopeState.COARSE_MOTOR),
         (names.START_SCAN, ScopeState.SCANNING),
-    ):
-        response = peer.act_once_free(action)
-        assert response.ok, (action, response.reason)
-        received = peer.until(state) + peer.until(FREE)
+    )
     assert scans(received)
     made.kill()
     assert "by hand" not in made.log_text()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from tests.plugins.park.park_bench import Bench
-from tests.plugins.vendor_bench import FLAT, SOON, left_in_danger, moved, ready, scanned, scans, small, states
+from tests.plugins.vendor_bench import FLAT, SOON, TURNED, left_in_danger, moved, ready, scanned, scans, small, states
 
 from afspm.basics.errors import InvalidValue
 from afspm.model import ControlResponse, Region, ScopeState, Spectrum, names
@@ -89,6 +89,18 @@ def test_restarted_translator_awaits_the_end_of_an_approach(bench: Make, replies
     busy: list[bool] = []
     made.at_panel(lambda emulator: busy.append(emulator.rig.busy(emulator.clock.now_s())))
     assert busy == [False]
+
+
+def test_scan_that_outlives_the_translator_is_published_by_the_next(bench: Make) -> None:
+    made = bench(speed=5.0)
+    peer = made.start()
+    ready(peer, shape=(64, 32))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.kill()
+    received = made.start().until(FREE)
+    assert "SCANNING" in states(received)
+    assert {(scan.region, scan.shape) for scan in scans(received)} == {(TURNED, (64, 32))}
 
 
 def test_withdrawing_ends_a_scan_and_lifts_the_stage(bench: Make) -> None:
