@@ -273,6 +273,39 @@ def test_settings_missing_in_the_published_file_keep_their_defaults(write: Write
     assert "drift" not in published(write, plain, PICTURE, SERIES).resolved.processes["mediator"].settings
 
 
+def test_the_drift_scheduler_has_its_equivalent_under_its_first_name(write: Write) -> None:
+    first = DRIFT.replace("drift.mediator.DriftCompensatedMediator", "drift.scheduler.CSCorrectedScheduler")
+    mediator = published(write, first, PICTURE, SERIES).resolved.processes["mediator"]
+    assert mediator.class_path.rpartition(".")[2] == "DriftCompensatedScheduler"
+    assert mediator.settings == published(write, DRIFT, PICTURE, SERIES).resolved.processes["mediator"].settings
+
+
+@pytest.mark.parametrize("line", ["intersection_ratio = 0.8", "correction_history_length = 5"])
+def test_setting_of_the_first_drift_scheduler_alone_is_refused(write: Write, line: str) -> None:
+    first = DRIFT.replace("drift.mediator.DriftCompensatedMediator", "drift.scheduler.CSCorrectedScheduler")
+    experiment = published(write, first.replace("display_fit = false", line), PICTURE, SERIES)
+    (error,) = errors(experiment)
+    assert (error.place.line, error.what) == (line_of(experiment, line), f"[mediator] {line}: this is not taken over")
+
+
+@pytest.mark.parametrize(
+    ("added", "surface"), [("", "particles"), ('surface = "steps"', "steps")], ids=["left out", "written"]
+)
+def test_a_drifting_picture_without_a_file_is_a_surface_with_features_in_both_directions(
+    write: Write, added: str, surface: str
+) -> None:
+    drifting = PICTURE.replace(
+        '"afspm.components.microscope.translators.image.translator.ImageTranslator"',
+        f'"translator.DriftImageTranslator"\n{added}',
+    )
+    experiment = published(write, MEDIATOR, drifting, SERIES)
+    assert errors(experiment) == []
+    assert experiment.resolved.processes["translator"].settings["surface"] == surface
+    known = {line: became for _, line, became in explained(experiment.resolved)}
+    assert ('surface = "particles"' in known["[translator] class"]) is not added
+    assert f'surface = "{surface}"' in short(experiment.resolved)
+
+
 @pytest.mark.parametrize(
     ("name", "settings", "ours", "expected"),
     [

@@ -66,11 +66,13 @@ class PublishedClass:
         ours: name of afspm's class.
         settings: settings that change, by their published names; all others are kept.
         why: a remark on the counterpart, for the explanation of the file.
+        defaults: settings that the file may override, where afspm's own defaults do not fit.
     """
 
     ours: str
     settings: Mapping[str, PublishedSetting] = field(default_factory=dict)
     why: str = ""
+    defaults: Mapping[str, object] = field(default_factory=dict)
 
 
 def wire_of(table: object) -> str:
@@ -187,9 +189,10 @@ def class_of(table: Table) -> PublishedClass | None:
     if name in _PICTURES:
         if "img_path" in table:
             return PublishedClass("ImageMicroscope", _EVERY | _PICTURE)
-        return PublishedClass(
-            "Simulator", _EVERY | _PICTURE, "a picture of yours is shown by ImageMicroscope with `file`"
-        )
+        # the steps of the default surface look alike along their edges: drift could be measured across them only
+        defaults = {"surface": "particles"} if name == "DriftImageTranslator" else {}
+        why = "a picture of yours is shown by ImageMicroscope with `file`"
+        return PublishedClass("Simulator", _EVERY | _PICTURE, why, defaults)
     return CLASSES.get(name)
 
 
@@ -359,6 +362,11 @@ _DRIFT: Final[dict[str, PublishedSetting]] = {
     **_gone("the component DriftTable writes drift_correction.csv into the folder of the run", "csv_attribs"),
     **_gone("the dashboard shows drift, and the component DriftPictures draws it", "display_fit"),
 }
+# its settings until 27 May 2025, before it had those of its successor
+_EARLY_DRIFT: Final[dict[str, PublishedSetting]] = {
+    "intersection_ratio": _refused("min_intersection_ratio is the least overlap of a pair of scans"),
+    "correction_history_length": _refused("drift.tracker has settings of its own"),
+}
 _RESCANNER: Final = {
     **_gone("a rescan is asked for as soon as the microscope is free", "rerun_wait_s"),
     **_gone("it listens to what the scheduler publishes", "scan_params_id", "control_state_id", "scope_state_id"),
@@ -375,6 +383,7 @@ CLASSES: Final[dict[str, PublishedClass]] = {
     "MicroscopeScheduler": PublishedClass("Scheduler", _EVERY),
     "DriftCompensatedMediator": PublishedClass("DriftCompensatedScheduler", _EVERY | _DRIFT),
     "DriftCompensatedScheduler": PublishedClass("DriftCompensatedScheduler", _EVERY | _DRIFT),
+    "CSCorrectedScheduler": PublishedClass("DriftCompensatedScheduler", _EVERY | _DRIFT | _EARLY_DRIFT),
     "DriftRescanner": PublishedClass("Rescanner", _EVERY | _RESCANNER),
     "ScanMetadataWriter": PublishedClass(
         "Metadata", _EVERY | _gone("metadata.csv is in the run's folder", "csv_attribs")
@@ -477,8 +486,10 @@ class _Conversion:
                 if became.startswith('class = "Dashboard"'):
                     self.parts.became[here] = f"the dashboard, [{other[0]}], shows this too"
                     return None
-        self.parts.became[here] = f'class = "{ours.ours}"{ours.why and "; "}{ours.why}'
-        settings = {key: value for key, value in table.items() if key not in ours.settings or key in WIRE_KEYS}
+        added = {key: value for key, value in ours.defaults.items() if key not in table}
+        became = ", ".join(f"{key} = {toml(value)}" for key, value in {"class": ours.ours, **added}.items())
+        self.parts.became[here] = f"{became}{ours.why and '; '}{ours.why}"
+        settings = {key: value for key, value in table.items() if key not in ours.settings or key in WIRE_KEYS} | added
         for key in filter(ours.settings.__contains__, table):
             self._put(settings, ours.settings[key], (name, key), {**table, **_wires_of(written)})
         return {**settings, "class": ours.ours}
