@@ -46,7 +46,7 @@ def check(
     experiment = load(*files)
     findings = experiment.check()
     console = Console(stderr=expanded or explain, highlight=False)
-    if explain:
+    if explain and experiment.is_readable:
         _explain(experiment, console)
     show(findings, console)
     if expanded:

@@ -32,6 +32,7 @@ class Experiment:
 
     def __init__(self, document: documents.Document) -> None:
         self._document = document
+        self._unreadable = () if document.is_whole else tuple(document.findings.found)
         self.parts = sorting.sort(document, forms.all_forms())
 
     @property
@@ -82,6 +83,8 @@ class Experiment:
     def check(self, only: Collection[str] = (), without: Collection[str] = ()) -> list[Finding]:
         """Return all errors and warnings: errors first, then by file and line. No process is started.
 
+        If a file can't be read, only that is returned: the other files may use names that it defines.
+
         Args:
             only, without: as for `launches`; classes of processes started elsewhere need not be installed here.
 
@@ -90,6 +93,8 @@ class Experiment:
         """
         from afspm.experiment.structure_checks import shared_files
 
+        if self._unreadable:
+            return Findings(list(self._unreadable)).ordered()
         chosen = process_starts.chosen_names(self.resolved, only, without)
         missing = process_starts.not_installed(self.resolved, chosen)
         return Findings([*self._document.findings.found, *missing, *shared_files(self.resolved, chosen)]).ordered()

@@ -306,6 +306,22 @@ def test_a_drifting_picture_without_a_file_is_a_surface_with_features_in_both_di
     assert f'surface = "{surface}"' in short(experiment.resolved)
 
 
+@pytest.mark.parametrize("broken", [0, 1], ids=["base", "overlay"])
+def test_nothing_follows_from_a_file_that_is_not_toml(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: int
+) -> None:
+    texts = [WIRING + MEDIATOR + SERIES, PICTURE + SHOWN.replace("list_keys", "lst_keys")]
+    texts[broken] += "again = 1\nagain = 2\n"
+    for name, text in zip(("base.toml", "overlay.toml"), texts, strict=True):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    files = tmp_path / "base.toml", tmp_path / "overlay.toml"
+    (finding,) = load(*files).check(only=["no such component"])
+    assert (finding.what[:14], finding.place.file) == ("not valid TOML", str(files[broken]))
+    done = CliRunner().invoke(app, ["check", "--explain", *map(str, files)])
+    assert (done.exit_code, done.stdout) == (1, "")
+    assert done.stderr.count("error: ") == 1
+
+
 @pytest.mark.parametrize(
     ("name", "settings", "ours", "expected"),
     [
