@@ -17,6 +17,7 @@ from afspm.experiment import class_loader, settings
 from afspm.experiment.findings import Finding, Level, closest, nearest
 from afspm.experiment.implied_parts import NO_PROGRAM, RECORDS, check_notify, is_program
 from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
+from afspm.experiment.toml_lines import Settings
 from afspm.experiment.wiring_classes import WIRE_SETTINGS, BoundSocket, wire_of
 from afspm.model import Role, component_of, is_process_name
 from afspm.model.events import LONGEST_PROCESS_NAME, PERSON
@@ -25,6 +26,10 @@ from afspm.wire.messages import SCAN_LINES
 
 OPENS_PLAIN: Final = "opens_plain"
 """Class attribute that marks a component through which programs without keys can send requests."""
+MICROSCOPE_ELSEWHERE: Final = "microscope_elsewhere"
+"""Class attribute of a scheduler that commands no translator of the file: advice for a file that has one."""
+LENDS_MICROSCOPE: Final = "lends_microscope"
+"""Static method of a component: returns whether, with given settings, it acts as a microscope for other schedulers."""
 FILE_SUFFIX: Final = "file_suffix"
 """Class attribute of a component that writes a file into the run folder: `file` of its settings, and this suffix."""
 _OF_EACH_RUN = ("experiment.toml", "journal.sqlite", "log.txt", "report.html", "run.json")
@@ -50,7 +55,18 @@ def check(resolved: ResolvedExperiment) -> None:
 
 
 def _is_complete(resolved: ResolvedExperiment) -> bool:
-    return _all_loaded(resolved) and all(resolved.with_role(role) for role in _MISSING)
+    return _all_loaded(resolved) and all(resolved.with_role(role) for role in _required(resolved))
+
+
+def _required(resolved: ResolvedExperiment) -> dict[Role, str]:
+    return {Role.SCHEDULER: _MISSING[Role.SCHEDULER]} if _microscope_elsewhere(resolved) else _MISSING
+
+
+def _microscope_elsewhere(resolved: ResolvedExperiment) -> dict[str, str]:
+    # advice by scheduler
+    schedulers = resolved.with_role(Role.SCHEDULER)
+    advice = {scheduler.name: getattr(scheduler.component, MICROSCOPE_ELSEWHERE, "") for scheduler in schedulers}
+    return {name: text for name, text in advice.items() if text}
 
 
 def _all_loaded(resolved: ResolvedExperiment) -> bool:
@@ -60,8 +76,8 @@ def _all_loaded(resolved: ResolvedExperiment) -> bool:
 
 
 def check_roles(resolved: ResolvedExperiment) -> None:
-    """Require one scheduler, one translator, and names that differ by more than case."""
-    for role, hint in _MISSING.items():
+    """Require one scheduler, one translator (if the scheduler needs one), and names that differ by more than case."""
+    for role, hint in _required(resolved).items():
         having = resolved.with_role(role)
         if not having and (name := _not_a_component(resolved, role)):
             resolved.document.error(f"there is no {role.value}", name, hint=f"[{name}] needs `component = true`")
@@ -292,9 +308,27 @@ def check_controller(resolved: ResolvedExperiment) -> None:
             resolved.document.warning(what, translator.name, ADDRESS, hint=hint)
 
 
+def check_microscope_elsewhere(resolved: ResolvedExperiment) -> None:
+    """Refuse a translator that no scheduler commands, and a scheduler whose microscope would be this experiment."""
+    for scheduler, advice in _microscope_elsewhere(resolved).items():
+        lending = [name for name, process in resolved.processes.items() if _lends_microscope(process)]
+        for name in lending:
+            what = f"[{name}] acts as the microscope of the scheduler that [{scheduler}] asks: nothing is measured"
+            resolved.document.error(what, name, hint=advice)
+        for translator in resolved.with_role(Role.TRANSLATOR) if not lending else ():
+            what = f"[{translator.name}] is never asked: [{scheduler}] passes all requests on to another scheduler"
+            resolved.document.error(what, translator.name, hint=advice)
+
+
+def _lends_microscope(process: ResolvedProcess) -> bool:
+    lends: Callable[[Settings], bool] | None = getattr(process.component, LENDS_MICROSCOPE, None)
+    return lends is not None and lends(process.settings)
+
+
 def check_clock(resolved: ResolvedExperiment) -> None:
     """Refuse simulated time if the microscope is not simulated."""
-    if not resolved.with_role(Role.TRANSLATOR) or resolved.simulated:
+    has_microscope = bool(resolved.with_role(Role.TRANSLATOR)) or bool(_microscope_elsewhere(resolved))
+    if not has_microscope or resolved.simulated:
         return
     if (speed := resolved.sections.clock.speed) != 1.0:
         hint = "a real microscope has real time: remove it, or set it to 1 in the file for this microscope"
@@ -439,6 +473,7 @@ ALWAYS: Final[tuple[Check, ...]] = (
     check_intermediaries,
     check_self_subscription,
     check_controller,
+    check_microscope_elsewhere,
     check_clock,
     check_names_of_people,
     check_likely_typos,

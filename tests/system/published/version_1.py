@@ -200,3 +200,72 @@ class Router:
         elif number < REQUEST or number == LAST:
             return [b"\0"] if name == self.holder else [b"\6"]
         return [b"\0"]
+
+
+class Mediator(Router):
+    """A scheduler with a cache: it asks a translator for the client in control, until a client ends the experiment.
+
+    Args:
+        socket: makes a socket of a type.
+    """
+
+    def __init__(self, socket: Callable[[int], Any], server: str, source: str) -> None:
+        super().__init__(socket(zmq.ROUTER))
+        self._publisher, self._translator, self._packets = socket(zmq.XPUB), socket(zmq.REQ), socket(zmq.SUB)
+        self.published = f"tcp://127.0.0.1:{self._publisher.bind_to_random_port('tcp://127.0.0.1')}"
+        self._translator.connect(server)
+        self._packets.setsockopt(zmq.SUBSCRIBE, b"")
+        self._packets.connect(source)
+        self._cache: dict[bytes, list[bytes]] = {}
+        self._newest_ns = 0
+        self.ended = False
+
+    def wait(self, timeout_ms: int) -> None:
+        """Wait for a message, at most for a time."""
+        poller = zmq.Poller()
+        for socket in (self._socket, self._packets, self._publisher):
+            poller.register(socket, zmq.POLLIN)
+        poller.poll(timeout_ms)
+
+    def pump(self) -> None:
+        super().pump()
+        while self._packets.poll(0):
+            self._take(self._packets.recv_multipart())
+        while self._publisher.poll(0):
+            subscription = self._publisher.recv()
+            for frames in self._cache.values() if subscription[:1] == b"\1" else ():
+                if frames[0].startswith(subscription[1:]):
+                    self._publisher.send_multipart(frames)
+
+    def _take(self, frames: list[bytes]) -> None:
+        name = frames[0].decode()
+        if name not in MESSAGES or len(frames) != 3:
+            raise Ended(f"no packet of version 1 by a translator: {name!r} of {len(frames)} frames")
+        message = MESSAGES[name].FromString(frames[1])
+        if isinstance(message, scan_pb2.Scan2d):
+            frames[0] = f"Scan2d_{message.params.spatial.roi.size.x}_{message.channel}".encode()
+        self._newest_ns = max(self._newest_ns, Timestamp.FromString(frames[2]).ToNanoseconds())
+        self._publish(frames)
+
+    def _publish(self, frames: list[bytes]) -> None:
+        self._cache[frames[0]] = frames
+        self._publisher.send_multipart(frames)
+
+    def _answer(self, name: bytes, number: int, thing: list[bytes]) -> list[bytes]:
+        if number == END:
+            self._publisher.send(b"KILL")
+            self.ended = True
+            return [b"\0"]
+        if number == RELEASE:
+            self.holder = b""
+        answer = super()._answer(name, number, thing)
+        if answer == [b"\0"] and (number < REQUEST or number == LAST):
+            self._translator.send_multipart([bytes([number]), *thing])
+            answer = self._translator.recv_multipart()
+        problems: Any = self.problems
+        state = control_pb2.ControlState(client_in_control_id=self.holder.decode(), problems_set=problems)
+        stamp = Timestamp()
+        self._newest_ns += 1000
+        stamp.FromNanoseconds(self._newest_ns)
+        self._publish([b"ControlState", state.SerializeToString(), stamp.SerializeToString()])
+        return answer

@@ -31,6 +31,7 @@ from afspm.wire.messages import CONTROL_STATE, SCOPE_STATE
 
 if TYPE_CHECKING:
     from afspm.basics.clock import Clock
+    from afspm.experiment.toml_lines import Settings
     from afspm.transport.process.context import ProcessContext
 
 SETTLED_S: Final = 0.05
@@ -63,6 +64,11 @@ class PublishedPeers:
     def __init__(self, serve: str, publish: str, *, as_translator: bool = False) -> None:
         self._serve, self._publish = serve, publish
         self._as_translator = as_translator
+
+    @staticmethod
+    def lends_microscope(settings: Settings) -> bool:
+        """Return whether these settings make this experiment the microscope of a published scheduler."""
+        return settings.get("as_translator") is True
 
     def run_process(self, context: ProcessContext) -> int:
         """Run until the experiment ends or the parent is gone."""

@@ -47,6 +47,12 @@ class PublishedScheduler:
     """
 
     role: ClassVar[Role] = Role.SCHEDULER
+    microscope_elsewhere: ClassVar[str] = (
+        "leave it out here; afspm's microscope serves the published scheduler from an experiment of its own, with "
+        "Scheduler and PublishedPeers (as_translator = true), since its own ports are encrypted: "
+        "see docs/how-to/under-a-published-mediator.md"
+    )
+    """Advice for an experiment file that has a microscope beside this scheduler."""
 
     def __init__(
         self,
