@@ -36,6 +36,8 @@ MOST_ANSWERS: Final = 256
 class PublishedScheduler:
     """An afspm scheduler that passes requests on to a scheduler of the published implementation.
 
+    The microscope belongs to the published scheduler: the experiment file has no translator.
+
     Args:
         serve: address of the published scheduler's router.
         publish: address of the published scheduler's publisher.
