@@ -89,9 +89,6 @@ class Component:
     needs_parameters: tuple[str, ...] = ()
     """Parameters that the microscope must have, for `afspm check`; they may depend on the settings of an instance."""
 
-    needs_lines: ClassVar[bool] = False
-    """Whether the microscope must publish lines of running scans."""
-
     longest_step_s: ClassVar[float] = 30.0
     period_s: float | None = None
     period_time: Literal["experiment", "real"] = "experiment"

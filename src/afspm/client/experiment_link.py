@@ -24,6 +24,7 @@ from afspm.model import (
     ControlRequest,
     ControlState,
     Feedback,
+    FeedbackUnits,
     Packet,
     ProbePosition,
     RelayedMessage,
@@ -66,6 +67,7 @@ class PublishedState:
         self.tip: TipStatus | None = None
         self.by_hand: ActByHand | None = None
         self.channels = ChannelRoles()
+        self.feedback_units = FeedbackUnits()
         self.newest_ns: int | None = None
         self._published: Counter[str] = Counter()
 

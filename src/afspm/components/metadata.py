@@ -20,6 +20,7 @@ from afspm.model import (
     ControlResponse,
     ControlState,
     Feedback,
+    FeedbackUnits,
     JournalEntries,
     JournalEntry,
     Note,
@@ -51,8 +52,8 @@ class Metadata(Component):
     The last columns are the bias and the setpoint of the feedback when the measurement began. The bias is not
     published: its column has the last requested value. It is empty before the first request and for a measurement
     begun at the controller. MANUAL mode, a lost controller or a restart of the scheduler empties it until the next
-    request. The setpoint is published without a unit: `setpoint_units` is empty until a request sets the parameter
-    `zctrl-setpoint` with a unit.
+    request. `setpoint_units` is the unit that the translator publishes beside the setpoint, or of the last request for
+    `zctrl-setpoint` with a unit; else empty.
 
     The file has one header, and each row exactly once, even if processes are killed.
 
@@ -61,7 +62,8 @@ class Metadata(Component):
     """
 
     listens: ClassVar = (
-        "Scan2d", "Spec1d", "ControlState", "ScopeStateMsg", "Note", "ZCtrlParameters", "JournalEntries",
+        "Scan2d", "Spec1d", "ControlState", "ScopeStateMsg", "Note", "ZCtrlParameters", "ZCtrlUnits",
+        "JournalEntries",
     )  # fmt: skip
 
     file_suffix: ClassVar[str] = ""
@@ -116,6 +118,10 @@ class Metadata(Component):
 
     def on_feedback(self, feedback: Feedback) -> None:
         self._feedback = feedback
+
+    def on_feedback_units(self, units: FeedbackUnits) -> None:
+        if units.setpoint:
+            self.memory["setpoint_units"] = units.setpoint
 
     def on_message(self, envelope: str, message: object) -> None:
         if isinstance(message, JournalEntries) and message.entries:

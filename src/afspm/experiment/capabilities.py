@@ -23,7 +23,6 @@ class MicroscopeCapabilities:
         sets: parameters that an action of the experiment file sets, by the action's name.
         table: the microscope's parameter table.
         channels: the channels that the microscope may have, by their roles.
-        lines: whether it publishes lines of running scans.
     """
 
     actions: frozenset[str]
@@ -31,7 +30,6 @@ class MicroscopeCapabilities:
     sets: Mapping[str, tuple[Parameter, ...]]
     table: ParameterTable
     channels: ChannelRoles
-    lines: bool
 
     def refuses(self, parameter: Parameter) -> str:
         """Return the reason of the microscope to refuse a value; empty for a valid value or an unknown parameter."""
@@ -60,8 +58,7 @@ def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None
     except (AfspmError, AttributeError):
         return None  # the check of its settings reports the error in the table
     units = {name: table[name].si_unit for name in table}
-    lines = microscope.publishes_lines(settings)
-    return MicroscopeCapabilities(frozenset(actions), units, sets, table, channels, lines)
+    return MicroscopeCapabilities(frozenset(actions), units, sets, table, channels)
 
 
 def _set_by(action: object, table: ParameterTable) -> tuple[Parameter, ...]:

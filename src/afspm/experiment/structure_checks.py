@@ -403,10 +403,6 @@ def check_needs(resolved: ResolvedExperiment) -> None:
             continue
         for name, process in resolved.processes.items():
             declared = process.declared
-            if getattr(process.component, "needs_lines", False) and not has.lines:
-                what = f"[{name}] needs lines of running scans, which [{translator.name}] does not publish"
-                hint = f'with live_lines_s = "2 s" in [{translator.name}] it may publish them'
-                resolved.document.error(what, name, hint=hint)
             for kind, needed, offered in (
                 ("action", declared.needs_actions, has.actions),
                 ("parameter", declared.needs_parameters, has.parameters),

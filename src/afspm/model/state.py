@@ -64,6 +64,15 @@ class Feedback:
 
 
 @dataclass(frozen=True)
+class FeedbackUnits:
+    """The units of the numbers of a `Feedback`; empty: without a unit, or not known."""
+
+    proportional_gain: str = ""
+    integral_gain: str = ""
+    setpoint: str = ""
+
+
+@dataclass(frozen=True)
 class ProbePosition:
     """The position of the probe between scans: (x, y) in m.
 

@@ -289,12 +289,6 @@ class DriverBase(ABC):
         return cls.declared_channels(settings).changed(settings.get("channels") or {})
 
     @classmethod
-    def publishes_lines(cls, settings: PlainMapping) -> bool:
-        """Return whether lines of running scans are published with these settings."""
-        every_s = settings.get("live_lines_s")
-        return cls.lines is not DriverBase.lines and bool(cls.live_real_s if every_s is None else every_s)
-
-    @classmethod
     def introductions(cls) -> Callable[[str], Introduction] | None:
         """Return a factory of introductions by address, for the replay of a trace; None without a secret.
 

@@ -16,6 +16,7 @@ from afspm.model import (
     ActByHand,
     ChannelRoles,
     ControlRequest,
+    FeedbackUnits,
     MeasurementConditions,
     PanelAct,
     Request,
@@ -69,6 +70,7 @@ class Observer:
         self.panel = PanelWatch(state.kept, driver.table, driver.is_last_written)
         self._published_tip: TipStatus | None = None
         self._published_channels: ChannelRoles | None = None
+        self._published_units: FeedbackUnits | None = None
         self._began_with: TipStatus | None = None
         self._acts: list[ActByHand] = []
         self._others_told = False
@@ -263,6 +265,14 @@ class Observer:
             self._published_channels = channels
             self._port.publish(*wire.encode(channels), self._state.stamp()[0])
 
+    def _publish_units(self) -> None:
+        table = self._driver.table
+        gains_and_setpoint = (names.ZCTRL_PGAIN, names.ZCTRL_IGAIN, names.ZCTRL_SETPOINT)
+        units = FeedbackUnits(*(table[name].si_unit if name in table else "" for name in gains_and_setpoint))
+        if units not in (self._published_units, FeedbackUnits()):
+            self._published_units = units
+            self._port.publish(*wire.encode(units), self._state.stamp()[0])
+
     def _publish_tip(self) -> None:
         tip = self.panel.tip
         if tip not in (self._published_tip, TipStatus()):
@@ -314,8 +324,9 @@ class Observer:
         """Publish the present settings and the published state again, for a newly connected scheduler."""
         for thing in setting_groups.messages(self.values).values():
             self.publish(thing)
-        self._published_tip = self._published_channels = None
+        self._published_tip = self._published_channels = self._published_units = None
         self._publish_channels()
+        self._publish_units()
         self._publish_tip()
         published = self._state.sequence.published
         if published.state is not ScopeState.UNDEFINED:
@@ -343,6 +354,7 @@ class Observer:
         self._take_in(values)
         if announce or values != old:
             self._publish_channels()
+            self._publish_units()
             before = setting_groups.messages(old)
             for name, thing in setting_groups.messages(values).items():
                 if name in announce or before.get(name) != thing:

@@ -331,7 +331,15 @@ CHANNEL_ROLES = MessageMapping(
     ),
     others=FieldMapping("others", from_wire=tuple),
 )
+FEEDBACK_UNITS = MessageMapping(
+    model.FeedbackUnits,
+    feedback_pb2.ZCtrlUnits,
+    proportional_gain=FieldMapping("proportional_gain", sparse=True),
+    integral_gain=FieldMapping("integral_gain", sparse=True),
+    setpoint=FieldMapping("setpoint", sparse=True),
+)
 MAPPINGS: tuple[MessageMapping[Any], ...] = (
+    FEEDBACK_UNITS,
     CHANNEL_ROLES,
     TIP_STATUS,
     ACT_BY_HAND,

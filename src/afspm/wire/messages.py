@@ -185,6 +185,15 @@ FEEDBACK: Final = MessageDeclaration(
     event="feedback",
     in_past=True,
 )
+FEEDBACK_UNITS: Final = MessageDeclaration(
+    type=feedback_pb2.ZCtrlUnits,
+    kind=MessageKind.STATE,
+    source=Role.TRANSLATOR,
+    always=False,
+    handler="on_feedback_units",
+    attribute="feedback_units",
+    in_past=True,
+)
 PROBE_POSITION: Final = MessageDeclaration(
     type=ProbePosition,
     kind=MessageKind.STATE,

@@ -1,4 +1,4 @@
-"""Every shipped component and scheduler does one small job on every instrument, or the check refuses it before the run."""
+"""Every shipped component and scheduler does one small job on every instrument, or the check refuses the job."""
 
 from __future__ import annotations
 

@@ -11,6 +11,9 @@ from .conftest import FRAME, Write, errors, only_error
 SIMULATED = FRAME[: FRAME.index("[microscope]")] + '[microscope]\ncomponent = true\nclass = "Simulator"\n'
 SWAPPER = '[swapper]\ncomponent = true\nclass = "parts.Swapper"\n'
 SERIES = '[series]\ncomponent = true\nclass = "ScanSeries"\nsize = ["1 um", "1 um"]\nscans = 2\n'
+SOLVED = (
+    '[control]\nsolved_by_hand = ["tip-shape-changed", "feedback-non-optimal", "thermal-drift", "device-malfunction"]\n'
+)
 ADDED = """
 [microscope.parameters.x-drive]
 vendor = "probe-pos-x"
@@ -87,3 +90,40 @@ def test_by_default_a_survey_is_as_fine_as_its_zooms_need_up_to_a_limit(write: W
     assert warning.hint == '20 pixels are enough: zoom = "196 nm"'
     assert warning.place.line == 5
     assert not warnings(write(SURVEY.replace("500 nm", "196 nm"), frame=DRIFTING)), "its own cure"
+
+
+def test_channel_that_the_microscope_lacks_is_refused_with_its_list(write: Write) -> None:
+    picture = '[picture]\ncomponent = true\nclass = "NightPicture"\nchannel = "Hight"\n'
+    error = only_error(write(picture, frame=SIMULATED))
+    assert error.what == "[picture] channel: the microscope has no channel 'Hight'"
+    assert "height (Height); height, retrace (Height Retrace); current (Current)" in error.hint
+    named = SIMULATED + '[microscope.channels]\nother = "Hight"\n'
+    assert errors(write(picture, frame=named)) == []
+
+
+def test_role_that_only_another_mode_has_is_refused(write: Write) -> None:
+    analysis = '[analysis]\ncomponent = true\nclass = "FeedbackAnalysis"\n'
+    assert errors(write(analysis + SOLVED, frame=SIMULATED)) == []
+    error = only_error(write(analysis + SOLVED, frame=SIMULATED + '[microscope.feedback]\nmode = "current"\n'))
+    assert error.what == "[analysis] channel: the microscope has no role 'amplitude'"
+
+
+def test_channel_of_drift_is_compared_too(write: Write) -> None:
+    drifting = '[scheduler]\ncomponent = true\nclass = "DriftCompensatedScheduler"\ndrift = { channel = "Z" }\n'
+    error = only_error(write("", frame=drifting + SIMULATED[SIMULATED.index("[microscope]") :] + SOLVED))
+    assert error.what == "[scheduler] drift.channel: the microscope has no channel 'Z'"
+
+
+def test_wrong_role_in_the_file_is_an_error(write: Write) -> None:
+    error = only_error(write("", frame=SIMULATED + '[microscope.channels]\nhight = "Height"\n'))
+    assert "there is no role 'hight' of a channel" in error.what
+
+
+def test_component_that_needs_lines_needs_a_microscope_that_publishes_them(write: Write) -> None:
+    watch = (
+        '[line_watch]\ncomponent = true\nclass = "LineWatch"\n'
+        '[tip_classifier]\ncomponent = true\nclass = "TipClassifier"\n' + SOLVED
+    )
+    assert errors(write(watch, frame=SIMULATED)) == []
+    error = only_error(write(watch, frame=SIMULATED + "live_lines_s = 0.0\n"))
+    assert error.what == "[line_watch] subscribes to 'ScanLines', which no component publishes"

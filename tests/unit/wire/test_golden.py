@@ -36,6 +36,7 @@ AS_MODEL = {
     "Approvals",
     "Proposal",
     "TipStatus",
+    "ZCtrlUnits",
     "ChannelRoles",
     "ActByHand",
     "MeasurementConditions",

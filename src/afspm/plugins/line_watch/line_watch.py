@@ -141,7 +141,6 @@ class LineWatch(Component):
 
     flags: ClassVar = ("tip-shape-changed",)
     publishes: ClassVar = (tip_verdict.OF_LINES,)
-    needs_lines: ClassVar = True
     listens: ClassVar = (
         "ScanLines", "Scan2d", "ScopeStateMsg", "ControlState", "ZCtrlParameters", tip_verdict.MESSAGE,
     )  # fmt: skip

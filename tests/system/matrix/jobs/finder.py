@@ -1,6 +1,6 @@
 """Flags a problem once, after the second scan, as a person would who sees it."""
 
-from afspm import Component
+from afspm import Component, Scan
 
 
 class Finder(Component):
@@ -12,7 +12,7 @@ class Finder(Component):
     def __init__(self, problem: str) -> None:
         self.problem = problem
 
-    def on_scan(self, scan) -> None:
+    def on_scan(self, scan: Scan) -> None:
         times = {*self.memory.get("times", []), scan.time_ns}
         self.memory["times"] = sorted(times)
         if len(times) > 4 and not self.memory.get("flagged"):
