@@ -83,8 +83,9 @@ class ExperimentView:
 
     @property
     def channels(self) -> ChannelRoles:
-        """Return the microscope's channels by their roles; empty if it has declared none."""
-        self._catch_up()
+        """Return the microscope's channels by their roles, also after the end; empty if it has declared none."""
+        with suppress(ExperimentEnded):
+            self._catch_up()
         return self._link.view.channels
 
     @property

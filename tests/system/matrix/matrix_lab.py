@@ -48,6 +48,16 @@ def spectra(at_least: int) -> Proof:
     return proof
 
 
+def published(message: str) -> Proof:
+    """Return a proof: a message is in the record."""
+
+    def proof(run: AfspmRun) -> bool:
+        with afspm.open_run(run.folder) as record:
+            return next(record.packets(messages=(message,)), None) is not None
+
+    return proof
+
+
 def file(name: str) -> Proof:
     """Return a proof: the run has left a file."""
     return lambda run: any(run.folder.glob(name))
@@ -81,10 +91,10 @@ PROOFS: Mapping[str, Mapping[str, Proof]] = {
     },
     "curves": {"SpectroscopyGrid": spectra(2)},
     "adaptive": {"Adaptive": file("map.csv")},
-    "survey": {"Survey": file("survey.csv")},
+    "survey": {"Survey": file("targets.csv")},
     "lines": {"LineWatch": scans(4)},
     "feedback": {
-        "FeedbackAnalysis": said("analysis", "."),
+        "FeedbackAnalysis": published("FeedbackAnalysis"),
         "FeedbackTuner": said("tuner", "integral gain"),
     },
     "repair": {"TipCorrector": said("tip_corrector", "pulse|repaired|good")},

@@ -15,7 +15,7 @@ class Finder(Component):
     def on_scan(self, scan: Scan) -> None:
         times = {*self.memory.get("times", []), scan.time_ns}
         self.memory["times"] = sorted(times)
-        if len(times) > 4 and not self.memory.get("flagged"):
+        if len(times) >= 3 and not self.memory.get("flagged"):
             self.memory["flagged"] = True
             self.memory.save()
             self.scope.flag(self.problem)
