@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
+from afspm.basics.clock import NeverLate
 
 
-class FakeClock:
+class FakeClock(NeverLate):
     """Stays at `t_s`, for experiment time and real time, until the test changes it."""
 
     def __init__(self, t_s: float = 1000.0) -> None:
@@ -22,6 +22,3 @@ class FakeClock:
 
     def real_s(self, experiment_s: float) -> float:
         return experiment_s
-
-    def late(self) -> AbstractContextManager[None]:
-        return nullcontext()

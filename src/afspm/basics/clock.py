@@ -6,15 +6,9 @@ concern processes are in real time: `monotonic_s`.
 
 from __future__ import annotations
 
-import mmap
-import struct
 import sys
-import threading
 import time
-import weakref
-import zlib
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import cache, cached_property
@@ -22,8 +16,8 @@ from pathlib import Path
 from typing import Protocol
 
 from afspm.basics.errors import ConfigError
-from afspm.basics.file_lock import locked
 from afspm.basics.plain_data import PlainMapping
+from afspm.basics.shared_time import Publication, SharedSimulationTime, SharedTime, TimeHold, opened
 
 NS_PER_S = 1_000_000_000
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -63,8 +57,16 @@ class Clock(Protocol):
         """Convert a duration from experiment time to real time, both in s."""
         ...
 
-    def late(self) -> AbstractContextManager[None]:
-        """Slow simulated time down to real time while the block runs, for a limited time."""
+    def late(self, since: float | Publication | None = None) -> AbstractContextManager[None]:
+        """Hold simulated time down to real time while the block runs; see `ExperimentClock.late`."""
+        ...
+
+    def passing(self) -> AbstractContextManager[None]:
+        """Let simulated time pass while the block runs, although this thread is late."""
+        ...
+
+    def published(self, what: Publication) -> None:
+        """Let the holds begin that begin with a publication."""
         ...
 
 
@@ -95,83 +97,17 @@ def monotonic_id() -> str:
     return f"{boot} {time.get_clock_info('monotonic').implementation}"
 
 
-LONGEST_LATE_S = 10.0  # real time: a process that is killed while it is late must not slow the rest of the night
-_LOOKS = 1000  # reads while another process writes; if none is valid, the writer was killed: the last valid one counts
-_MOST_LATE = 16  # late processes at a time; further ones get no time
-# in ns: real time, experiment time at that moment, and for each late process the real time when its slow period ends
-_SHARED = struct.Struct(f"<{2 + _MOST_LATE}q")
-_CHECKSUM = struct.Struct("<I")
+class NeverLate:
+    """The part of a `Clock` that never waits: of real time, and of a simulation in which no process is late."""
 
+    def late(self, since: float | Publication | None = None) -> AbstractContextManager[None]:
+        return nullcontext()
 
-class SharedSimulationTime:
-    """Simulated time, shared by the processes of a run in a small file; it slows down for late processes.
+    def passing(self) -> AbstractContextManager[None]:
+        return nullcontext()
 
-    While a process is late, experiment time passes as fast as real time; otherwise at the speed of the run. A late
-    process writes the start of the slow period and its latest end into the file.
-
-    Args:
-        path: an existing file.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._file = path.open("r+b")  # stays open: opening it may hang with the disk, and a late process must not
-        weakref.finalize(self, self._file.close)
-        self._turn = threading.Lock()  # threads of one process share the lock of the file
-        self._map = mmap.mmap(self._file.fileno(), _SHARED.size + _CHECKSUM.size)
-        self._last: tuple[int, ...] = (0,) * (2 + _MOST_LATE)
-
-    def now_ns(self, real_ns: int, speed: float) -> int:
-        """Return the experiment time, ns since the Unix epoch, at the moment `real_ns` of `time.monotonic_ns`."""
-        return _shown_ns(self._read(), real_ns, speed)
-
-    @contextmanager
-    def late(self, speed: float) -> Iterator[None]:
-        mine_ns = time.monotonic_ns() + int(LONGEST_LATE_S * NS_PER_S)
-        self._change(0, mine_ns, speed)
-        try:
-            yield
-        finally:
-            self._change(mine_ns, 0, speed)
-
-    def _change(self, before_ns: int, after_ns: int, speed: float) -> None:
-        # the end of one slow period is replaced, and the moment of writing becomes the new origin
-        with self._turn, locked(self._file):
-            real_ns, (since_ns, shown_ns, *until_ns) = time.monotonic_ns(), self._read()
-            shown_ns = _shown_ns((since_ns, shown_ns, *until_ns), real_ns, speed)
-            until_ns = [until if until > real_ns else 0 for until in until_ns]
-            if before_ns in until_ns:
-                until_ns[until_ns.index(before_ns)] = after_ns
-            self._map[:] = _shared_bytes(real_ns, shown_ns, *until_ns)
-
-    def _read(self) -> tuple[int, ...]:
-        for _ in range(_LOOKS):
-            found = self._map[:]
-            if _CHECKSUM.unpack_from(found, _SHARED.size)[0] == zlib.crc32(found[: _SHARED.size]):
-                self._last = _SHARED.unpack_from(found)
-                break
-        return self._last
-
-
-def _shown_ns(shared: tuple[int, ...], real_ns: int, speed: float) -> int:
-    since_ns, shown_ns, *until_ns = shared
-    real_ns = max(real_ns, since_ns)
-    fast_since_ns = min(max(since_ns, *until_ns), real_ns)
-    return shown_ns + fast_since_ns - since_ns + int((real_ns - fast_since_ns) * speed)
-
-
-def _shared_bytes(real_ns: int, shown_ns: int, *until_ns: int) -> bytes:
-    # the checksum shows a reader that a writer was killed half way
-    shared = _SHARED.pack(real_ns, shown_ns, *until_ns)
-    return shared + _CHECKSUM.pack(zlib.crc32(shared))
-
-
-def _waiting_in(path: str | None) -> SharedSimulationTime | None:
-    # None once the file is gone with its run, or was cut off by a full disk
-    try:
-        return SharedSimulationTime(Path(path)) if path else None
-    except (OSError, ValueError):
-        return None
+    def published(self, what: Publication) -> None:
+        """Do nothing: no process is late."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +160,7 @@ class ExperimentClock:
                     hint="set waits = false where the scheduler is started",
                 )
             return cls(*times)
-        return cls(*times, float(values["wall_at_zero_s"]), _waiting_in(waits))
+        return cls(*times, float(values["wall_at_zero_s"]), opened(waits))
 
     def as_dict(self) -> dict[str, object]:
         """Return the clock in JSON's types, for the other processes of the run."""
@@ -245,16 +181,37 @@ class ExperimentClock:
         """
         if self.speed <= 1.0 or self._waiting is not None:
             return self
-        path.write_bytes(_shared_bytes(time.monotonic_ns(), self.now_ns(), *[0] * _MOST_LATE))
-        return replace(self, _waiting=SharedSimulationTime(path))
+        return replace(self, _waiting=SharedSimulationTime.create(path, self.now_ns()))
 
-    def late(self) -> AbstractContextManager[None]:
-        """Slow the experiment's time down to real time while the block runs, for at most `LONGEST_LATE_S`.
+    def late(self, since: float | Publication | None = None) -> AbstractContextManager[None]:
+        """Slow the experiment's time down to real time while the block runs, for at most `LONGEST_HOLD_S`.
 
         Use it around work that takes computing time but no experiment time: starting a scan that is due, or
-        registering a finished scan. Without effect unless the clock is from `waiting_in`.
+        registering a finished scan. Waits that need experiment time belong outside, or into `passing`. Without effect
+        unless the clock is from `waiting_in`.
+
+        Args:
+            since: experiment time, in s, from which time is slow: for a process that sleeps until then, and may wake
+                up late; or the publication from which on its receiver is late. None: at once.
         """
-        return nullcontext() if self._waiting is None else self._waiting.late(self.speed)
+        return nullcontext() if self._waiting is None else self._waiting.late(self.speed, since)
+
+    def passing(self) -> AbstractContextManager[None]:
+        """Withdraw the holds of this thread while the block runs: it waits for something that takes experiment time."""
+        return nullcontext() if self._waiting is None else self._waiting.passing(self.speed)
+
+    def published(self, what: Publication) -> None:
+        """Let the holds begin that begin with a publication: call it when something was published."""
+        if self._waiting is not None:
+            self._waiting.published(what, self.speed)
+
+    def holds(self) -> SharedTime | None:
+        """Return the processes for which simulated time waits, or will wait; None if it waits for none."""
+        return None if self._waiting is None else self._waiting.read()
+
+    def drop(self, hold: TimeHold) -> bool:
+        """Let simulated time wait no longer for a process; return False if that must be tried again."""
+        return self._waiting is None or self._waiting.drop(hold, self.speed)
 
     def wall_ahead_s(self) -> float:
         """Return the lead of the system clock over the run's clock in s: nonzero after a clock change or a suspend."""

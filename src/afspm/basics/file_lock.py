@@ -37,12 +37,30 @@ def locked(file: IO[bytes]) -> Iterator[None]:
     try:
         yield
     finally:
-        if sys.platform == "win32":
-            import msvcrt
+        _unlock(file)
 
-            file.seek(0)
-            msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)
-        else:
-            import fcntl
 
-            fcntl.flock(file, fcntl.LOCK_UN)
+@contextmanager
+def unless_locked(file: IO[bytes]) -> Iterator[bool]:
+    """Hold the lock of a file in the block if it is free; yield whether it is."""
+    try:
+        lock(file)
+    except OSError:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        _unlock(file)
+
+
+def _unlock(file: IO[bytes]) -> None:
+    if sys.platform == "win32":
+        import msvcrt
+
+        file.seek(0)
+        msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_UN)

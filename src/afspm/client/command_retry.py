@@ -125,7 +125,8 @@ class CommandRetry:
         count = view.count(message)
         self.ask(kind, wanted, until_s=until_s)
         if link.wait(lambda: view.count(message) != count, link.earlier(SETTLED_WITHIN_S, until_s)):
-            link.wait(lambda: view.state is not ScopeState.MOVING, until_s)
+            with link.clock.passing():
+                link.wait(lambda: view.state is not ScopeState.MOVING, until_s)
 
     def set_parameter(self, wanted: Parameter, until_s: float | None) -> Parameter:
         """Set a parameter, and return the value in force. Control must be held. Raises as `ask`."""
@@ -228,7 +229,8 @@ class CommandRetry:
             self._control.lost(response.reason)
         elif response.code == ControlResponse.NOT_FREE:
             self._log_reason(response.reason)
-            self._wait_free(states, until_s)
+            with self._link.clock.passing():
+                self._wait_free(states, until_s)
         else:
             raise refused(kind, response, self._link.name)
 

@@ -128,7 +128,7 @@ class ExperimentView:
             raise InvalidValue(f"can't wait for {experiment_s!r}", hint="a number of seconds, zero or more")
         clock = self._link.clock
         end_s = clock.now_s() + experiment_s
-        with self._call():
+        with self._call(), clock.late(end_s):
             self._before_wait()
             while (left_s := end_s - clock.now_s()) > 0.0:
                 self._link.wait(lambda: False, self._link.until(clock.real_s(left_s)))

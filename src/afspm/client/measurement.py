@@ -18,6 +18,7 @@ from afspm.basics.errors import (
     WireError,
 )
 from afspm.basics.formatting import day_and_time
+from afspm.basics.shared_time import Publication
 from afspm.client.command_retry import NOT_IN_CONTROL, CommandRetry
 from afspm.client.control_hold import ControlHold
 from afspm.client.cycle import Cycle, CycleOutcome
@@ -52,7 +53,12 @@ class _Watch:
 
     def wait_if_begun(self, until_s: float | None) -> None:
         if self.cycle.begun:
-            self._link.wait(self.is_over, until_s)
+            self.wait_over(until_s)
+
+    def wait_over(self, until_s: float | None) -> bool:
+        # late from the moment of publication: a drift correction may register the result before it is passed on
+        with self._link.clock.late(Publication.RESULTS):
+            return self._link.wait(self.is_over, until_s)
 
     def _take(self, packet: Packet, ours: bool) -> None:
         if not ours:
@@ -291,7 +297,7 @@ class MeasurementRunner:
             begun = link.wait_connected(lambda: cycle.begun or watch.is_over(), BEGUN_WITHIN_S, task.until_s)
         if not begun:
             cycle.outcome = CycleOutcome.VANISHED
-        elif not link.wait(watch.is_over, task.until_s):
+        elif not watch.wait_over(task.until_s):
             raise NoResponse(
                 f"the {task.target.what} was not finished in time",
                 where=link.name,

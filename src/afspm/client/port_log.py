@@ -28,6 +28,7 @@ from typing import TypedDict
 from afspm import wire
 from afspm.basics.clock import Clock
 from afspm.basics.plain_data import Plain, PlainList
+from afspm.basics.shared_time import Publication
 from afspm.client.keyed_results import kept_in
 from afspm.model import Packet
 from afspm.storage.line_log import REQUESTS_FOLDER, LineLog
@@ -88,8 +89,14 @@ class RecordedClock:
         self._keep("r", real_s)
         return real_s
 
-    def late(self) -> AbstractContextManager[None]:
-        return self._clock.late()
+    def late(self, since: float | Publication | None = None) -> AbstractContextManager[None]:
+        return self._clock.late(since)
+
+    def passing(self) -> AbstractContextManager[None]:
+        return self._clock.passing()
+
+    def published(self, what: Publication) -> None:
+        self._clock.published(what)
 
     def taken(self) -> PlainList:
         """Return the readings since the last call, as a flat list: kind, value, kind, value …"""

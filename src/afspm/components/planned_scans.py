@@ -166,7 +166,8 @@ class PlannedScans(Component):
             self.memory["begun"] = step.index
         # saved before the request: a scan interrupted by a kill still belongs to this beat
         self.memory["due_s"] = due_s
-        self.memory.save()
+        with self.clock.late():
+            self.memory.save()
         return is_left
 
     def _on_missed(self, rounds: int) -> None:

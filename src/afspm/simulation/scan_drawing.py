@@ -5,7 +5,9 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 
+from afspm.basics.clock import Clock
 from afspm.basics.errors import InvalidValue
 from afspm.basics.plain_data import Plain
 from afspm.simulation.activities import NoValues, ScanActivity, ScanValues, ValuesInAir
@@ -33,6 +35,7 @@ class ScanDrawing:
     Attributes:
         wake: called from the thread of the computation when a scan is ready.
         log: receives unexpected errors.
+        clock: waits at the end of a scan that is still being computed, until `release`; None: no clock waits.
     """
 
     def __init__(self, world: World, units: Callable[[], Mapping[str, str]], seed: int, run: RunWork) -> None:
@@ -41,6 +44,8 @@ class ScanDrawing:
         self._before: Plain = {}
         self.wake: Callable[[], None] = lambda: None
         self.log = logging.getLogger(__name__)
+        self.clock: Clock | None = None
+        self._late = ExitStack()
 
     def start(self, scan: ScanActivity, draw: Draw) -> None:
         """Start the computation returned by `prepared`; an unexpected error stops the scan and leaves it empty."""
@@ -55,7 +60,15 @@ class ScanDrawing:
             self.wake()
 
         self._newest = scan
+        self._late.close()
+        if self.clock is not None:
+            self._late.enter_context(self.clock.late(scan.end_s))
         self._run(work)
+
+    def release(self) -> None:
+        """Let time pass again, unless the scan is still being computed: call it after each look at the instrument."""
+        if not self.goes_on:
+            self._late.close()
 
     @property
     def world_before(self) -> Plain:

@@ -74,7 +74,7 @@ def follow(
 
 
 def summary(outcome: RunOutcome, folder: Path) -> list[str]:
-    """Return the lines of the summary: reason of the end, processes, restarts, measurements and folder."""
+    """Return the lines of the summary: reason of the end, processes, restarts, waits given up, measurements, folder."""
     lines = [f"{outcome.text}, after {duration_text(outcome.duration_s)}"]
     lines.append(f"ran: {', '.join(report.name for report in outcome.reports if report.starts)}")
     for report in outcome.reports:
@@ -86,6 +86,9 @@ def summary(outcome: RunOutcome, folder: Path) -> list[str]:
             lines.append(f"{report.name} was {report.unfinished}")
         if report.given_up:
             lines.append(f"{report.name} was GIVEN UP: {report.last_exit or 'it never started'}")
+    if outcome.waits_given_up:
+        how_often = _times(outcome.waits_given_up)
+        lines.append(f"simulated time went on {how_often} without a process that was behind: scans may be late")
     try:
         lines += run_bounded(lambda: _counts_of_record(folder) or _counts_of_table(folder / TABLE), COUNTED_WITHIN_S)
     except DiskTimeout as error:

@@ -19,7 +19,17 @@ from afspm.basics.launch import Launch, Sockets
 from afspm.client.connect import GUEST, guest_facts
 from afspm.experiment import Experiment, ProcessStart, Role
 from afspm.model.events import LOGGED_AS
-from afspm.record.run_json import COMPUTER, ENDED, METADATA, PLANNED, REAL_S, STATE_DIR, UNFINISHED, run_json_or_empty
+from afspm.record.run_json import (
+    COMPUTER,
+    ENDED,
+    METADATA,
+    PLANNED,
+    REAL_S,
+    STATE_DIR,
+    UNFINISHED,
+    WAITS_GIVEN_UP,
+    run_json_or_empty,
+)
 from afspm.record.run_lock import lock_run
 from afspm.storage.disk import run_bounded
 from afspm.storage.packet_log import discard_if_recorded, expect_recorder, log_folder
@@ -149,6 +159,8 @@ def go(
             ending = {**facts, ENDED: outcome.text, HOW: outcome.why.name.lower()}
             if unfinished := {report.name: report.unfinished for report in outcome.reports if report.unfinished}:
                 ending[UNFINISHED] = unfinished
+            if given_up := before.get(WAITS_GIVEN_UP, 0) + outcome.waits_given_up:
+                ending[WAITS_GIVEN_UP] = given_up
             if not before or REAL_S in facts:  # without REAL_S an earlier part was cut off at an unknown time
                 so_far_s = before.get(REAL_S, 0.0)
                 ending[REAL_S] = round(so_far_s + outcome.duration_s, 1)

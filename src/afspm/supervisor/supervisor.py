@@ -22,6 +22,7 @@ from afspm.model import Role
 from afspm.model.events import LOGGED_AS
 from afspm.supervisor.activity_monitor import ActivityMonitor
 from afspm.supervisor.child_output import OutputDropped, OutputLine
+from afspm.supervisor.hold_watch import HoldWatch
 from afspm.supervisor.log import LineReader, RunLog
 from afspm.supervisor.process import ChildEvent, ChildProcess, Task
 from afspm.supervisor.reaper import Reaper
@@ -64,12 +65,16 @@ REPORT_PERIOD_S = 0.1
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """Outcome of a run; `duration_s` is real time until the end begins, without the time that components then take."""
+    """Outcome of a run; `duration_s` is real time until the end begins, without the time that components then take.
+
+    `waits_given_up`: how often simulated time went on without a process that was behind.
+    """
 
     why: EndReason
     text: str
     reports: tuple[ProcessReport, ...]
     duration_s: float
+    waits_given_up: int = 0
 
     @property
     def exit_code(self) -> int:
@@ -94,6 +99,11 @@ class Supervisor:
         self._reporter = reporter
         self._clock = clock
         self._clock_check = ClockCheck(clock)
+        self._hold_watch = HoldWatch(
+            clock,
+            lambda level, text: log.write(LOGGED_AS, level, text),
+            lambda: {process.pid: name for name, process in self._processes.items()},
+        )
         self._status = ProcessStatus(policy.liveness)
         self._reported_s = -math.inf
         self._wakeup: WakeUp[ChildEvent | EndSignal | ReporterEvent] = WakeUp()
@@ -148,7 +158,8 @@ class Supervisor:
             self._reaper.close()
         ending = self._core.ending
         assert ending is not None
-        return RunOutcome(ending.why, ending.text, self._core.reports(), ending.began_s - began_s)
+        duration_s, given_up = ending.began_s - began_s, self._hold_watch.given_up
+        return RunOutcome(ending.why, ending.text, self._core.reports(), duration_s, given_up)
 
     def stop(self) -> None:
         """End the run as Ctrl-C does, from any thread; a second call kills the processes at once."""
@@ -198,6 +209,7 @@ class Supervisor:
     def _look(self) -> None:
         if warning := self._clock_check.warning():
             self._log.write(LOGGED_AS, logging.WARNING, warning)
+        self._hold_watch.look()
         now_s = self._clock.monotonic_s()
         overdue, lately_s = self._core.overdue(now_s)
         self._monitors = {

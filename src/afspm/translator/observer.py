@@ -6,12 +6,13 @@ import contextlib
 import logging
 import math
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
 from afspm import wire
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import AfspmError
+from afspm.basics.shared_time import Publication
 from afspm.model import (
     ActByHand,
     ChannelRoles,
@@ -110,6 +111,7 @@ class Observer:
             self._log.critical("%s", overdue)
         for name, payload in self._new_lines():
             self._port.publish(name, payload, self._state.stamp()[0], keep=False)
+            self._clock.published(Publication.LINES)
 
     def _new_lines(self) -> list[tuple[str, bytes]]:
         try:
@@ -132,6 +134,12 @@ class Observer:
                 until_s = self._clock.real_s(at_s - now_s)
                 wait_s = min(wait_s, until_s if until_s > 0.0 else self._driver.eager_poll_s)
         return max(0.0, wait_s)
+
+    def late_at_change(self) -> AbstractContextManager[None]:
+        """Return a context that holds simulated time at the driver's next known change."""
+        at_s = self._driver.next_change_s()
+        is_coming = at_s is not None and at_s > self._clock.now_s()
+        return self._clock.late(at_s) if is_coming else nullcontext()
 
     @property
     def reads_settings(self) -> bool:
@@ -191,6 +199,8 @@ class Observer:
             steps += sequence.observe(status, results and not steps, self._clock.now_s())
             self._tell(self._acts_shown_by(steps, was, is_requested=is_requested))
             self.play(self._without_spoiled(steps))
+            if is_over and sequence.published.state not in MEASURING:
+                self._clock.published(Publication.RESULTS)
         # only now: a free microscope whose result is awaited, or whose scan this look shows to have ended, is no proof
         self.panel.is_certain = self.panel.is_certain or sequence.published.state is ScopeState.FREE
 

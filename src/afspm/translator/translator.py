@@ -116,10 +116,14 @@ class Translator:
         Returns:
             ENDED after the scheduler's CLOSE; otherwise ORPHAN, after the safe exit.
         """
+        due = contextlib.ExitStack()
         try:
             while not self._ended:
                 with self._step():
                     self.look()
+                due.close()  # after the look: on a busy computer the poll may return late
+                if self._connection.stands:
+                    due.enter_context(self.observer.late_at_change())
                 arrived = self._port.poll(self.wait_s())
                 for one in arrived:
                     if not isinstance(one, ParentGone):
@@ -132,6 +136,7 @@ class Translator:
                     return ExitCode.ORPHAN
             return ExitCode.ENDED
         finally:
+            due.close()
             self.driver.close()
             self._port.close()
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from afspm.basics.clock import NS_PER_S, ExperimentClock, _shown_ns
+from afspm.basics.clock import NS_PER_S, ExperimentClock
 from afspm.basics.errors import ConfigError
 
 ROUNDING_S = 1e-6
@@ -102,13 +102,6 @@ def test_time_is_no_faster_than_real_time_while_a_process_is_late(tmp_path: Path
     while time.monotonic() < real_s + 0.05:
         pass
     assert other.now_s() - began_s >= 0.05 * 480.0
-
-
-def test_process_that_dies_late_slows_the_night_for_a_moment_only() -> None:
-    told = (0, 0, 10 * NS_PER_S)
-    assert _shown_ns(told, 4 * NS_PER_S, 480.0) == 4 * NS_PER_S
-    assert _shown_ns(told, 12 * NS_PER_S, 480.0) == (10 + 2 * 480) * NS_PER_S
-    assert _shown_ns(told, -1, 480.0) == 0  # read just before it was written
 
 
 def test_time_never_goes_back_however_many_are_late(tmp_path: Path) -> None:

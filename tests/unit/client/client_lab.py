@@ -7,13 +7,13 @@ import itertools
 import logging
 import signal
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from afspm import wire
+from afspm.basics.clock import NeverLate
 from afspm.basics.launch import Launch, Sockets
 from afspm.client.component import Component
 from afspm.model import (
@@ -59,7 +59,7 @@ REGION = Region((0.0, 0.0), (1e-6, 1e-6))
 OTHER_REGION = Region((5e-6, 0.0), (1e-6, 1e-6))
 
 
-class FakeClock:
+class FakeClock(NeverLate):
     """A clock that only the test moves."""
 
     def __init__(self) -> None:
@@ -76,9 +76,6 @@ class FakeClock:
 
     def real_s(self, experiment_s: float) -> float:
         return experiment_s
-
-    def late(self) -> AbstractContextManager[None]:
-        return nullcontext()
 
 
 class Nothing(AssertionError):

@@ -60,7 +60,7 @@ class TrialSession:
         return (self.clock.now_ns() - self.began_ns) / 60e9
 
     def thinking(self) -> AbstractContextManager[None]:
-        """Slow the experiment down to real time during the `with` block, for at most 10 real seconds."""
+        """Slow the experiment down to real time during the `with` block, for at most ten real minutes."""
         return self.clock.late()
 
     def report(

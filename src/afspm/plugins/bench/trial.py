@@ -45,8 +45,6 @@ RETRY_S: Final = 0.05
 ENDED_WITHIN_S: Final = 60.0
 GRANT_MARGIN_S: Final = 3600.0
 """Experiment time added to the duration of a grant, for the start and end of the processes."""
-LONGEST_HOLD_S: Final = 8.0
-"""Real seconds between two renewals of the hold on the clock, which ends without renewal after ten seconds."""
 _FINAL: Final = (names.SCAN_SPEED, names.TIP_BIAS_VOLTAGE, names.ZCTRL_SETPOINT)
 
 
@@ -183,9 +181,8 @@ class _Hold:
         self._thread.join()
 
     def _keep(self) -> None:
-        while not self._released.is_set():
-            with self._clock.late():
-                self._released.wait(LONGEST_HOLD_S)
+        with self._clock.late():
+            self._released.wait()
 
 
 @contextlib.contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import UnitError
+from afspm.basics.shared_time import Publication
 from afspm.basics.units import convert
 from afspm.client.component import Component
 from afspm.client.events import Events, PublishedEvent
@@ -168,6 +170,8 @@ class LineWatch(Component):
         self.expected = MissingChannels(self.channels, self.log)
         self._missing_lines = _MissingLines(self.log, self.clock.now_ns())
         self._later_states = _LaterStates(self.scope.events("ScopeStateMsg"))
+        self._late = ExitStack()
+        self._await_lines()
         if "judge" in self.memory:
             self.judge.restore(self.memory["judge"])
 
@@ -203,6 +207,16 @@ class LineWatch(Component):
             finished.is_trusted = finished.is_whole  # also of a test scan that ends a repair
 
     def on_scan_lines(self, lines: ScanLines) -> None:
+        with self.clock.late():
+            self._take_lines(lines)
+            self._await_lines()
+
+    def _await_lines(self) -> None:
+        # a fast simulated clock waits from the publication of lines until they are judged
+        self._late.close()
+        self._late.enter_context(self.clock.late(Publication.LINES))
+
+    def _take_lines(self, lines: ScanLines) -> None:
         channel = next((one for one in self.channels if lines.is_of(one)), None)
         if channel is None:
             return

@@ -6,11 +6,11 @@ import threading
 from base64 import b64decode
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from afspm import wire
+from afspm.basics.clock import NeverLate
 from afspm.basics.errors import FileError, WireError
 from afspm.basics.plain_data import PlainList
 from afspm.client.port_log import LifeFacts
@@ -125,7 +125,7 @@ def _name(handled: PlainList | None) -> PacketName | None:
     return None if handled is None else PacketName(handled[0] or 0, handled[1])
 
 
-class ReplayClock:
+class ReplayClock(NeverLate):
     """Clock that shows the recorded readings in order; without a reading, the time of the last recorded event.
 
     As in the record, only readings by the component's own thread count. No time passes between events, so a loop that
@@ -155,9 +155,6 @@ class ReplayClock:
     def real_s(self, experiment_s: float) -> float:
         coming = self._coming["r"] if threading.get_ident() == self._thread else None
         return float(coming.popleft()) if coming else experiment_s / self._speed
-
-    def late(self) -> AbstractContextManager[None]:
-        return nullcontext()
 
     @property
     def shown_s(self) -> float:

@@ -238,14 +238,22 @@ class Emulator(ABC):
         self.faults = Faults(self._faults, self.all_faults(), clock.now_s())
         folder.mkdir(parents=True, exist_ok=True)
         self.woken = WakeUp()
-        self.rig.drawing.wake, self.rig.drawing.log = self.woken.post, log
+        self.rig.drawing.wake, self.rig.drawing.log, self.rig.drawing.clock = self.woken.post, log, clock
+        due = ExitStack()
         try:
             listening(self._open())
             while not self._stop.is_set() and clock.monotonic_s() < self._leave_at_s:
-                self._call_guarded(self.serve, self._wait_s())
+                wait_s = self._wait_s()
+                due.close()  # after the tick: on a busy computer the wait may end late
+                self.rig.drawing.release()
+                ends_s = self.rig.next_change_s(clock.now_s())
+                if ends_s is not None:
+                    due.enter_context(clock.late(ends_s))
+                self._call_guarded(self.serve, wait_s)
                 self.woken.take()
                 self.rig.account(clock.now_s())
         finally:
+            due.close()
             self.close()
             self.take_button_away()
             self.woken.close()

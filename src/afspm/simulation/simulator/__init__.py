@@ -267,6 +267,7 @@ class Simulator(Driver):
         )
         instrument.setup.approach_s = self._approach_s
         instrument.drawing.wake, instrument.drawing.log = self.wake, self.log
+        instrument.drawing.clock = self.clock
         if "instrument" not in kept:
             instrument.note(start_s, "start", {"settings": self._world_settings, "seed": self._seed})
         folder = (self.run_dir / "scans").resolve()
@@ -283,7 +284,10 @@ class Simulator(Driver):
         return controller
 
     def status(self) -> ScopeStatus:
-        return ScopeStatus(self._reached(refuses=False).state(self.clock.now_s()))
+        controller = self._reached(refuses=False)
+        status = ScopeStatus(controller.state(self.clock.now_s()))
+        controller.instrument.drawing.release()
+        return status
 
     def next_change_s(self) -> float | None:
         # neither acts at the panel nor faults: no controller announces them, so polling has to find them

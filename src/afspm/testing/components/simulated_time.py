@@ -6,7 +6,8 @@ import heapq
 import math
 import random
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+
+from afspm.basics.clock import NeverLate
 
 START_S = 1_750_000_000.0
 """Experiment time at the beginning."""
@@ -33,7 +34,7 @@ class Timer:
         self.cancelled = True
 
 
-class SimulatedTime:
+class SimulatedTime(NeverLate):
     """A queue of future events in the order of their times, which is a `Clock` as well.
 
     Args:
@@ -68,10 +69,6 @@ class SimulatedTime:
 
     def real_s(self, experiment_s: float) -> float:
         return experiment_s / self.speed
-
-    def late(self) -> AbstractContextManager[None]:
-        """Do nothing: no process is late in simulation."""
-        return nullcontext()
 
     # --- what happens ---
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from afspm.basics.clock import NeverLate
 from afspm.basics.errors import FileError
 from afspm.model import Note, Scan
 from afspm.model.geometry import XY
@@ -185,7 +186,7 @@ class ChannelNames(FrameStore):
         self._names[scan.channel] = None
 
 
-class StoppedClock:
+class StoppedClock(NeverLate):
     """A clock that shows a fixed time."""
 
     def __init__(self, time_ns: int, speed: float) -> None:
@@ -203,9 +204,6 @@ class StoppedClock:
 
     def real_s(self, experiment_s: float) -> float:
         return experiment_s / self._speed
-
-    def late(self) -> AbstractContextManager[None]:
-        return nullcontext()
 
 
 def _events(run: Run) -> Iterator[NightEvent]:
