@@ -7,7 +7,7 @@ import multiprocessing
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from afspm.basics.clock import NS_PER_S, ExperimentClock
 from afspm.basics.file_lock import locked
 from afspm.basics.shared_time import _NEVER_NS, LONGEST_HOLD_S, MOST_HOLDS, Publication, SharedTime, TimeHold
+from afspm.simulation.instrument import SimulatedInstrument
 
 SPEED = 480.0
 SPAWN = multiprocessing.get_context("spawn")
@@ -205,3 +206,20 @@ def test_drop_does_not_wait_for_a_process_that_hangs_while_it_writes(tmp_path: P
         with (tmp_path / "clock").open("r+b") as file, locked(file):
             assert not clock.drop(hold)
         assert holds_of(clock) == (hold,)
+
+
+# --- of the simulated instrument ---
+
+
+def test_time_waits_at_the_end_of_a_scan_that_is_still_being_computed(tmp_path: Path) -> None:
+    clock, works = shared_clock(tmp_path), list[Callable[[], None]]()
+    instrument = SimulatedInstrument({"surface": "flat"}, 1, clock.now_s(), run=works.append)
+    instrument.drawing.clock = clock
+    scan = instrument.start_scan(clock.now_s())
+    instrument.drawing.release()
+    (hold,) = holds_of(clock)
+    assert hold.from_ns == int(scan.end_s * NS_PER_S)
+    works[0]()
+    assert holds_of(clock) == (hold,)  # until a look at the instrument shows the end of the scan
+    instrument.drawing.release()
+    assert holds_of(clock) == ()
