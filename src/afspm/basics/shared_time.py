@@ -38,6 +38,8 @@ _LOOKS = 1000  # reads while another process writes; if none is valid, the write
 _NEVER_NS = 1 << 62  # experiment time of a hold that begins with a publication: this, and the number of its kind
 _HEAD = struct.Struct("<5q")
 _HOLD = struct.Struct("<4q")
+_AT_ONCE_NS = -_NEVER_NS  # before every start of a clock, which may lie before 1970
+_LATEST_S = 4e9
 _CHECKSUM = struct.Struct("<I")
 _SIZE = _HEAD.size + MOST_HOLDS * _HOLD.size
 
@@ -118,7 +120,9 @@ class SharedTime:
 
     def with_published(self, what: Publication) -> SharedTime:
         """Return the content in which the holds that begin with a publication have begun."""
-        begun = (replace(one, from_ns=0) if one.from_ns == _NEVER_NS + what.value else one for one in self.holds)
+        begun = (
+            replace(one, from_ns=_AT_ONCE_NS) if one.from_ns == _NEVER_NS + what.value else one for one in self.holds
+        )
         return replace(self, holds=tuple(begun))
 
     def moved_to(self, real_ns: int, speed: float) -> SharedTime:
@@ -194,7 +198,7 @@ class SharedSimulationTime:
         if isinstance(since, Publication):
             own = _OwnHold(_NEVER_NS + since.value)
         else:
-            own = _OwnHold(0 if since is None else int(since * _NS_PER_S))
+            own = _OwnHold(_AT_ONCE_NS if since is None else int(min(since, _LATEST_S) * _NS_PER_S))
         self._own.append(own)
         self._declare(own, speed)
         try:

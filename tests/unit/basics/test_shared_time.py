@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import multiprocessing
 import os
 import threading
@@ -197,6 +198,15 @@ def test_hold_of_a_killed_process_can_be_dropped(
     while time.monotonic_ns() < real_ns + NS_PER_S // 50:
         pass
     assert clock.now_ns() - began_ns >= SPEED * (NS_PER_S // 50)
+
+
+@pytest.mark.parametrize("since_s", [None, -86_000.0, math.inf])
+def test_hold_works_before_1970_and_for_a_sleep_without_end(tmp_path: Path, since_s: float | None) -> None:
+    clock = ExperimentClock.starting_now(-86_400.0, SPEED).waiting_in(tmp_path / "clock")
+    with clock.late(since_s):
+        (hold,) = holds_of(clock)
+        assert bool(hold.until_ns) is (since_s is None)
+    assert holds_of(clock) == ()
 
 
 def test_drop_does_not_wait_for_a_process_that_hangs_while_it_writes(tmp_path: Path) -> None:
