@@ -152,3 +152,33 @@ def test_heights_of_a_real_studio_agree_with_nsfopen() -> None:
     (ours,) = [scan for scan in afspm.read(path).scans if scan.channel == "Topography Forward"]
     np.testing.assert_allclose(ours.values, heights, atol=1e-14)
     assert (ours.unit, ours.region.size_m) == ("m", (1e-5, 1e-5))
+
+
+def tuning(lines: int = 1) -> bytes:
+    """Return a file of thermal tuning: a spectrum over the frequency and its fit, without images."""
+    channel = (
+        f"Version=2\r\nPoints=5\r\nLines={lines}\r\nDim0Name=Frequency\r\nDim0Unit=Hz\r\nDim0Range=200000\r\n"
+        "Dim0Min=1000\r\nDim1Range=0\r\nDim2Name=Amplitude Spectral Density\r\nDim2Unit=m/sqrt(Hz)\r\n"
+        "Dim2Range=2e-12\r\nDim2Min=-1e-12\r\nSaveBits=32\r\n"
+    )
+    head = (
+        "[DataSet]\r\nGroupCount=2\r\nGr0-Ch0=DataSet-0:0\r\nGr1-Ch0=DataSet-1:0\r\n\r\n[DataSet-0:0]\r\n"
+        f"Frame=Spectrum FFT\r\n{channel}\r\n[DataSet-1:0]\r\nFrame=Spectrum Fit\r\n{channel}\r\n"
+    )
+    densities = np.arange(5 * lines) * 2**26
+    return head.encode() + b"#!" + densities.astype("<i4").tobytes() + (2 * densities).astype("<i4").tobytes()
+
+
+@pytest.mark.parametrize("lines", [1, 2])
+def test_spectrum_over_the_frequency_alone_is_read(tmp_path: Path, lines: int) -> None:
+    path = tmp_path / "thermal.nid"
+    path.write_bytes(tuning(lines))
+    content = afspm.read(path)
+    assert content.scans == ()
+    assert [one.kind for one in content.spectra] == ["Spectrum FFT"] * lines + ["Spectrum Fit"] * lines
+    for number, one in enumerate(content.spectra):
+        assert (one.names, one.units) == (("Frequency", "Amplitude Spectral Density"), ("Hz", "m/sqrt(Hz)"))
+        assert one.position_m is None
+        np.testing.assert_allclose(one["Frequency"], [1e3, 51e3, 101e3, 151e3, 201e3])
+        step, first = (1 + number // lines) * 2.0**-5 * 1e-12, 5 * (number % lines)
+        np.testing.assert_allclose(one["Amplitude Spectral Density"], step * np.arange(first, first + 5), atol=1e-27)

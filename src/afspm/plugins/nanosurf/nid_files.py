@@ -2,7 +2,8 @@
 
 Ten files of the maker's examples (NSFopen, MIT), compared with Gwyddion, show: rows ascend, backward lines are not
 mirrored, integers are scaled to a range. A rotation is taken as counter-clockwise, which is unconfirmed (!). Curves
-have no position, since a map of curves does not contain the positions.
+have no position, since a map of curves does not contain the positions. Thermal tuning writes a spectrum over the
+frequency and its fit, without images: each is a spectrum of its own, whose kind is the maker's name for it.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from afspm.storage.formats.content import FileContent, local_ns, text_of
 _DATA: Final = b"#!"
 _CHANNEL: Final = re.compile(r"Gr(\d{1,6})-Ch(\d{1,6})")
 _CURVE: Final = re.compile(r"Spec (forward|backward)")
+_FREQUENCY: Final = re.compile(r"Spectrum .+|Frequency sweep.*")
 _BITS: Final = {8: "<i1", 16: "<i2", 32: "<i4"}
 
 Section = dict[str, str]
@@ -48,7 +50,8 @@ def read_nid(path: Path, zone: tzinfo | None) -> FileContent:
     images = (_scan(channel, values, region) for channel, values in channels if _is_image(channel))
     scans = tuple(replace(one, filename=str(path)) for one in images)
     curves = _curves([one for one in channels if _CURVE.match(one[0]["Frame"])])
-    spectra = tuple(replace(one, filename=str(path)) for one in curves)
+    frequency = _over_frequency([one for one in channels if _FREQUENCY.fullmatch(one[0]["Frame"])])
+    spectra = tuple(replace(one, filename=str(path)) for one in (*curves, *frequency))
     if not (scans or spectra):
         raise FileError("holds neither images nor curves")
     date = f"{info.get('Date', '')} {info.get('Time', '')}".strip()
@@ -142,6 +145,17 @@ def _curves(channels: list[tuple[Section, Array]]) -> Iterator[Spectrum]:
         swept = np.concatenate([_swept(part[shared[0]][0], line) for part in parts])
         columns = [np.concatenate([_taken(*part[name], line) for part in parts]) for name in shared]
         yield Spectrum(None, "force", names, units, np.column_stack([swept, *columns]))
+
+
+def _over_frequency(channels: list[tuple[Section, Array]]) -> Iterator[Spectrum]:
+    for kind in dict.fromkeys(channel["Frame"] for channel, _ in channels):
+        columns = [one for one in channels if one[0]["Frame"] == kind]
+        first, values = columns[0]
+        names = (first["Dim0Name"], *(channel["Dim2Name"] for channel, _ in columns))
+        units = (first.get("Dim0Unit", ""), *(channel.get("Dim2Unit", "") for channel, _ in columns))
+        for line in range(len(values)):
+            curves = [_taken(channel, taken, line) for channel, taken in columns]
+            yield Spectrum(None, kind, names, units, np.column_stack([_swept(first, line), *curves]))
 
 
 def _swept(channel: Section, line: int) -> Array:
