@@ -52,6 +52,46 @@ def dat() -> bytes:
     ).encode("latin-1")
 
 
+GRID_ROWS, GRID_COLUMNS = 2, 3
+GRID_POINTS = 5
+SEGMENTS = "Segment Start (V), Segment End (V), Settling (s), Integration (s), Steps (xn)"
+
+
+def grid(*, positions: bool = True, entries: dict[str, str] | None = None) -> bytes:
+    """Return a Nanonis grid over `REGION`: record by record the parameters, then each channel.
+
+    Point k has the height k nm; current and its backward sweep at sweep point j are 100 k + j and its negative, in pA.
+    """
+    points = GRID_ROWS * GRID_COLUMNS
+    pixels = GRID_COLUMNS, GRID_ROWS
+    size_m = [size * count / (count - 1) for size, count in zip(REGION.size_m, pixels, strict=True)]
+    frame = [*REGION.center_m, *size_m, -ANGLE_DEG]
+    places = "X (m);Y (m);" if positions else ""
+    header = {
+        "Grid dim": f'"{GRID_COLUMNS} x {GRID_ROWS}"',
+        "Grid settings": ";".join(map(repr, frame)),
+        "Filetype": "Linear",
+        "Sweep Signal": '"Bias (V)"',
+        "Fixed parameters": '"Sweep Start;Sweep End"',
+        "Experiment parameters": f'"{places}Z (m);Settling time (s);Scan:Current (A)"',
+        "# Parameters (4 byte)": "7" if positions else "5",
+        "Points": str(GRID_POINTS),
+        "Channels": '"Current (A);Current [bwd] (A)"',
+        "Experiment": '"Grid Spectroscopy"',
+        "Start time": '"14.11.2023 22:12:00"',
+        "End time": '"14.11.2023 22:13:20"',
+        "Comment": '"at 4.4 K, 30 \xb0"',
+    } | (entries or {})
+    k = np.arange(points)
+    x, y = (axis.ravel() for axis in REGION.pixels_m((GRID_ROWS, GRID_COLUMNS)))
+    sweep = [np.full(points, 1.0), np.full(points, -1.0)]
+    once = [k * 1e-9, np.full(points, 0.02), k * 1e-12]
+    currents = (100 * k[:, None] + np.arange(GRID_POINTS)) * 1e-12
+    records = np.column_stack([*sweep, *([x, y] if positions else []), *once, currents, -currents])
+    lines = "".join(f"{key}={value}\r\n" for key, value in header.items())
+    return lines.encode("cp1252") + b":HEADER_END:\r\n" + records.astype(">f4").tobytes()
+
+
 def wave(values: np.ndarray, unit: str, steps: tuple[float, ...], labels: list[str], note: str) -> bytes:
     """An Igor binary wave of version 5 (Technical Note 003), its last dimension labelled; `unit` of the others."""
     text = b"".join(name.encode().ljust(32, b"\0") for name in ["", *labels])
@@ -241,6 +281,7 @@ WHOLE: dict[str, Callable[[Path], None]] = {
     "up.sxm": written(sxm),
     "down.sxm": written(lambda: sxm("down")),
     "spectrum.dat": written(dat),
+    "grid.3ds": written(grid),
     "scan.ibw": written(ibw),
     "force.ibw": written(force),
     "field.gsf": written(gsf),

@@ -21,7 +21,8 @@ from afspm.record import nexus_writer
 from afspm.storage.formats import read
 
 
-@pytest.mark.parametrize("name", WHOLE)
+# a Nanonis grid may end after any of its spectra: `test_nanonis_grids`
+@pytest.mark.parametrize("name", [name for name in WHOLE if not name.endswith(".3ds")])
 @settings(max_examples=20)
 @given(data=st.data())
 def test_a_file_that_was_cut_off_is_refused_or_holds_the_same(name: str, data: st.DataObject) -> None:
