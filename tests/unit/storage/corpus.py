@@ -38,4 +38,4 @@ def reading(content: bytes, name: str) -> FileContent:
 def to_damage(names: Iterable[str]) -> list[Any]:
     """Return the parameters of a test that reads damaged files."""
     old = not_on_wine("the older HDF5 that runs there ends the process on some damaged files")
-    return [pytest.param(name, marks=old) if name.endswith((".nc", ".h5", ".nhf")) else name for name in names]
+    return [pytest.param(name, marks=old) if name.endswith((".nc", ".h5", ".nxs", ".nhf")) else name for name in names]

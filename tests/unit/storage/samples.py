@@ -217,6 +217,43 @@ def nsid(path: Path) -> None:
                 note[key] = value.strip()
 
 
+def nexus_image(
+    path: Path, *, program: str = "Nanonis", angle_deg: float = -ANGLE_DEG, unit: str = "m", transposed: bool = False
+) -> None:
+    """Write an image as NXspm, like pynxtools-spm since 2026: y descends, the angle is not applied to the axes."""
+    import h5py
+
+    per_m = {"m": 1.0, "nm": 1e9}[unit]
+    (x, y), (width, height) = REGION.center_m, REGION.size_m
+    axes = {"x": np.linspace(x - width / 2, x + width / 2, NX), "y": np.linspace(y + height / 2, y - height / 2, NY)}
+    with h5py.File(path, "w") as file:
+        file.attrs["NX_class"] = "NXroot"
+        entry = file.create_group("entry")
+        entry.attrs["NX_class"], entry["definition"] = "NXentry", "NXspm"
+        entry["start_time"], entry["end_time"] = "2023-11-14T23:12:00+01:00", "2023-11-14T23:13:20+01:00"
+        entry["instrument/software/name"] = program
+        region = entry.create_group("instrument/scan_region")
+        region.attrs["NX_class"] = "NXspm_scan_region"
+        for (axis, center), size in zip((("x", x), ("y", y)), REGION.size_m, strict=True):
+            pixels = {"x": NX, "y": NY}[axis]
+            whole = size * pixels / (pixels - 1)
+            facts = {"offset_value": center, "range": whole, "start": center - whole / 2, "end": center + whole / 2}
+            for name, value in facts.items():
+                region[f"scan_{name}_{axis}"] = value
+                region[f"scan_{name}_{axis}"].attrs["units"] = "meter"
+        region["scan_angle_x"] = angle_deg
+        region["scan_angle_x"].attrs["units"] = "degree"
+        for name, values, of in (("z_forward", HEIGHT_M, "meter"), ("phase_forward", OTHER, "degree")):
+            data = entry.create_group(name)
+            data.attrs["NX_class"], data.attrs["signal"] = "NXdata", "signal"
+            data.attrs["axes"] = ["x", "y"] if transposed else ["y", "x"]
+            data["signal"] = values[::-1].T if transposed else values[::-1]
+            data["signal"].attrs["units"] = of
+            for axis, places in axes.items():
+                data[axis] = places * per_m
+                data[axis].attrs["units"] = unit
+
+
 def nhf(path: Path) -> None:
     """Write a file of format 1, like the maker's example."""
     import h5py
@@ -291,6 +328,7 @@ WHOLE: dict[str, Callable[[Path], None]] = {
     "gxsm4.nc": gxsm4,
     "curve-VP001-VP.vpdata": written(vpdata),
     "nsid.h5": nsid,
+    "image.nxs": nexus_image,
     "image.nhf": nhf,
     "image.nid": written(nid),
     "image.tiff": written(park_image),

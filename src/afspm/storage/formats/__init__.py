@@ -34,9 +34,9 @@ def suffixes() -> tuple[str, ...]:
 def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     """Return the scans and spectra of a file.
 
-    The suffix of the file selects the reader: of a maker's format, of Gwyddion's simple fields (.gsf), of afspm's
-    record or of an exported grid of spectra (.h5). `afspm doctor` lists the suffixes. If two channels have the same
-    name, the second becomes "name #2".
+    The suffix of the file selects the reader: of a maker's format, of Gwyddion's simple fields (.gsf), or of NeXus
+    (.h5, .nxs), be it afspm's record, an exported grid of spectra or the file of another program. `afspm doctor`
+    lists the suffixes. If two channels have the same name, the second becomes "name #2".
 
     Args:
         zone: time zone of the controller's clock, which most files do not state; None: the zone of this computer.
