@@ -193,6 +193,8 @@ def at(common: Floats, swept: Floats, values: Floats) -> Floats:
 def _turning_point(swept: Floats) -> int | None:
     # half of a sweep that goes forth and back over the same values; None for a one-way sweep
     half, odd = divmod(len(swept), 2)
+    if not np.isfinite(swept).all():
+        return None
     extent = float(np.ptp(swept)) if half else 0.0
     if odd or half < 2 or not np.allclose(swept[:half], swept[half:][::-1], rtol=0.0, atol=1e-3 * extent):
         return None
@@ -201,7 +203,9 @@ def _turning_point(swept: Floats) -> int | None:
 
 
 def _same_sweep(one: Floats, other: Floats) -> bool:
-    return one.shape == other.shape and np.allclose(one, other, rtol=0.0, atol=1e-6 * float(np.ptp(one)) + 1e-30)
+    finite = one[np.isfinite(one)]  # a stopped sweep has NaN
+    atol = 1e-6 * float(np.ptp(finite)) + 1e-30 if finite.size else 0.0
+    return one.shape == other.shape and np.allclose(one, other, rtol=0.0, atol=atol, equal_nan=True)
 
 
 def _kind(spectrum: Spectrum) -> str:

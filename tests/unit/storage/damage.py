@@ -27,7 +27,7 @@ MEMORY = 40
 ENOUGH = 1 << 22
 TEXTS = [b"nan", b"-inf", b"1e999", b"-1", b"0", b"99999999999", b"1e-320", b"", b"x", b"\xb0", b"0x10", b"1,5", b"\0"]
 NUMBERS = [0, 1, -1, 3, 2**15, 2**31 - 1, -(2**31), 2**30 + 1]
-FIXED = (".ibw", ".nc", ".h5", ".nxs", ".nhf", ".tiff")
+FIXED = (".ibw", ".nc", ".gwy", ".h5", ".nxs", ".nhf", ".tiff")
 """Suffixes of formats with fixed positions."""
 ODD = st.one_of(
     st.binary(max_size=12),

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from afspm.model import Feedback, Region, Spectrum
+from afspm.model import Feedback, Region, Scan, ScanSet, Spectrum
 from afspm.plugins.park.emulator import files as park
+from afspm.record.export import gwyddion, netcdf
 from afspm.simulation.activities import ScanActivity, SpectrumActivity
 from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 
@@ -141,6 +142,20 @@ def simulated() -> bytes:
 def simulated_spectrum() -> bytes:
     curve = Spectrum((1e-9, -2e-9), "IV", ("Bias", "Current"), ("V", "A"), np.arange(6.0).reshape(3, 2))
     return encode_spectrum(curve, FileFacts(END_NS, {}))
+
+
+def exported_scans() -> ScanSet:
+    return ScanSet([Scan(REGION, "Height", "m", HEIGHT_M, END_NS), Scan(REGION, "Phase", "deg", OTHER, END_NS)])
+
+
+def exported_nc() -> bytes:
+    return netcdf.scan_file(exported_scans(), {}, {"time_ns": END_NS, "began_ns": None, "controller": ""})
+
+
+def exported_gwy() -> bytes:
+    about = {"center_m": REGION.center_m, "size_m": REGION.size_m, "angle_rad": REGION.angle_rad}
+    meta = gwyddion.meta_of(about | {"frame": "tip", "time_ns": END_NS})
+    return gwyddion.scan_file([*exported_scans().values()], meta)
 
 
 def vpdata() -> bytes:
@@ -324,6 +339,8 @@ WHOLE: dict[str, Callable[[Path], None]] = {
     "field.gsf": written(gsf),
     "simulated.nc": written(simulated),
     "simulated-spectrum.nc": written(simulated_spectrum),
+    "exported.nc": written(exported_nc),
+    "exported.gwy": written(exported_gwy),
     "gxsm3.nc": gxsm3,
     "gxsm4.nc": gxsm4,
     "curve-VP001-VP.vpdata": written(vpdata),

@@ -30,7 +30,7 @@ Item = tuple[str, str, object]
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
     """Yield (suffix, content) of the file of a scan or spectrum."""
-    meta = _meta(run.about(row))
+    meta = meta_of(run.about(row))
     if isinstance(row, ScanRow):
         yield ".gwy", scan_file(list(run.scan(row).values()), meta)
     else:
@@ -181,13 +181,14 @@ def _typical(values: NDArray[np.float64]) -> float:
     return float(np.median(known)) if known.size else 0.0
 
 
-def _meta(about: PlainMapping) -> dict[str, str]:
-    texts = {}
+def meta_of(about: PlainMapping) -> dict[str, str]:
+    """Return facts about a measurement as Gwyddion's metadata, which are texts."""
+    texts: dict[str, str] = {}
     for name, value in about.items():
         if name in ("channels", "variables", "content") or value is None:
             continue
         if name == "angle_rad":
-            texts["angle"] = f"{math.degrees(value):g} deg"
+            texts |= {"angle": f"{math.degrees(value):g} deg", "angle_rad": repr(value)}
         elif name == "notes":
             texts |= {f"note {number}": note for number, note in enumerate(value, 1)}
         elif isinstance(value, Mapping):
