@@ -253,7 +253,8 @@ class Scan:
     def to_xarray(self) -> xarray.DataArray:
         """Return an xarray DataArray with coordinates in m (needs the extra `xarray`).
 
-        The coordinates are x and y of the unrotated rectangle; `angle_rad` is in the attributes. NaN without values.
+        `x` and `y` are those of the unrotated rectangle. If it is turned (`angle_rad` in the attributes), `x_m` and
+        `y_m` over (y, x) are where each pixel was measured: `array.plot(x="x_m", y="y_m")`. NaN without values.
         """
         import numpy as np
 
@@ -262,7 +263,7 @@ class Scan:
 
         (left, low), (width, height) = self.region.top_left_m, self.region.size_m
         ny, nx = self.shape
-        return xarray.DataArray(
+        array = xarray.DataArray(
             self.values if self.values.size else np.full(self.shape, np.nan),
             {
                 "y": ("y", np.linspace(low, low + height, ny), {"units": "m"}),
@@ -278,6 +279,10 @@ class Scan:
                 "file": self.filename,
             },
         )
+        if not self.region.angle_rad or not array.size:
+            return array
+        x_m, y_m = self.region.pixels_m((ny, nx))
+        return array.assign_coords(x_m=(("y", "x"), x_m, {"units": "m"}), y_m=(("y", "x"), y_m, {"units": "m"}))
 
     def _repr_html_(self) -> str:
         return str(required(DISPLAYS, "scan_html")(self))

@@ -78,12 +78,14 @@ class Spectrum:
         columns: Plain = {
             name: (swept, self[name], {"units": unit}) for name, unit in zip(rest, self.units[1:], strict=True)
         }
-        attributes = {
+        attributes: dict[str, object] = {
             "kind": self.kind,
-            "position_m": self.position_m,
+            "frame": self.frame.value,
             "time": str(self.time),
             "file": self.filename,
         }
+        if self.position_m is not None:  # NetCDF has no None
+            attributes["position_m"] = self.position_m
         return xarray.Dataset(columns, {swept: (swept, self[swept], {"units": self.units[0]})}, attributes)
 
     def _repr_html_(self) -> str:

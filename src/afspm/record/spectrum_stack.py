@@ -15,6 +15,7 @@ from afspm.basics.requirements import imports_of_extra
 from afspm.model.geometry import Frame, Region
 from afspm.model.scan import Scan
 from afspm.model.spectrum import Spectrum
+from afspm.record.netcdf_encoding import fit_classic_netcdf
 from afspm.record.spectrum_grid import (
     DIRECTIONS,
     Floats,
@@ -65,12 +66,15 @@ class SpectrumStack:
     times: NDArray[np.datetime64]
 
     def to_xarray(self) -> xarray.Dataset:
-        """Return the arrays with their coordinates (needs the extra `xarray`)."""
+        """Return the arrays with their coordinates (needs the extra `xarray`).
+
+        `x` and `y` are those of the unrotated grid; if it is turned, `x_m` and `y_m` are the positions of the points.
+        """
         with imports_of_extra("xarray", "stacking spectra"):
             import xarray
 
         points = self.points
-        return xarray.Dataset(
+        stack = xarray.Dataset(
             {name: (DIMENSIONS, values, {"units": self.units[name]}) for name, values in self.curves.items()},
             {
                 "y": ("y", points.y_m, {"units": "m"}),
@@ -87,6 +91,11 @@ class SpectrumStack:
                 "center_m": points.center_m,
             },
         )
+        if points.angle_rad:
+            places = [points.position_m(row, column) for row, column in np.ndindex(self.times.shape[:2])]
+            x_m, y_m = np.reshape(places, (*self.times.shape[:2], 2)).transpose(2, 0, 1)
+            stack = stack.assign_coords(x_m=(("y", "x"), x_m, {"units": "m"}), y_m=(("y", "x"), y_m, {"units": "m"}))
+        return fit_classic_netcdf(stack)
 
 
 def stacked(spectra: Sequence[Spectrum], *, interpolate: bool = False) -> SpectrumStack:

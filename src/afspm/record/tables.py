@@ -201,11 +201,14 @@ class Table(Sequence[T], Generic[T]):
         return made
 
     def to_xarray(self) -> xarray.Dataset:
-        """Return a Dataset over `row` (needs the extra `xarray`)."""
+        """Return a Dataset over `row`, which `to_netcdf` can write (needs the extra `xarray`)."""
         with imports_of_extra("xarray", "to_xarray"):
             import xarray
 
-        return xarray.Dataset({name: ("row", _array(name, values)) for name, values in self.columns().items()})
+        from afspm.record.netcdf_encoding import fit_classic_netcdf  # imports numpy, which the supervisor avoids
+
+        columns = {name: ("row", _array(name, values)) for name, values in self.columns().items()}
+        return fit_classic_netcdf(xarray.Dataset(columns))
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return a DataFrame with the columns of `to_numpy` (needs the extra `xarray`)."""
