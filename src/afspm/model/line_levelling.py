@@ -84,6 +84,17 @@ def _lines(values: Array, finite: NDArray[np.bool_]) -> Array:
 
 
 def _medians(values: Array, finite: NDArray[np.bool_]) -> Array:
+    measured = finite.mean(axis=1)
+    if not ((measured > 0.0) & (measured < 1.0)).any():
+        return _row_medians(values, finite)
+    # the median of a tilted row depends on which of its pixels were measured, so the tilt is left out of it
+    steps = np.diff(np.where(finite, values, np.nan), axis=1)
+    known = steps[np.isfinite(steps)]
+    x = np.arange(values.shape[1]) - (values.shape[1] - 1) / 2
+    return _row_medians(values - (float(np.median(known)) if known.size else 0.0) * x, finite)
+
+
+def _row_medians(values: Array, finite: NDArray[np.bool_]) -> Array:
     medians = np.zeros((len(values), 1))
     # numpy warns of a median over no values
     some = finite.any(axis=1)
@@ -95,7 +106,7 @@ def _differences(values: Array, finite: NDArray[np.bool_]) -> Array:
     some = finite.any(axis=1)  # rows without values are skipped: the previous row is the last with values
     known, there = np.where(finite, values, 0.0)[some], finite[some]
     offsets = np.zeros((len(values), 1))
-    offsets[some] = np.cumsum([[0.0], *_medians(np.diff(known, axis=0), there[1:] & there[:-1])], axis=0)
+    offsets[some] = np.cumsum([[0.0], *_row_medians(np.diff(known, axis=0), there[1:] & there[:-1])], axis=0)
     return offsets
 
 

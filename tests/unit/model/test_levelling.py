@@ -8,6 +8,8 @@ import pytest
 from afspm.basics.errors import InvalidValue
 from afspm.model import Region, Scan
 from afspm.model.levelling import FITS
+from afspm.model.line_levelling import Levelling
+from afspm.model.line_levelling import levelled as line_levelled
 
 SHAPE = (48, 64)
 Y, X = np.meshgrid(np.linspace(-1, 1, SHAPE[0]), np.linspace(-1, 1, SHAPE[1]), indexing="ij")
@@ -74,3 +76,29 @@ def test_rows_are_levelled_one_by_one(rows: str) -> None:
     assert np.isnan(flat[7]).all()
     with pytest.raises(InvalidValue, match="one of difference, line, median"):
         scan(values).levelled(rows="mean")
+
+
+@pytest.mark.parametrize("rows", ["median", "difference", "line"])
+@pytest.mark.parametrize("part", [0.05, 0.3, 0.6])
+def test_scattered_missing_pixels_leave_no_tilt(rows: str, part: float) -> None:
+    tilt = 0.3e-9 * np.arange(SHAPE[1]) - 0.1e-9 * np.arange(SHAPE[0])[:, None]
+    missing = np.random.default_rng(1).random(SHAPE) < part
+    missing[5] = True
+    flat = scan(np.where(missing, np.nan, tilt)).levelled(rows=rows).values
+    np.testing.assert_array_equal(np.isnan(flat), missing)
+    np.testing.assert_allclose(flat[~missing], 0.0, atol=1e-17)
+
+
+def test_row_steps_are_levelled_where_pixels_are_missing() -> None:
+    generator = np.random.default_rng(2)
+    steps = generator.normal(0.0, 5e-9, SHAPE[0])[:, None]
+    missing = generator.random(SHAPE) < 0.3
+    flat = scan(np.where(missing, np.nan, substrate(1) + steps)).levelled(rows="median").values
+    assert np.nanstd(flat) < 0.07e-9
+
+
+def test_missing_rows_change_no_other_row() -> None:
+    values = substrate(2)
+    rows = values - np.median(values, axis=1, keepdims=True)
+    values[10:20] = np.nan
+    np.testing.assert_array_equal(line_levelled(values, Levelling.MEDIANS)[20:], rows[20:])
