@@ -21,7 +21,9 @@ def is_address(text: str) -> bool:
 
 
 def hint_on(text: str) -> str:
-    """Return the hint for an address whose port is out of range; empty for any other text."""
+    """Return the hint for an `inproc` address or a port out of range; empty for any other text."""
+    if text.startswith("inproc://"):
+        return "inproc:// stays within one process, and each component is a process: use tcp:// or ipc://"
     match = _ADDRESS.fullmatch(text)
     return f"a port is {HIGHEST_PORT} at most" if match and not _has_port(match) else ""
 

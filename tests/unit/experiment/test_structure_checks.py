@@ -199,6 +199,18 @@ BROKEN = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        PEAKS + 'publisher = "inproc://peaks"\n',
+        ANYTHING + 'subscriber = "s"\n[s]\nclass = "Subscriber"\nsub_url = "inproc://peaks"\n',
+        LOG + 'at = "inproc://log"\n',
+    ],
+)
+def test_the_refusal_of_an_in_process_address_says_why(write: Write, text: str) -> None:
+    assert "inproc:// stays within one process" in only_error(write(text)).hint
+
+
 EMULATED = '[clock]\nspeed = 60\n[controller]\ncomponent = true\nclass = "parts.Emulated"\n'
 
 
