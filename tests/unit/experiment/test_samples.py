@@ -85,6 +85,7 @@ def test_the_paper_s_drift_method_has_the_values_of_its_table() -> None:
     assert tracker == {"class": "paper", "transform": "translation", "f_min": 0.5, "sr_norm_min": 0.25, "w_update": 1.0}
     assert (rescan["rule"], rescan["f_rescan"]) == ("paper", 0.75)
     assert (series["size"], series["pixels"], series["every"]) == (pytest.approx([2e-6, 2e-6]), [128, 128], 900.0)
+    assert experiment.resolved.metadata()["probe"] == "MikroMasch HQ:NSC15/Al, 40 N/m, 325 kHz"
 
 
 def test_the_published_form_of_the_drift_night_has_nothing_wrong() -> None:
