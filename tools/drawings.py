@@ -106,6 +106,47 @@ def workflow() -> str:
     return sheet.document(720, 325, "The workflow of drift correction")
 
 
+def drift_designs() -> str:
+    """The two designs of drift correction in the paper: components of their own, and a scheduler of its own."""
+    sheet = Sheet()
+    sheet.note((20, 22), "a  estimator, corrector and rescanner apart", anchor="start", bold=True)
+    sheet.svg.box(22, 130, 256, 182, fill="none", stroke=BAD, dashed=True)
+    sheet.box((85, 65), (110, 36), "component", "Experiment")
+    sheet.box((85, 160), (110, 44), "component", "Drift Corrector", "tip ↔ sample")
+    sheet.box((215, 220), (110, 44), "component", "Drift Estimator", "pairs of scans")
+    sheet.box((330, 160), (90, 36), "component", "Rescanner")
+    sheet.box((150, 285), (150, 36), "scheduler", "Scheduler")
+    sheet.arrow((85, 137), (85, 86), stroke=DATA, both=True)
+    sheet.arrow((85, 183), (85, 266), stroke=DATA, both=True)
+    sheet.arrow((205, 266), (205, 243), stroke=DATA)
+    sheet.note((210, 259), "scans", anchor="start", fill=DATA, size=11)
+    sheet.arrow((185, 197), (185, 175), (141, 175), stroke=DATA)
+    sheet.note((190, 190), "estimates", anchor="start", fill=DATA, size=11)
+    sheet.arrow((141, 152), (284, 152), stroke=CONTROL, text="rescan", at=(213, 147))
+    sheet.arrow((330, 179), (330, 285), (226, 285), stroke=CONTROL)
+    sheet.note((405, 22), "b  a Drift Compensated Scheduler", anchor="start", bold=True)
+    sheet.box((470, 65), (110, 36), "component", "Experiment")
+    sheet.box((605, 65), (90, 36), "component", "Rescanner")
+    sheet.box(
+        (535, 215),
+        (215, 66),
+        "scheduler",
+        "Drift Compensated Scheduler",
+        "scheduler, estimator, corrector",
+        outlined=BAD,
+    )
+    sheet.arrow((470, 84), (470, 176), stroke=DATA, both=True)
+    sheet.arrow((592, 177), (592, 86), stroke=CONTROL, text="region", at=(568, 130))
+    sheet.arrow((618, 84), (618, 177), stroke=CONTROL, text="request", at=(643, 130))
+    for x in (150, 535):
+        sheet.box((x, 360), (150, 36), "translator", "Translator")
+        sheet.arrow((x, 306 if x == 150 else 254), (x, 339), stroke=DATA, both=True)
+    for x in (155, 665):
+        sheet.note((x, 112), "↑ sample coordinates", anchor="start", fill=QUIET, size=11)
+        sheet.note((x + 75 if x == 155 else x, 335), "↓ tip coordinates", anchor="start", fill=QUIET, size=11)
+    return sheet.document(790, 390, "Two designs of drift correction: three components, or one scheduler")
+
+
 def one_dimension() -> str:
     """The paper's worked example: drift of 1 a step from the start, and of 1/2 at step 13."""
     sheet = Sheet()
@@ -176,6 +217,7 @@ DRAWINGS: dict[str, Callable[[], str]] = {
     "one-and-two-computers": computers,
     "reuse": reuse,
     "drift-workflow": workflow,
+    "drift-designs": drift_designs,
     "drift-one-dimension": one_dimension,
     "two-paths": two_paths,
     "message-bytes": message_bytes,
