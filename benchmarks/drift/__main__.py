@@ -32,6 +32,7 @@ from benchmarks.drift.workers import done
 from benchmarks.rows import Row
 
 PARTS = ("tracks", "sizes", "accuracy", "unseen", "independent")  # the longest jobs first
+ON_REQUEST = ("inliers",)  # of the paper's method, without a target
 RESULT = Path("build/bench-drift.json")
 NAMES = entry_points.names(entry_points.ESTIMATORS)
 
@@ -64,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.drift", description=__doc__)
     parser.add_argument("--seed", type=int, default=secrets.randbelow(10**6) * 1000, help="default: a fresh one")
     parser.add_argument("--quick", action="store_true", help="an eighth of the pairs")
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--parts", nargs="+", choices=(*PARTS, *ON_REQUEST), default=list(PARTS))
     parser.add_argument("--estimators", nargs="+", default=[DEFAULT, *(n for n in NAMES if n != DEFAULT)],
                         help="names; the first is held against the targets")  # fmt: skip
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)

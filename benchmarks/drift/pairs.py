@@ -170,6 +170,7 @@ def pair(
     samplings: tuple[Sampling, Sampling] | None = None,
     prior_sd_px: float | None = None,
     half: Half | None = None,
+    overlap: float | None = None,
 ) -> Pair:
     """Return a pair that depends only on the arguments.
 
@@ -181,6 +182,7 @@ def pair(
         prior_sd_px: give a prior about the true displacement with this standard deviation (for unrelated scans: about
             the displacement that they would have with an overlap).
         half: draw the parameters of surface and condition, too; see `families`.
+        overlap: of the scans, in place of the condition's.
     """
     numbers = (seed, list(SURFACES).index(surface), list(CONDITIONS).index(condition))
     if half is None:
@@ -188,6 +190,8 @@ def pair(
     else:
         random = source(half, *numbers)
         how, relief = drawn_condition(condition, random), drawn_surface(surface, random)
+    if overlap is not None:
+        how = replace(how, overlap=(overlap, overlap))
     first, second = samplings or (Sampling((size, size), (1.0, how.aspect)),) * 2
     frames = framed(first, second, how, random)
     views = _views(relief, frames, how, [*numbers[:2], *([] if half is None else [HALVES.index(half)])], random)
