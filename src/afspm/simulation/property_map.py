@@ -34,7 +34,7 @@ QUANTITIES: Final = {
     "adhesion": Quantity("force", "J/m^2", 0.02, 0.1),
 }
 _STEEPNESS = 1.6  # of the logistic curve that keeps a field within its range: 90 % of it is used
-_REACH = 3.5  # of a spot, in its standard deviations
+_REACH = 3.0  # of a spot, in its half-widths: less than 0.002 of its height is left there
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,7 @@ class PropertyMapSettings:
         low, high: range of the quantity, in its unit; if both are equal, the usual range of the quantity.
         size_m: width of hills, or mean width of spots at half their height.
         spacing_m: mean distance of spots.
+        spot_exponent: shape of spots: 2 for Gaussian spots, larger values for flat spots with a steep edge.
     """
 
     kind: str = "none"
@@ -55,6 +56,7 @@ class PropertyMapSettings:
     high: float = 0.0
     size_m: float = 150e-9
     spacing_m: float = 400e-9
+    spot_exponent: float = 2.0
 
     def __post_init__(self) -> None:
         one_of(self.kind, KINDS, "kind")
@@ -62,6 +64,8 @@ class PropertyMapSettings:
         check(self, above_zero="size_m spacing_m", from_zero="low")
         if self.high < self.low:
             raise ConfigError(f"{self.high!r} is below low = {self.low!r}", where="high")
+        if not 2.0 <= self.spot_exponent <= 20.0:
+            raise ConfigError(f"{self.spot_exponent!r} is not between 2 and 20", where="spot_exponent")
 
     @property
     def range(self) -> tuple[float, float]:
@@ -114,12 +118,12 @@ class PropertyMap:
 
     def _spots(self, x_m: Array, y_m: Array) -> Array:
         # overlapping spots saturate, so that no value leaves the range
-        sigma_m = self._settings.size_m / 2.355
-        sites = Sites.within(self._seed, x_m, y_m, 2.0 * _REACH * sigma_m, self._settings.spacing_m)
+        half_m = self._settings.size_m / 2
+        sites = Sites.within(self._seed, x_m, y_m, 2.0 * _REACH * half_m, self._settings.spacing_m)
         heights = 0.5 + 0.5 * chance.uniform(self._seed + 5, sites.key)
-        widths_m = sigma_m * np.clip(np.exp(0.2 * chance.normal(self._seed + 6, sites.key)), 0.7, 1.4)
+        widths_m = half_m * np.clip(np.exp(0.2 * chance.normal(self._seed + 6, sites.key)), 0.7, 1.4)
         left = np.ones(x_m.shape)
         for site_x_m, site_y_m, height, width_m in zip(sites.x_m, sites.y_m, heights, widths_m, strict=True):
             square = ((x_m - site_x_m) ** 2 + (y_m - site_y_m) ** 2) / width_m**2
-            left *= 1.0 - height * np.exp(-0.5 * square)
+            left *= 1.0 - height * 0.5 ** (square ** (self._settings.spot_exponent / 2))
         return 1.0 - left

@@ -48,6 +48,24 @@ def test_a_smooth_map_varies_everywhere_and_a_spotty_one_in_few_places() -> None
     assert quiet_share("spotty") > 0.5
 
 
+def test_spot_exponent_steepens_the_edges_of_spots_and_keeps_their_half_width() -> None:
+    def shares(exponent: float) -> np.ndarray:
+        return values(kind="spotty", low=0.0, high=1.0, spacing_m=2e-6, size_m=400e-9, spot_exponent=exponent)
+
+    soft, steep = shares(2.0), shares(8.0)
+    highest = soft.max()
+    assert steep.max() == pytest.approx(highest, rel=0.02)
+    between = [int(((one > 0.1 * highest) & (one < 0.9 * highest)).sum()) for one in (soft, steep)]
+    assert between[1] < 0.4 * between[0]
+    assert (steep > highest / 2).sum() == pytest.approx((soft > highest / 2).sum(), rel=0.05)
+
+
+@pytest.mark.parametrize("exponent", [1.9, 21.0])
+def test_spot_exponent_outside_its_range_is_refused(exponent: float) -> None:
+    with pytest.raises(ConfigError, match="is not between 2 and 20"):
+        PropertyMapSettings(kind="spotty", spot_exponent=exponent)
+
+
 def test_values_do_not_depend_on_the_positions_asked_together() -> None:
     for kind in ("smooth", "spotty"):
         found = PropertyMap(PropertyMapSettings(kind=kind), 3)
