@@ -184,6 +184,15 @@ def test_a_large_scan_of_their_translator_arrives(rig: BridgedRig, plain: Any) -
     assert wire.decode("Scan2d", payload).shape == (512, 512)
 
 
+def test_file_says_what_the_channels_of_their_translator_measure(rig: BridgedRig, plain: Any) -> None:
+    rig.translator_settings = {"channels": {"height": "HeightTrace"}}
+    bare_translator(rig, plain)
+    ours = rig.component("Ours")
+    rig.until(lambda: ours.packets("ChannelRoles"))
+    roles = wire.decode("ChannelRoles", ours.packets("ChannelRoles")[-1][1])
+    assert roles.of("HeightTrace") == ("height", "topography")
+
+
 @pytest.fixture
 def locked_rig(tmp_path: Path) -> Iterator[BridgedRig]:
     keys.generate(tmp_path / "keys", ["scheduler", "translator", "Experiment", "bridge"])

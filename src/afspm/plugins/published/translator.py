@@ -6,7 +6,7 @@ import math
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +20,7 @@ from afspm.basics.exit_codes import ExitCode
 from afspm.basics.interpreter import python_command
 from afspm.basics.launch import Launch, Sockets
 from afspm.model import (
+    ChannelRoles,
     ControlRequest,
     ControlResponse,
     Packet,
@@ -40,7 +41,7 @@ from afspm.translator.requests import RequestOutcomes
 from afspm.transport.frames import receive_frames, send_frames
 from afspm.transport.network import CONNECTED, DISCONNECTED, MAX_PACKET_BYTES, Monitor, Network
 from afspm.transport.polling import Poller, WakeUp
-from afspm.transport.port import ParentGone, RequestReceived, Served
+from afspm.transport.port import ParentGone, RequestReceived, Served, SubscriberJoined
 from afspm.transport.zmq_server import ZmqServerPort
 from afspm.wire.messages import SCOPE_STATE, SPECTRUM
 
@@ -62,15 +63,24 @@ class PublishedTranslator:
         program: command that starts the translator; its standard input gets afspm's launch line with both addresses.
         spectra_by_variable: whether the translator sends the values of a spectrum variable by variable, as the
             published translators for Nanonis and Asylum do.
+        channels: names of channels by role, `{ height = "HeightTrace" }`: version 1 does not know what a channel
+            measures, and components that ask for a role need it.
 
     Raises:
-        ConfigError: neither a program nor both addresses are given, or a program and both addresses.
+        ConfigError: neither a program nor both addresses are given, or a program and both addresses; there is no role
+            of such a name.
     """
 
     role: ClassVar[Role] = Role.TRANSLATOR
 
     def __init__(
-        self, serve: str = "", publish: str = "", program: Sequence[str] = (), *, spectra_by_variable: bool = False
+        self,
+        serve: str = "",
+        publish: str = "",
+        program: Sequence[str] = (),
+        *,
+        spectra_by_variable: bool = False,
+        channels: Mapping[str, str | list[str]] | None = None,
     ) -> None:
         if bool(program) == bool(serve and publish):
             raise ConfigError(
@@ -80,6 +90,7 @@ class PublishedTranslator:
             )
         self._serve, self._publish, self._program = serve, publish, tuple(program)
         self._by_variable = spectra_by_variable
+        self._channels = ChannelRoles().changed(channels or {}).with_topography(feedback_on=None)
 
     def run_process(self, context: ProcessContext) -> int:
         """Run until the experiment ends, the parent is gone, or the started program has ended."""
@@ -100,6 +111,7 @@ class PublishedTranslator:
         memory = Memory(Path(launch.state_dir) / f"{launch.name}.json" if launch.state_dir else None, synced=False)
         while not stop.is_set and _is_connected(context.launch, serve, stop):
             bridge = _TranslatorPort(context, memory, serve, publish, by_variable=self._by_variable)
+            bridge.channels = self._channels
             try:
                 if bridge.run(stop):
                     return ExitCode.ENDED
@@ -208,6 +220,7 @@ class _TranslatorPort(ZmqServerPort):
         self._state = ScopeState.UNDEFINED
         self._ends_s = math.inf
         self._is_lost = False
+        self.channels = ChannelRoles()
         self._outside = version_1.outside(launch)
         self._dealer = self._outside.socket(zmq.DEALER)
         self._dealer.setsockopt(zmq.IMMEDIATE, 1)  # no request is queued for a translator that is gone
@@ -231,6 +244,8 @@ class _TranslatorPort(ZmqServerPort):
                 for arrived in self.poll(None if self._ends_s == math.inf else self._ends_s - now_s):
                     if isinstance(arrived, RequestReceived):
                         self._take(arrived)
+                    elif isinstance(arrived, SubscriberJoined) and self.channels.names:
+                        self.publish(*wire.encode(self.channels))
             return False
         finally:
             stop.bridge = None
