@@ -7,7 +7,7 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 DEV := .venv/.dev
 
-.PHONY: demo demo-drift dev test test-times test-all test-apart test-lowest mutants test-samples coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
+.PHONY: demo demo-drift dev test test-times test-all test-apart test-lowest mutants test-samples test-matrix coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
 .PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift soak chaos simulate replay-nights power-cut docs release-check test-plug-ins changelog clean
 .DEFAULT_GOAL := demo
 
@@ -88,6 +88,13 @@ mutants: $(TEST)
 LOWEST ?= tests/unit tests/plugins
 test-lowest:
 	@$(PYTHON) tools/lowest_versions.py -n $(TESTS_AT_A_TIME) --dist worksteal -m "not slow" $(LOWEST)
+
+## each component on the simulator and on five emulated controllers, and the table of docs/reference/instruments.md
+test-matrix: $(COLLECTED)
+	@rm -rf build/matrix
+	@AFSPM_MATRIX=$(CURDIR)/build/matrix $(PYTEST) -n 3 --dist worksteal tests/system/matrix -k job_is_done
+	@$(BIN)/python tools/matrix.py build/matrix
+	@$(BIN)/python tools/docs.py
 
 ## every sample in experiments/, shortened, to its end
 test-samples: $(TEST)

@@ -9,6 +9,7 @@ import dataclasses
 import inspect
 import re
 import sys
+import tomllib
 import typing
 from collections.abc import Callable, Iterator
 from functools import reduce
@@ -96,6 +97,17 @@ def channels() -> str:
     for role in (one for one in ROLES if any(one in of.names for of in every.values())):
         cells = [", ".join(of.names.get(role, ())) for of in every.values()]
         lines.append("| " + " | ".join([role, *cells]) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def matrix() -> str:
+    """The table of what runs on what, from the record of `make test-matrix`."""
+    jobs = tomllib.loads((ROOT / "tests/system/matrix/matrix.toml").read_text(encoding="utf-8"))
+    instruments = list(next(iter(jobs.values()))["on"])
+    lines = ["| component | " + " | ".join(instruments) + " |", "| --- " * (len(instruments) + 1) + "|"]
+    for component, on in sorted((component, one["on"]) for one in jobs.values() for component in one["components"]):
+        cells = [on[name] if on[name] == "done" else f"not possible: {on[name]}" for name in instruments]
+        lines.append("| " + " | ".join([f"`{component}`", *cells]) + " |")
     return "\n".join(lines) + "\n"
 
 
@@ -333,6 +345,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "instruments": instruments,
     "controllers": controllers,
     "channels": channels,
+    "matrix": matrix,
     "quality": quality.scale_tables,
     "quality-rules": quality.rules_table,
     "components": component_pages,

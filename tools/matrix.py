@@ -11,15 +11,12 @@ HEAD = "# By job and instrument: done, or why `afspm check` refuses it. Written 
 
 
 def main(folder: Path) -> None:
-    outcomes: dict[str, dict[str, str]] = {}
+    jobs: dict[str, str] = {}
     for file in sorted(folder.glob("*.json")):
-        job, instrument, outcome = json.loads(file.read_text(encoding="utf-8"))
-        outcomes.setdefault(job, {})[instrument] = outcome
-    tables = (
-        f"\n[{job}]\n" + "".join(f"{instrument} = {json.dumps(outcome)}\n" for instrument, outcome in of_job.items())
-        for job, of_job in outcomes.items()
-    )
-    RECORD.write_text(HEAD + "".join(tables), encoding="utf-8")
+        job, components, instrument, outcome = json.loads(file.read_text(encoding="utf-8"))
+        head = f"\n[{job}]\ncomponents = {json.dumps(components)}\n\n[{job}.on]\n"
+        jobs[job] = jobs.get(job, head) + f"{instrument} = {json.dumps(outcome)}\n"
+    RECORD.write_text(HEAD + "".join(jobs.values()), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from afspm.model import (
     ControlMode,
     ControlState,
     Feedback,
+    FeedbackUnits,
     ProbePosition,
     ProblemNames,
     ScanParameters,
@@ -74,6 +75,12 @@ class ExperimentView:
         """Return the z feedback; None if the microscope has not published it."""
         self._catch_up()
         return self._link.view.feedback
+
+    @property
+    def feedback_units(self) -> FeedbackUnits:
+        """Return the units of the numbers of `feedback`; empty where the microscope has not published them."""
+        self._catch_up()
+        return self._link.view.feedback_units
 
     @property
     def tip(self) -> TipStatus | None:

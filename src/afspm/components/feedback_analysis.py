@@ -36,12 +36,9 @@ class FeedbackAnalysis(FeedbackObserver):
         if flag_after < 1 or clear_after < 1:
             raise ConfigError("`flag_after` and `clear_after` must be at least 1")
         self.flag_after, self.clear_after = flag_after, clear_after
-        self._pairing = ChannelPairing(self.channel, self.height)
+        self._pairing: ChannelPairing | None = None
         self._feedback = Feedback()
-        self._is_flagged = self._is_being_solved = False
-
-    def on_start(self) -> None:
-        self.expected = MissingChannels(self._pairing.channels, self.log)
+        self._is_flagged = self._is_being_solved = self._is_told = False
 
     def on_feedback(self, feedback: Feedback) -> None:
         self._feedback = feedback
@@ -51,6 +48,15 @@ class FeedbackAnalysis(FeedbackObserver):
         self._is_being_solved = self._is_flagged and bool(control_state.holder)
 
     def on_scan(self, scan: Scan) -> None:
+        if self._pairing is None:
+            try:
+                self._pairing = ChannelPairing(self.held_channel(), self.height)
+            except InvalidValue as unknown:
+                if not self._is_told:
+                    self.log.error("nothing is judged: %s; %s", unknown.what, unknown.hint)
+                self._is_told = True
+                return
+            self.expected = MissingChannels(self._pairing.channels, self.log)
         self.expected.see(scan)
         pair = self._pairing.add(scan)
         if pair is None or self._feedback.on is False:

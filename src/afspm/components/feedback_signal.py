@@ -19,11 +19,15 @@ _M_PER_V = 50e-9  # usual for the light lever of a cantilever
 _CURRENT_DECAY_M = 0.05e-9  # a tenth of the current for 0.1 nm: work functions of some eV
 
 
+_HELD = {"V": "amplitude", "A": "current", "Hz": "frequency shift", "m": "amplitude"}
+"""The signal that the feedback holds, by the unit of its setpoint."""
+
+
 class FeedbackSignal:
     """The comparison of a channel with the setpoint.
 
-    The setpoint is published without a unit. So the first scan in each unit causes a request to the microscope: whether
-    it can return the setpoint in that unit.
+    The first scan in each unit causes a request to the microscope: whether it can return the setpoint in that unit. A
+    channel in m is compared with a setpoint in V by the sensitivity, if it is given.
 
     Args:
         threshold: error above which a pixel is bad, as a share of the setpoint (of a current: as a difference of
@@ -47,7 +51,9 @@ class FeedbackSignal:
                 the translator does not answer at present, the channel has no value, the setpoint is zero, or `height`
                 is not in a unit of length or differs in pixels.
         """
-        if setpoint is not None:
+        if setpoint is not None and self._is_calibrated(signal, scope):
+            setpoint *= abs(self._sensitivity or 0.0) / convert(1.0, signal.unit, "m")
+        elif setpoint is not None:
             if signal.unit not in self._reasons:
                 self._reasons[signal.unit] = self._reason(signal, scope)
             if reason := self._reasons[signal.unit]:
@@ -64,6 +70,11 @@ class FeedbackSignal:
         if height_m.shape != error.shape:
             raise InvalidValue(f"{height.channel} and {signal.channel} differ in pixels")
         return feedback_error(error, threshold, height_m, self._gap_m(signal, setpoint))
+
+    def _is_calibrated(self, signal: Scan, scope: Scope) -> bool:
+        # An amplitude in m, with the setpoint in V: the height for 1 V is the amplitude of 1 V.
+        in_volts = bool(scope.feedback_units.setpoint) and same_kind(scope.feedback_units.setpoint, "V")
+        return self._sensitivity is not None and in_volts and same_kind(signal.unit, "m")
 
     def _gap_m(self, signal: Scan, setpoint: float | None) -> float:
         # 0 where the gap per relative error is not known.
@@ -91,19 +102,21 @@ class FeedbackObserver(Component):
     """Base of components that judge the feedback by its error signal in scans.
 
     Args:
-        channel: the signal that the feedback holds at the setpoint, in a unit that fits the setpoint's.
+        channel: the signal that the feedback holds at the setpoint, by role or name; None: by the unit of the setpoint
+            the amplitude, the current or the frequency shift.
         height: the channel of the heights; empty if not recorded: then a slightly slow feedback is not detected.
         threshold: error above which a pixel is bad, as a share of the setpoint (of a current: as a difference of
             logarithms); by default 0.1, and 0.5 for a current.
         limit: largest share of bad pixels with a good feedback.
         relief_limit: share of the relief that may be in the error instead of the height.
         sensitivity: height for 1 V of the channel, or, for a current, for a factor of 2.7; by default 50 nm, and 50 pm.
-            Negative if the signal falls as the tip withdraws, as a deflection does. Not needed for a channel in metres.
+            Negative if the signal falls as the tip withdraws, as a deflection does. A channel in metres needs it where
+            the setpoint is in V.
     """
 
     def __init__(
         self,
-        channel: ChannelName = "amplitude",
+        channel: ChannelName | None = None,
         height: ChannelName = HEIGHT,
         threshold: float | None = None,
         limit: float = FeedbackLimits.pixels,
@@ -115,3 +128,16 @@ class FeedbackObserver(Component):
         self.channel, self.height = channel, height
         self.limits = FeedbackLimits(limit, relief_limit)
         self.signal = FeedbackSignal(threshold, sensitivity)
+
+    def held_channel(self) -> str:
+        """Return the signal that the feedback holds, by role or name.
+
+        Raises:
+            InvalidValue: no channel is named, and the unit of the setpoint does not tell it.
+        """
+        unit = self.scope.feedback_units.setpoint
+        found = self.channel or next((role for kind, role in _HELD.items() if unit and same_kind(unit, kind)), None)
+        if found is None:
+            what = f"the unit of the setpoint, {unit!r}, does not tell which signal the feedback holds"
+            raise InvalidValue(what, where="channel", hint='name it: channel = "deflection"')
+        return found

@@ -108,11 +108,12 @@ class FeedbackTuner(FeedbackObserver):
         self.memory["way"] = [*self.memory["way"], gain]
         self.memory.save()
         scans = self.scope.scan()
-        for name in (self.channel, self.height):
+        held = self.held_channel()
+        for name in (held, self.height):
             if name and name not in scans:
                 raise InvalidValue(f"the scans have no channel {name!r}, there are {', '.join(scans)}")
         setpoint = self.scope.feedback.setpoint if self.scope.feedback else None
-        error = self.signal.error(scans[self.channel], scans.get(self.height), setpoint, self.scope)
+        error = self.signal.error(scans[held], scans.get(self.height), setpoint, self.scope)
         following = self.limits.judge(error)
         self.log.info("integral gain %g: the feedback %s: %s", gain, following.value, error)
         return following

@@ -23,16 +23,21 @@ def true_drift(run_dir: Path, scans: Sequence[DriftScan]) -> Array | None:
 
     The result includes displacement by rotation and expansion of the sample. The drift that the controller itself
     compensates is subtracted, since tip coordinates move with the compensation; the compensated drift is interpolated
-    between the starts and ends of scans. The result is None without the file or without scans.
+    between the starts and ends of scans. The result is None without the file or without scans, and after a restart of an
+    emulated controller.
 
     Raises:
         FileError: the file can't be read, or does not describe a simulated run.
     """
-    path = run_dir / TRUTH_FILE
-    if not path.exists() or not scans:
+    # the simulated microscope writes it into the run's folder, an emulated controller into its own
+    path = next(iter((*run_dir.glob(TRUTH_FILE), *sorted(run_dir.glob(f"*/{TRUTH_FILE}")))), None)
+    if path is None or not scans:
         return None
     try:
-        start, followed = _read(path)
+        starts, followed = _read(path)
+        if len(starts) > 1:  # an emulated controller that was restarted has begun with another sample
+            return None
+        (start,) = starts
         world = World.from_settings(start["settings"], int(start["seed"]), float(start["time_s"]))
     except (OSError, KeyError, ValueError, AfspmError) as error:
         raise FileError(f"does not say what was simulated: {error}", where=str(path)) from error
@@ -44,9 +49,9 @@ def true_drift(run_dir: Path, scans: Sequence[DriftScan]) -> Array | None:
     return tip_m - at_first_m
 
 
-def _read(path: Path) -> tuple[Plain, Array]:
-    # the entry of the simulator's start, and the drift that the controller compensated by then, (n, 3): time, x, y
-    start: Plain | None = None
+def _read(path: Path) -> tuple[list[Plain], Array]:
+    # the entries of starts, and the drift that the controller compensated by then, (n, 3): time, x, y
+    starts: list[Plain] = []
     followed: list[tuple[float, float, float]] = [(0.0, 0.0, 0.0)]
     with path.open(encoding="utf-8") as file:
         for line in file:
@@ -54,11 +59,11 @@ def _read(path: Path) -> tuple[Plain, Array]:
                 entry: Plain = from_json(line)
             except ValueError:
                 continue  # a line cut off by a kill
-            if entry["event"] == "start" and start is None:
-                start = entry
+            if entry["event"] == "start":
+                starts.append(entry)
             scan = entry.get("scan")
             if isinstance(scan, dict) and "compensated_start_m" in scan:
                 followed += [(scan[f"{at}_s"], *scan[f"compensated_{at}_m"][:2]) for at in ("start", "end")]
-    if start is None:
+    if not starts:
         raise ValueError("the entry of the simulator's start is missing")
-    return start, np.array(sorted(followed), dtype=np.float64)
+    return starts, np.array(sorted(followed), dtype=np.float64)

@@ -235,6 +235,7 @@ class Emulator(ABC):
         self.rig = SimulatedInstrument(
             self._world_settings, self.seed, clock.now_s(), run=in_background, note=truth.note
         )
+        truth.note(clock.now_s(), "start", {"settings": self._world_settings, "seed": self.seed})
         self.faults = Faults(self._faults, self.all_faults(), clock.now_s())
         folder.mkdir(parents=True, exist_ok=True)
         self.woken = WakeUp()
