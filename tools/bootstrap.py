@@ -19,8 +19,8 @@ ROOT = Path(__file__).resolve().parents[1]
 VENV = ROOT / ".venv"
 TOOLS = ROOT / "build" / "tools"
 UV_VERSION = "uv>=0.5,<1"
-NOT_TESTED = {"all", "notebook"}
-"""The extras that are not installed for the tests: these install Jupyter where they need it."""
+NOT_TESTED = {"all", "formats", "notebook"}
+"""The extras that are not installed for the tests: these install Jupyter where they need it, and write a converter."""
 
 
 def main(wanted: str) -> None:

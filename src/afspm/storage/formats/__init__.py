@@ -11,7 +11,6 @@ files (`afspm.basics.entry_points`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from datetime import tzinfo
 from pathlib import Path
@@ -23,12 +22,15 @@ from afspm.storage.formats.content import FileContent, OtherFormat
 __all__ = ["FileContent", "OtherFormat", "read", "suffixes"]
 
 
+_ANY = "*"
+"""The suffix of readers that try the files of all others."""
 Reader = Callable[[Path, tzinfo | None], FileContent]
 
 
 def suffixes() -> tuple[str, ...]:
-    """Return the suffixes of readable files, with their dots."""
-    return tuple(dict.fromkeys(f".{name.partition('.')[0]}" for name in entry_points.names(entry_points.READERS)))
+    """Return the suffixes of readable files, with their dots; those that only a converter reads are left out."""
+    names = (name.partition(".")[0] for name in entry_points.names(entry_points.READERS))
+    return tuple(dict.fromkeys(f".{name}" for name in names if name != _ANY))
 
 
 def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
@@ -36,7 +38,8 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
 
     The suffix of the file selects the reader: of a maker's format, of Gwyddion's simple fields (.gsf), or of NeXus
     (.h5, .nxs), be it afspm's record, an exported grid of spectra or the file of another program. `afspm doctor`
-    lists the suffixes. If two channels have the same name, the second becomes "name #2".
+    lists the suffixes. Gwyddion's converter, if it is installed (`afspm[formats]`), reads some 170 further formats. If
+    two channels have the same name, the second becomes "name #2".
 
     Args:
         zone: time zone of the controller's clock, which most files do not state; None: the zone of this computer.
@@ -47,15 +50,8 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     path = Path(path)
     if not path.is_file():
         raise FileError("no such file", where=str(path))
-    readers = _readers(path.suffix.lower())
-    if not readers:
-        raise FileError(
-            f"afspm has no reader for {path.suffix or 'a file without a suffix'}",
-            where=str(path),
-            hint=f"read: {' '.join(suffixes())}",
-        )
     try:
-        return _with_unique_channels(_first_that_reads(readers, path, zone))
+        return _with_unique_channels(_first_that_reads(path, zone))
     except FileError as error:
         if error.where:
             raise
@@ -65,15 +61,20 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
         raise FileError(f"is not readable as {path.suffix}: {why}", where=str(path)) from error
 
 
-def _readers(suffix: str) -> list[str]:
-    return [name for name in entry_points.names(entry_points.READERS) if f".{name.partition('.')[0]}" == suffix]
-
-
-def _first_that_reads(readers: Sequence[str], path: Path, zone: tzinfo | None) -> FileContent:
-    for name in readers[:-1]:
-        with suppress(OtherFormat):
+def _first_that_reads(path: Path, zone: tzinfo | None) -> FileContent:
+    own = _readers(path.suffix.lower().removeprefix("."))
+    refusals: list[OtherFormat] = []
+    for name in (*own, *_readers(_ANY)):
+        try:
             return _read(name, path, zone)
-    return _read(readers[-1], path, zone)
+        except OtherFormat as error:
+            refusals.append(error)
+    # what the last reader of the suffix says is closer to the truth than what a converter says
+    raise refusals[max(len(own) - 1, 0)]
+
+
+def _readers(suffix: str) -> list[str]:
+    return [name for name in entry_points.names(entry_points.READERS) if name.partition(".")[0] == suffix]
 
 
 def _read(name: str, path: Path, zone: tzinfo | None) -> FileContent:
