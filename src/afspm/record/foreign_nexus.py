@@ -1,7 +1,7 @@
 """Reader of NeXus files of other programs (.nxs, .h5): images and curves in any NXdata with units.
 
-NeXus gives an image axes and, in NXspm, a scan region: `scan_offset_value` is its centre, `scan_angle` its rotation, in
-a sense that the definition leaves open. Files of pynxtools-spm, compared with the Nanonis files that they were made
+NeXus gives an image axes and, in NXspm, a scan region: its offset is the centre, its angle the rotation, in a sense
+that the definition leaves open. Files of pynxtools-spm, compared with the Nanonis files that they were made
 from, show: the angle is Nanonis' own, clockwise, and is not applied to the axes. Its older files state the offset as
 the start of the region, their axes are wrong by half a frame, and y descends although the rows ascend.
 """

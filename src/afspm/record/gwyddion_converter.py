@@ -1,4 +1,4 @@
-"""Files in formats of which Gwyddion alone has a reader, converted by its program `gwyconvert` to .gwy.
+"""Files in formats that only Gwyddion reads, converted to .gwy by its program `gwyconvert`.
 
 The program has another licence than afspm (GPL-2.0-or-later) and reads files of strangers in C: it is installed by the
 user, and runs as a process of its own with limits of time and, except on Windows, of memory.

@@ -201,7 +201,7 @@ class Table(Sequence[T], Generic[T]):
         return made
 
     def to_xarray(self) -> xarray.Dataset:
-        """Return a Dataset over `row`, which `to_netcdf` can write (needs the extra `xarray`)."""
+        """Return a Dataset over `row`, which xarray can write as NetCDF (needs the extra `xarray`)."""
         with imports_of_extra("xarray", "to_xarray"):
             import xarray
 

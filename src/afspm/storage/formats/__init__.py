@@ -28,7 +28,7 @@ Reader = Callable[[Path, tzinfo | None], FileContent]
 
 
 def suffixes() -> tuple[str, ...]:
-    """Return the suffixes of readable files, with their dots; those that only a converter reads are left out."""
+    """Return the suffixes of readable files, with their dots, except suffixes that only a converter reads."""
     names = (name.partition(".")[0] for name in entry_points.names(entry_points.READERS))
     return tuple(dict.fromkeys(f".{name}" for name in names if name != _ANY))
 
