@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import sqlite3
 from dataclasses import replace
@@ -17,6 +18,7 @@ import afspm
 from afspm import wire
 from afspm.basics.errors import FileError
 from afspm.model import (
+    ChannelRoles,
     Frame,
     InstrumentReading,
     InstrumentReadings,
@@ -55,6 +57,40 @@ def test_scan_is_one_file_with_all_channels_and_its_provenance(
     about = run.about(row)
     assert about["feedback"] == {"on": True, "proportional_gain": 0.125, "integral_gain": 1500.0, "setpoint": 0.75}
     assert (about["experiment"], about["seeds"], about["simulated"]) == ("night", {"microscope": 7}, True)
+
+
+def test_roles_of_channels_are_kept_and_the_topography_is_first(
+    night: Night, store: RecordStore, tmp_path: Path
+) -> None:
+    roles = ChannelRoles({"height": ("Topo",), "current": ("Current",)}).with_topography(feedback_on=True)
+    store.take([night.packet(roles)])
+    again = RecordStore(tmp_path, ABOUT)  # in another life, which gets the roles again from the cache
+    packets = night.scan_in_files(1, ("Current", "Topo"))
+    again.take([night.packet(roles), night.state(ScopeState.SCANNING), *packets, night.state(ScopeState.FREE)])
+    again.close()
+    run = afspm.open_run(tmp_path)
+    assert [name for name, _ in run.scans[0].channels] == ["Topo", "Current"]
+    scans = run.scan(0)
+    assert (scans["topography"].channel, scans["height"].channel, scans["current"].channel) == (
+        "Topo",
+        "Topo",
+        "Current",
+    )
+    assert run.about(run.scans[0])["channels"][0]["roles"] == ["height", "topography"]
+
+
+def test_scan_recorded_without_roles_is_read(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    store.take(night.whole_scan(1))
+    file = tmp_path / afspm.open_run(tmp_path).scans[0].file
+    with h5py.File(file, "r+") as opened:  # as versions without roles wrote it
+        kept = opened["entry/afspm"]
+        about = json.loads(kept["about"][()])
+        for channel in about["channels"]:
+            del channel["roles"]
+        del kept["about"]
+        kept["about"] = json.dumps(about)
+    assert [scan.roles for scan in read(file).scans] == [(), ()]
 
 
 def test_file_follows_nexus(night: Night, store: RecordStore, tmp_path: Path) -> None:

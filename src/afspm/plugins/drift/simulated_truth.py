@@ -23,8 +23,8 @@ def true_drift(run_dir: Path, scans: Sequence[DriftScan]) -> Array | None:
 
     The result includes displacement by rotation and expansion of the sample. The drift that the controller itself
     compensates is subtracted, since tip coordinates move with the compensation; the compensated drift is interpolated
-    between the starts and ends of scans. The result is None without the file or without scans, and after a restart of an
-    emulated controller.
+    between the starts and ends of scans. The result is None without the file or without scans, and after a restart of
+    an emulated controller.
 
     Raises:
         FileError: the file can't be read, or does not describe a simulated run.
