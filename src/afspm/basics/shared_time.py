@@ -252,7 +252,7 @@ class SharedSimulationTime:
 
     def _withdraw(self, own: _OwnHold, speed: float) -> None:
         hold, own.hold = own.hold, None
-        if hold is not None:
+        if hold is not None and not self._file.closed:  # else it ends with its process
             self._change(lambda shared: shared.without_hold(hold), speed)
 
     def _change(self, change: Callable[[SharedTime], SharedTime], speed: float) -> None:

@@ -58,7 +58,7 @@ class ChannelRoles:
         return cls(of_roles, tuple(names.get(OTHER, ())))
 
     def changed(self, given: Mapping[str, str | Sequence[str]]) -> ChannelRoles:
-        """Return the roles with those that the experiment file names instead.
+        """Return the roles, with the names of the experiment file in place of the driver's.
 
         Raises:
             ConfigError: there is no such role, or a name is not a text.
@@ -74,7 +74,7 @@ class ChannelRoles:
         return ChannelRoles(of_roles, (*self.others, *found.get(OTHER, ())))
 
     def with_topography(self, *, feedback_on: bool | None) -> ChannelRoles:
-        """Return the roles with that of the topography: at constant height, the height shows nothing."""
+        """Return the roles with the topography: at constant height, the height shows nothing."""
         wanted = AT_CONSTANT_HEIGHT if feedback_on is False else ()
         role = next((one for one in (*wanted, HEIGHT) if one in self.names), None)
         return self if role is None else replace(self, names={**self.names, TOPOGRAPHY: self.names[role]})
@@ -89,7 +89,7 @@ class ChannelRoles:
         return replace(measured, roles=roles) if roles else measured
 
     def topography_first(self, channels: Iterable[str]) -> tuple[str, ...]:
-        """Return channels as they are shown: that of the topography first, the others in their order."""
+        """Return channels as they are shown: the topography first, the others in their order."""
         return tuple(sorted(channels, key=lambda channel: TOPOGRAPHY not in self.of(channel)))
 
     def refuses(self, channel: str) -> str:

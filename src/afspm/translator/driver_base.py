@@ -281,7 +281,7 @@ class DriverBase(ABC):
 
     @classmethod
     def channels_of(cls, settings: PlainMapping) -> ChannelRoles:
-        """Return the channels that the microscope may have, with those that the experiment file names.
+        """Return the channels that the microscope may have, with the names of the experiment file.
 
         Raises:
             ConfigError: the file names a role that there is not.

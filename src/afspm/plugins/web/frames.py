@@ -76,7 +76,7 @@ class FrameStore:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The channels: that of the topography first, the others in the order of their first appearance."""
+        """The channels: the topography first, the others in the order of their first appearance."""
         return self.roles.topography_first(self._newest)
 
     def take_scan(self, scan: Scan, time_ns: int) -> None:
