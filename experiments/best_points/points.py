@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from afspm import ChannelName, Component, Region, wire
+from afspm import Component, Region, wire
 from afspm.basics.units import Length
+from afspm.model import ChannelName
 
 MESSAGE = "SpatialPointWithScoreList"
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from afspm import ChannelName, Component
+from afspm import Component
+from afspm.model import ChannelName
 
 
 class Sharpness(Component):

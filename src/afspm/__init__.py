@@ -12,13 +12,12 @@ if TYPE_CHECKING:
     from afspm.client.component import Component
     from afspm.client.connect import connect
     from afspm.client.scope import Scope
-    from afspm.model import ChannelName, ControlMode, Problem, Region, Scan, ScanSet, ScopeState, Spectrum
+    from afspm.model import ControlMode, Problem, Region, Scan, ScanSet, ScopeState, Spectrum
     from afspm.record.catalogue import find_runs
     from afspm.record.run import open_run
     from afspm.storage.formats import read
 
 __all__ = [
-    "ChannelName",
     "Component",
     "ControlMode",
     "Problem",

@@ -7,6 +7,7 @@ else. `make test-matrix` runs all of them, and writes `matrix.toml` again.
 from __future__ import annotations
 
 import re
+import shutil
 import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -109,14 +110,16 @@ ELSEWHERE = {
 CELLS = [(job, instrument) for job in PROOFS for instrument in SECOND_FILES]
 
 
-def files(job: str, instrument: str) -> tuple[Path, Path]:
-    """Return the files of a cell."""
-    return JOBS / f"{job}.toml", SECOND_FILES[instrument]
+def files(folder: Path, job: str, instrument: str) -> tuple[Path, Path]:
+    """Return the files of a cell; the job with the modules that it names is copied into the folder."""
+    shutil.copytree(JOBS, folder)
+    shutil.copy(EXPERIMENTS / "agent" / "scripted.py", folder)
+    return folder / f"{job}.toml", SECOND_FILES[instrument]
 
 
-def refusal(job: str, instrument: str) -> str:
-    """Return why `afspm check` refuses a job on an instrument; empty if it does not."""
-    errors = [one.what for one in load(*files(job, instrument)).check() if one.is_error]
+def refusal(of_cell: tuple[Path, Path]) -> str:
+    """Return why `afspm check` refuses the files of a cell; empty if it does not."""
+    errors = [one.what for one in load(*of_cell).check() if one.is_error]
     return re.sub(r", which \[microscope\] .*", "", errors[-1]) if errors else ""
 
 

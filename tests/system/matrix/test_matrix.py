@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 from pathlib import Path
 
 import pytest
@@ -15,9 +14,7 @@ from tests.system.matrix.matrix_lab import (
     CELLS,
     DONE,
     ELSEWHERE,
-    EXPERIMENTS,
     PROOFS,
-    SECOND_FILES,
     files,
     recorded,
     refusal,
@@ -40,23 +37,19 @@ def test_record_has_an_outcome_for_every_cell() -> None:
 
 
 @pytest.mark.parametrize(("job", "instrument"), CELLS)
-def test_check_refuses_what_the_record_calls_impossible(job: str, instrument: str) -> None:
+def test_check_refuses_what_the_record_calls_impossible(tmp_path: Path, job: str, instrument: str) -> None:
     outcome = recorded()[job][instrument]
-    assert refusal(job, instrument) == ("" if outcome == DONE else outcome)
+    assert refusal(files(tmp_path / "jobs", job, instrument)) == ("" if outcome == DONE else outcome)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("job", "instrument"), rotated(CELLS, len(CELLS) // 12) if not WRITTEN else CELLS)
 def test_job_is_done(afspm_run: Run, tmp_path: Path, job: str, instrument: str) -> None:
     pytest.importorskip("matplotlib")
-    outcome = refusal(job, instrument) or DONE
+    of_cell = files(tmp_path / "jobs", job, instrument)
+    outcome = refusal(of_cell) or DONE
     if outcome == DONE:
-        folder = tmp_path / "jobs"
-        shutil.copytree(files(job, instrument)[0].parent, folder)
-        shutil.copy(EXPERIMENTS / "agent" / "scripted.py", folder)
-        one = afspm_run(
-            str(folder / f"{job}.toml"), str(SECOND_FILES[instrument]), "--runs", str(tmp_path / "runs"), where=tmp_path
-        )
+        one = afspm_run(*map(str, of_cell), "--runs", str(tmp_path / "runs"), where=tmp_path)
         assert one.end() == 0, one.output
         wrong = [line for line in one.lines if re.search(r" CRITICAL |Traceback", line) and NO_GAIN not in line]
         assert not wrong, one.output

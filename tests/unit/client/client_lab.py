@@ -22,6 +22,7 @@ from afspm.model import (
     ControlResponse,
     ControlState,
     Feedback,
+    FeedbackUnits,
     Packet,
     Parameter,
     ProbePosition,
@@ -115,6 +116,7 @@ class Lab:
         self.open = True
         self.connect()
         self.publish(Simulator.declared_channels({"feedback": {"mode": "amplitude"}}).with_topography(feedback_on=True))
+        self.publish(FeedbackUnits(setpoint="V"))
         self.publish(ScopeStatus(self.state))
         self.publish(self.parameters)
         self.publish(self.position)

@@ -161,6 +161,7 @@ def test_other_messages_come_by_their_name_or_to_on_message() -> None:
     assert others.named == [("FeedbackAnalysis_fine", 0.25)]
     assert others.rest == [
         "ChannelRoles",
+        "ZCtrlUnits",
         "ScopeStateMsg",
         "ScanParameters2d",
         "ProbePosition",

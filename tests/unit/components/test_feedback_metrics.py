@@ -22,7 +22,7 @@ from afspm.components.feedback_metrics import (
     relative_error,
 )
 from afspm.components.feedback_signal import FeedbackSignal
-from afspm.model import Feedback, Region, Scan
+from afspm.model import Feedback, FeedbackUnits, Region, Scan
 from afspm.simulation import World
 
 PICTURE = Path(__file__).parents[3] / "experiments" / "picture" / "sample.png"
@@ -85,7 +85,7 @@ def scanned(sample: Sample, gain: float) -> tuple[Scan, Scan]:
 def following(name: str, gain: float) -> FeedbackQuality:
     sample = {**SAMPLES, **FLAT}[name]
     signal, height = scanned(sample, gain)
-    scope: Any = type("Scope", (), {"get": lambda *_, **__: sample.setpoint})()
+    scope: Any = type("Scope", (), {"get": lambda *_, **__: sample.setpoint, "feedback_units": FeedbackUnits()})()
     return FeedbackLimits().judge(FeedbackSignal(None, None).error(signal, height, sample.setpoint, scope))
 
 

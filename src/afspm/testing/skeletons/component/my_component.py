@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from afspm import ChannelName, Component, Scan
+from afspm import Component, Scan
+from afspm.model import ChannelName
 
 
 class MyComponent(Component):
