@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from afspm.model import Region, Scan, ScanLines
+from afspm.model import ChannelRoles, Region, Scan, ScanLines
 from afspm.model.line_levelling import Levelling
 from afspm.plugins.web.dashboard.pictures import Look, PictureCache
 from afspm.plugins.web.frames import MEMORY_BYTES, MOST_CHANNELS, FrameStore
@@ -99,6 +99,16 @@ def test_each_channel_has_its_own_newest() -> None:
     assert first is not None
     assert (phase.values[0, 0], first.channel) == (2.0, "Height")
     assert store.newest("Amplitude") is None
+
+
+def test_topography_is_shown_whatever_channel_came_first() -> None:
+    store = FrameStore()
+    store.take_scan(scan(1.0, 20 * S, "Phase"), 20 * S)
+    store.roles = ChannelRoles({"height": ("Z Forward",)}).with_topography(feedback_on=True)
+    store.take_scan(scan(2.0, 20 * S, "Z Forward"), 20 * S)
+    newest = store.newest()
+    assert newest is not None
+    assert (newest.channel, store.channels) == ("Z Forward", ("Z Forward", "Phase"))
 
 
 def test_finished_scans_are_kept_within_the_memory_bound() -> None:
