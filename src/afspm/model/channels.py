@@ -21,6 +21,8 @@ QUANTITIES: Final = (
     HEIGHT, CURRENT, "amplitude", "phase", "deflection", FREQUENCY_SHIFT, "excitation", "friction", "potential",
 )  # fmt: skip
 """The measured quantities, each with a role for the trace, and one with `RETRACE` for the retrace."""
+ROLES_APART: Final = "; "
+"""Between the roles of a channel in an exported file."""
 OTHER: Final = "other"
 """Under this name the experiment file lists channels without a role."""
 AT_CONSTANT_HEIGHT: Final = (FREQUENCY_SHIFT, CURRENT)

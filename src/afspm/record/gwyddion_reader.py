@@ -21,6 +21,7 @@ from afspm.basics.errors import FileError
 from afspm.basics.plain_data import Plain
 from afspm.basics.units import convert
 from afspm.model import Frame, Region, Scan, Spectrum
+from afspm.model.channels import ROLES_APART
 from afspm.storage.formats.content import FileContent, text_of
 
 _MAGIC: Final = b"GWYP"
@@ -74,7 +75,8 @@ def _scan(content: Plain, number: int, filename: str) -> Scan:
     region = Region(_pair(meta["center_m"]), _pair(meta["size_m"]), angle_rad, frame)
     if (mask := content.get(f"/{number}/mask")) is not None:
         values[_pixels(mask)[::-1] > 0.5] = np.nan
-    return Scan(region, title, unit, values, _whole(meta, "time_ns"), meta.get("filename", ""))
+    roles = tuple(filter(None, meta.get("roles", "").split(ROLES_APART)))
+    return Scan(region, title, unit, values, _whole(meta, "time_ns"), meta.get("filename", ""), roles=roles)
 
 
 def _pixels(field: Plain) -> Array:

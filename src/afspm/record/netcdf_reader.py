@@ -11,6 +11,7 @@ import numpy as np
 
 from afspm.basics.plain_data import Plain
 from afspm.model import Frame, Region, Scan, Spectrum
+from afspm.model.channels import ROLES_APART
 from afspm.storage.formats import hdf5, netcdf
 from afspm.storage.formats.content import FileContent, OtherFormat
 
@@ -43,7 +44,14 @@ def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
 def _scans(file: netcdf.File, facts: Plain) -> list[Scan]:
     region = Region(tuple(facts["center_m"]), tuple(facts["size_m"]), facts["angle_rad"], Frame(facts["frame"]))
     return [
-        Scan(region, *_name_and_unit(variable), variable.values, time_ns, facts["filename"])
+        Scan(
+            region,
+            *_name_and_unit(variable),
+            variable.values,
+            time_ns,
+            facts["filename"],
+            roles=tuple(filter(None, str(variable.attributes.get("roles", "")).split(ROLES_APART))),
+        )
         for variable, time_ns in zip(
             (variable for name, variable in file.variables.items() if name not in _AXES), facts["ends_ns"], strict=True
         )

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tests.unit.record.record_lab import ABOUT, Night
 
 import afspm
-from afspm.model import Frame, Region, Scan, ScanSet, ScopeState, Spectrum
+from afspm.model import ChannelRoles, Frame, Region, Scan, ScanSet, ScopeState, Spectrum
 from afspm.record.export import export, gwyddion, netcdf
 from afspm.record.run import Run
 from afspm.record.store import RecordStore
@@ -66,6 +66,8 @@ def recorded(folder: Path, things: list[Scan] | list[Spectrum]) -> Run:
     night, store = Night(), RecordStore(folder / "run", ABOUT)
     states = (ScopeState.SPEC if isinstance(things[0], Spectrum) else ScopeState.SCANNING, ScopeState.FREE)
     envelopes = [f"Scan2d_1_{one.channel}" if isinstance(one, Scan) else "Spec1d_IV" for one in things]
+    roles = ChannelRoles({"height, retrace": (things[0].channel,)} if isinstance(things[0], Scan) else {})
+    store.take([night.packet(roles.with_topography(feedback_on=None))])
     packets = [night.packet(one, envelope) for one, envelope in zip(things, envelopes, strict=True)]
     store.take([night.control(), night.state(states[0]), *packets, night.state(states[1])])
     store.close()
@@ -92,6 +94,7 @@ def test_exported_scan_is_read_as_it_was_measured(to: str, measured: list[Scan])
     for one, expected in zip(found.scans, there.values(), strict=True):
         np.testing.assert_array_equal(one.values, expected.values)
         assert one.region == expected.region
+        assert one.roles == expected.roles == (("height, retrace",) if one is found.scans[0] else ())
         assert (one.channel, one.unit, one.filename) == (expected.channel, expected.unit, expected.filename)
         assert one.time_ns == (found.end_ns if to == "gwy" else expected.time_ns)
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from afspm.basics.plain_data import PlainMapping
 from afspm.model import Scan, Spectrum
+from afspm.model.channels import ROLES_APART
 from afspm.record.run import Run
 from afspm.record.spectrum_stack import SpectrumStack, mean_over_repeats
 from afspm.record.tables import ScanRow, SpectrumRow
@@ -47,7 +48,8 @@ def scan_file(scans: Sequence[Scan], meta: Mapping[str, str]) -> bytes:
         items.append((f"/{number}/data/visible", "b", True))
         if unknown.any():  # Gwyddion has no NaN: unmeasured pixels are masked
             items.append((f"/{number}/mask", "o", _field(scan, unknown.astype(np.float64), "")))
-        items.append((f"/{number}/meta", "o", _object("GwyContainer", [(k, "s", v) for k, v in meta.items()])))
+        own = {**meta, "roles": ROLES_APART.join(scan.roles)} if scan.roles else meta
+        items.append((f"/{number}/meta", "o", _object("GwyContainer", [(k, "s", v) for k, v in own.items()])))
     return _MAGIC + _object("GwyContainer", items)
 
 

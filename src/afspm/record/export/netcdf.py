@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from afspm.model import ScanSet, Spectrum
+from afspm.model.channels import ROLES_APART
 from afspm.record.netcdf_reader import FACTS, PLACES
 from afspm.record.nexus_writer import field_names
 from afspm.record.run import Run
@@ -43,7 +44,8 @@ def scan_file(scans: ScanSet, about: Mapping[str, object], facts: Mapping[str, o
         for name, places_m in zip(PLACES, scans.region.pixels_m((rows, columns)), strict=True):
             variables[name] = Variable(("y", "x"), places_m, {"units": "m", "long_name": f"{name[0]} of each pixel"})
     for name, scan in zip(field_names(scans, ("x", "y", *PLACES)), scans.values(), strict=True):
-        attributes: Attributes = {"long_name": scan.channel, "units": scan.unit}
+        roles = {"roles": ROLES_APART.join(scan.roles)} if scan.roles else {}
+        attributes: Attributes = {"long_name": scan.channel, "units": scan.unit, **roles}
         variables[name] = Variable(("y", "x"), scan.values, attributes)
     region, first = scans.region, scans.first
     where = {"center_m": region.center_m, "size_m": region.size_m, "angle_rad": region.angle_rad}
