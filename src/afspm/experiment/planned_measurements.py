@@ -164,7 +164,7 @@ def _refusals_by_role(name: str, planned: PlannedMeasurements, role: RoleLimits)
 
 def _refusals_by(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[Refusal]:
     # steps and rates depend on the value before, which is unknown here
-    guard = LimitChecker(_without_changes(limits))
+    guard = LimitChecker(limits.fixed)
     found: dict[str, Refusal] = {}
 
     def check(kind: ControlRequest, subject: object, where: tuple[str | int, ...] = (), hint: str = "") -> None:
@@ -174,14 +174,14 @@ def _refusals_by(name: str, planned: PlannedMeasurements, limits: ExperimentLimi
 
     for setting, parameters in planned.parameters.items():
         if setting == "initial":  # values of the microscope itself; its frame is checked in parts
-            guard = LimitChecker(replace(_for_all(_without_changes(limits)), region=None))
+            guard = LimitChecker(replace(_for_all(limits.fixed), region=None))
         for parameter in parameters:
             check(ControlRequest.PARAM, parameter, (setting, parameter.name))
     for before, after in _sweep_steps(planned.sweep, limits) if planned.sweep else ():
         guard = LimitChecker(_with_steps_alone(limits)).in_force(before, 0)
         hint = 'list values between them, or leave `order` at "snake"'
         check(ControlRequest.PARAM, after, ("parameters", after.name), hint)
-    guard = LimitChecker(_without_changes(limits))
+    guard = LimitChecker(limits.fixed)
     cure = _remedy(planned, limits.region)
     for number, region in enumerate(planned.regions):
         wanted, where = ScanParameters(region, planned.shape), ("regions", number)
@@ -293,7 +293,7 @@ def too_slow(planned: PlannedMeasurements, usual_m_s: float | None) -> str:
 def refused_actions(limits: ExperimentLimits) -> list[tuple[str, str]]:
     """Return the actions whose settings the limits would always refuse, with the reasons."""
     # the tip's position is unknown before the start
-    guard = LimitChecker(replace(_for_all(_without_changes(limits)), actions={}, region=None))
+    guard = LimitChecker(replace(_for_all(limits.fixed), actions={}, region=None))
     found = []
     for action in limits.sets:
         refused = guard.check("", Request(ControlRequest.ACTION, action, b""), 0)
@@ -322,10 +322,3 @@ def _with_steps_alone(limits: ExperimentLimits) -> ExperimentLimits:
 
 def _for_all(limits: ExperimentLimits) -> ExperimentLimits:
     return replace(limits, parameters={name: replace(limit, only=None) for name, limit in limits.parameters.items()})
-
-
-def _without_changes(limits: ExperimentLimits) -> ExperimentLimits:
-    parameters = {
-        name: replace(limit, step=None, rate_per_s=None, interval_s=None) for name, limit in limits.parameters.items()
-    }
-    return replace(limits, parameters=parameters)

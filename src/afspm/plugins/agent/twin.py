@@ -25,6 +25,7 @@ from afspm.model.line_levelling import Levelling, levelled
 from afspm.plugins.agent.plan import MoveStep, Plan, ScanStep, SetStep, SpectrumStep, plan_of
 from afspm.record.drawing.raster import indices, png, value_range
 from afspm.record.run_json import EXPERIMENT_FILE
+from afspm.scheduler.safety.grants import not_of_role
 from afspm.scheduler.safety.limit_checker import LimitChecker
 from afspm.scheduler.safety.limits import ExperimentLimits
 from afspm.scheduler.safety.parameter_values import number_of
@@ -52,20 +53,15 @@ def refusals(plan: Plan, who: str, limits: ExperimentLimits, frame: Frame) -> li
     """Return the reasons, as text, for which the limits would refuse requests of a plan."""
     found = []
     role = limits.roles.get(who) or limits.roles.get(component_of(who))
-    # steps and rates depend on the values in force then: only the scheduler can check them
-    fixed = {name: replace(one, step=None, rate_per_s=None, interval_s=None) for name, one in limits.parameters.items()}
-    checkers = [LimitChecker(replace(limits, parameters=fixed, actions={
-        name: replace(one, interval_s=None) for name, one in limits.actions.items()
-    }))]  # fmt: skip
+    checkers = [LimitChecker(limits.fixed)]
     if role is not None:
-        checkers.append(LimitChecker(role.limits))
+        checkers.append(LimitChecker(role.limits.fixed))
     for number, planned in enumerate(plan.requests(frame), 1):
         request = Request(planned.kind, planned.subject)
         refused = [one for checker in checkers if (one := checker.check(who, request, 0)) is not None]
         found += [f"request {number} ({planned.text}): {one.reason}" for one in refused]
-        if role is not None and role.actions is not None and isinstance(planned.subject, str):
-            is_allowed = planned.subject in role.actions
-            found += [] if is_allowed else [f"request {number}: {planned.subject} is not allowed ({role.source})"]
+        if role is not None and (why := not_of_role(role, who, request)):
+            found.append(f"request {number} ({planned.text}): {why}")
     return found
 
 

@@ -422,12 +422,9 @@ class GrantChecker:
             return ""
         if why := _outside(role.limits, who, request, now_ns, offset_m, state):
             return why
-        if request.kind != ControlRequest.ACTION:
-            others = _others(request, role.limits) if role.parameters_only else []
-            return f"{others[0]} is not among the parameters of {who} ({role.source})" if others else ""
-        action = str(request.subject)
-        if role.actions is not None and action not in role.actions and action not in _STOPS:
-            return f"{action} is not among the actions of {who} ({role.source})"
+        if why := not_of_role(role, who, request):
+            return why
+        action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
         most = role.per_hour.get(action)
         lately = [one for one in self.book.spent.get(who, ()) if one.action == action and now_ns - one.at_ns < _HOUR_NS]
         is_repeated = bool(request.id) and self._spent(who, request.id) is not None
@@ -487,6 +484,17 @@ class GrantChecker:
 
     def _with(self, **changes: object) -> GrantChecker:
         return replace(self, book=replace(self.book, **changes))  # type: ignore[arg-type]
+
+
+def not_of_role(role: RoleLimits, who: str, request: Request) -> str:
+    """Return the reason why a role lacks the parameter or action of a request at any time; empty if it has it."""
+    if request.kind != ControlRequest.ACTION:
+        others = _others(request, role.limits) if role.parameters_only else []
+        return f"{others[0]} is not among the parameters of {who} ({role.source})" if others else ""
+    action = str(request.subject)
+    if role.actions is None or action in role.actions or action in _STOPS:
+        return ""
+    return f"{action} is not among the actions of {who} ({role.source})"
 
 
 def _less(held: Mapping[str, HeldGrant], agent: str) -> dict[str, HeldGrant]:

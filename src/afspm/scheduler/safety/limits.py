@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -96,6 +96,18 @@ class ExperimentLimits:
     most_pixels: int = 8192 * 8192
     sets: Mapping[str, tuple[Parameter, ...]] = field(default_factory=dict)
     roles: Mapping[str, RoleLimits] = field(default_factory=dict)
+
+    @cached_property
+    def fixed(self) -> ExperimentLimits:
+        """The limits that can be checked before a run: without steps, rates and intervals.
+
+        These depend on the values in force when a request is sent, which only the scheduler knows.
+        """
+        fixed = {
+            name: replace(one, step=None, rate_per_s=None, interval_s=None) for name, one in self.parameters.items()
+        }
+        actions = {name: replace(one, interval_s=None) for name, one in self.actions.items()}
+        return replace(self, parameters=fixed, actions=actions)
 
     @cached_property
     def bounded(self) -> frozenset[str]:
