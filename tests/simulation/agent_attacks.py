@@ -144,7 +144,7 @@ class Attack:
     def _approve(self) -> None:
         proposal = self.random.choice(list(self.rig.place.proposals.values())[-3:])
         if proposal.preflight:
-            self._person(GRANT_REQUEST, of_plan(proposal, self.rig.place.frame)[0])
+            self._person(GRANT_REQUEST, of_plan(proposal, self.rig.place.frame, facts(self.rig))[0])
 
     # --- the model ---
 

@@ -139,7 +139,7 @@ def test_tip_is_retracted_after_a_plan_that_failed_with_the_feedback_off(monkeyp
         given: dict[str, object] = {"plan": {"title": "t", "steps": steps}}
         id_ = facts(await rig.tools.call("claude", "propose", given))["proposal"]
         await rig.tools.call("claude", "preflight", {"proposal": id_})
-        approval, _ = of_plan(rig.place.proposal(id_)[0], Frame.TIP)
+        approval, _ = of_plan(rig.place.proposal(id_)[0], Frame.TIP, agent_rig.facts(rig))
         assert rig.request(ADA, Request(GRANT_REQUEST, approval, b"", f"{ADA}/a/1")).ok
         await rig.tools.call("claude", "run", {"proposal": id_})
         while rig.place.runs["1"].state == "running" or rig.core.control.holder is not None:

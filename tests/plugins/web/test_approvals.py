@@ -12,11 +12,11 @@ import pytest
 
 from afspm import wire
 from afspm.basics.errors import InvalidValue
-from afspm.model import Approval, Approvals, GrantedCount, GrantedRange, Proposal
-from afspm.plugins.agent.approval import of_table, simulated
+from afspm.model import Approval, Approvals, Frame, GrantedCount, GrantedRange, Proposal
+from afspm.plugins.agent.approval import of_plan, of_table, simulated
 from afspm.plugins.agent.plan import read_plan
 from afspm.plugins.web.archive import agents_in
-from afspm.plugins.web.dashboard.approvals import in_force, reviewed, title, waiting
+from afspm.plugins.web.dashboard.approvals import in_force, in_words, title, waiting
 from afspm.plugins.web.dashboard.grant_dialog import GrantFields
 from afspm.plugins.web.dashboard.steering_panel import drawn_box
 from afspm.record.overview import Overview
@@ -29,7 +29,7 @@ PLAN = read_plan({
         {"do": "scan", "center": ["0 nm", "0 nm"], "size": ["1 um", "1 um"], "pixels": [8, 8]},
     ],
 })  # fmt: skip
-FOUND = {"seconds": 8.0, "harm": {"pressed_m": 2e-9}, "refusals": ["too far"], "facts": {"run": "r", "now_ns": 1}}
+FOUND = {"seconds": 8.0, "harm": {"pressed_m": 2e-9}, "refusals": ["too far"]}
 
 
 def proposal(preflight: str = json.dumps(FOUND), id_: str = PLAN.id) -> Proposal:
@@ -37,7 +37,8 @@ def proposal(preflight: str = json.dumps(FOUND), id_: str = PLAN.id) -> Proposal
 
 
 def test_each_request_is_shown_and_is_in_the_approval() -> None:
-    grant, lines = reviewed(proposal())
+    grant, plan = of_plan(proposal(), Frame.TIP, {"run": "r", "now_ns": 1})
+    lines = in_words(plan)
     assert len(lines) == len(grant.steps) == 3
     assert lines[0] == "set tip-bias-voltage to 0.5 V"
     sent = wire.decode_request([bytes([grant.steps[0].request]), grant.steps[0].payload])
@@ -54,7 +55,7 @@ def test_title_is_escaped_and_the_simulation_is_in_words() -> None:
 @pytest.mark.parametrize("changed", [proposal(""), proposal(id_="f" * 16)])
 def test_plan_without_preflight_or_with_another_hash_is_not_reviewed(changed: Proposal) -> None:
     with pytest.raises(InvalidValue):
-        reviewed(changed)
+        of_plan(changed, Frame.TIP, {})
 
 
 def test_failed_simulation_is_not_shown_as_harmless() -> None:
@@ -68,7 +69,7 @@ def test_failed_simulation_is_not_shown_as_harmless() -> None:
 def test_unreadable_proposal_is_shown_without_an_error(text: str) -> None:
     assert title(replace(proposal(), plan=text)) == ""
     assert waiting(replace(proposal(), plan=text))[1] == f"proposes {PLAN.id}"
-    assert waiting(proposal(text))[2] == "Not simulated: the preflight can't be read."
+    assert waiting(proposal(text))[2] == "Its own preflight: Not simulated: the preflight can't be read."
 
 
 def test_approval_in_force_shows_its_person_and_its_end() -> None:
@@ -93,7 +94,7 @@ def test_waiting_proposal_names_its_agent_its_requests_and_its_simulation() -> N
     agent, what, details = waiting(proposal())
     assert agent == "agent:claude"
     assert what.startswith("waits for your approval: “look <b>here</b>\\u202e”: set tip-bias-voltage to 0.5 V; ")
-    assert details == simulated(proposal())
+    assert details == f"Its own preflight: {simulated(proposal())}"
 
 
 FIELDS = GrantFields(

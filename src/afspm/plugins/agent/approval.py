@@ -22,9 +22,9 @@ _FIELDS = ("agent", "for", "region", "parameters", "counts")
 
 
 def simulated(proposal: Proposal) -> str:
-    """Return a summary of a plan's simulated run, for the person who decides."""
+    """Return a summary of a plan's preflight, as the agent's server published it."""
     try:
-        return _summary(preflight_of(proposal))
+        return summary(preflight_of(proposal))
     except (InvalidValue, TypeError, ValueError, AttributeError):
         # the agent's process wrote the preflight, and any other JSON may come in its place
         return "Not simulated: the preflight can't be read."
@@ -47,7 +47,8 @@ def preflight_of(proposal: Proposal) -> Plain:
     return found
 
 
-def _summary(found: Plain) -> str:
+def summary(found: Plain) -> str:
+    """Return the result of a simulated run as text."""
     harm, seconds = found.get("harm"), found.get("seconds")
     if harm is None or seconds is None:
         text = f"Not simulated: {escaped(str(found.get('error') or 'no result'))}."
@@ -60,11 +61,14 @@ def _summary(found: Plain) -> str:
     return f"{text} The limits will refuse: {'; '.join(refusals)}" if refusals else text
 
 
-def of_plan(proposal: Proposal, frame: Frame) -> tuple[Grant, Plan]:
+def of_plan(proposal: Proposal, frame: Frame, facts: Plain) -> tuple[Grant, Plan]:
     """Return the approval of a proposed plan, and the plan.
 
+    Args:
+        facts: the result of `Scope.approval_facts`, from before the person decides.
+
     Raises:
-        InvalidValue: the preflight is missing or unreadable, the plan is malformed, or the id is not its hash.
+        InvalidValue: the preflight is missing, the plan is malformed, or the id is not its hash.
     """
     plan = plan_of(proposal.plan)
     if plan.id != proposal.id:
@@ -76,12 +80,7 @@ def of_plan(proposal: Proposal, frame: Frame) -> tuple[Grant, Plan]:
     grant = Grant(
         proposal.who, plan.id, steps, lasts_s=PLAN_LASTS_S, drift_m=min(sizes) * DRIFT_PART if sizes else DRIFT_M
     )
-    facts = preflight_of(proposal).get("facts") or {}
-    try:
-        return fresh(grant, facts), plan
-    except (TypeError, ValueError, AttributeError) as error:  # the agent's process wrote the facts
-        what = f"the facts in the preflight of {proposal.id} can't be read: {error}"
-        raise InvalidValue(what, hint="the agent calls the tool preflight again") from error
+    return fresh(grant, facts), plan
 
 
 def of_table(table: Mapping[str, object], facts: Plain) -> Grant:

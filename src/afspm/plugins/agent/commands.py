@@ -55,7 +55,7 @@ def approve(
             scope.approve(wanted)
         typer.echo(f"{wanted.agent} has the grant")
         return
-    proposals, frame = _proposals(where)
+    proposals = _proposals(where)
     if not proposal:
         for one in proposals:
             typer.echo(f"{one.id}  {one.who}  {_state(one)}  {_title(one)}")
@@ -63,7 +63,7 @@ def approve(
     found = next((one for one in proposals if one.id == proposal), None)
     if found is None:
         raise InvalidValue(f"there is no proposal {proposal}", hint="`afspm approve` lists them")
-    _approve(where, found, sample=frame, yes=yes)
+    _approve(where, found, yes=yes)
 
 
 @agent_app.command()
@@ -94,26 +94,37 @@ def grant_lines(grant: Grant) -> list[str]:
     return [*lines, "  nothing else"]
 
 
-def _approve(where: Path, proposal: Proposal, *, sample: bool, yes: bool) -> None:
-    from afspm.model import Frame
-    from afspm.plugins.agent.approval import of_plan, simulated
+def _approve(where: Path, proposal: Proposal, *, yes: bool) -> None:
+    import asyncio
+
+    from afspm.basics.errors import AfspmError
+    from afspm.client.connect import find_run
+    from afspm.model import Frame, names
+    from afspm.plugins.agent.approval import of_plan, summary
+    from afspm.plugins.agent.simulated_run import repeated
     from afspm.plugins.agent.untrusted import escaped
 
-    frame = Frame.SAMPLE if sample else Frame.TIP
-    grant, plan = of_plan(proposal, frame)
-    typer.echo(f"{proposal.who} proposes, in its own words: {_title(proposal)}")
-    for number, request in enumerate(plan.requests(frame), 1):
-        typer.echo(f"  {number}. {escaped(request.text)}")
-    typer.echo(simulated(proposal))
-    _confirm(yes)
     with acting(where) as scope:
+        # requests have the same bytes in each frame
+        grant, plan = of_plan(proposal, Frame.TIP, scope.approval_facts())
+        typer.echo(f"{proposal.who} proposes, in its own words: {_title(proposal)}")
+        for number, request in enumerate(plan.requests(Frame.TIP), 1):
+            typer.echo(f"  {number}. {escaped(request.text)}")
+        try:
+            speed = scope.get(names.SCAN_SPEED)
+        except AfspmError:
+            speed = None  # this microscope has no such parameter
+        speed_m_s = speed if isinstance(speed, float) else None
+        found = repeated(plan, proposal.who, frame=Frame.TIP, run_dir=find_run(where), speed_m_s=speed_m_s)
+        typer.echo(summary(asyncio.run(found)))
+        _confirm(yes)
         scope.approve(grant)
     typer.echo(f"{proposal.id} is approved, for one run within an hour")
 
 
-def _proposals(where: Path) -> tuple[list[Proposal], bool]:
+def _proposals(where: Path) -> list[Proposal]:
     with looking(where) as follower:
-        return list(follower.overview.proposals.values()), follower.launch.sample_coordinates
+        return list(follower.overview.proposals.values())
 
 
 def _state(proposal: Proposal) -> str:

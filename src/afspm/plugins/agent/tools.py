@@ -238,9 +238,7 @@ class AgentTools:
     async def _preflight(self, person: str, given: arguments.OfProposal) -> Content:
         self._own(person, given.proposal)
         proposal, plan = self._place.proposal(given.proposal)
-        facts = await self._place.facts()
         found, picture = await self._twin.of(plan, self._place, proposal.who)
-        found["facts"] = facts
         result = with_preflight(proposal, found)
         await self._place.publish(person, plan, result.preflight)
         reasons = found.get("refusals") or []

@@ -15,7 +15,6 @@ from afspm import wire
 from afspm.basics.plain_data import Plain
 from afspm.client.targets import Target
 from afspm.model import (
-    CLOCK_REQUEST,
     LEASE_AT_ONCE_S,
     RELAY_REQUEST,
     STOPPED_BY_AGENT,
@@ -36,7 +35,6 @@ from afspm.plugins.web.archive import Archive
 from afspm.plugins.web.gateway.measurements import Measurement, Measurements
 from afspm.plugins.web.gateway.models import MeasurementState
 from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest, of_error, refused
-from afspm.plugins.web.gateway.services import READER
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.watch import Bell, Watch
 from afspm.storage.memory import Memory
@@ -159,12 +157,6 @@ class Workplace:
         if not response.ok:
             raise refused(response)
         return response
-
-    async def facts(self) -> Plain:
-        """Return the facts that a preflight depends on: run, limits, offset of the coordinates, time."""
-        response = await self.ask(READER, lambda commands: commands.request(CLOCK_REQUEST))
-        found: Plain = json.loads(response.payload)
-        return {name: found.get(name) for name in ("run", "limits", "offset_m", "now_ns")}
 
     # --- proposals ---
 

@@ -14,8 +14,18 @@ from afspm.basics.errors import AfspmError, UnitError
 from afspm.basics.formatting import counted, quantity, typeset_position
 from afspm.basics.plain_data import Plain
 from afspm.basics.units import parse_quantity
-from afspm.client.parameter_text import from_parameter
-from afspm.model import CLOCK_REQUEST, GRANT_REQUEST, ControlMode, ControlResponse, Grant, Region, Response, names
+from afspm.client.parameter_text import from_parameter, value_in
+from afspm.model import (
+    CLOCK_REQUEST,
+    GRANT_REQUEST,
+    ControlMode,
+    ControlResponse,
+    Grant,
+    Parameter,
+    Region,
+    Response,
+    names,
+)
 from afspm.model.geometry import XY
 from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.person_commands import PersonCommands
@@ -94,6 +104,12 @@ class Actions:
             raise AfspmError(refusal(response))
         facts: Plain = json.loads(response.payload)
         return facts
+
+    def scan_speed_m_s(self) -> float | None:
+        """Return the scan speed in force; None if the microscope does not have it."""
+        response = self._commands.get(names.SCAN_SPEED)
+        value = value_in(response, Parameter(names.SCAN_SPEED), None) if response.ok else None
+        return value if isinstance(value, float) else None
 
     def restart(self, process: str) -> ActionResult:
         return _result(self._commands.restart(process), f"{process} is being restarted")

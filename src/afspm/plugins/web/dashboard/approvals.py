@@ -13,10 +13,11 @@ from afspm.basics.formatting import counted, day_and_time, quantity, typeset_are
 from afspm.basics.plain_data import Plain
 from afspm.model import Approval, Frame, Grant, Proposal, names
 from afspm.model.events import PERSON
-from afspm.plugins.agent.approval import of_plan, of_table, simulated
-from afspm.plugins.agent.plan import plan_of, title_of
+from afspm.plugins.agent.approval import of_plan, of_table, simulated, summary
+from afspm.plugins.agent.plan import Plan, plan_of, title_of
+from afspm.plugins.agent.simulated_run import repeated
 from afspm.plugins.agent.untrusted import escaped
-from afspm.plugins.web.dashboard.actions import ActionResult
+from afspm.plugins.web.dashboard.actions import ActionResult, Actions
 from afspm.plugins.web.dashboard.steering_session import SteeringSession, ask_in_dialog, button
 
 MOST_SHOWN = 5
@@ -29,6 +30,8 @@ class ApprovalBar:
     def __init__(self, session: SteeringSession) -> None:
         self._session = session
         self._shown: tuple[object, ...] = ()
+        self._facts: Plain = {}
+        self._speed_m_s: float | None = None
         self._box = ui.element("div").classes("problems approvals").props('role="status"')
         self._box.set_visibility(False)
 
@@ -71,19 +74,33 @@ class ApprovalBar:
 
     async def _decide(self, proposal: Proposal) -> None:
         with self._box:
+            looked = await self._session.carry_out(self._look)
+            if not looked.ok:
+                self._session.say(looked)
+                return
             try:
-                grant, lines = reviewed(proposal)
+                grant, plan = of_plan(proposal, Frame.TIP, self._facts)
             except AfspmError as error:
                 self._session.say(ActionResult(str(error), ok=False))
                 return
+            ui.notify("Simulating the plan …", position="bottom-right", classes="toast done")
+            found = await repeated(
+                plan, proposal.who, frame=Frame.TIP, run_dir=self._session.run_dir, speed_m_s=self._speed_m_s
+            )
+            lines = in_words(plan)
 
             def body() -> None:
                 items = "".join(f"<li>{escape(one)}</li>" for one in lines)
                 ui.html(f"<ol>{items}</ol>", sanitize=False)
-                ui.label(simulated(proposal))
+                ui.label(summary(found))
 
             if await ask_in_dialog(f"Let {proposal.who} do exactly this, once?", body, "Approve"):
                 self._session.do(lambda a: a.approve(grant))
+
+    def _look(self, actions: Actions) -> ActionResult:
+        # what happens from here on makes the approval stale
+        self._facts, self._speed_m_s = actions.approval_facts(), actions.scan_speed_m_s()
+        return ActionResult("")
 
 
 def in_force(approval: Approval) -> tuple[str, str, str]:
@@ -111,7 +128,7 @@ def in_force(approval: Approval) -> tuple[str, str, str]:
 
 
 def waiting(proposal: Proposal) -> tuple[str, str, str]:
-    """Return (agent, its plan in one line, the result of the preflight) of a pending proposal."""
+    """Return (agent, its plan in one line, the result of its own preflight) of a pending proposal."""
     try:
         plan = plan_of(proposal.plan)
     except AfspmError as error:
@@ -119,7 +136,11 @@ def waiting(proposal: Proposal) -> tuple[str, str, str]:
     steps = [escaped(one.text) for one in plan.requests(Frame.TIP)]
     more = f" and {counted(len(steps) - STEPS_SHOWN, 'more request')}" if len(steps) > STEPS_SHOWN else ""
     line = "; ".join(steps[:STEPS_SHOWN]) + more
-    return proposal.who, f"waits for your approval: “{title(proposal)}”: {line}", simulated(proposal)
+    return (
+        proposal.who,
+        f"waits for your approval: “{title(proposal)}”: {line}",
+        f"Its own preflight: {simulated(proposal)}",
+    )
 
 
 def _line_html(agent: str, what: str, details: str) -> str:
@@ -136,12 +157,7 @@ def title(proposal: Proposal) -> str:
     return escaped(title_of(proposal.plan))
 
 
-def reviewed(proposal: Proposal) -> tuple[Grant, list[str]]:
-    """Return the approval of a proposal, and each request in words.
-
-    Raises:
-        AfspmError: the proposal can't be approved.
-    """
+def in_words(plan: Plan) -> list[str]:
+    """Return each request of a plan in words."""
     # requests have the same bytes in each frame
-    grant, plan = of_plan(proposal, Frame.TIP)
-    return grant, [escaped(one.text) for one in plan.requests(Frame.TIP)]
+    return [escaped(one.text) for one in plan.requests(Frame.TIP)]

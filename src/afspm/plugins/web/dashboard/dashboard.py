@@ -88,6 +88,7 @@ class Dashboard(WebComponent):
             experiment_name(self.run_dir, "afspm"),
             self.simulated,
             Conditions(self._watch, self._steering.read),
+            self.run_dir,
         )
         app, self._wait_for_end_shown = application(services, archive, host=self._host, encrypted=self.encrypted)
         self.serve(app, bound)

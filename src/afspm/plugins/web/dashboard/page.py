@@ -55,6 +55,7 @@ class Services:
     title: str
     simulated: bool
     conditions: Conditions
+    run_dir: Path
 
 
 TABS = {"scan": "Scan", "sample": "Sample", "steer": "Steer", "time": "Night", "log": "Log"}
@@ -75,7 +76,7 @@ class Page:
         ui.add_head_html(_HEAD)
         ui.colors(primary="#0b6e72", negative="#b3261e", positive="#2f7d46")
         self._theme = Theme()
-        self._session = SteeringSession(services.watch, services.steering, visitor)
+        self._session = SteeringSession(services.watch, services.steering, visitor, services.run_dir)
         with ui.element("div").classes("top"):
             self._header()
         with ui.element("main").classes(f"page{' may-steer' if visitor.may_steer else ''}"):

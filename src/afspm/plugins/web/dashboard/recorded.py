@@ -75,7 +75,7 @@ def serve(settings: RecordedSettings, tell: Callable[[str], object], stopped: th
     pictures = f"/live/thumbnail/{secrets.token_hex(4)}"
     services = Services(
         watch, Contents(watch, allowed_region(night.folder), pictures=pictures), steering, Audience(), access,
-        night.title, night.simulated, Conditions(watch, partial(steering.do, Visitor())),
+        night.title, night.simulated, Conditions(watch, partial(steering.do, Visitor())), night.folder,
     )  # fmt: skip
     encrypted = settings.certificate is not None
     app, wait_until_end_shown = application(

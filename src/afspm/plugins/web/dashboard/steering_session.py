@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from html import escape
+from pathlib import Path
 
 from nicegui import background_tasks, context, ui
 
@@ -20,8 +21,8 @@ _CLOSE = [{"label": "Close", "color": "white"}]
 class SteeringSession:
     """The actions of one viewer, and the display of their results."""
 
-    def __init__(self, watch: Watch, steering: Steering, visitor: Visitor) -> None:
-        self.watch = watch
+    def __init__(self, watch: Watch, steering: Steering, visitor: Visitor, run_dir: Path) -> None:
+        self.watch, self.run_dir = watch, run_dir
         self.content = Content()
         self._steering = steering
         self._visitor = visitor
