@@ -14,6 +14,8 @@ _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, 
 PREFIXABLE = frozenset(
     {"m", "V", "A", "s", "N", "Hz", "W", "F", "m/s", "m/V", "V/m", "C", "S", "Pa", "Ohm", "Ω", "T", "g"}
 )
+LONGEST_FOREIGN = 200
+"""Greatest number of characters shown of a text from outside, such as a message of a controller."""
 _DAY_NS = 86_400 * NS_PER_S
 _LENGTHS = ((1e-3, "mm"), (1e-6, "µm"), (1e-9, "nm"), (1e-12, "pm"))
 
@@ -174,3 +176,9 @@ def unit_text(unit: str) -> str:
 def counted(count: int, one: str, many: str = "") -> str:
     """Return a count with its noun: (1, "scan") as "1 scan", (2, "scan") as "2 scans"; `many`: irregular plural."""
     return f"{count} {one if count == 1 else many or f'{one}s'}"
+
+
+def escaped(text: str) -> str:
+    """Return a text from outside, cut at `LONGEST_FOREIGN` characters, with non-printable characters escaped."""
+    cut = "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text[:LONGEST_FOREIGN])
+    return f"{cut}…" if len(text) > LONGEST_FOREIGN else cut

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import random
 import socket
@@ -144,3 +145,40 @@ def test_nested_json_of_a_server_does_not_end_the_component(cryo: Cryo, levels: 
     assert "this is no SECoP server" in cryo.reports[-1].readings[0].reason
     cryo.later(10.0)
     assert cryo.reports[-1].readings[0].value == pytest.approx(cryo.cryostat.value_k, abs=0.1)
+
+
+EVIL = "\x1b[2J" + "x" * 100_000
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [f"update tt:value {json.dumps([EVIL, {}])}"],
+        [f"error_update tt:value {json.dumps(['Impossible', EVIL, {}])}"],
+        [f"update tt:status {json.dumps([[400, EVIL], {}])}"],
+        [f"update tt:status {json.dumps([[EVIL, EVIL], {}])}"],
+        [f"describing . {json.dumps({'modules': {EVIL: {}}})}"],
+    ],
+)
+def test_texts_of_a_server_are_cut_and_escaped(cryo: Cryo, lines: list[str], caplog: pytest.LogCaptureFixture) -> None:
+    cryo.later(1.0)
+    cryo.answers += lines
+    del cryo.reports[:]
+    cryo.component.on_tick()
+    reason = cryo.reports[-1].readings[0].reason
+    for text in (reason, *caplog.messages):
+        assert "\x1b" not in text
+        assert len(text) < 500
+    assert "xxx" in reason
+
+
+def test_unit_of_a_server_is_cut_and_a_changing_one_is_logged_once(
+    cryo: Cryo, caplog: pytest.LogCaptureFixture
+) -> None:
+    cryo.later(1.0)
+    for number in range(5):
+        cryo.cryostat.unit = f"{EVIL}{number}"
+        cryo.answers += cryo.cryostat.answer("describe")
+        cryo.later(1.0)
+    assert len(cryo.reports[-1].readings[0].unit) < 250
+    assert sum("its unit changed" in one for one in caplog.messages) == 1

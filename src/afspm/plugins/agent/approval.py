@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from afspm.basics.errors import InvalidValue
-from afspm.basics.formatting import duration_text, quantity
+from afspm.basics.formatting import duration_text, escaped, quantity
 from afspm.basics.plain_data import Plain, from_json
 from afspm.basics.units import parse_quantity, si
 from afspm.model import Frame, Grant, GrantedCount, GrantedRange, Proposal, is_of_instrument, names
 from afspm.plugins.agent.plan import Plan, ScanStep, plan_of
-from afspm.plugins.agent.untrusted import escaped
 
 PLAN_LASTS_S = 3600.0
 DRIFT_PART = 0.1

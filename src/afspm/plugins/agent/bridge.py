@@ -11,8 +11,8 @@ from mcp.client.streamable_http import streamable_http_client
 from mcp.server.lowlevel import Server
 from mcp.server.stdio import stdio_server
 
+from afspm.basics.formatting import escaped
 from afspm.plugins.agent.serving import PATH
-from afspm.plugins.agent.untrusted import escaped
 from afspm.plugins.web.gateway.problems import RefusalCode
 
 ANSWER_S = 300.0

@@ -98,11 +98,11 @@ def _approve(where: Path, proposal: Proposal, *, yes: bool) -> None:
     import asyncio
 
     from afspm.basics.errors import AfspmError
+    from afspm.basics.formatting import escaped
     from afspm.client.connect import find_run
     from afspm.model import Frame, names
     from afspm.plugins.agent.approval import of_plan, summary
     from afspm.plugins.agent.simulated_run import repeated
-    from afspm.plugins.agent.untrusted import escaped
 
     with acting(where) as scope:
         # requests have the same bytes in each frame
@@ -139,8 +139,8 @@ def _state(proposal: Proposal) -> str:
 
 
 def _title(proposal: Proposal) -> str:
+    from afspm.basics.formatting import escaped
     from afspm.plugins.agent.plan import title_of
-    from afspm.plugins.agent.untrusted import escaped
 
     return f'"{escaped(title_of(proposal.plan))}"'
 

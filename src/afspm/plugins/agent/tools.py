@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from afspm.basics.clock import iso_utc
 from afspm.basics.errors import AfspmError
+from afspm.basics.formatting import escaped
 from afspm.basics.plain_data import Plain
 from afspm.model import ControlMode, ControlResponse, ControlState, names
 from afspm.model.line_levelling import Levelling, levelled
@@ -26,7 +27,7 @@ from afspm.plugins.agent import arguments
 from afspm.plugins.agent.approval import preflight_of
 from afspm.plugins.agent.plan import Plan, PlannedRequest, plan_of, read_plan, read_step
 from afspm.plugins.agent.preflight import Preflight
-from afspm.plugins.agent.untrusted import escaped, untrusted
+from afspm.plugins.agent.untrusted import untrusted
 from afspm.plugins.agent.workplace import PlanRun, Workplace, with_preflight
 from afspm.plugins.web.gateway import views
 from afspm.plugins.web.gateway.guard import PERSON

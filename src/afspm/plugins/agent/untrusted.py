@@ -4,14 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-LONGEST = 200
+from afspm.basics.formatting import escaped
+
 MOST = 50
-
-
-def escaped(text: str) -> str:
-    """Return a text cut at `LONGEST` characters, with non-printable characters escaped."""
-    cut = "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text[:LONGEST])
-    return f"{cut}…" if len(text) > LONGEST else cut
 
 
 def untrusted(texts: Mapping[str, object]) -> dict[str, object]:

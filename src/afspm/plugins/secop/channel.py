@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from afspm.basics.errors import UnitError
+from afspm.basics.formatting import escaped
 from afspm.basics.units import convert
 from afspm.plugins.secop import lines
 from afspm.plugins.secop.lines import SecopLine, number_in
@@ -98,14 +99,14 @@ def described(modules: Mapping[str, object], module: str, accessible: str) -> Ch
     found = modules.get(module)
     accessibles = found.get("accessibles") if isinstance(found, dict) else None
     if not isinstance(accessibles, dict):
-        raise ServerUnfit(f"there is no module {module!r}; the server has {', '.join(sorted(modules))}")
+        raise ServerUnfit(f"there is no module {module!r}; the server has {escaped(', '.join(sorted(modules)))}")
     value = accessible or "value"
     info = _info(accessibles, value)
     if info is None or info.get("type") not in _NUMBERS:
         having = [name for name in accessibles if (_info(accessibles, name) or {}).get("type") in _NUMBERS]
         what = f"{module}:{value} is no number, or is missing"
-        raise ServerUnfit(f"{what}; the module has the numbers {', '.join(having) or '(none)'}")
-    unit = str(info.get("unit", ""))
+        raise ServerUnfit(f"{what}; the module has the numbers {escaped(', '.join(having)) or '(none)'}")
+    unit = escaped(str(info.get("unit", "")))
     target = accessible or "target"
     bounds = _info(accessibles, target) or {}
     low, high = (number_in(bounds.get(one)) for one in ("min", "max"))
@@ -203,7 +204,7 @@ class PolledValue:
             return False
         number = line.number
         if number is None or not math.isfinite(number):
-            self.fault = f"the server answers {line.value!r}"
+            self.fault = f"the server answers {escaped(repr(line.value))}"
             return False
         self.number, self.fault = number, ""
         if asked_s is not None:
@@ -258,11 +259,11 @@ class ModuleState:
     def take_status(self, status: object) -> None:
         code, text = (status[0], str(status[1])) if isinstance(status, list) and len(status) > 1 else (status, "")
         if not isinstance(code, int):
-            self.fault = f"the server answers the status {status!r}"
+            self.fault = f"the server answers the status {escaped(repr(status))}"
             return
         self.is_busy = _BUSY <= code < _ERROR
         is_well = _IDLE <= code < _ERROR
-        self.fault = "" if is_well else f"status {code}: {text[:200] or 'no text'}"
+        self.fault = "" if is_well else f"status {code}: {escaped(text) or 'no text'}"
 
 
 @dataclass

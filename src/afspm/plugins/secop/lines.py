@@ -6,6 +6,7 @@ import json
 from dataclasses import dataclass
 from itertools import chain
 
+from afspm.basics.formatting import escaped
 from afspm.basics.plain_data import from_json
 
 IDENTIFY, DESCRIBE, ACTIVATE = "*IDN?", "describe", "activate"
@@ -53,7 +54,7 @@ class SecopLine:
     def error(self) -> str:
         """The text of an error report, [class, text, details]."""
         parts = self.data if isinstance(self.data, list) else [self.data]
-        return ": ".join(str(one) for one in parts[:2])[:200]
+        return escaped(": ".join(str(one) for one in parts[:2]))
 
 
 def parse(line: str) -> SecopLine | None:

@@ -210,8 +210,9 @@ class SecopClient:
         if not isinstance(modules, dict):
             raise ServerUnfit("the server describes no modules")
         for channel in self.channels.values():
+            was_wrong = bool(channel.unit_fault)
             channel.describe(modules)
-            if channel.unit_fault:
+            if channel.unit_fault and not was_wrong:
                 self.log.append(f"{channel.name}: {channel.unit_fault}; it is not believed until the unit is back")
         self.is_described = True
         self.polled_s = -math.inf

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import re
 import sys
 
 ROOT = "afspm"
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 
 class LineFormatter(logging.Formatter):
@@ -15,7 +17,9 @@ class LineFormatter(logging.Formatter):
         super().__init__("%(levelname)s %(message)s")
 
     def format(self, record: logging.LogRecord) -> str:
-        return super().format(record).replace("\n", "\n  ")
+        # a text from outside must not command the terminal that shows the log
+        text = _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), super().format(record))
+        return text.replace("\n", "\n  ")
 
 
 def set_up(name: str, level: str) -> logging.Logger:
