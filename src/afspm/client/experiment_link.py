@@ -21,6 +21,7 @@ from afspm.model import (
     RELAY_REQUEST,
     ActByHand,
     ChannelRoles,
+    ControlMode,
     ControlRequest,
     ControlState,
     Feedback,
@@ -56,9 +57,14 @@ from afspm.transport.process.parent import StopRequested
 
 
 class PublishedState:
-    """The newest published states, and the number of publications of each, so that a caller can wait for the next."""
+    """The newest published states, and the number of publications of each, so that a caller can wait for the next.
 
-    def __init__(self) -> None:
+    Args:
+        began_ns: start of this process; an earlier pause is no part of `manual_ns`.
+    """
+
+    def __init__(self, began_ns: int = 0) -> None:
+        self._began_ns = began_ns
         self.status: ScopeStatus | None = None
         self.control: ControlState | None = None
         self.scan_parameters: ScanParameters | None = None
@@ -69,6 +75,8 @@ class PublishedState:
         self.channels = ChannelRoles()
         self.feedback_units = FeedbackUnits()
         self.newest_ns: int | None = None
+        self._manual_ns = 0
+        self._manual_since_ns: int | None = None
         self._published: Counter[str] = Counter()
 
     @property
@@ -79,6 +87,20 @@ class PublishedState:
         """Store `thing`, published as the message `message`."""
         setattr(self, wire.declaration(message).attribute, thing)
         self._published[message] += 1
+        if isinstance(thing, ControlState):
+            self._note_mode(thing.mode)
+
+    def manual_ns(self, now_ns: int) -> int:
+        """Return the time in MANUAL."""
+        return self._manual_ns + (0 if self._manual_since_ns is None else max(0, now_ns - self._manual_since_ns))
+
+    def _note_mode(self, mode: ControlMode) -> None:
+        # a mode of the scheduler's cache may be older than this process
+        at_ns = max(self._began_ns, self.newest_ns or 0)
+        if mode is ControlMode.MANUAL:
+            self._manual_since_ns = self._manual_since_ns or at_ns
+        else:
+            self._manual_ns, self._manual_since_ns = self.manual_ns(at_ns), None
 
     def with_roles(self, thing: Any) -> Any:
         """Return a scan, or lines of one, with the roles of its channel; any other thing unchanged."""
@@ -192,7 +214,8 @@ class ExperimentLink:
         self.port = port
         self.name = name
         self.clock: Clock = port.clock
-        self.view = PublishedState()
+        self._began_ns = self.clock.now_ns()
+        self.view = PublishedState(self._began_ns)
         self.activity = activity or ProcessActivity(self.clock)
         self.log = log or logging.getLogger(f"afspm.{name}")
         self.ended = False
@@ -326,6 +349,11 @@ class ExperimentLink:
 
     def is_caught_up(self) -> bool:
         return self._source in self._caught_up if self._source else bool(self._caught_up)
+
+    def worked_s(self) -> float:
+        """Return the experiment time since the start of this link, without the time in MANUAL."""
+        now_ns = self.clock.now_ns()
+        return (now_ns - self._began_ns - self.view.manual_ns(now_ns)) * 1e-9
 
     def until(self, timeout_s: float | None) -> float | None:
         """Return the end of a timeout in monotonic time; None for no timeout."""

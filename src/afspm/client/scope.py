@@ -95,7 +95,7 @@ class Scope(ExperimentView):
     ) -> None:
         super().__init__(link, problems or ProblemNames(), between)
         self._frame = frame
-        self._begun: tuple[int, int] | None = None  # finished parts, and the time, at the first call of `progress`
+        self._begun: tuple[int, float] | None = None  # finished parts and time at the first `progress`
         self._control = ControlHold(link, self.problems)
         self._commands = CommandRetry(link, self._control)
         self._setup = MeasurementSetup(link.view, self._commands)
@@ -469,13 +469,17 @@ class Scope(ExperimentView):
 
         Args:
             done, of: number of finished parts, and of all parts.
-            left_s: experiment time left; None: estimated from the rate since the first call.
+            left_s: experiment time left; None: estimated from the rate since the first call, without times in MANUAL.
         """
-        now_ns = self._link.clock.now_ns()
-        begun, begun_ns = self._begun = self._begun or (done, now_ns)
+        worked_s = self.worked_s()
+        begun, begun_s = self._begun = self._begun or (done, worked_s)
         if left_s is None and done > begun:
-            left_s = (now_ns - begun_ns) * 1e-9 / (done - begun) * (of - done)
-        self._link.relay(Progress(now_ns, self._link.name, done, of, left_s))
+            left_s = (worked_s - begun_s) / (done - begun) * (of - done)
+        self._link.relay(Progress(self._link.clock.now_ns(), self._link.name, done, of, left_s))
+
+    def worked_s(self) -> float:
+        """Return the experiment time since this process has joined, without the time in MANUAL."""
+        return self._link.worked_s()
 
     def note(
         self, text: str, *, scan: HasTime | None = None, time_ns: int | None = None, key: str | None = None

@@ -17,6 +17,7 @@ from afspm.client.component import Component
 from afspm.client.events import PublishedEvent
 from afspm.client.parameter_text import to_parameter
 from afspm.components import tip_verdict
+from afspm.components.pace import Pace
 from afspm.components.scan_plan import (
     XY,
     PlanRest,
@@ -108,6 +109,7 @@ class PlannedScans(Component):
         self.memory.setdefault("start_s", self._began_s)
         rhythm = RoundSchedule(float(self.memory["start_s"]), self.beat_s)
         self.memory.save()
+        self._pace = Pace(self.scope, self.memory)
         self._set_parameters()
         done = int(self.memory.get("done", 0))
         if done and done != self._total:
@@ -195,6 +197,7 @@ class PlannedScans(Component):
             self._leave_out(step, refused)
             self._round_began_s = None
             self.memory["done"], self.memory["done_s"] = step.index + 1, self.clock.now_s()
+            self._pace.note()
             self.memory.save(synced=False)
             self._tell_progress(step.index + 1)
             return
@@ -206,13 +209,16 @@ class PlannedScans(Component):
             # the fastest round counts, since a slower round may have waited for control
             self.memory["pace_s"] = min(round_s, float(self.memory.get("pace_s", round_s)))
         self.memory["done"], self.memory["done_s"] = step.index + 1, self.clock.now_s()
+        self._pace.note()
         self._save_taken(step, 0, scans)
         self._tell_progress(step.index + 1)
         self._log_taken(step, scans)
 
     def _tell_progress(self, done: int) -> None:
         if (total := self._total) is not None:
-            self.scope.progress(done, total, left_s=self._left_s(done, total))
+            # as fast as so far, but not faster than `every` allows
+            least_s = self.beat_s / len(self.plan.regions)
+            self.scope.progress(done, total, left_s=self._pace.left_s(done, total, least_s))
 
     def _leave_out(self, step: PlanStep, refused: Refused) -> None:
         message = f"scan {step.index + 1} is left out: {refused.reason}"
@@ -327,11 +333,6 @@ class PlannedScans(Component):
         self.memory["rest"] = [step.key, rest.first, rest.last]
         self.memory.save()
         return rest
-
-    def _left_s(self, done: int, total: int) -> float:
-        # as fast as so far, but not faster than `every` allows
-        per_scan_s = (self.clock.now_s() - float(self.memory["start_s"])) / done
-        return (total - done) * max(per_scan_s, self.beat_s / len(self.plan.regions))
 
     @property
     def _total(self) -> int | None:

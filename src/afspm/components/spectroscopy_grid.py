@@ -9,6 +9,7 @@ from afspm.basics.errors import ConfigError, Refused, RequestError
 from afspm.basics.formatting import position_text
 from afspm.basics.units import Angle, Length
 from afspm.client.component import Component
+from afspm.components.pace import Pace
 from afspm.components.planned_scans import pair
 from afspm.components.scan_plan import XY, RefusedPlaces, grid_centers
 from afspm.model import names
@@ -80,7 +81,7 @@ class SpectroscopyGrid(Component):
 
     def run(self) -> None:
         total = len(self.positions) * self.repeats
-        start_s = float(self.memory.setdefault("start_s", self.clock.now_s()))
+        pace = Pace(self.scope, self.memory)
         refusals = RefusedPlaces(len(self.positions), self.memory)
         while (index := int(self.memory.get("done", 0))) < total:
             place, repeat = divmod(index, self.repeats)
@@ -96,10 +97,10 @@ class SpectroscopyGrid(Component):
                 is_told = total <= MOST_LINES or done * MOST_LINES // total > index * MOST_LINES // total
                 self.log.log(logging.INFO if is_told else logging.DEBUG, "spectrum %d of %d", done, total)
             self.memory["done"] = done
+            pace.note()
             if self.memory.save(synced=False):  # if not saved, a restart requests the same spectrum
                 self.scope.forget(key)
-            per_spectrum_s = (self.clock.now_s() - start_s) / done
-            self.scope.progress(done, total, left_s=per_spectrum_s * (total - done))
+            self.scope.progress(done, total, left_s=pace.left_s(done, total))
         if refusals.number:
             self.log.error("%d of %d spectra were refused", refusals.number, total)
         if self.end_when_done:

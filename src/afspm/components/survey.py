@@ -16,6 +16,7 @@ from afspm.client.component import Component
 from afspm.client.events import Events
 from afspm.client.keyed_results import check_key
 from afspm.client.targets import xy_of
+from afspm.components.pace import Pace
 from afspm.components.planned_scans import FRAME, Pixels, checked_parameters, pair, shape_of, speed_in_force
 from afspm.components.scan_plan import ScanPlan
 from afspm.components.surveying.record import Outcome, SurveyRecord, Visit
@@ -168,13 +169,12 @@ class Survey(Component):
         self._keep(self._record)
         visits = self._record.visits
         self._set(self._closer.parameters if visits else {})
-        began_s = float(self.memory.setdefault("visits_began_s", self.clock.now_s()))
+        pace = Pace(self.scope, self.memory)
         for visit in visits:
             self._visit(visit, mappings)
             self._keep(self._record)
-            left = len(visits) - visit.number
-            per_visit_s = (self.clock.now_s() - began_s) / visit.number
-            self.scope.progress(visit.number, len(visits), left_s=per_visit_s * left)
+            pace.note()
+            self.scope.progress(visit.number, len(visits), left_s=pace.left_s(visit.number, len(visits)))
             if visit.number > int(self.memory.get("done", 0)):  # else it was logged before a restart
                 self._tell(visit, self._record.outcome(visit))
                 self.memory["done"] = visit.number

@@ -10,6 +10,7 @@ from afspm.basics.formatting import quantity
 from afspm.basics.plain_data import Plain
 from afspm.basics.units import Angle, Length
 from afspm.client.component import Component
+from afspm.components.pace import Pace
 from afspm.components.planned_scans import FRAME, Pixels, pair, shape_of
 from afspm.components.scan_plan import ScanPlan
 from afspm.model import Parameter, Region, names
@@ -107,17 +108,17 @@ class Sweep(Component):
                 hint="undo the change, or begin a new run",
             )
         total, done = self.sweep.total, int(self.memory.get("done", 0))
-        start_s = float(self.memory.setdefault("start_s", self.clock.now_s()))
+        pace = Pace(self.scope, self.memory)
         self.memory.save()
         if 0 < done < total:
             self.log.info("going on with point %d of %d", done + 1, total)
         with self.scope.sweep(**self._given, **self._what, measure=self.measure, key=KEY, done=done) as points:
             for point in points:
                 self.memory["done"] = point.number
+                pace.note()
                 if self.memory.save(synced=False):  # else a restart asks for it again
                     self.scope.forget(point.key)
-                per_point_s = (self.clock.now_s() - start_s) / point.number
-                self.scope.progress(point.number, total, left_s=per_point_s * (total - point.number))
+                self.scope.progress(point.number, total, left_s=pace.left_s(point.number, total))
                 self.log.info("point %d of %d: %s", point.number, total, self._text(point.values))
         self.log.info("all %d points are measured", total)
         if self.end_when_done:

@@ -19,6 +19,7 @@ from afspm.components.spectroscopy_grid import SpectroscopyGrid
 from afspm.components.tip_verdict import BAD, GOOD, MESSAGE, LineVerdict, line_verdict_message, verdict_message
 from afspm.model import (
     RELAY_REQUEST,
+    ControlMode,
     ControlRequest,
     ControlResponse,
     Note,
@@ -285,6 +286,49 @@ def test_remaining_time_of_a_list_follows_its_pace() -> None:
     assert first == pytest.approx(2 * SCAN_S, rel=0.1)
     assert second == pytest.approx(SCAN_S, rel=0.1)
     assert last == 0.0
+
+
+def list_of(number: int) -> ScanList:
+    place = {"center": (0.0, 0.0), "size": (1e-6, 1e-6)}
+    return ScanList([place] * number, pixels=(8, 8), end_when_done=True)  # type: ignore[list-item]
+
+
+def test_remaining_time_leaves_out_the_pause_of_a_person() -> None:
+    lab = Lab("list")
+    lab.at(1.5 * SCAN_S, lambda: lab.set_mode(ControlMode.MANUAL))
+    lab.at(100 * SCAN_S, lambda: lab.set_mode(ControlMode.AUTOMATED))
+    run(list_of(4), lab)
+    # the second scan was interrupted after half of it, and taken again
+    assert progress_of(lab)[1].left_s == pytest.approx(2 * 2.5 / 2 * SCAN_S, rel=0.1)
+
+
+def test_remaining_time_includes_repairs() -> None:
+    lab = Lab("list")
+    lab.at(1.5 * SCAN_S, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
+    lab.at(11 * SCAN_S, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    run(list_of(4), lab)
+    assert progress_of(lab)[1].left_s == pytest.approx(2 * 12 / 2 * SCAN_S, rel=0.1)
+
+
+def test_remaining_time_leaves_out_the_time_before_a_restart(tmp_path: Path) -> None:
+    lab = Lab("list")
+    port = LabPort(lab)
+
+    def die() -> None:
+        port.is_dead = True
+        lab.wake_up()
+
+    lab.at(1.5 * SCAN_S, die)
+    context = context_of(lab, tmp_path)
+    context.open_port, context.session = lambda: port, "killed"
+    with pytest.raises(Kill9):
+        list_of(4).run_process(context)
+    lab.clock.passed_s += 1000 * SCAN_S
+    lab.restart_component()
+    run(list_of(4), lab, tmp_path)
+    assert progress_of(lab)[-1].left_s == 0.0
+    # the second scan ended while no component ran
+    assert progress_of(lab)[-2].left_s == pytest.approx(2 / 3 * SCAN_S, rel=0.1)
 
 
 def test_remaining_time_is_estimated_from_the_pace_by_default() -> None:
