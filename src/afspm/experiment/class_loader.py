@@ -154,12 +154,21 @@ def _attribute(module: ModuleType, name: str) -> Any:
     try:
         return getattr(module, name)
     except AttributeError:
-        hint = _shadowing_hint(module) or nearest(name, getattr(module, "__all__", None) or _public_classes(module))
+        is_ours = module.__name__.partition(".")[0] == "afspm" and _has_bare_name(name)
+        hint = f'write class = "{name}"' if is_ours else _shadowing_hint(module)
+        hint = hint or nearest(name, getattr(module, "__all__", None) or _public_classes(module))
         raise Unloadable(f"{module.__name__} has no {name!r}", hint) from None
     except ModuleNotFoundError as error:
         raise _no_module(f"{module.__name__}.{name}", error) from error
     except (Exception, SystemExit) as error:  # a lazy import may run the user's code, too
         raise Unloadable(f"importing {name} fails: {_error_line(error)}") from error
+
+
+def _has_bare_name(name: str) -> bool:
+    try:
+        return full_path(name) != name
+    except Unloadable:
+        return False
 
 
 def _shadowing_hint(module: ModuleType) -> str:

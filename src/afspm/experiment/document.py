@@ -77,7 +77,9 @@ def _text(file: Path, findings: Findings) -> str | None:
     try:
         return file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
-        findings.error(f"the file is not UTF-8 text: {error.reason} at byte {error.start}", SourceLocation(str(file)))
+        line = error.object[: error.start].count(b"\n") + 1
+        what = f"the file is not UTF-8 text: {error.reason} at byte {error.start}"
+        findings.error(what, SourceLocation(str(file), line), 'save it as "UTF-8" in your editor')
     except OSError as error:
         findings.error(f"the file can't be read: {error.strerror or error}", SourceLocation(str(file)))
     return None
@@ -112,6 +114,7 @@ _SYNTAX_HINTS = (
     ("", r"=\s*(True|False)\b", "true and false are written in lower case"),
     ("", r"=\s*None\b", "there is no None: leave the line out"),
     ("", r"=\s*[-+]?\d+,\d", "a number has a decimal point, not a comma"),
+    ("", "[\u201c\u201d\u201e\u2018\u2019]", "quotes are straight: \" or '"),
     ("", r"=\s*[^\W\d]", "text is written in quotes"),
     ("", r'"[^"]*\\', "in double quotes a backslash begins a code: take single quotes, 'C:\\data', or C:/data"),
     ("", r"=\s*\{[^}]*$", "a table in braces stays on one line; else it is one of its own, e.g. [limits.region]"),

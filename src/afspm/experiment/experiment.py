@@ -208,7 +208,9 @@ class Experiment:
 
     def _anchored(self) -> sorting.ExperimentParts:
         parts, resolved = self.parts, self.resolved
-        variables, sections = dict(parts.variables), dict(parts.sections)
+        # the values of other variables stand in their places already
+        variables = {name: value for name, value in parts.variables.items() if name in sorting.KNOWN_VARIABLES}
+        sections = dict(parts.sections)
         if self._is_elsewhere("messages"):
             variables["messages"] = list(resolved.messages)
         if resolved.keys_folder is not None and self._is_elsewhere("security", "keys"):

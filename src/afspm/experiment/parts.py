@@ -12,6 +12,8 @@ from afspm.experiment.findings import SourceLocation, closest, nearest
 from afspm.experiment.toml_lines import Path, Settings, Table
 from afspm.experiment.wiring_classes import WIRE_KEYS, wire_of
 
+KNOWN_VARIABLES: Final = frozenset({"name", "messages"})
+_INCLUDES = "no file includes another: lay files over each other, as in `afspm run first.toml second.toml`"
 SECTIONS: Final = (
     "clock", "control", "limits", "problems", "cache", "security", "restart", "record", "metadata", "notify",
     "conditions",
@@ -166,6 +168,12 @@ def _misspelt(table: Table, wanted: tuple[str, ...]) -> str:
 
 def _report_unused(parts: ExperimentParts, used: set[str], document: Document) -> None:
     components = [part.name for part in parts.components]
+    # a file of another form may have values of its own program
+    unused = parts.variables.keys() - used - KNOWN_VARIABLES
+    for name in () if parts.became else sorted(unused):
+        meant = closest(name, sorted({*SECTIONS, *(key for part in parts.components for key in part.settings)}))
+        hint = _INCLUDES if name == "include" else f"did you mean {meant!r}, in a table?" if meant else ""
+        document.warning(f"nothing uses the variable {name!r}", name, hint=hint)
     for name, table in parts.intermediaries.items():
         if name in used:
             continue

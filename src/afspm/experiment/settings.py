@@ -88,6 +88,16 @@ def default_of(component: type, name: str) -> Any:
     return None if parameter is None or parameter.default is inspect.Parameter.empty else parameter.default
 
 
+def choices(component: type) -> dict[str, tuple[object, ...]]:
+    """Return the words that each setting of a component can have, if it has a choice of words."""
+    literal: object = typing.Literal
+    return {
+        name: typing.get_args(annotation)
+        for name, annotation in _annotations(component).items()
+        if typing.get_origin(annotation) is literal
+    }
+
+
 def listening(component: type, settings: Table) -> Iterator[tuple[str, str, bool]]:
     """Yield (setting, address, True if guarded by keys) of each socket that a component binds by its settings."""
     everything = {**{name: default_of(component, name) for name in _parameters(component)}, **settings}

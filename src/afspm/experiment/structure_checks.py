@@ -19,7 +19,7 @@ from afspm.experiment.implied_parts import NO_PROGRAM, RECORDS, check_notify, is
 from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.wiring_classes import WIRE_SETTINGS, BoundSocket, wire_of
-from afspm.model import Role, component_of, is_process_name
+from afspm.model import Role, component_of, is_process_name, names
 from afspm.model.events import LONGEST_PROCESS_NAME, PERSON
 from afspm.transport.network import is_local
 from afspm.wire.messages import SCAN_LINES
@@ -124,7 +124,7 @@ def check_commands(resolved: ResolvedExperiment) -> None:
 
 def check_intermediaries(resolved: ResolvedExperiment) -> None:
     """Require known settings, numbers and valid addresses in intermediary tables."""
-    names = [*resolved.parts.variables, *resolved.parts.intermediaries]
+    known = [*resolved.parts.variables, *resolved.parts.intermediaries]
     for name, table in resolved.parts.intermediaries.items():
         kind = wire_of(table)
         if kind is None:
@@ -139,7 +139,7 @@ def check_intermediaries(resolved: ResolvedExperiment) -> None:
             elif key.endswith("url"):
                 for url in value if isinstance(value, list) else [value]:
                     if not isinstance(url, str) or not is_address(url):
-                        near = closest(str(url), names, 0.7)
+                        near = closest(str(url), known, 0.7)
                         hint = f"did you mean {near!r}?" if near else hint_on(str(url)) or EXAMPLE
                         resolved.document.error(f"[{name}] {key} = {url!r} is not an address", name, key, hint=hint)
 
@@ -378,13 +378,26 @@ def _has_password(resolved: ResolvedExperiment, member: str) -> bool:
 
 def check_likely_typos(resolved: ResolvedExperiment) -> None:
     """Warn of texts that almost equal a variable's name."""
-    names = [*resolved.parts.variables, *resolved.parts.intermediaries]
+    known = [*resolved.parts.variables, *resolved.parts.intermediaries]
     for part in resolved.parts.components:
         for path, text in _texts(part.settings, (part.name,)):
-            near = closest(text, names, 0.85) if _WORD.fullmatch(text) and len(text) > 3 else None
+            near = closest(text, known, 0.85) if _WORD.fullmatch(text) and len(text) > 3 else None
             if near:
                 what = f"[{part.name}] {path[1]} = {text!r} is nearly the name of a variable"
                 resolved.document.warning(what, *path, hint=f"did you mean {near!r}?")
+
+
+def check_replaced_choices(resolved: ResolvedExperiment) -> None:
+    """Warn of a variable with the name of a choice of a setting, which the variable replaces."""
+    for name, process in resolved.processes.items():
+        written = resolved.document.data.get(name, {})
+        words = {} if process.component is None else settings.choices(process.component)
+        for key in written.keys() & words.keys():
+            text = written[key]
+            if isinstance(text, str) and text in words[key] and text in resolved.parts.variables:
+                value = resolved.parts.variables[text]
+                what = f"[{name}] {key} = {text!r} is replaced by {value!r}, the value of the variable {text!r}"
+                resolved.document.warning(what, name, key, hint="give the variable another name")
 
 
 def _texts(value: object, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], str]]:
@@ -410,6 +423,19 @@ def check_needs(resolved: ResolvedExperiment) -> None:
                 for one in [one for one in needed if one not in offered]:
                     what = f"[{name}] needs the {kind} {one!r}, which [{translator.name}] does not have"
                     resolved.document.error(what, name, hint=nearest(one, offered))
+
+
+def check_treatments(resolved: ResolvedExperiment) -> None:
+    """Warn of treatments of a real tip without limits."""
+    translators = resolved.with_role(Role.TRANSLATOR)
+    if "limits" in resolved.document.data or all(one.is_microscope for one in translators):
+        return
+    for name, process in resolved.processes.items():
+        treatments = [one for one in process.declared.needs_actions if one in names.TREATMENTS]
+        if treatments:
+            what = f"[{name}] uses {' and '.join(treatments)} on a microscope that is not simulated, without [limits]"
+            hint = "bound the voltage and the place: [limits] region = …, parameters = { tip-bias-voltage = … }"
+            resolved.document.warning(what, name, hint=hint)
 
 
 def check_handlers(resolved: ResolvedExperiment) -> None:
@@ -473,7 +499,9 @@ ALWAYS: Final[tuple[Check, ...]] = (
     check_clock,
     check_names_of_people,
     check_likely_typos,
+    check_replaced_choices,
     check_needs,
+    check_treatments,
     check_handlers,
     check_notify,
 )

@@ -66,7 +66,7 @@ def test_plan_is_measured_once_after_its_preflight_and_approval(started: Started
     assert asked
 
 
-def test_person_reads_a_simulation_of_the_own_side_not_that_of_the_agent(started: Started, tmp_path: Path) -> None:
+def test_person_reads_a_simulation_of_the_own_side_not_of_the_agent(started: Started, tmp_path: Path) -> None:
     (tmp_path / "forging.py").write_text(FORGING, encoding="utf-8")
     run = started(experiment=EXPERIMENT.replace('class = "Agent"', 'class = "forging.ForgingAgent"'))
     steps = [{"do": "set", "parameter": "x-feedback-on", "value": "off"}, SCAN]

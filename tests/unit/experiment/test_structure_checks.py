@@ -35,6 +35,7 @@ WITHOUT_TRANSLATOR = FRAME[: FRAME.index("[microscope]")]
         ("a = Scheduler", "in quotes"),
         ("a = = 3", ""),
         ("a = [1", ""),
+        ("a = \u201chello\u201d", "straight"),
         ("a = 1,5", "decimal point"),
         ("a: 3", "after ="),
         ("a:", "in brackets"),
@@ -469,3 +470,44 @@ def test_a_program_beside_the_file_is_run_from_there(write: Write, tmp_path: Pat
     starts = {start.launch.name: start for start in experiment.launches(take_address=lambda: "tcp://127.0.0.1:5555")}
     assert starts["a"].command == (str(program),)
     assert starts["notifier"].launch.settings["program"] == [str(program), "ada"]
+
+
+def test_variable_that_nothing_uses_is_a_warning(write: Write) -> None:
+    experiment = write(
+        'name = "night"\nchannels = "Height"\nsize_of = 3\ninclude = ["a.toml"]\n' + ANYTHING + 'channel = "channels"\n'
+    )
+    assert not errors(experiment)
+    found = {finding.what: finding for finding in experiment.check()}
+    assert set(found) == {"nothing uses the variable 'include'", "nothing uses the variable 'size_of'"}
+    assert "afspm run first.toml second.toml" in found["nothing uses the variable 'include'"].hint
+    assert found["nothing uses the variable 'size_of'"].place.line == line_of(experiment, "size_of")
+
+
+def test_variable_that_replaces_a_choice_of_a_setting_is_a_warning(write: Write) -> None:
+    series = '[series]\ncomponent = true\nclass = "ScanSeries"\nsize = ["1 um", "1 um"]\nmissed = "extend"\n'
+    (warning,) = write('extend = "skip"\n' + series).check()
+    assert warning.what == "[series] missed = 'extend' is replaced by 'skip', the value of the variable 'extend'"
+    assert write('later = "skip"\n' + series.replace("extend", "later")).check() == []
+
+
+@pytest.mark.parametrize(
+    ("frame", "more", "warns"), [(FRAME, "", False), (REAL, "", True), (REAL, "[limits]\n", False)]
+)
+def test_treatment_of_a_real_tip_without_limits_is_a_warning(
+    write: Write, frame: str, more: str, *, warns: bool
+) -> None:
+    repair = '[repair]\ncomponent = true\nclass = "TipCorrector"\nworkshop_center = ["8 um", "0 um"]\n'
+    found = write(repair + CLASSIFIER + more, frame=frame).check()
+    assert any("on a microscope that is not simulated, without [limits]" in one.what for one in found) is warns
+
+
+def test_bare_name_of_a_class_is_the_remedy_of_a_wrong_path(write: Write) -> None:
+    error = only_error(write('[series]\ncomponent = true\nclass = "afspm.components.ScanSeries"\n'))
+    assert error.hint == 'write class = "ScanSeries"'
+
+
+def test_line_that_is_not_utf_8_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "night.toml"
+    file.write_bytes("a = 1\n# größe\n".encode("latin-1"))
+    error = only_error(load(file))
+    assert (error.place.line, error.hint) == (2, 'save it as "UTF-8" in your editor')

@@ -18,7 +18,7 @@ def application(tools: AgentTools, passwords: Passwords, *, host: str, origins: 
     """Return the HTTP application; `GatewayGuard` checks name, token, origin and host of each request first."""
     # the guard checks host and origin for both eras of the protocol, and off loopback as well
     security = TransportSecuritySettings(enable_dns_rebinding_protection=False)
-    # no sessions for the older era: a caller without a name could open so many that no agent could call `stop`
+    # no sessions for the older era: callers without a name could use them all up, and no agent could call `stop`
     app = tools.server().streamable_http_app(
         streamable_http_path=PATH, transport_security=security, host=host, stateless_http=True
     )
