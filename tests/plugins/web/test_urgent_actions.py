@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, cast
 
 import pytest
@@ -10,7 +11,7 @@ from deadlines import DEADLINE_S
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.launch import Launch
 from afspm.client.experiment_link import ExperimentLink
-from afspm.model import ControlResponse, Response, ScopeState, ScopeStatus, names
+from afspm.model import ControlResponse, Region, Response, ScanParameters, ScopeState, ScopeStatus, names
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.persons import Persons
 from afspm.plugins.web.watch import Watch
@@ -52,6 +53,24 @@ def persons(link: BusyMicroscope, monkeypatch: pytest.MonkeyPatch) -> Persons:
 
     monkeypatch.setattr(made, "_connect", connect)
     return made
+
+
+def test_wait_for_a_region_ends_with_its_centre_size_and_angle(
+    link: BusyMicroscope, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = Region((0.0, 0.0), (2e-6, 2e-6), 0.5)
+    others = [replace(wanted, size_m=(1e-6, 2e-6)), replace(wanted, angle_rad=0.0), wanted.moved_to((1e-6, 0.0))]
+    watch = Watch(link.clock)
+    commands = PersonCommands(cast("ExperimentLink", link), watch)
+    waits: list[Any] = []
+    monkeypatch.setattr(commands, "_settle", waits.append)
+    assert commands.prepare_scan(wanted, (64, 64)) is None
+    ended = []
+    for number, region in enumerate([*others, wanted]):
+        watch.take("ScanParameters2d", ScanParameters(region, (64, 64)), number + 1)
+        with watch.reading() as overview:
+            ended.append(waits[0](overview))
+    assert ended == [False, False, False, True]
 
 
 def test_stop_ends_the_waits_of_earlier_scans(persons: Persons, link: BusyMicroscope) -> None:

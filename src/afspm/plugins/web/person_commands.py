@@ -9,6 +9,7 @@ from collections.abc import Callable
 from afspm import wire
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.parameter_text import Value, to_parameter
+from afspm.client.targets import FITS, is_set
 from afspm.model import (
     LEASE_REQUEST,
     RELAY_REQUEST,
@@ -32,6 +33,7 @@ from afspm.record.overview import Overview
 
 ANSWER_S = 20.0  # real time for an answer
 FREE_S = 60.0  # real time for the microscope to reach a place
+AT_M = 5e-9  # a controller's rounding of the probe's position
 SETTLED_S = 2.0  # a changed setting is published within this time
 
 
@@ -115,7 +117,7 @@ class PersonCommands:
         response = self._ask(ControlRequest.SET_SCAN_PARAMS, wanted)
         if not response.ok:
             return response
-        self._settle(lambda o: o.readings.scan_parameters is not None and _fits(o.readings.scan_parameters, wanted))
+        self._settle(lambda o: is_set(wanted, o.readings.scan_parameters, FITS))
         return None
 
     def prepare_spectrum(self, at_m: XY | None) -> Response | None:
@@ -125,7 +127,9 @@ class PersonCommands:
         response = self._ask(ControlRequest.SET_PROBE_POS, ProbePosition(at_m))
         if not response.ok:
             return response
-        self._settle(lambda o: o.readings.probe_position is not None and _near(o.readings.probe_position.xy_m, at_m))
+        self._settle(
+            lambda o: o.readings.probe_position is not None and math.dist(o.readings.probe_position.xy_m, at_m) <= AT_M
+        )
         return None
 
     def act_when_free(self, action: str, next_id: Callable[[], str] = str) -> Response:
@@ -179,14 +183,3 @@ class PersonCommands:
     def _settle(self, done: Callable[[Overview], bool]) -> None:
         # an unchanged value is not published, so the wait is bounded
         self._watch.wait_for(done, SETTLED_S)
-
-
-def _fits(now: ScanParameters, wanted: ScanParameters) -> bool:
-    if wanted.shape is not None and now.shape != wanted.shape:
-        return False
-    a, b = now.region, wanted.region
-    return b is None or (isinstance(a, Region) and isinstance(b, Region) and _near(a.center_m, b.center_m))
-
-
-def _near(a: XY, b: XY) -> bool:
-    return math.dist(a, b) < 1e-3 * max(math.hypot(*b), 1e-9)
