@@ -26,6 +26,7 @@ class FilesUnlessNamed(TyperGroup):
 app = typer.Typer(
     cls=FilesUnlessNamed,
     no_args_is_help=True,
+    add_completion=False,
     rich_markup_mode="markdown",
     rich_help_panel=AFTERWARDS,
     help="Follow drift in recorded scans (afspm drift FILE…; its options: afspm drift files --help), or study settings "

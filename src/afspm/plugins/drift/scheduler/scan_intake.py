@@ -263,7 +263,7 @@ def _log_if_slow(draft: DriftDraft, held: HeldScan) -> None:
     if draft.worker.slow_logged or took_s < limit_s / 3:
         return
     draft.worker = replace(draft.worker, slow_logged=True)
-    text = f"registering a scan took {took_s:.1f} s, and is given up after longest_registration = {limit_s:g} s"
+    text = f"registering a scan took {took_s:.1f} s; above longest_registration = {limit_s:g} s it is given up"
     draft.log("WARNING", f"{text}: use fewer pixels, or raise longest_registration")
 
 
