@@ -207,3 +207,21 @@ def test_unreadable_proposal_hides_no_other() -> None:
         f"the preflight of {'b' * 16} is no JSON object",
     ]
     assert (good["id"], good["untrusted"]["title"]) == (plan.id, "look")
+
+
+@pytest.mark.parametrize(
+    ("tool", "given", "reason"),
+    [
+        ("propose", ("scan-speed", "5"), 'steps[0].value: 5 has no unit (such as "1 um/s")'),
+        ("propose", ("scan-speed", "5 pA"), 'steps[0].value: 5 pA is no value of scan-speed (such as "1 um/s")'),
+        ("propose", ("scan-speed", "nan m/s"), "steps[0].value: nan m/s is not finite"),
+        ("scan_numbers", 1, 'scan: this is text in quotes: an id of `scans`, a quantity as "100 nm", or a word'),
+    ],
+)
+def test_refusal_of_arguments_has_one_example_that_a_model_may_copy(tool: str, given: Any, reason: str) -> None:
+    set_it = (
+        {"title": "t", "steps": [{"do": "set", "parameter": given[0], "value": given[1]}]} if tool == "propose" else {}
+    )
+    answer = called(AgentRig(), tool, {"plan": set_it} if set_it else {"scan": given})
+    assert answer.is_error
+    assert facts(answer)["untrusted"]["reason"] == reason

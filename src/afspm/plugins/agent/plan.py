@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from afspm.basics.errors import AfspmError, InvalidValue
 from afspm.basics.formatting import area_text, position_text
 from afspm.basics.plain_data import from_json
-from afspm.basics.units import parse_quantity, si
+from afspm.basics.units import convert, parse_quantity, si
 from afspm.client.parameter_text import to_parameter
 from afspm.client.targets import ScanTarget, SpectrumTarget
 from afspm.model import ControlRequest, Frame, GrantedStep, Parameter, ProbePosition, Region, names
@@ -22,6 +22,8 @@ MOST_STEPS = 200
 MOST_PIXELS = 4096
 LONGEST_TITLE = 200
 _FARTHEST_M = 1.0
+# a model copies an example: one metre is no size for a microscope
+_EXAMPLES = {"m": "100 nm", "m/s": "1 um/s", "V": "0.5 V", "A": "100 pA"}
 _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 
 
@@ -233,10 +235,15 @@ def _set_step(given: Mapping[str, object], where: str) -> SetStep:
             raise InvalidValue(error.what, where=f"{where}.value", hint=error.hint) from error
         if not math.isfinite(number):
             raise InvalidValue(f"{value} is not finite", where=f"{where}.value")
-        if not unit and names.BASE_PARAMETERS.get(name):
-            unit = names.BASE_PARAMETERS[name] or ""
-            raise InvalidValue(f"{value} has no unit", where=f"{where}.value", hint=f'such as "{value} {unit}"')
-    elif value.strip().lower() in ("nan", "inf", "infinity"):
+        if base := names.BASE_PARAMETERS.get(name):
+            example = f'such as "{_EXAMPLES.get(base, f"1 {base}")}"'
+            if not unit:
+                raise InvalidValue(f"{value} has no unit", where=f"{where}.value", hint=example)
+            try:
+                convert(1.0, unit, base)
+            except AfspmError as error:
+                raise InvalidValue(f"{value} is no value of {name}", where=f"{where}.value", hint=example) from error
+    elif value.split()[0].lower() in ("nan", "inf", "infinity"):
         raise InvalidValue(f"{value} is not finite", where=f"{where}.value")
     return SetStep(name, value)
 
@@ -263,7 +270,9 @@ def _pair(value: object, where: str) -> XY:
 
 def _quantity(value: object, unit: str, where: str) -> float:
     if not isinstance(value, str) or not parse_unit(value, where):
-        raise InvalidValue("a quantity is text with a unit", where=where, hint=f'as in "1 {unit}"')
+        raise InvalidValue(
+            "a quantity is text with a unit", where=where, hint=f'as in "{_EXAMPLES.get(unit, f"1 {unit}")}"'
+        )
     try:
         number = si(value, unit)
     except AfspmError as error:

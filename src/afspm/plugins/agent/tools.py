@@ -47,6 +47,8 @@ BLOCKS = 16
 _log = logging.getLogger("afspm.plugins.agent")
 Content = dict[str, object] | tuple[dict[str, object], bytes]
 Tool = Callable[[str, object], Awaitable[Content]]
+# a model gives the number of a scan where its id belongs, or a quantity without its unit
+_IN_WORDS = {"string_type": 'this is text in quotes: an id of `scans`, a quantity as "100 nm", or a word'}
 _READS = types.ToolAnnotations(read_only_hint=True)
 _PROPOSES = types.ToolAnnotations(destructive_hint=False)
 _ACTS = types.ToolAnnotations(destructive_hint=True)
@@ -107,13 +109,13 @@ class AgentTools:
             tool: Tool = getattr(self, f"_{name}")
             content = await tool(person, model.model_validate(given))
         except pydantic.ValidationError as error:
-            wrong = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()[:8]]
+            found = [(one["loc"], _IN_WORDS.get(one["type"], one["msg"])) for one in error.errors()[:8]]
+            wrong = [f"{'.'.join(map(str, where))}: {what}" for where, what in found]
             return _refusal(RefusedRequest(RefusalCode.INVALID, "; ".join(wrong)))
         except RefusedRequest as error:
             return _refusal(error)
         except AfspmError as error:
-            hint = f" ({error.hint})" if error.hint else ""
-            return _refusal(RefusedRequest(RefusalCode.INVALID, f"{error}{hint}"))
+            return _refusal(RefusedRequest(RefusalCode.INVALID, str(error)))
         except Exception as error:  # of this program: the model gets a code, the log the traceback
             _log.exception("the tool %s failed", name)
             return _refusal(of_error(error))
