@@ -71,7 +71,9 @@ class DriftTable(NightCodec):
             return self.encode(replace(thing, sample=there.region))
         return self.encode(replace(thing, region=there.region) if isinstance(thing, ScanParameters) else there)
 
-    def encode_mapping(self, registered: Registered, filename: str, center_m: XY, *, correcting: bool) -> bytes:
+    def encode_mapping(
+        self, registered: Registered, filename: str, center_m: XY, *, correcting: bool, channel: str | None
+    ) -> bytes:
         return self.encode(("mapping", registered.key, str(registered.matrix)))
 
     def encode_rescan(self, wanted: RescanWanted) -> bytes:
