@@ -44,8 +44,9 @@ demo-drift: $(DEMO)
 	@$(NEXT)
 
 ## the tests of every change, in four minutes on two idle cores: units, decisions in simulated nights, protocols, and the
-## processes that everything else stands on. More at a time than there are cores, since many of them wait
-TESTS_AT_A_TIME ?= 8
+## processes that everything else stands on. More at a time than there are cores, since many of them wait; each process
+## of pytest takes 14 s on the reference computer to import and collect all tests
+TESTS_AT_A_TIME ?= 4
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest
 COLLECTED := .venv/.tests-collected
 POWER_CUT := tests/system/record/test_power_cut.py
