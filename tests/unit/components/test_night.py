@@ -64,9 +64,10 @@ def night(scans: int = 12) -> NightRecord:
     record = NightRecord()
     middle = scans * 10 * MINUTE_NS // 2
     record.add(control_entry(ControlState(holder="series"), 0))
+    entry = scan_entry(scan(), 0, 0, "series")
     for number in range(scans):
         end = (10 * number + 2) * MINUTE_NS
-        record.add(scan_entry(scan(end), end, end - MINUTE_NS, "series"))
+        record.add({**entry, "time_ns": end, "start_ns": end - MINUTE_NS})
     record.add(mark_entry("tip_classifier", "verdict", middle, BAD, 12 * MINUTE_NS))
     record.add(control_entry(ControlState(problems=(TIP,)), middle))
     record.add(control_entry(ControlState(holder="tip_corrector", problems=(TIP,)), middle + MINUTE_NS))
@@ -176,9 +177,9 @@ def test_problems_that_overlap_are_one_episode() -> None:
     assert [(span.start_ns, span.end_ns) for span in _episodes(record)] == [(1, 4), (9, None)]
 
 
-@pytest.mark.parametrize("record", [night(), night(300), night(1)], ids=["usual", "long", "short"])
-def test_a_picture_is_drawn(tmp_path: Path, record: NightRecord) -> None:
-    draw(record, tmp_path / "night.png", {TIP: "tip-shape-changed"}, title="A night", simulated=True)
+@pytest.mark.parametrize("scans", [12, 300, 1], ids=["usual", "long", "short"])
+def test_a_picture_is_drawn(tmp_path: Path, scans: int) -> None:
+    draw(night(scans), tmp_path / "night.png", {TIP: "tip-shape-changed"}, title="A night", simulated=True)
     assert (tmp_path / "night.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "night.png").stat().st_size > 10_000
 
