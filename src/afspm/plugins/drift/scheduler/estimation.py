@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -91,7 +90,8 @@ class Estimation:
         self._keep()
 
     def _keep(self) -> None:
-        self._save({"tracker": self._tracker.state(), "answers": [asdict(one) for one in self._answers.values()]})
+        # not asdict: it copies sixteen forecasts at each scan, and an answer never changes
+        self._save({"tracker": self._tracker.state(), "answers": [dict(vars(one)) for one in self._answers.values()]})
 
     def _answer(self, key: str, scan: DriftScan, asked: Region | None, update: Update) -> Registered:
         after, before = update.after, update.before

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Generic, Protocol, TypeVar
 
 from afspm.basics.units import convert
@@ -82,12 +83,15 @@ class TargetPosition(Generic[P]):
         None if the place is neither in force nor among the recently sent places, within a controller's rounding.
         """
         known: list[PositionPair[P]] = [*self.sent] if self.current is None else [self.current, *self.sent]
-        near = [place for place in reversed(known) if is_same(place.tip, tip)]  # of equally near places the newest
-        return self.at(min(near, key=lambda place: away_m(place.tip, tip))) if near else None
+        away = [(away_m(place.tip, tip), place) for place in reversed(known)]
+        near = [(far_m, place) for far_m, place in away if far_m <= _rounding_m(place.tip)]
+        return self.at(min(near, key=itemgetter(0))[1]) if near else None  # of equally near places the newest
 
 
 def away_m(a: Region | ProbePosition, b: Region | ProbePosition) -> float:
     """Return the largest distance between corresponding corners of two regions, or between two positions, in m."""
+    if a == b:  # as for each packet of lines, but for those after a new frame
+        return 0.0
     if isinstance(a, Region) and isinstance(b, Region):
         corners = zip(a.corners_m(), b.corners_m(), strict=True)
         return max(math.dist(one, other) for one, other in corners)
@@ -98,8 +102,11 @@ def away_m(a: Region | ProbePosition, b: Region | ProbePosition) -> float:
 
 def is_same(a: Region | ProbePosition, b: Region | ProbePosition) -> bool:
     """Return whether two places are equal to within the rounding of a controller."""
-    near_m = SAME * math.hypot(*a.size_m) if isinstance(a, Region) else SAME_PLACE_M
-    return away_m(a, b) <= near_m
+    return away_m(a, b) <= _rounding_m(a)
+
+
+def _rounding_m(place: Region | ProbePosition) -> float:
+    return SAME * math.hypot(*place.size_m) if isinstance(place, Region) else SAME_PLACE_M
 
 
 def value_in(name: str, region: Region) -> float:
