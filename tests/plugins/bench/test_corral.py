@@ -26,7 +26,7 @@ class MadeScope:
     """A scope whose only skill is a scan."""
 
     def scan(self, region: Region, shape: tuple[int, int]) -> ScanSet:
-        return ScanSet([Scan(region, "Height", "m", np.ones(shape), 17)])
+        return ScanSet([Scan(region, "Height", "m", np.ones(shape), 17, roles=("height",))])
 
     def set(self, parameter: str, value: object) -> None:
         raise InvalidValue(f"{parameter} can't be {value}")
@@ -39,7 +39,8 @@ def test_trial_is_offered_and_ends_with_the_report(tmp_path: Path, monkeypatch: 
     monkeypatch.setenv("AFSPM_BENCH_PORT", str(port))
     scope, clock = cast("Scope", MadeScope()), ExperimentClock.real()
     session = TrialSession("operate/made", scope, "Scan.", {}, {"a.txt": "b"}, clock, 0, 1.0, 1, tmp_path)
-    serving = threading.Thread(target=CorralEnvironment().solve, args=(session,))
+    # a daemon: a failing assertion leaves it without a report, and pytest would wait for it
+    serving = threading.Thread(target=CorralEnvironment().solve, args=(session,), daemon=True)
     serving.start()
 
     def ask(path: str, content: object = None) -> tuple[int, Any]:
