@@ -17,6 +17,7 @@ from afspm.basics.errors import InvalidValue
 from afspm.model import Frame, Region, Scan, ScanSet
 from afspm.model.geometry import XY
 from afspm.plugins.drift.estimators.correlation import Correlation
+from afspm.plugins.drift.estimators.images import Unusable, prepare
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
 from afspm.plugins.drift.registration import DriftScan, Registration
 from afspm.record.drawing.raster import reduced
@@ -123,10 +124,15 @@ def _drift_scan(scan: Scan) -> DriftScan:
 
 def _likely_angles(reference: DriftScan, scan: DriftScan, within_rad: float) -> list[float]:
     small, other = (replace(one, values=reduced(one.values, COARSE_PX)) for one in (reference, scan))
+    try:
+        images = [prepare(one.values) for one in (small, other)]  # the same at all angles
+    except Unusable:
+        return []
     estimator = Correlation()
     heights: list[tuple[float, float]] = []
     for angle in _angles(within_rad):
-        height = estimator.register(small, _turned_scan(other, angle)).quality.get("height", 0.0)
+        found = estimator.register_images(small, images[0], _turned_scan(other, angle), images[1])
+        height = found.quality.get("height", 0.0)
         if height > 0.0:
             heights.append((height, angle))
     best: list[float] = []

@@ -55,7 +55,13 @@ class Correlation:
                 images.append(prepare(one.values))
             except Unusable as error:
                 return Registration.refused(f"the {name}: {error}")
-        grid, first, second = onto_common_grid(reference, images[0], scan, images[1])
+        return self.register_images(reference, images[0], scan, images[1], prior)
+
+    def register_images(
+        self, reference: DriftScan, first: Image, scan: DriftScan, second: Image, prior: Prior | None = None
+    ) -> Registration:
+        """Return the registration of two scans whose prepared images are given."""
+        grid, first, second = onto_common_grid(reference, first, scan, second)
         found = self._peak(first, second, grid, prior)
         if found is None:
             return Registration.refused("no shift leaves enough overlap")
