@@ -214,6 +214,9 @@ class DriverBase(ABC):
     memory_is_all: ClassVar[bool] = False
     """True if all state of the (simulated) microscope is in `memory`: an action missing there was not executed."""
 
+    shadow: ClassVar[str] = ""
+    """The class that only reads this controller, "package.module.Class" (see `shadow`); empty: there is none."""
+
     start_engages: ClassVar[bool] = False
     """True if the start of a scan brings a withdrawn tip to the sample."""
 

@@ -84,6 +84,8 @@ class Asylum(Driver):
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
     start_engages: ClassVar[bool] = True
+    shadow: ClassVar[str] = "afspm.plugins.asylum.shadow.AsylumShadow"
+    link: ClassVar[type[Link]] = Link
     _activity: AsylumActivity
 
     def __init__(
@@ -122,7 +124,7 @@ class Asylum(Driver):
 
     def connect(self) -> None:
         self.close()
-        self._session = session = Session(Link(self.controller_at, self._reply_timeout_s, self.clock.monotonic_s))
+        self._session = session = Session(self.link(self.controller_at, self._reply_timeout_s, self.clock.monotonic_s))
         self.prove()
         self._kept.kept_in(self.memory)
         self._files = AsylumFiles(self.memory, self.log)

@@ -39,7 +39,7 @@ from afspm.plugins.gxsm.hardware import (
     execute,
     recognised,
 )
-from afspm.plugins.gxsm.link import Address, Asking, open_link
+from afspm.plugins.gxsm.link import Address, Asking, Link, open_link
 from afspm.plugins.gxsm.result_files import LATE_S, SOON_S, GxsmFiles
 from afspm.plugins.gxsm.scan_memory import new_lines
 from afspm.plugins.gxsm.settings import (
@@ -99,6 +99,7 @@ class Gxsm(Driver):
     software: ClassVar[str] = "Gxsm"
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
+    shadow: ClassVar[str] = "afspm.plugins.gxsm.shadow.GxsmShadow"
 
     def __init__(
         self,
@@ -147,8 +148,7 @@ class Gxsm(Driver):
     def connect(self) -> None:
         """Open the link; detect the hardware, the panel's unit of lengths, and whether Auto Save can be switched."""
         self.close()
-        address = Address.parse(self.controller_at)
-        ask = self._asking = Asking(self._open(address, monotonic_s=self.clock.monotonic_s))
+        ask = self._asking = Asking(self._open_link())
         self.prove()
         # the lists are the only proof that a name exists: neither `set`, `get` nor `action` reports an unknown name
         refnames, actions = ask.names("list_refnames"), ask.names("list_actions")
@@ -190,6 +190,9 @@ class Gxsm(Driver):
         feedback = FeedbackSwitch(ask, self._activity.gxsm.doing, self._feedback_actions)
         self.groups = (own, self._tip, self._kept, feedback)
         self.log.info("GXSM with the hardware %s; unsupported: %s", self._offered.kind, ", ".join(lacking) or "none")
+
+    def _open_link(self) -> Link:
+        return self._open(Address.parse(self.controller_at), monotonic_s=self.clock.monotonic_s)
 
     def _find_parameters(self) -> list[str]:
         table = self._whole_table

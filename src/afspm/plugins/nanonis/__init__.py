@@ -92,6 +92,9 @@ class Nanonis(Driver):
     software: ClassVar[str] = "Nanonis"
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
+    shadow: ClassVar[str] = "afspm.plugins.nanonis.shadow.NanonisShadow"
+    session_class: ClassVar[type[Session]] = Session
+    activity_class: ClassVar[type[NanonisActivity]] = NanonisActivity
 
     def __init__(
         self,
@@ -125,13 +128,13 @@ class Nanonis(Driver):
     def connect(self) -> None:
         self.close()
         addresses = _addresses(self.controller_at)
-        session = self._session = Session(self, addresses, self._reply_timeout_s, self._release)
+        session = self._session = self.session_class(self, addresses, self._reply_timeout_s, self._release)
         if not hasattr(self, "_files"):
             self._kept.kept_in(self.memory)
             own_folder = (self.run_dir / "scans").resolve()
             patience_s = self.patience_s(self.common.result_timeout_s / 2)
             self._files = NanonisFiles(self.memory, self._session_dir, own_folder, patience_s, self.log)
-        self._activity = NanonisActivity(
+        self._activity = self.activity_class(
             session, self._files, self._probe, self._tip, self.memory, self.clock, self.log
         )
         z_controller.compare(session.ask, self.table[names.ZCTRL_SETPOINT].unit, self.log)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from queue import SimpleQueue
 from threading import Thread
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
@@ -84,9 +84,11 @@ class Session:
         ControllerLost: a connection can't be opened, or fails.
     """
 
+    link: ClassVar[type[Link]] = Link
+
     def __init__(self, driver: Driver, addresses: list[tuple[str, int]], timeout_s: float, release: int | None) -> None:
         self._log = driver.log
-        self._link = Link(addresses[0], timeout_s, driver.clock.monotonic_s)
+        self._link = self.link(addresses[0], timeout_s, driver.clock.monotonic_s)
         self.ask = self._link.ask
         self._listener: Listener | None = None
         # each port of Nanonis serves one client, one call at a time: a blocking call needs a port of its own
@@ -98,7 +100,7 @@ class Session:
             # The spectroscopy modules of the real software answer only after their Open.
             self.opened = {module for module in (*MODULES.values(), APPROACH) if self._open(module)}
             self._find_range()
-            second = Link(addresses[-1], timeout_s, driver.clock.monotonic_s, self._link.release)
+            second = self.link(addresses[-1], timeout_s, driver.clock.monotonic_s, self._link.release)
             self._listener = self.listener = Listener(second, driver.wake)
             driver.prove()
         except AfspmError:

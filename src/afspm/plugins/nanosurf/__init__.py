@@ -34,6 +34,11 @@ _AT_FIRST: Final[dict[str, Value]] = {names.SCAN_DIRECTION: names.UP, names.SPEC
 _STORAGE: Final = "data.storage"
 _ONE_FRAME: Final = 1
 _NEW_FILE: Final = 1
+SAVES: Final[dict[str, Value]] = {
+    f"{_STORAGE}.nhf_backend_enabled": True,
+    f"{_STORAGE}.nhf_auto_store_mode": _NEW_FILE,
+}
+"""The settings with which Studio saves each measurement to a new file."""
 _CHANNELS: Final = both_ways(
     {
         "height": ["Height", "Topography", "Z-Axis"],
@@ -70,6 +75,8 @@ class Nanosurf(Driver):
     software: ClassVar[str] = "Nanosurf Studio"
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
+    shadow: ClassVar[str] = "afspm.plugins.nanosurf.shadow.NanosurfShadow"
+    link: ClassVar[type[Link]] = Link
 
     def __init__(
         self,
@@ -116,6 +123,7 @@ class Nanosurf(Driver):
             session, self._files, self._place, self.memory, self._folder, self._scan_time, self.clock, self.log
         )
         self._save_files(session)
+        self._look_at_folder()
 
     def close(self) -> None:
         if self._activity is not None:
@@ -202,7 +210,7 @@ class Nanosurf(Driver):
     # --- inside ---
 
     def _open_link(self) -> Link:
-        return Link(self.controller_at, self._reply_timeout_s, self.clock.monotonic_s)
+        return self.link(self.controller_at, self._reply_timeout_s, self.clock.monotonic_s)
 
     def _studio(self) -> Session:
         return connected(self._session, "Studio", self.controller_at)
@@ -223,14 +231,12 @@ class Nanosurf(Driver):
         return Path(self._gallery_dir or str(self._studio().values([path])[path]))
 
     def _save_files(self, session: Session) -> None:
-        wanted: dict[str, Value] = {
-            f"{_STORAGE}.nhf_backend_enabled": True,
-            f"{_STORAGE}.nhf_auto_store_mode": _NEW_FILE,
-        }
         # The other modes append to the current file or save nothing, and results are recognised by new files.
-        if session.values(list(wanted)) != wanted:
+        if session.values(list(SAVES)) != SAVES:
             self.log.warning("Studio did not save each measurement to a new .nhf file; it does from now on")
-            session.put(wanted)
+            session.put(SAVES)
+
+    def _look_at_folder(self) -> None:
         folder = self._folder()
         if not folder.is_dir():
             problem = f"Studio's gallery {folder} does not exist on this computer"

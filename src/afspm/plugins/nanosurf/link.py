@@ -45,13 +45,13 @@ class Link:
             ControllerLost: no reply, or a malformed reply; the connection is closed.
         """
         self.begin(script)
-        return self._values(_shown(script))
+        return self._values(shown(script))
 
     def begin(self, script: str) -> None:
         """Start a script; its `reply` must be received before the next script. Raises ControllerLost."""
         raw = script.encode()
         # Studio executes one script at a time on a connection, and replies at its end.
-        self._connection.send(_shown(script), _LENGTH.pack(len(raw)) + raw)
+        self._connection.send(shown(script), _LENGTH.pack(len(raw)) + raw)
 
     def wait(self, within_s: float) -> None:
         """Wait for the reply to `begin`, at most `within_s` of real time."""
@@ -86,6 +86,7 @@ def _read(receiver: Receiver) -> tuple[Any, dict[Any, Any]]:
     return reply[1], reply[2]
 
 
-def _shown(script: str) -> str:
+def shown(script: str) -> str:
+    """Return the beginning of a script, for messages."""
     first = " ".join(script.split())
     return first if len(first) <= _SHOWN else f"{first[:_SHOWN]}…"

@@ -21,6 +21,10 @@ from afspm.translator.parameters import Value
 
 ENUMS: Final = frozenset({"imaging.scan_mode", "imaging.slow_axis_scan_direction", "data.storage.nhf_auto_store_mode"})
 """Paths of choices, whose value is a number."""
+# (!) before release 17 there may be no full version
+_FULL: Final = "root.version.full and root.version.full() or root.version.major()"
+VERSIONS: Final = f"return root.version.major(), {_FULL}, root.session.list()"
+"""Returns the release, the full version and the names of the sessions."""
 _LARGEST_BUFFERED: Final = 2**31 - 1
 
 
@@ -195,9 +199,7 @@ class Session:
 
     def _checked_name(self, name: str) -> str:
         self._link.run("return root.session.select_main(0)")
-        # (!) before release 17 there may be no full version
-        full = "root.version.full and root.version.full() or root.version.major()"
-        major, full, listed = self._link.run(f"return root.version.major(), {full}, root.session.list()")
+        major, full, listed = self._link.run(VERSIONS)
         self.controller = f"Nanosurf Studio {full}"
         commands.has_old_commands(major)  # too old: the hint below would lead to a refusal
         if major != self._release:

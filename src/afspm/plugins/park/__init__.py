@@ -71,6 +71,8 @@ class Park(Driver):
     software: ClassVar[str] = "SmartScan"
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0 + SETTLE_S
+    shadow: ClassVar[str] = "afspm.plugins.park.shadow.ParkShadow"
+    link: ClassVar[type[Link]] = Link
 
     def __init__(
         self,
@@ -209,7 +211,7 @@ class Park(Driver):
     # --- inside ---
 
     def _open_link(self) -> Link:
-        return Link(self.controller_at, self._reply_timeout_s, self.clock.monotonic_s)
+        return self.link(self.controller_at, self._reply_timeout_s, self.clock.monotonic_s)
 
     def _smartscan(self) -> Session:
         return connected(self._session, "SmartScan", self.controller_at)
