@@ -88,6 +88,7 @@ app.command("export", rich_help_panel=AFTERWARDS)(runs.export)
 app.command("test-client", rich_help_panel=MICROSCOPES)(developing.check_client)
 app.command("test-translator", rich_help_panel=MICROSCOPES)(developing.check_translator)
 app.command("commission", rich_help_panel=MICROSCOPES)(commission.commission)
+app.command("shadow", rich_help_panel=MICROSCOPES)(run.shadow)
 app.command("trace", rich_help_panel=MICROSCOPES)(run.trace)
 app.command("emulate", rich_help_panel=MICROSCOPES)(developing.emulate)
 

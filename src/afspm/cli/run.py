@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Protocol
 
@@ -15,6 +15,7 @@ from afspm.cli.arguments import RUNS, Files, OptionalFiles, Runs, Speed, names_i
 if TYPE_CHECKING:
     from afspm.basics.plain_data import PlainMapping
     from afspm.experiment import Experiment, ProcessStart
+    from afspm.experiment.resolved_experiment import ResolvedExperiment
     from afspm.supervisor.resume import ResumableRun
     from afspm.supervisor.run import FinishedRun
 
@@ -238,15 +239,49 @@ def trace(
     raise typer.Exit(ended.outcome.exit_code)
 
 
-def _with_trace(files: list[Path]) -> Experiment:
-    import tempfile
+def shadow(
+    files: Files,
+    runs: Runs = RUNS,
+) -> None:
+    """Watch a person's work at the microscope, and write down what afspm would have done.
 
-    from afspm.basics.errors import ConfigError
-    from afspm.experiment import load
+    The controller is only read: the process that talks to it has no function that sets or starts anything. Components
+    see all scans, and nobody gets control. Ctrl-C ends it, and a killed shadow leaves the controller as it is. The
+    report and shadow.csv have what afspm would have done, beside what the person did.
+    """
+    import sys
+
+    from afspm.cli.experiment_file import require_no_errors
+    from afspm.experiment.shadow import shadow_overlay
+    from afspm.record.report import shadow as watched
+    from afspm.record.run import open_run
+    from afspm.supervisor import run as running
+
+    experiment = _with_overlay(files, shadow_overlay)
+    require_no_errors(experiment, (), ())
+    ended = running.run(experiment, running.RunOptions(runs=runs), terminal=sys.stdout)
+    with open_run(ended.folder) as found:
+        for line in watched.agreement_lines(watched.read(found)):
+            typer.echo("{}: {}, the person acted at {} of them ({} with 95 %)".format(*line))
+    raise typer.Exit(ended.outcome.exit_code)
+
+
+def _with_trace(files: list[Path]) -> Experiment:
     from afspm.experiment.tracing import trace_overlay
 
-    with tempfile.TemporaryDirectory() as folder:
-        overlay = trace_overlay(load(*files).resolved, Path(folder))
-        if overlay is None:
+    def overlay(resolved: ResolvedExperiment, folder: Path) -> Path:
+        found = trace_overlay(resolved, folder)
+        if found is None:
             raise ConfigError("no translator here talks to a controller: nothing to trace", where=str(files[0]))
-        return load(*files, overlay)
+        return found
+
+    return _with_overlay(files, overlay)
+
+
+def _with_overlay(files: list[Path], overlay: Callable[[ResolvedExperiment, Path], Path]) -> Experiment:
+    import tempfile
+
+    from afspm.experiment import load
+
+    with tempfile.TemporaryDirectory() as folder:
+        return load(*files, overlay(load(*files).resolved, Path(folder)))

@@ -48,7 +48,9 @@ def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None
 
     if not issubclass(microscope, Driver):
         return None
-    marks = (getattr(getattr(microscope, name), "_afspm_action", None) for name in dir(microscope))
+    # components beside a shadow are checked as in a run, although none of their requests is sent
+    acting = getattr(microscope, "watches", microscope)
+    marks = (getattr(getattr(acting, name), "_afspm_action", None) for name in dir(acting))
     added = settings.get("actions") or {}
     actions = {mark.name for mark in marks if mark is not None} | set(added)
     try:

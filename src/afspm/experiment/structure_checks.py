@@ -243,7 +243,7 @@ def check_problems(resolved: ResolvedExperiment) -> None:
                 if number is None:
                     hint = nearest(problem, resolved.problems) + ", or name it under [problems]"
                     resolved.document.error(f"[{name}] {verb} {problem!r}, which is not a problem", name, hint=hint)
-                elif verb == "flags" and number not in solved:
+                elif verb == "flags" and number not in solved and not control.shadow:
                     what = f"[{name}] flags {problem!r}, which no component solves: the experiment would stand still"
                     hint = "add a component that solves it, or name it in [control] end_on or solved_by_hand"
                     resolved.document.error(what, name, hint=hint)

@@ -64,6 +64,8 @@ class ControlSettings:
             component repairs the tip.
         agents: components whose commands need the approval of a person; without the key: components of the class
             `Agent`.
+        shadow: whether the run only watches a person's work. The mode is MANUAL from the start and stays so: nobody
+            gets control, flagged problems are only noted, and nothing is sent. `afspm shadow` sets it.
         roles: see below.
     """
 
@@ -83,6 +85,7 @@ class ControlSettings:
     solved_by_hand: tuple[str, ...] = ("device-malfunction",)
     end_on: tuple[str, ...] = ()
     agents: tuple[str, ...] | None = None
+    shadow: Switch = False
     roles: RoleTable = field(default_factory=RoleTable)
 
     __pydantic_config__: ClassVar[object] = SECTION
@@ -103,6 +106,7 @@ class ControlSettings:
             frozenset(map(problems.number, self.end_on)),
             frozenset(self.agents or ()),
             frozenset(problems[name] for name in self.solved_by_hand if name in problems),
+            self.shadow,
         )
 
     def watchdog(self) -> WatchdogSettings:

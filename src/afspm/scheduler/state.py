@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 
 from afspm.basics.frozen import replace
-from afspm.model import component_of
+from afspm.model import ControlMode, component_of
 from afspm.model.idempotency_cache import IdempotencyCache
 from afspm.model.microscope_status import MicroscopeStatus
 from afspm.model.sessions import SessionTable
@@ -81,7 +81,7 @@ class SchedulerState:
     def initial(cls, settings: SchedulerSettings, frame: CoordinateFrame = TIP_FRAME) -> SchedulerState:
         dog, control, waits = settings.watchdog, settings.control, settings.waits
         return cls(
-            control=ArbitrationState(),
+            control=ArbitrationState(ControlMode.MANUAL if control.shadow else ControlMode.AUTOMATED),
             lease=Lease(None if control.lease_s is None else round(control.lease_s * 1e9)),
             peers=Peers(SessionTable(waits.takeover_s), HolderTimeout(control.grace_s, waits.restart_grace_s)),
             idempotency=IdempotencyCache(),

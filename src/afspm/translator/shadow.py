@@ -13,6 +13,7 @@ read without a side effect is not read there.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from typing import ClassVar
 
 from afspm.basics.errors import Refused
 from afspm.model import ControlResponse
@@ -28,8 +29,14 @@ class ShadowDriver(DriverBase):
     Write it before the maker's driver: `class MineShadow(ShadowDriver, Mine)`.
     """
 
+    watches: ClassVar[type[DriverBase]]
+    """The maker's driver, with all that a run could ask of it."""
+
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
+        cls.watches = next(
+            one for one in cls.__mro__ if issubclass(one, DriverBase) and not issubclass(one, ShadowDriver)
+        )
         acting = [name for name in dir(cls) if hasattr(getattr(cls, name, None), "_afspm_action")]
         for name in (*_REMOVED, *acting):
             setattr(cls, name, None)

@@ -90,6 +90,21 @@ def test_stop_by_request_is_no_act_by_hand(bench: Make) -> None:
     assert (states(received), acts(received)) == (["INTERRUPTED", "FREE"], [])
 
 
+def test_shadow_leaves_a_scan_in_the_air_to_the_person(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = bench(speed=20.0)
+    monkeypatch.setattr(made, "translator", "afspm.plugins.nanonis.shadow.NanonisShadow")
+    peer = made.start()
+    peer.until(FREE)
+    called = calls(made, monkeypatch)
+    made.strike("safe-tip")
+    made.until_logged("Nanonis' safe tip withdrew the tip")
+    call(made, "Scan.Action", 0, 1)
+    made.until_logged("a run would have stopped the scan")
+    assert called == []
+    call(made, "Scan.Action", 1, 0)
+    assert not scans(peer.until(FREE))
+
+
 def test_scan_ended_by_the_safe_tip_is_no_act_by_hand(bench: Make) -> None:
     made = bench()
     peer = slow_scan(made)

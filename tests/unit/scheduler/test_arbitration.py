@@ -18,6 +18,7 @@ from afspm.scheduler.control.arbitration import (
     ArbitrationEvent,
     ArbitrationState,
     Cause,
+    ControlChange,
     ControlInput,
     RoleTable,
     Rules,
@@ -69,13 +70,35 @@ def test_every_row_can_apply() -> None:
     roles = RoleTable(end_experiment=("boss",), set_mode=("boss",), clear_problems=("boss",), operate=("boss",))
     met = set()
     stopping = Rules(problems=ProblemNames({STOPPED_BY_AGENT: 99}), agents=frozenset({"a"}))
-    for rules in (RULES, Rules(roles), Rules(end_on=frozenset({TIP})), stopping):
+    for rules in (RULES, Rules(roles), Rules(end_on=frozenset({TIP})), Rules(shadow=True), stopping):
         for control in _states():
             for event in ArbitrationEvent:
                 for who in ("a", "b", "boss"):
                     for number in (0, 1, 2, 3, 99):
                         met.add(id(row_for(control, ControlInput(event, who, number), rules)))
     assert [row for rows in TABLE.values() for row in rows if id(row) not in met] == []
+
+
+@given(
+    st.lists(
+        st.builds(
+            ControlInput,
+            st.sampled_from(list(ArbitrationEvent)),
+            st.sampled_from(["a", "b", "boss"]),
+            st.sampled_from([0, MANUAL, AUTOMATED, TIP, MALFUNCTION, 99]),
+        ),
+        max_size=12,
+    )
+)
+def test_shadow_gives_no_control_and_forwards_only_reading(asks: list[ControlInput]) -> None:
+    rules = Rules(RoleTable(operate=("boss",), set_mode=("boss",)), end_on=frozenset({TIP}), shadow=True)
+    control = ArbitrationState(ControlMode.MANUAL)
+    for ask in asks:
+        row = row_for(control, ask, rules)
+        control = apply(row, control, ask)
+        assert (control.mode, control.holder) == (ControlMode.MANUAL, None)
+        assert set(control.problems) <= {MALFUNCTION}
+        assert ask.event is ArbitrationEvent.READ or ControlChange.FORWARD not in row.do
 
 
 def test_a_cause_is_given_where_control_is_taken_and_only_there() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from afspm.basics.errors import FileError
-from afspm.record.report import curves, page, pictures, story
+from afspm.record.report import curves, page, pictures, shadow, story
 from afspm.record.run import open_run
 from afspm.storage.atomic import replace_file
 
@@ -15,7 +15,7 @@ REPORT_FILE = "report.html"
 
 
 def write(folder: str | Path) -> Path:
-    """Write `report.html`, and figures that no component has drawn; return the path of the report.
+    """Write `report.html`, figures that no component has drawn, and a shadow's table; return the path of the report.
 
     Args:
         folder: the folder of a run, which may still go on; or the folder of all runs, for the newest run.
@@ -32,6 +32,8 @@ def write(folder: str | Path) -> Path:
             pictures.draw(run, contents, shown)
             text = page.html(contents, shown, curves.read(run), pictures.of_figures(run.folder))
             replace_file(target, [text.encode()], synced=False)
+            if contents.shadow.agreement:
+                replace_file(run.folder / shadow.FILE, [shadow.csv_text(contents.shadow).encode()], synced=False)
         except OSError as error:
             raise FileError(f"can't be written: {error.strerror or error}", where=str(target)) from error
     return target

@@ -14,7 +14,7 @@ from afspm.record.allowed_bands import instrument_curves
 from afspm.record.drawing import timeline
 from afspm.record.drawing.image_html import data_url
 from afspm.record.overview import ROUTINE
-from afspm.record.report import agents, curves, estimate, markup, parameters, sample
+from afspm.record.report import agents, curves, estimate, markup, parameters, sample, shadow
 from afspm.record.report.curves import SpectrumGroup
 from afspm.record.report.markup import PageTimes, document, section, table
 from afspm.record.report.pictures import FigurePicture, TopographyPicture
@@ -36,6 +36,7 @@ def html(
         f"<header><h1>{escape(story.name)}{badge}</h1>{_sample_line(story)}{_duration_line(story, clock)}</header>",
         section("", _cards(story) + estimate.html(story)),
         section("Time line", f'<div class="scroll">{_timeline(story)}</div>{_zones(clock)}'),
+        section("What afspm would have done", shadow.html(story.shadow, clock)),
         section("Problems and repairs", _problems(story, clock)),
         section("Critical messages", _alarms(story, clock)),
         section("Treatments of the tip", _treatments(story)),

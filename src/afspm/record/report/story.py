@@ -22,7 +22,7 @@ from afspm.record.allowed_bands import AllowedBands, allowed_bands
 from afspm.record.drawing.timeline import TimelineRow
 from afspm.record.expected_end import plans_of
 from afspm.record.overview import Overview, ProcessRestart
-from afspm.record.report import agents, parameters
+from afspm.record.report import agents, parameters, shadow
 from afspm.record.report.work_comparison import WorkComparison, compare
 from afspm.record.run import Run
 from afspm.record.run_json import REAL_S, UNFINISHED
@@ -65,6 +65,7 @@ class RunStory:
         agents: the work of each agent.
         changes: the changed parameters, except the place of scans and spectra.
         bands: the values of other instruments that the conditions allowed.
+        shadow: decisions of a run in shadow mode beside the person's acts.
         unfinished: how each unfinished component was stopped, as text by name.
     """
 
@@ -88,6 +89,7 @@ class RunStory:
     agents: Sequence[agents.AgentWork] = ()
     changes: Sequence[parameters.ChangedParameter] = ()
     bands: AllowedBands = field(default_factory=dict)
+    shadow: shadow.ShadowNight = field(default_factory=shadow.ShadowNight)
     unfinished: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -190,6 +192,7 @@ def read(run: Run) -> RunStory:
         agents=agents.read(run),
         changes=parameters.read(run),
         bands=allowed_bands(run.folder),
+        shadow=shadow.read(run),
         unfinished=run.facts.get(UNFINISHED) or {},
     )
 

@@ -164,6 +164,7 @@ class Rules:
         end_on: problems that end the experiment.
         agents: components whose commands need the approval of a person.
         by_hand: problems that a person solves.
+        shadow: whether the run only watches a person's work (`afspm shadow`): nobody gets control, nothing is sent.
     """
 
     roles: RoleTable = RoleTable()
@@ -172,6 +173,7 @@ class Rules:
     end_on: frozenset[int] = frozenset()
     agents: frozenset[str] = frozenset()
     by_hand: frozenset[int] = frozenset()
+    shadow: bool = False
 
     @property
     def stop(self) -> int:
@@ -244,6 +246,12 @@ def _may_clear(control: ArbitrationState, ask: ControlInput, rules: Rules) -> bo
 
 OTHERWISE = Condition("otherwise", lambda c, a, r: True)
 IS_MANUAL = Condition("the mode is manual", lambda c, a, r: c.mode is ControlMode.MANUAL)
+IS_SHADOW = Condition("[control] shadow is true", lambda c, a, r: r.shadow)
+# the scheduler would flag a lost microscope again and again if its flag were not kept
+IS_NOTED = Condition(
+    "[control] shadow is true and it is not device-malfunction",
+    lambda c, a, r: r.shadow and a.number != Problem.DEVICE_MALFUNCTION,
+)
 IS_OPERATOR = Condition(
     "the mode is manual and it has the role `operate`",
     lambda c, a, r: c.mode is ControlMode.MANUAL and may(r.roles.operate or (), a.who),
@@ -345,6 +353,7 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
     ),
     ArbitrationEvent.FLAG: (
         _refuse(UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, "this experiment knows no problem with the number {number}"),
+        _accept(IS_NOTED, (), "a shadow notes it in the record, and goes on as before"),
         _accept(IS_FLAGGED, (), "it is flagged already: two components may notice the same"),
         _accept(ENDS_EXPERIMENT, (_D.FLAG, _D.END), "the experiment ends instead of waiting for a solver"),
         _accept(STOPS, (_D.FLAG, _D.TAKE), "until a person has cleared it, no component is in control", Cause.STOPPED),
@@ -385,6 +394,7 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
     ),
     ArbitrationEvent.SET_MODE: (
         _refuse(MAY_NOT_SET_MODE, _R.FAILURE, "{who} does not have the role set_mode ([control.roles])"),
+        _refuse(IS_SHADOW, _R.FAILURE, "a shadow only watches a person's work: its mode stays MANUAL"),
         _refuse(NO_SUCH_MODE, _R.WRONG_CONTROL_MODE, "there is no control mode {number}: 1 manual, 2 automated"),
         _accept(SAME_MODE, (), "nothing changes"),
         _accept(
@@ -400,11 +410,13 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
         _accept(OTHERWISE, (_D.END,), "all receivers close"),
     ),
     ArbitrationEvent.COMMAND: (
+        _refuse(IS_SHADOW, _R.NOT_IN_CONTROL, "a shadow only watches a person's work: nothing is sent"),
         _without_answer(ASKER_HOLDS, (_D.FORWARD,), "the holder of control commands the microscope"),
         _without_answer(IS_OPERATOR, (_D.FORWARD,), "in MANUAL mode a person may, through a component"),
         _refuse(OTHERWISE, _R.NOT_IN_CONTROL, "{who} is not in control, {holder} is"),
     ),
     ArbitrationEvent.ADJUST: (
+        _refuse(IS_SHADOW, _R.NOT_IN_CONTROL, "a shadow only watches a person's work: nothing is sent"),
         _without_answer(ASKER_HOLDS, (_D.FORWARD,), "the holder of control commands the microscope"),
         _without_answer(IS_OPERATOR, (_D.FORWARD,), "in MANUAL mode a person may, through a component"),
         _without_answer(IS_ADJUSTER, (_D.FORWARD,), "the experiment file lets a person adjust it beside the holder"),

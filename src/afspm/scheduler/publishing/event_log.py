@@ -212,8 +212,13 @@ def start_entry(now_ns: int, control: ArbitrationState, *, is_restart: bool) -> 
     return JournalEntry(now_ns, CONTROL, SCHEDULER, what, event=ControlEvent.RESTARTED)
 
 
-def panel_entry(now_ns: int, who: str, act: ActByHand) -> JournalEntry:
-    return JournalEntry(now_ns, CONTROL, who, str(act), event=ControlEvent.BY_HAND)
+def panel_entry(now_ns: int, who: str, act: ActByHand, outside: Sequence[str]) -> JournalEntry:
+    """Return the log entry of an act by hand.
+
+    Args:
+        outside: why a request for the same values would have been refused by [limits].
+    """
+    return JournalEntry(now_ns, CONTROL, who, str(act), reason="; ".join(outside), event=ControlEvent.BY_HAND)
 
 
 def control_entries(

@@ -100,14 +100,14 @@ def _update_state(draft: StateDraft, published: object) -> None:
 
 
 def _take_act(draft: StateDraft, act: ActByHand) -> None:
-    draft.event_log = draft.event_log.add(draft.now_s, panel_entry(draft.now_ns, TRANSLATOR, act))
     for one in act.changes:
         changed = Parameter(one.parameter, one.after, one.unit or None)
         draft.panel = draft.panel.with_change(one.parameter, draft.limits.outside(changed))
         draft.limits = draft.limits.in_force(changed, draft.now_ns)
+    outside = [draft.panel.outside[one.parameter] for one in act.changes if one.parameter in draft.panel.outside]
+    draft.event_log = draft.event_log.add(draft.now_s, panel_entry(draft.now_ns, TRANSLATOR, act, outside))
     control = draft.env.settings.control
     if draft.panel.asks_for_pause(act, stopped=control.stopped_by_hand, changed=control.changed_by_hand):
-        outside = [draft.panel.outside[one.parameter] for one in act.changes if one.parameter in draft.panel.outside]
         _give_to_person(draft, "; ".join([str(act), *outside]))
 
 

@@ -1,0 +1,94 @@
+"""`afspm shadow` beside a person at an emulated Nanonis, with all of its processes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from deadlines import DEADLINE_S
+from makers import MAKERS
+from tests.system.experiment.experiment_lab import AfspmRun
+from tests.system.experiment.test_at_the_panel import STOP, UP, panel
+
+from afspm.client.connect import join
+from afspm.model import ControlRequest, ScopeState
+from afspm.record.run import open_run
+
+EXPERIMENT = """
+[clock]
+speed = 20.0
+
+[scheduler]
+component = true
+class = "Scheduler"
+
+[series]
+component = true
+class = "ScanSeries"
+size = ["1 um", "1 um"]
+pixels = [32, 32]
+every = "1 s"
+scans = 3
+end_when_done = true
+
+[classifier]
+component = true
+class = "TipClassifier"
+
+[limits.tip-bias-voltage]
+max = "2 V"
+"""
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[AfspmRun]:
+    file = tmp_path / "experiment.toml"
+    file.write_text(EXPERIMENT, encoding="utf-8")
+    options = ("--runs", str(tmp_path / "runs"))
+    one = AfspmRun("shadow", str(file), str(MAKERS["nanonis"].emulated), *options, folder=tmp_path)
+    yield one
+    one.close()
+
+
+def test_shadow_tells_a_persons_night_and_sends_no_command(run: AfspmRun) -> None:
+    run.wait_for("waiting for control")  # the series would scan, if it were in control
+    with join(run.folder, "witness") as scope:
+        assert scope.wait_until(lambda: scope.state is ScopeState.FREE, timeout_s=DEADLINE_S)
+        with panel(run) as person:
+            before = person.Bias_Get()[2][0]
+            person.Scan_Action(0, UP)
+            assert scope.wait_until(lambda: scope.state is ScopeState.SCANNING, timeout_s=DEADLINE_S)
+            # a detector flags a problem: it is noted, and the person answers by a stop
+            scope.flag("tip-shape-changed")
+            assert not scope.control_state.problems
+            person.Scan_Action(STOP, UP)
+            assert scope.wait_until(lambda: scope.state is ScopeState.FREE, timeout_s=DEADLINE_S)
+            assert person.Bias_Get()[2][0] == before
+            journal = scope.events("JournalEntries", timeout_s=DEADLINE_S)
+            person.Bias_Set(5.0)
+            published = (entry for event in journal for entry in event.message.entries)
+            assert any("tip-bias-voltage" in entry.what for entry in published)
+    run.process.send_signal(signal.SIGINT)
+    run.end()
+    assert "problem: 1, the person acted at 1 of them" in run.output
+    with open_run(run.folder) as found:
+        assert [one.interrupted for one in found.scans] == [True]
+        assert not [one for one in found.journal if one.request == ControlRequest.REQUEST_CTRL and one.response == 0]
+    rows = list(csv.DictReader((run.folder / "shadow.csv").read_text(encoding="utf-8").splitlines()))
+    assert [(row["kind"], bool(row["person"])) for row in rows if row["afspm"]] == [("problem", True), ("limit", True)]
+    assert [row["afspm"].split(":")[0] for row in rows if row["kind"] == "limit"] == ["would have refused this"]
+    assert [row["person"].split(",")[0] for row in rows if not row["afspm"]] == [
+        "a scan was begun at the microscope",
+        "a scan ended before its last line",
+        "set at the microscope: tip-bias-voltage = 5 V (before: 0.100000001490116 V)",
+    ]
+    assert "What afspm would have done" in (run.folder / "report.html").read_text(encoding="utf-8")
+    lines = (run.folder / "controller.trace.jsonl").read_text(encoding="utf-8").splitlines()[1:]
+    asked = {json.loads(line).get("what", "") for line in lines if line.endswith("}")}
+    assert len(asked) > 10
+    assert [one for one in asked if not re.fullmatch(r"\w+\.\w*Get|Scan\.(WaitEndOfScan|FrameDataGrab)|", one)] == []
