@@ -246,7 +246,7 @@ def shadow(
     """Watch a person's work at the microscope, and write down what afspm would have done.
 
     The controller is only read: the process that talks to it has no function that sets or starts anything. Components
-    see all scans, and nobody gets control. Ctrl-C ends it, and a killed shadow leaves the controller as it is. The
+    see all scans, and no component gets control. Ctrl-C ends it; a killed shadow leaves the controller as it is. The
     report and shadow.csv have what afspm would have done, beside what the person did.
     """
     import sys

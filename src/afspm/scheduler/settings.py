@@ -64,8 +64,8 @@ class ControlSettings:
             component repairs the tip.
         agents: components whose commands need the approval of a person; without the key: components of the class
             `Agent`.
-        shadow: whether the run only watches a person's work. The mode is MANUAL from the start and stays so: nobody
-            gets control, flagged problems are only noted, and nothing is sent. `afspm shadow` sets it.
+        shadow: whether the run only watches a person's work. The mode is MANUAL from the start and stays so: no
+            component gets control, a flagged problem is only noted, and nothing is sent. `afspm shadow` sets it.
         roles: see below.
     """
 

@@ -55,7 +55,7 @@ def run(tmp_path: Path) -> Iterator[AfspmRun]:
     one.close()
 
 
-def test_shadow_tells_a_persons_night_and_sends_no_command(run: AfspmRun) -> None:
+def test_shadow_reports_a_persons_night_and_sends_no_command(run: AfspmRun) -> None:
     run.wait_for("waiting for control")  # the series would scan, if it were in control
     with join(run.folder, "witness") as scope:
         assert scope.wait_until(lambda: scope.state is ScopeState.FREE, timeout_s=DEADLINE_S)

@@ -70,9 +70,9 @@ class PersonAct:
 
 @dataclass(frozen=True)
 class Agreement:
-    """The number of decisions of a kind, and of those that the person answered.
+    """The number of decisions of a kind, and the number that the person answered.
 
-    For `ShadowKind.PERSON`: the number of acts that answer, and of those that a decision preceded.
+    For `ShadowKind.PERSON`: the number of acts that can answer, and how many a decision preceded.
     """
 
     kind: ShadowKind

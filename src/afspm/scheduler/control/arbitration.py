@@ -164,7 +164,7 @@ class Rules:
         end_on: problems that end the experiment.
         agents: components whose commands need the approval of a person.
         by_hand: problems that a person solves.
-        shadow: whether the run only watches a person's work (`afspm shadow`): nobody gets control, nothing is sent.
+        shadow: whether the run only watches a person's work (`afspm shadow`): no component gets control.
     """
 
     roles: RoleTable = RoleTable()
