@@ -101,7 +101,7 @@ def test_each_channel_has_its_own_newest() -> None:
     assert store.newest("Amplitude") is None
 
 
-def test_topography_is_shown_whatever_channel_came_first() -> None:
+def test_topography_is_shown_before_a_channel_that_came_first() -> None:
     store = FrameStore()
     store.take_scan(scan(1.0, 20 * S, "Phase"), 20 * S)
     store.roles = ChannelRoles({"height": ("Z Forward",)}).with_topography(feedback_on=True)
