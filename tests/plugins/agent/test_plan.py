@@ -166,6 +166,7 @@ def test_grant_of_a_table() -> None:
         {"region": {"x": ["1 um", "0 um"], "y": ["0 um", "1 um"]}},
         {"parameters": {"tip-bias-voltage": [0.1, 0.2]}},
         {"parameters": {"tip-bias-voltage": ["1 V", "0 V"]}},
+        {"parameters": {"tip-bias-voltage": ["-5", "5 V"]}},
         {"treatments": 1},
     ],
 )

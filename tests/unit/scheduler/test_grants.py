@@ -117,9 +117,9 @@ class AgentLab:
         effects = self.lab.ask(who, kind, subject, "" if id_ == NO_ID else id_ or f"{who}/1/{self.ids}")
         left, low = (self.place.center_m[i] - self.place.size_m[i] / 2 for i in (0, 1))
         effects += self.lab.answer_reads(
-            **self.in_force, scan_size_x=str(self.place.size_m[0]), scan_size_y=str(self.place.size_m[1]),
+            scan_size_x=str(self.place.size_m[0]), scan_size_y=str(self.place.size_m[1]),
             scan_top_left_x=str(left), scan_top_left_y=str(low), scan_angle="0",
-            probe_pos_x="0", probe_pos_y="0",
+            **{"probe_pos_x": "0", "probe_pos_y": "0", **self.in_force},
         )  # fmt: skip
         new = [one for one in self.lab.forwarded[before:] if (one.request.kind, one.request.subject) == (kind, subject)]
         if new and answers is not None:
@@ -473,6 +473,27 @@ def test_request_outside_of_the_grant_is_refused(agent: AgentLab, kind: int, sub
     agent.begin(agent.grant())
     agent.place = HERE
     assert agent.do(kind, subject) != ""
+
+
+@pytest.mark.parametrize(
+    ("kind", "subject", "part"),
+    [
+        (PARAM, Parameter(names.SCAN_TOP_LEFT_X, "0", "m"), names.SCAN_TOP_LEFT_X),
+        (PARAM, Parameter(names.SCAN_ANGLE, "0", "deg"), names.SCAN_ANGLE),
+        (PARAM, Parameter(names.PROBE_POS_X, "0", "m"), names.PROBE_POS_X),
+        (SCAN, ScanParameters(RegionChange(left_m=0.0)), names.SCAN_TOP_LEFT_X),
+    ],
+)
+def test_part_of_a_place_is_refused_with_the_cure(agent: AgentLab, kind: int, subject: Any, part: str) -> None:
+    agent.begin(agent.grant())
+    assert agent.do(kind, subject).startswith(f"{part} is a part of a place, and a grant allows whole places")
+
+
+def test_spectrum_at_the_edge_of_a_grant_is_allowed(agent: AgentLab) -> None:
+    agent.begin(agent.grant(counts=(GrantedCount(names.START_SPEC, 1),)))
+    assert agent.do(int(ControlRequest.SET_PROBE_POS), ProbePosition((0.0, 0.999 * UM))) == ""
+    agent.in_force = {"probe_pos_y": str(0.999 * UM)}
+    assert agent.do(ACTION, names.START_SPEC) == ""
 
 
 def test_value_with_a_unit_is_outside_a_range_whose_unit_is_unknown(agent: AgentLab) -> None:

@@ -103,7 +103,13 @@ def of_table(table: Mapping[str, object], facts: Plain) -> Grant:
         if is_of_instrument(name):
             what = f"{name} is a parameter of another instrument, which a grant can't include"
             raise InvalidValue(what, where="grant, parameters", hint="approve a plan that sets it")
-        low, high = (si(one, names.BASE_PARAMETERS.get(name) or "") for one in _pair(pair, name))
+        unit = names.BASE_PARAMETERS.get(name) or ""
+        texts = _pair(pair, name)
+        # a plain "5" would be 5 V, where a person may mean mV
+        if unit and not all(parse_quantity(one)[1] for one in texts):
+            what = f"{' and '.join(texts)} have no unit"
+            raise InvalidValue(what, where=f"grant, parameters.{name}", hint=f'as in ["-1 {unit}", "1 {unit}"]')
+        low, high = (si(one, unit) for one in texts)
         ranges.append(GrantedRange(name, low, high))
     counts = []
     for action, count in _table(table, "counts").items():

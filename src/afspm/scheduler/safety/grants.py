@@ -61,6 +61,7 @@ _STOPS = frozenset({names.STOP_SCAN, names.STOP_SPEC})
 approval."""
 _PLACES = frozenset((*REGION_CHANGES, *SHAPE_CHANGES, *PROBE_CHANGES))
 _OF_SUPERVISORS = frozenset({PROCESSES.name, LOG.name})
+_PARAM = int(ControlRequest.PARAM)
 _SET_REGION, _SET_PROBE = int(ControlRequest.SET_SCAN_PARAMS), int(ControlRequest.SET_PROBE_POS)
 _COMMANDS = frozenset(
     map(
@@ -471,14 +472,17 @@ class GrantChecker:
                 return f"the grant's number of {action} is used up"
             if grant.region is None:
                 return "the grant has no region"
-            placed = self.book.placed.for_action(who, action)
-            # rotated as it may be: its corners, as of a request that sets it
-            asked = Request(_SET_REGION, ScanParameters(placed))
+            placed = self.book.placed
+            asked = Request(_SET_REGION, ScanParameters(placed.region))  # all corners, also if the scan is turned
+            if action in names.AT_PROBE and placed.probe_m is not None:
+                asked = Request(_SET_PROBE, ProbePosition(placed.probe_m))
             refusal = LimitChecker(limits).check(who, asked, now_ns)
             refusal = refusal or LimitChecker(limits, state).check_treatment(request)
             return "" if refusal is None else refusal.reason
         if others := _others(request, limits):
             return f"the grant does not include {others[0]}"
+        if part := _part_of_place(request, limits):
+            return f"{part} is a part of a place, and a grant allows whole places: set the region or the probe"
         refusal = LimitChecker(limits).check(who, request, now_ns)
         return "" if refusal is None else refusal.reason
 
@@ -495,6 +499,14 @@ def not_of_role(role: RoleLimits, who: str, request: Request) -> str:
     if role.actions is None or action in role.actions or action in _STOPS:
         return ""
     return f"{action} is not among the actions of {who} ({role.source})"
+
+
+def _part_of_place(request: Request, limits: ExperimentLimits) -> str:
+    # a part is checked with the rest in force, which the person who gave the grant has not seen
+    subject = request.subject.region if isinstance(request.subject, ScanParameters) else request.subject
+    if request.kind != _PARAM and not isinstance(subject, RegionChange | PositionChange):
+        return ""
+    return min(_PLACES.intersection(LimitChecker(limits).names_set_by(request)), default="")
 
 
 def _less(held: Mapping[str, HeldGrant], agent: str) -> dict[str, HeldGrant]:
