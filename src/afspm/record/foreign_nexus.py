@@ -23,7 +23,7 @@ from afspm.basics.errors import FileError, UnitError
 from afspm.basics.units import convert, same_kind
 from afspm.model import Region, Scan, Spectrum
 from afspm.model.geometry import XY
-from afspm.storage.formats import hdf5
+from afspm.storage.formats import hdf5_reading
 from afspm.storage.formats.content import FileContent, OtherFormat, clock_ns
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def read_nexus(path: Path, zone: tzinfo | None) -> FileContent:
         OtherFormat: the file has no NXdata.
         FileError: it is damaged, or no NXdata can be read: the error names what each one lacks.
     """
-    with hdf5.opened(path) as file:
+    with hdf5_reading.opened(path) as file:
         nodes: dict[str, h5py.Dataset | h5py.Group] = {}
         file.visititems(lambda name, node: nodes.update({name: node}))
         groups = {name: node for name, node in nodes.items() if _class(node) == "NXdata"}
@@ -111,12 +111,18 @@ def read_nexus(path: Path, zone: tzinfo | None) -> FileContent:
 
 
 def _class(node: h5py.Dataset | h5py.Group) -> str:
-    return hdf5.text(node.attrs.get("NX_class", ""))
+    return hdf5_reading.text(node.attrs.get("NX_class", ""))
 
 
 def _plain(node: h5py.Dataset) -> object:
     value = node[()]
-    return hdf5.text(value) if isinstance(value, bytes) else value.item() if isinstance(value, np.generic) else value
+    return (
+        hdf5_reading.text(value)
+        if isinstance(value, bytes)
+        else value.item()
+        if isinstance(value, np.generic)
+        else value
+    )
 
 
 def _last(texts: Mapping[str, object], end: str) -> str:
@@ -131,7 +137,7 @@ def _time(texts: Mapping[str, object], name: str, zone: tzinfo | None) -> int | 
 
 
 def _signals(path: str, group: h5py.Group, *, is_only: bool) -> Iterator[_Signal]:
-    first = hdf5.text(group.attrs.get("signal", ""))
+    first = hdf5_reading.text(group.attrs.get("signal", ""))
     if not first:
         raise FileError("lacks the attribute signal")
     axes = tuple(_axis(group, name) for name in _texts(group.attrs.get("axes", ())))
@@ -144,8 +150,8 @@ def _signals(path: str, group: h5py.Group, *, is_only: bool) -> Iterator[_Signal
             raise FileError(f"has {data.ndim} dimensions, not 1 or 2")
         if data.shape != shape:
             raise FileError(f"has a signal of shape {data.shape} and axes of {shape}")
-        unit = hdf5.text(data.attrs.get("units", ""))
-        values = hdf5.array(data)
+        unit = hdf5_reading.text(data.attrs.get("units", ""))
+        values = hdf5_reading.array(data)
         if same_kind(unit, "m"):
             values, unit = convert(values, unit, "m"), "m"
         # of several groups, the names tell forward from backward, and the signals often do not
@@ -156,11 +162,13 @@ def _signals(path: str, group: h5py.Group, *, is_only: bool) -> Iterator[_Signal
 def _axis(group: h5py.Group, name: str) -> _Axis:
     if name not in group:
         raise FileError(f"lacks its axis {name}")
-    return _Axis(name, hdf5.text(group[name].attrs.get("units", "")), hdf5.array(group[name]).ravel())
+    return _Axis(name, hdf5_reading.text(group[name].attrs.get("units", "")), hdf5_reading.array(group[name]).ravel())
 
 
 def _texts(value: object) -> list[str]:
-    return [hdf5.text(value)] if isinstance(value, str | bytes) else [hdf5.text(one) for one in np.ravel(value)]  # type: ignore[call-overload]
+    if isinstance(value, str | bytes):
+        return [hdf5_reading.text(value)]
+    return [hdf5_reading.text(one) for one in np.ravel(value)]  # type: ignore[call-overload]
 
 
 def _symbol(unit: str) -> str:
@@ -227,7 +235,7 @@ _LENGTHS: Final = [(f"scan_{what}_{axis}", "m") for what in ("offset_value", "ra
 def _quantity(group: h5py.Group, name: str, unit: str) -> float | None:
     if name not in group or group[name].shape != ():
         return None
-    return convert(float(group[name][()]), hdf5.text(group[name].attrs.get("units", unit)), unit)
+    return convert(float(group[name][()]), hdf5_reading.text(group[name].attrs.get("units", unit)), unit)
 
 
 def _position(nodes: Mapping[str, h5py.Dataset | h5py.Group]) -> XY | None:

@@ -12,7 +12,7 @@ import numpy as np
 from afspm.basics.plain_data import Plain
 from afspm.model import Frame, Region, Scan, Spectrum
 from afspm.model.channels import ROLES_APART
-from afspm.storage.formats import hdf5, netcdf
+from afspm.storage.formats import hdf5_reading, netcdf
 from afspm.storage.formats.content import FileContent, OtherFormat
 
 FACTS: Final = "afspm"
@@ -29,7 +29,7 @@ def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
         OtherFormat: another program wrote the file.
         FileError, KeyError, ValueError: the file is damaged.
     """
-    if hdf5.is_hdf5(path):
+    if hdf5_reading.is_hdf5(path):
         raise OtherFormat("is NetCDF-4, which afspm does not export")
     file = netcdf.read(path)
     if FACTS not in file.attributes:

@@ -17,7 +17,7 @@ from afspm.basics.errors import FileError
 from afspm.basics.plain_data import Plain, from_json
 from afspm.model import Frame, Region, Scan, Spectrum
 from afspm.record.spectrum_grid import PointGrid
-from afspm.storage.formats import hdf5
+from afspm.storage.formats import hdf5_reading
 from afspm.storage.formats.content import FileContent, OtherFormat
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def read_hdf5(path: Path, zone: tzinfo | None) -> FileContent:
         OtherFormat: another program wrote the file.
         FileError: the file is damaged.
     """
-    with hdf5.opened(path) as file:
+    with hdf5_reading.opened(path) as file:
         if not _is_ours(file):
             raise OtherFormat("afspm did not write it")
         about = about_of(file)
@@ -62,7 +62,7 @@ def about_of(file: h5py.File) -> Plain:
         FileError: the file is damaged.
     """
     try:
-        about: Plain = from_json(hdf5.text(file["entry"][ABOUT]["about"][()]))
+        about: Plain = from_json(hdf5_reading.text(file["entry"][ABOUT]["about"][()]))
     except (KeyError, ValueError) as error:
         raise FileError(f"is damaged: {error}") from error
     return about
@@ -73,7 +73,7 @@ def vendor_header(file: h5py.File) -> dict[str, object]:
     group = file["entry"].get(VENDOR)
     if group is None or "header" not in group:
         return {}
-    header: dict[str, object] = from_json(hdf5.text(group["header"][()]))
+    header: dict[str, object] = from_json(hdf5_reading.text(group["header"][()]))
     return header
 
 
@@ -90,7 +90,7 @@ def _scans(file: h5py.File, about: Plain) -> list[Scan]:
             region,
             channel["name"],
             channel["unit"],
-            hdf5.array(data[channel["field"]]),
+            hdf5_reading.array(data[channel["field"]]),
             channel["time_ns"],
             about["filename"],
             roles=tuple(channel.get("roles", ())),
@@ -101,7 +101,7 @@ def _scans(file: h5py.File, about: Plain) -> list[Scan]:
 
 def _spectrum(file: h5py.File, about: Plain) -> Spectrum:
     data, variables = file["entry"]["data"], about["variables"]
-    columns = [hdf5.array(data[variable["field"]]) for variable in variables]
+    columns = [hdf5_reading.array(data[variable["field"]]) for variable in variables]
     place = about["position_m"]
     return Spectrum(
         None if place is None else (place[0], place[1]),
@@ -118,10 +118,12 @@ def _spectrum(file: h5py.File, about: Plain) -> Spectrum:
 def _grid(file: h5py.File, about: Plain) -> Iterator[Spectrum]:
     # only the points that were measured, row by row
     entry, swept, columns = file["entry"], about["swept"], about["columns"]
-    data = [[hdf5.array(entry[way][one["field"]]) for way in one["ways"]] for one in columns]
+    data = [[hdf5_reading.array(entry[way][one["field"]]) for way in one["ways"]] for one in columns]
     forward = entry[columns[0]["ways"][0]]
-    points = PointGrid(hdf5.array(forward["x"]), hdf5.array(forward["y"]), tuple(about["center_m"]), about["angle_rad"])
-    sweep = _there_and_back([hdf5.array(forward[swept["field"]])] * max(len(one["ways"]) for one in columns))
+    points = PointGrid(
+        hdf5_reading.array(forward["x"]), hdf5_reading.array(forward["y"]), tuple(about["center_m"]), about["angle_rad"]
+    )
+    sweep = _there_and_back([hdf5_reading.array(forward[swept["field"]])] * max(len(one["ways"]) for one in columns))
     times = np.asarray(entry[ABOUT]["time_ns"][()]).astype("datetime64[ns]")
     for row, column in np.ndindex(times.shape):
         curves = [_there_and_back([way[row, column] for way in ways]) for ways in data]

@@ -29,7 +29,7 @@ from afspm.model import Scan, Spectrum
 from afspm.record import nxspm
 from afspm.record.nexus_reader import ABOUT, BIAS_SPECTRUM, DEFINITION, VENDOR, about_of
 from afspm.record.nxspm import group, values
-from afspm.storage.formats import hdf5
+from afspm.storage.formats import hdf5_reading
 
 if TYPE_CHECKING:
     import h5py
@@ -123,7 +123,7 @@ def encode_spectrum(spectrum: Spectrum, circumstances: FileProvenance) -> bytes:
 
 def facts_of(path: Path) -> Plain:
     """Return the facts stored in a file beside its values. Raises FileError if the file is damaged."""
-    with hdf5.opened(path) as file:
+    with hdf5_reading.opened(path) as file:
         return about_of(file)
 
 

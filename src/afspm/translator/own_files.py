@@ -16,7 +16,7 @@ import numpy as np
 from afspm.basics.clock import NS_PER_S, utc_time
 from afspm.basics.errors import FileError
 from afspm.model import Region, Scan, Spectrum, names
-from afspm.storage.formats import hdf5, netcdf
+from afspm.storage.formats import hdf5_reading, netcdf
 from afspm.storage.formats.content import FileContent, OtherFormat
 from afspm.storage.formats.netcdf import Attributes, File, Variable
 
@@ -89,7 +89,7 @@ def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
         OtherFormat: another program wrote the file.
         FileError: a part of the file is missing.
     """
-    if hdf5.is_hdf5(path):
+    if hdf5_reading.is_hdf5(path):
         raise OtherFormat("is NetCDF-4, which the simulated microscope does not write")
     file = netcdf.read(path)
     if file.attributes.get("Conventions") != CONVENTIONS:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from tests.unit.storage.samples import WHOLE
 from afspm.basics.errors import FileError
 from afspm.model import Region, Scan
 from afspm.record import nexus_writer
-from afspm.storage.formats import read
+from afspm.storage.formats import hdf5_reading, read
 
 
 # a Nanonis grid may end after any of its spectra: `test_nanonis_grids`
@@ -82,3 +83,12 @@ def test_values_that_are_in_another_file_are_refused(
         elsewhere(changed, f"entry/data/{name}", tmp_path / "secret.h5")
     with pytest.raises(FileError, match="in another file"):
         read(file)
+
+
+@pytest.mark.parametrize("depth", [90, 300])
+def test_groups_nested_without_end_are_refused(tmp_path: Path, depth: int) -> None:
+    file = tmp_path / "scan.h5"
+    with h5py.File(file, "w") as deep:
+        deep.create_group("/".join("g" * depth))
+    with pytest.raises(FileError, match="nested") if depth > 100 else nullcontext():
+        hdf5_reading.opened(file).close()

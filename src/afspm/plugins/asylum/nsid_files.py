@@ -16,7 +16,7 @@ from afspm.basics.errors import FileError
 from afspm.basics.units import convert
 from afspm.model import Region, Scan
 from afspm.plugins.asylum import scan_files as asylum
-from afspm.storage.formats import hdf5
+from afspm.storage.formats import hdf5_reading
 from afspm.storage.formats.content import FileContent, OtherFormat
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def read_nsid(path: Path, zone: tzinfo | None) -> FileContent:
         FileError: the file is not HDF5, or has no image. UnitError: the axes are not lengths.
         OSError: the file is damaged.
     """
-    with hdf5.opened(path) as file:
+    with hdf5_reading.opened(path) as file:
         nodes: list[h5py.Dataset | h5py.Group] = []
         file.visititems(lambda _, node: nodes.append(node))
         images = [node for node in nodes if "quantity" in node.attrs and len(getattr(node, "shape", ())) == 2]
@@ -61,17 +61,19 @@ def _note(image: h5py.Dataset) -> dict[str, object]:
 def _plain(value: object) -> object:
     if isinstance(value, np.generic):
         value = value.item()
-    return hdf5.text(value) if isinstance(value, bytes) else value
+    return hdf5_reading.text(value) if isinstance(value, bytes) else value
 
 
 def _axis_m(axis: h5py.Dataset, unit: str) -> NDArray[np.float64]:
-    values: NDArray[np.float64] = convert(hdf5.array(axis), unit or hdf5.text(axis.attrs.get("units", "m")), "m")
+    values: NDArray[np.float64] = convert(
+        hdf5_reading.array(axis), unit or hdf5_reading.text(axis.attrs.get("units", "m")), "m"
+    )
     return values
 
 
 def _scan(image: h5py.Dataset, note: dict[str, object], end_ns: int | None, path: Path) -> Scan:
-    channel = hdf5.text(image.attrs["quantity"])
-    values = hdf5.array(image).T
+    channel = hdf5_reading.text(image.attrs["quantity"])
+    values = hdf5_reading.array(image).T
     # the program that converts Asylum's files gives axes the unit of the channel, but their values are in m
     x, y = (_axis_m(image.parent[axis], "m" if note else "") for axis in "xy")
     if values.shape != (len(y), len(x)) or not ((np.diff(x) > 0).all() and (np.diff(y) > 0).all()):
@@ -81,5 +83,5 @@ def _scan(image: h5py.Dataset, note: dict[str, object], end_ns: int | None, path
         center_m, angle_rad = asylum.center_and_angle(note)
     region = Region(center_m, (x[-1] - x[0], y[-1] - y[0]), angle_rad)
     # the program that converts the files gives the unit "m" to unknown channels
-    unit = (asylum.unit_of(channel) if note else "") or hdf5.text(image.attrs.get("units", ""))
+    unit = (asylum.unit_of(channel) if note else "") or hdf5_reading.text(image.attrs.get("units", ""))
     return Scan(region, channel, unit, np.ascontiguousarray(values), end_ns, str(path))

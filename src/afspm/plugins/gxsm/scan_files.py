@@ -20,7 +20,7 @@ from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import FileError
 from afspm.basics.units import convert
 from afspm.model import Region, Scan
-from afspm.storage.formats import hdf5, netcdf
+from afspm.storage.formats import hdf5_reading, netcdf
 from afspm.storage.formats.content import FileContent, OtherFormat
 
 CONTROLLER = "GXSM"
@@ -68,7 +68,7 @@ class _Raw:
 
 def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
     """Read a scan. Raises FileError, KeyError, ValueError: another format, or damaged."""
-    if hdf5.is_hdf5(path):
+    if hdf5_reading.is_hdf5(path):
         return _content(_netcdf4(path), path)
     return _content(_netcdf3(netcdf.read(path)), path)
 
@@ -87,7 +87,7 @@ def _as_texts(attributes: netcdf.Attributes) -> dict[str, str]:
 
 
 def _netcdf4(path: Path) -> _Raw:
-    with hdf5.opened(path) as file:
+    with hdf5_reading.opened(path) as file:
         if "FloatField" not in file:
             raise OtherFormat("a NetCDF file that GXSM did not write")
         field = file["FloatField"]
@@ -95,10 +95,12 @@ def _netcdf4(path: Path) -> _Raw:
         texts: dict[str, str] = {}
         for key, node in file.items():
             if node.dtype.kind == "S" and node.size * node.dtype.itemsize <= _TEXT_MAX:
-                texts[key] = hdf5.text(node[()])
+                texts[key] = hdf5_reading.text(node[()])
             elif node.dtype.kind in "iuf" and node.size == 1:
                 numbers[key] = float(np.ravel(node[()])[0])
-        return _Raw(hdf5.array(field), hdf5.texts(field.attrs), numbers, texts, hdf5.texts(file.attrs))
+        return _Raw(
+            hdf5_reading.array(field), hdf5_reading.texts(field.attrs), numbers, texts, hdf5_reading.texts(file.attrs)
+        )
 
 
 def _content(raw: _Raw, path: Path) -> FileContent:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from afspm.basics.errors import FileError
 from afspm.basics.plain_data import PlainMapping
 from afspm.model import Region, Scan, Spectrum
-from afspm.storage.formats import hdf5
+from afspm.storage.formats import hdf5_reading
 from afspm.storage.formats.content import FileContent
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def read_nhf(path: Path, zone: tzinfo | None) -> FileContent:
         FileError: the file has another format, inconsistent sizes, or neither images nor curves.
         OSError: the file is damaged.
     """
-    with hdf5.opened(path) as file:
+    with hdf5_reading.opened(path) as file:
         version = int(file.attrs.get("nsf_file_version_major", 0))
         if version not in (1, 2):
             raise FileError(f"is of Nanosurf's format {version}, not 1 or 2")
@@ -67,7 +67,7 @@ def read_nhf(path: Path, zone: tzinfo | None) -> FileContent:
 
 
 def _kind(group: h5py.Group) -> str:
-    return hdf5.text(group.attrs.get("group_type", group.attrs.get("measurement_type", "")))
+    return hdf5_reading.text(group.attrs.get("group_type", group.attrs.get("measurement_type", "")))
 
 
 def _scans(group: h5py.Group) -> Iterator[Scan]:
@@ -85,7 +85,7 @@ def _scans(group: h5py.Group) -> Iterator[Scan]:
             values = _values(dataset).reshape(rows, columns)
             # A stopped image: the remaining lines were not scanned.
             if acquired < rows:
-                upwards = hdf5.text(group.attrs.get("image_scan_direction", "up")) == "up"
+                upwards = hdf5_reading.text(group.attrs.get("image_scan_direction", "up")) == "up"
                 values[slice(acquired, None) if upwards else slice(rows - acquired)] = np.nan
             yield Scan(region, f"{name} {_segment_name(segment)}", unit, values)
 
@@ -118,10 +118,10 @@ def _block_sizes(segment: h5py.Group, dataset: h5py.Dataset) -> NDArray[np.int64
     # Another dataset of the segment has the number of values of each curve.
     source = dataset.attrs.get("dataset_block_size_source")
     for other in segment.values():
-        named = hdf5.text(other.attrs.get("name", "")) == "number_of_datapoints_acquired"
+        named = hdf5_reading.text(other.attrs.get("name", "")) == "number_of_datapoints_acquired"
         referenced = source is not None and other.attrs.get("dataset_block_size_id") == source
         if named or referenced:
-            return hdf5.array(other).astype(np.int64).ravel()
+            return hdf5_reading.array(other).astype(np.int64).ravel()
     return np.array([dataset.size])
 
 
@@ -130,7 +130,7 @@ def _segments(group: h5py.Group) -> list[h5py.Group]:
 
 
 def _segment_name(segment: h5py.Group) -> str:
-    return hdf5.text(segment.attrs.get("segment_name", segment.attrs.get("name", "")))
+    return hdf5_reading.text(segment.attrs.get("segment_name", segment.attrs.get("name", "")))
 
 
 def _channels(segment: h5py.Group) -> Iterator[tuple[str, str, h5py.Dataset]]:
@@ -140,16 +140,16 @@ def _channels(segment: h5py.Group) -> Iterator[tuple[str, str, h5py.Dataset]]:
         name = attributes.get("signal_name", attributes.get("name"))
         unit = attributes.get(f"{prefix}_calibration_unit")
         if name is not None and unit is not None and hasattr(dataset, "dtype"):
-            yield hdf5.text(name), hdf5.text(unit), dataset
+            yield hdf5_reading.text(name), hdf5_reading.text(unit), dataset
 
 
 def _values(dataset: h5py.Dataset) -> Array:
     # Integers span the range of their type; in format 2 one number stands for a missing value.
-    raw = hdf5.array(dataset)
+    raw = hdf5_reading.array(dataset)
     attributes = dataset.attrs
     prefix = "signal" if "signal_name" in attributes else "base"
     kind = attributes.get("dataset_element_type", 7)
-    kind = hdf5.text(kind) if isinstance(kind, str | bytes) else _TYPES.get(int(kind), "double")
+    kind = hdf5_reading.text(kind) if isinstance(kind, str | bytes) else _TYPES.get(int(kind), "double")
     # Floating-point values are stored in their unit.
     if kind == "double" or f"{prefix}_calibration_max" not in attributes:
         return raw
@@ -176,7 +176,7 @@ def _frame(attributes: PlainMapping) -> tuple[Region, tuple[int, int]]:
 
 
 def _plain(value: object) -> Any:
-    return hdf5.text(value) if isinstance(value, bytes | str) else getattr(value, "tolist", lambda: value)()
+    return hdf5_reading.text(value) if isinstance(value, bytes | str) else getattr(value, "tolist", lambda: value)()
 
 
 def _time_ns(text: object) -> int | None:
