@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 from afspm.basics.errors import ConfigError
 from afspm.plugins.nanosurf import SAVES, Nanosurf, commands
@@ -45,11 +45,11 @@ class NanosurfShadow(ShadowDriver, Nanosurf):
 
     link: ClassVar[type[Link]] = QuestionLink
 
-    def connect(self) -> None:
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
         if commands.is_before_this_tree(self._release) or not commands.has_old_commands(self._release):
             problem = f"a shadow can't see what Nanosurf Studio {self._release} does without leaving handlers in it"
             raise ConfigError(problem, where="release", hint="shadows are for releases 17 and 18")
-        super().connect()
 
     def _save_files(self, session: Session) -> None:
         if session.values(list(SAVES)) != SAVES:

@@ -1,0 +1,67 @@
+"""Experiments that run as a shadow."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from afspm.basics.errors import ConfigError
+from afspm.experiment import Experiment, load
+from afspm.experiment.shadow import shadow_overlay
+
+FILE = """
+[scheduler]
+component = true
+class = "Scheduler"
+
+[instrument]
+component = true
+class = "{driver}"
+{settings}
+[series]
+component = true
+class = "ScanSeries"
+size = ["1 um", "1 um"]
+
+[classifier]
+component = true
+class = "TipClassifier"
+"""
+
+
+def shadow(folder: Path, driver: str, settings: str = "") -> Experiment:
+    file = folder / "experiment.toml"
+    file.write_text(FILE.format(driver=driver, settings=settings), encoding="utf-8")
+    return load(file, shadow_overlay(load(file).resolved, folder))
+
+
+@pytest.mark.parametrize(
+    ("driver", "settings"),
+    [("Nanonis", ""), ("Asylum", ""), ("Gxsm", ""), ("Park", ""), ("Nanosurf", "release = 18\n")],
+)
+def test_shadow_of_each_maker_is_valid_and_keeps_a_trace(tmp_path: Path, driver: str, settings: str) -> None:
+    experiment = shadow(tmp_path, driver, settings)
+    experiment.require_valid()
+    instrument = experiment.resolved.processes["instrument"]
+    assert instrument.class_path.endswith(f"{driver}Shadow")
+    assert instrument.settings["trace"] is True
+    assert experiment.resolved.sections.control.shadow
+
+
+@pytest.mark.parametrize("release", [16, 19])
+def test_studio_that_reports_only_to_handlers_has_no_shadow(tmp_path: Path, release: int) -> None:
+    with pytest.raises(ConfigError, match="without leaving handlers"):
+        shadow(tmp_path, "Nanosurf", f"release = {release}\n").require_valid()
+
+
+def test_driver_without_a_shadow_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="has no shadow"):
+        shadow(tmp_path, "Simulator")
+
+
+def test_experiment_without_a_controller_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "experiment.toml"
+    file.write_text('[scheduler]\ncomponent = true\nclass = "Scheduler"\n', encoding="utf-8")
+    with pytest.raises(ConfigError, match="no controller to watch"):
+        shadow_overlay(load(file).resolved, tmp_path)
