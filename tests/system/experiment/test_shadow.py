@@ -44,11 +44,16 @@ class = "TipClassifier"
 max = "2 V"
 """
 
+LINES = """
+[microscope]
+live_lines_s = "0.5 s"
+"""
+
 
 @pytest.fixture
-def run(tmp_path: Path) -> Iterator[AfspmRun]:
+def run(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[AfspmRun]:
     file = tmp_path / "experiment.toml"
-    file.write_text(EXPERIMENT, encoding="utf-8")
+    file.write_text(EXPERIMENT + getattr(request, "param", ""), encoding="utf-8")
     options = ("--runs", str(tmp_path / "runs"))
     one = AfspmRun("shadow", str(file), str(MAKERS["nanonis"].emulated), *options, folder=tmp_path)
     yield one
@@ -92,3 +97,17 @@ def test_shadow_reports_a_persons_night_and_sends_no_command(run: AfspmRun) -> N
     asked = {json.loads(line).get("what", "") for line in lines if line.endswith("}")}
     assert len(asked) > 10
     assert [one for one in asked if not re.fullmatch(r"\w+\.\w*Get|Scan\.(WaitEndOfScan|FrameDataGrab)|", one)] == []
+
+
+@pytest.mark.parametrize("run", [LINES], indirect=True, ids=["live lines"])
+def test_detectors_see_the_scans_and_lines_of_a_person(run: AfspmRun) -> None:
+    with join(run.folder, "witness") as scope:
+        assert scope.wait_until(lambda: scope.state is ScopeState.FREE, timeout_s=DEADLINE_S)
+        lines = scope.events("ScanLines", timeout_s=DEADLINE_S)
+        with panel(run) as person:
+            person.Scan_BufferSet([14], 32, 32)  # of the signals: Z
+            person.Scan_SpeedSet(1e-6, 1e-6, 1.0, 1.0, 1, 1.0)
+            person.Scan_Action(0, UP)
+            first = next(lines).message
+            assert first.shape == (32, 32)
+        run.wait_for(r"classifier .*reference 1 of")
