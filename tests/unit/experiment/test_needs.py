@@ -102,7 +102,7 @@ def test_channel_that_the_microscope_lacks_is_refused_with_its_list(write: Write
 
 
 def test_role_that_only_another_mode_has_is_refused(write: Write) -> None:
-    analysis = '[analysis]\ncomponent = true\nclass = "FeedbackAnalysis"\n'
+    analysis = '[analysis]\ncomponent = true\nclass = "FeedbackAnalysis"\nchannel = "amplitude"\n'
     assert errors(write(analysis + SOLVED, frame=SIMULATED)) == []
     error = only_error(write(analysis + SOLVED, frame=SIMULATED + '[microscope.feedback]\nmode = "current"\n'))
     assert error.what == "[analysis] channel: the microscope has no role 'amplitude'"

@@ -17,8 +17,10 @@ from afspm.basics.errors import FileError, Refused
 from afspm.basics.exit_codes import ExitCode
 from afspm.model import (
     ActByHand,
+    ChannelRoles,
     ControlRequest,
     ControlResponse,
+    FeedbackUnits,
     MeasurementConditions,
     Region,
     Request,
@@ -181,7 +183,7 @@ def a_scan(channel: str = "Height") -> Scan:
     return Scan(Region((0.0, 0.0), (1e-6, 1e-6)), channel, "m", np.zeros((2, 3)), 5, "one.dat")
 
 
-_BESIDE = (TipStatus, ActByHand, MeasurementConditions)
+_BESIDE = (TipStatus, ActByHand, MeasurementConditions, ChannelRoles, FeedbackUnits)
 
 
 class Bench:
@@ -190,7 +192,7 @@ class Bench:
     def __init__(self, folder: Path, settings: dict[str, Any] | None = None) -> None:
         self.clock = FakeClock()
         self.folder = folder
-        self.beside: list[TipStatus | ActByHand | MeasurementConditions] = []
+        self.beside: list[TipStatus | ActByHand | MeasurementConditions | ChannelRoles | FeedbackUnits] = []
         self.microscope = FakeMicroscope(**(settings or {}))
         self.start()
 
