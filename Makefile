@@ -8,7 +8,7 @@ TEST := .venv/.test
 DEV := .venv/.dev
 
 .PHONY: demo demo-drift dev test test-times test-all test-apart test-lowest mutants test-samples test-matrix coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
-.PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift soak chaos simulate replay-nights power-cut docs release-check test-plug-ins changelog clean
+.PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift bench-guests soak chaos simulate replay-nights power-cut docs release-check test-plug-ins changelog clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -189,6 +189,12 @@ bench-compare: $(TEST)
 ## drift: errors of the estimates beside the theoretical bound, and build/bench-drift.json: make bench-drift QUICK=1
 bench-drift: $(TEST)
 	@$(BIN)/python -m benchmarks.drift $(if $(QUICK),--quick)
+
+## line watch, learning repair and adaptive maps, on surfaces, answers and maps that no setting was tried on: an hour
+bench-guests: $(TEST)
+	@$(BIN)/python -m benchmarks.line_watch --rooms 40
+	@$(BIN)/python -m benchmarks.tip_learning --full
+	@$(BIN)/python -m benchmarks.adaptive
 
 ## malformed requests and packets, and random calls of every emulated controller: make soak MESSAGES=20000 CALLS=5000
 MESSAGES ?= 1000000

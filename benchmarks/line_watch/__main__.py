@@ -1,5 +1,8 @@
 """`python -m benchmarks.line_watch [--nights 1000] [--minutes 10] [--half unseen]`: judges `LineWatch` over nights.
 
+With `--rooms 40` it judges scans of noisy rooms and changing samples instead, on surfaces that no setting was tried on:
+see `benchmarks.line_watch.rooms`. Keeps the outcomes in build/line_watch_rooms.jsonl.
+
 Prints false aborts, visible changes found in time, and scan time saved, relative to the time that an oracle would save
 (it stops each scan at the row of the change). Keeps each night's outcome in build/line_watch.jsonl. Exits with 1 where
 a target is missed.
@@ -15,13 +18,16 @@ from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
-from itertools import islice
+from itertools import islice, repeat
 from pathlib import Path
 
 from benchmarks.line_watch.nights import HALVES, ROWS, WITHIN, NightOutcome, judged_night
+from benchmarks.line_watch.rooms import ROOM_KINDS, SAMPLE_KINDS, JudgedScan, judged_room, table
 
 KEPT = Path("build/line_watch.jsonl")
+KEPT_ROOMS = Path("build/line_watch_rooms.jsonl")
 MOST_FALSE, LEAST_SEEN, LEAST_SAVED = 1 / 50, 0.9, 0.6
+MOST_CHANGED, LEAST_IN_ROOMS = 0.05, 0.85
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -31,7 +37,10 @@ def main(arguments: Sequence[str]) -> int:
     asked.add_argument("--minutes", type=float, default=10.0, help="begin no night after that long")
     asked.add_argument("--half", choices=HALVES, default="unseen")
     asked.add_argument("--processes", type=int, default=1)
+    asked.add_argument("--rooms", type=int, default=0, help="judge as many rooms in place of nights")
     given = asked.parse_args(arguments)
+    if given.rooms:
+        return judge_rooms(range(given.first, given.first + given.rooms), given.processes)
     end_s, found = time.monotonic() + 60.0 * given.minutes, []
     KEPT.parent.mkdir(exist_ok=True)
     seeds = iter(range(given.first, given.first + given.nights))
@@ -42,6 +51,30 @@ def main(arguments: Sequence[str]) -> int:
                 kept.write(json.dumps(asdict(outcome)) + "\n")
                 kept.flush()
     return report(found)
+
+
+def judge_rooms(seeds: Sequence[int], processes: int) -> int:
+    """Print the table of some rooms; return 1 where a target is missed."""
+    found: list[JudgedScan] = []
+    KEPT_ROOMS.parent.mkdir(exist_ok=True)
+    with ProcessPoolExecutor(processes) as pool, KEPT_ROOMS.open("w", encoding="utf-8") as kept:
+        for outcomes in pool.map(judged_room, repeat("kept"), seeds):
+            found += outcomes
+            kept.writelines(json.dumps(asdict(one)) + "\n" for one in outcomes)
+    print(*table(found), sep="\n")
+    stopped = [one for one in found if one.stop_row is not None]
+    tips = [one for one in found if one.is_visible]
+    is_met = (
+        share(stopped, found, ROOM_KINDS) <= MOST_FALSE
+        and share(stopped, found, SAMPLE_KINDS) <= MOST_CHANGED
+        and sum(one.is_seen for one in tips) >= LEAST_IN_ROOMS * len(tips)
+    )
+    return 0 if is_met else 1
+
+
+def share(some: Sequence[JudgedScan], of: Sequence[JudgedScan], kinds: Sequence[str]) -> float:
+    """Return the share of some scans in all scans of these kinds."""
+    return sum(one.kind in kinds for one in some) / max(1, sum(one.kind in kinds for one in of))
 
 
 def report(found: Sequence[NightOutcome]) -> int:

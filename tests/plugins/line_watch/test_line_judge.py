@@ -86,6 +86,61 @@ def test_scan_at_another_setpoint_is_another_kind() -> None:
     assert taught().begin(HOME, other, LEARNT * PERIOD_S, channels=2) is None
 
 
+def test_more_noise_with_the_same_image_is_reported_as_noise() -> None:
+    random = np.random.default_rng(3)
+    usual_m = LineStatistic(taught()._kinds[0].pairs).flat_m / np.sqrt(2.0)  # of the difference of two scans
+    noisy = [values + 1.5 * usual_m * random.standard_normal(values.shape) for values in heights(night()[LEARNT])]
+    running = taught().begin(HOME, KIND, LEARNT * PERIOD_S, channels=2)
+    assert running is not None
+    for row in range(ROWS):
+        assert running.add(row, [values[row] for values in noisy]) is None
+    assert running.noise > 1.25
+    quiet = taught().begin(HOME, KIND, LEARNT * PERIOD_S, channels=2)
+    assert quiet is not None
+    for row in range(ROWS):
+        quiet.add(row, [values[row] for values in heights(night()[LEARNT])])
+    assert quiet.noise < 1.1
+
+
+@pytest.mark.parametrize("period_px", [7.3, 18.0, 45.0])
+def test_hum_is_no_change(period_px: float) -> None:
+    usual_m = LineStatistic(taught()._kinds[0].pairs).flat_m / np.sqrt(2.0)
+    time = 2.0 * ROWS * np.arange(ROWS)[:, None] + np.arange(ROWS)
+    humming = [
+        values + 2.0 * usual_m * np.sin(2.0 * np.pi * at / period_px)
+        for values, at in zip(heights(night()[LEARNT]), (time, time[:, ::-1] + ROWS), strict=True)
+    ]
+    assert stopped(taught(), humming) is None
+
+
+def adorned(picture: Heights, at: tuple[int, int]) -> Heights:
+    """Return a scan with a round adsorbate."""
+    y, x = np.mgrid[0:ROWS, 0:ROWS]
+    return [values + 30e-9 * np.exp(-((x - at[1]) ** 2 + (y - at[0]) ** 2) / 1.5**2) for values in picture]
+
+
+def test_adsorbate_is_looked_at_and_never_stopped_for() -> None:
+    running = taught().begin(HOME, KIND, LEARNT * PERIOD_S, channels=2)
+    assert running is not None
+    picture = adorned(heights(night()[LEARNT]), (35, 20))
+    levels = [
+        alarm.level
+        for row in range(ROWS)
+        if (alarm := running.add(row, [values[row] for values in picture])) is not None
+    ]
+    assert levels == [AlarmLevel.LOOK]
+
+
+def test_zero_rows_are_missing_rows() -> None:
+    picture = heights(night()[LEARNT])
+    for values in picture:
+        values[[14, 15, 16, 17, 30, 31, 45]] = 0.0
+    running = taught().begin(HOME, KIND, LEARNT * PERIOD_S, channels=2)
+    assert running is not None
+    assert all(running.add(row, [values[row] for values in picture]) is None for row in range(ROWS))
+    assert not {14, 15, 16, 17, 30, 31, 45} & set(running.fitted)
+
+
 def test_missing_rows_are_no_change() -> None:
     picture = heights(night()[LEARNT])
     for values in picture:
@@ -168,7 +223,7 @@ def test_missing_rows_of_a_reference_are_interpolated() -> None:
 
 def test_few_pairs_are_judged_by_the_least_alike_one() -> None:
     alike, unlike = (
-        PairStatistics(flat_m=one, per_slope=0.1, usual=one, spread=0.1, highest=1.0) for one in (1.0, 2.0)
+        PairStatistics(flat_m=one, per_slope=0.1, usual=one, spread=0.1, highest=1.0, noise=1.0) for one in (1.0, 2.0)
     )
     assert LineStatistic([alike, alike, unlike]).flat_m == 2.0
     assert LineStatistic([alike, alike, alike, unlike]).flat_m == 1.0

@@ -6,6 +6,7 @@ import heapq
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tests.plugins.line_watch.line_scans_lab import (
     CHANGED_ROW,
@@ -104,6 +105,35 @@ def test_look_publishes_the_row_and_flags_nothing() -> None:
     assert flags(lab) == 0
     assert verdicts(lab)
     assert not any(one.stops for one in verdicts(lab))
+
+
+def test_adsorbate_that_stays_is_looked_at_twice_and_is_then_the_reference(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab("line_watch")
+    rows, columns = np.mgrid[0:ROWS, 0:ROWS]
+    bump = 30e-9 * np.exp(-((columns - 20) ** 2 + (rows - 35) ** 2) / 1.5**2)
+    world = world_with("double", 1e6)
+    for number in range(LEARNT + 4):
+        picture = scan_at(world, number, "up")
+        adsorbate = {name: values + bump for name, values in picture.items()}
+        tell(lab, number, picture if number < LEARNT else adsorbate)
+    lab.at(900.0, lab.kill)
+    with caplog.at_level("INFO"):
+        run(LineWatch(action="stop"), lab)
+    assert [one.began_ns for one in verdicts(lab)] == [began_ns(LEARNT), began_ns(LEARNT + 1)]
+    assert flags(lab) == 0
+    assert "4 of 7 complete scans were watched; 0 lines came after the end of their scan" in caplog.messages
+
+
+def test_more_noise_is_reported_once_a_scan(caplog: pytest.LogCaptureFixture) -> None:
+    lab, random = Lab("line_watch"), np.random.default_rng(7)
+    for number, picture in enumerate(night()[: LEARNT + 1]):
+        noise_m = 0.0 if number < LEARNT else 0.6e-9
+        tell(lab, number, {name: v + noise_m * random.standard_normal(v.shape) for name, v in picture.items()})
+    lab.at(900.0, lab.kill)
+    run(LineWatch(action="stop"), lab)
+    [text] = [text for text in caplog.messages if "the noise is" in text]
+    assert "times the noise of earlier scans" in text
+    assert verdicts(lab) == []
 
 
 def test_reason_why_nothing_is_judged_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:

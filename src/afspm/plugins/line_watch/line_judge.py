@@ -1,14 +1,19 @@
 """Detection of tip changes from the lines of running scans. Pure.
 
 Each line is compared with an earlier scan of the same place, at the shift found from the lines so far (`registration`).
-The remaining difference, relative to the usual difference of two good scans of this kind, goes into a CUSUM (Page
-1954): its sum grows while lines differ more than usual, and falls back to zero otherwise. So a scar or a spike in one
-line raises no alarm, but ten slightly different lines do. Without an earlier scan of the place, nothing is judged.
+The remaining difference is split into two numbers. What trace and retrace share is of the image; what they don't share
+is noise, however strong (`NoiseFilter`). Without retrace, two successive lines are taken instead.
+
+The image's part, relative to its usual size for two good scans of this kind, goes into a CUSUM (Page 1954): its sum
+grows while lines differ more than usual, and falls back to zero otherwise. So a scar or a spike in one line raises no
+alarm, but ten slightly different lines do. Without an earlier scan of the place, nothing is judged.
 
 Each kind of scan (same size, angle, pixels and setpoint; decision 0044) has its own threshold: the highest sum of good
 scans, times a factor, and at least a fixed value. A sum above the threshold raises `STOP`, a sum above 60 % of the
 threshold `LOOK`, once enough lines since the change are known. Before an alarm, a wider search for the shift shows
-whether the sample has jumped: then the template explains the lines again.
+whether the sample has jumped: then the template explains the lines again. A scan is stopped only for a change of the
+whole line, or for one that lasts, as a tip makes it: an adsorbate, or a particle that was dragged, changes one or two
+narrow parts of some lines.
 """
 
 from __future__ import annotations
@@ -19,6 +24,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from afspm.basics.plain_data import Plain
 from afspm.model import Region
@@ -53,6 +59,11 @@ FLOOR, FACTOR = 15.0, 2.0  # least threshold, and ratio of a threshold to the hi
 FEWEST_SUSPECT = 6  # rows since a change before an alarm: fewer don't show whether the sample has jumped
 FEWEST_STOP = 10  # rows since a change before a scan is stopped, after a second search for a jump with more lines
 LOOK = 0.6  # share of the threshold above which a person should look
+PARTS = ((1, 1 / 4), (2, 1 / 8))  # number and width, relative to the line, of parts that a changed sample may fill
+ELSEWHERE = 0.4  # share of the threshold that the rest of the lines must reach before a scan is stopped
+LASTING = 3 / 8  # of the rows: a change that grows for so long is no single adsorbate
+LEAST_SPREAD = 0.05  # of the image's part
+NEWER = 0.15  # weight of the newest line in the spectrum of the noise
 GOOD_DECAY = 5.0  # decay, with the evidence, of the share of good scans that reach it: assumed, not fitted
 FEWEST_PAIRS = 2  # least number of pairs of good scans before scans of their kind are judged
 ENOUGH_PAIRS = 4  # least number of pairs for medians
@@ -122,8 +133,9 @@ class PairStatistics:
     Attributes:
         flat_m: standard deviation on flat pixels.
         per_slope: further difference in m for each m per pixel of slope, added in quadrature.
-        usual, spread: centre and spread of `line_statistic`.
+        usual, spread: centre and spread of the image's part of a line's difference.
         highest: highest value of the CUSUM.
+        noise: usual square of the noise's part.
     """
 
     flat_m: float
@@ -131,6 +143,7 @@ class PairStatistics:
     usual: float
     spread: float
     highest: float
+    noise: float
 
 
 @dataclass
@@ -147,6 +160,23 @@ class Place:
     at_s: float
     templates: tuple[RowTemplate, ...]
     slipped: Shift = (0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class WholeScan:
+    """A complete scan.
+
+    Attributes:
+        picture: heights in m, [y, x], of trace and, if recorded, retrace.
+        at_s: end of the scan.
+        downwards: whether the lines arrived from last to first.
+    """
+
+    picture: Sequence[Array]
+    region: Region
+    kind: Kind
+    at_s: float
+    downwards: bool = False
 
 
 @dataclass
@@ -240,6 +270,7 @@ class LineStatistic:
             float(middle([getattr(pair, name) for pair in pairs]))
             for name in ("flat_m", "per_slope", "usual", "spread")
         )
+        self.noise = float(np.median([pair.noise for pair in pairs]))
         self.pairs = len(pairs)
         highest = sorted(pair.highest for pair in pairs)
         # the highest of many may be of a scan whose tip had changed without an alarm
@@ -248,17 +279,63 @@ class LineStatistic:
     def sigma_m(self, steepness: Array) -> Array:
         return np.asarray(np.hypot(self.flat_m, self.per_slope * steepness))
 
-    def sigmas(self, fits: Sequence[RowFit]) -> float:
-        return (line_statistic(fits, self.flat_m, self.per_slope) - self._usual) / self._spread
+    def sigmas(self, products: Array) -> float:
+        """Return the image's part in standard deviations above the usual, from the products of `NoiseFilter`."""
+        counted = products[np.isfinite(products)]
+        if not counted.size:
+            return 0.0
+        # the mean of fewer pixels is noisier
+        spread = self._spread * math.sqrt(products.size / counted.size)
+        return (float(np.mean(counted)) - self._usual) / spread
 
 
-def line_statistic(fits: Sequence[RowFit], flat_m: float, per_slope: float) -> float:
-    """Return the mean squared difference of a line, relative to the usual variance, with an upper limit per pixel."""
-    means = []
-    for fit in fits:
-        square = (fit.residual / np.hypot(flat_m, per_slope * fit.steepness)) ** 2
-        means.append(float(np.nanmean(np.minimum(square, CLIP_SIGMAS**2))))
-    return float(np.mean(means))
+class NoiseFilter:
+    """Separator of a line's difference into the part of the image and the part of noise.
+
+    Both recordings of a line share a change of the image; their noise is independent. So the difference of the two
+    contains noise alone. Frequencies with more noise than usual get less weight: a hum fills few of them, and its two
+    recordings may agree by chance.
+
+    Attributes:
+        square: mean square of the noise's part, over the newest lines, relative to `PairStatistics.flat_m` squared.
+    """
+
+    def __init__(self, flat_m: float, per_slope: float) -> None:
+        self._flat_m, self._per_slope = flat_m, per_slope
+        self._power: Array | None = None
+        self._count = 1
+        self.square = 1.0
+
+    def add(self, fits: Sequence[RowFit]) -> Array:
+        """Learn the noise of a line, and return its products; see `products`."""
+        first, second = self._relative(fits)
+        there = np.isfinite(first + second)
+        noise = np.where(there, first - second, 0.0) / math.sqrt(2.0)
+        power = np.abs(np.fft.rfft(noise)) ** 2 / max(1, int(there.sum()))
+        power = np.convolve(np.pad(power, 1, mode="edge"), np.full(3, 1 / 3), mode="valid")
+        before = np.ones_like(power) if self._power is None else self._power
+        self._count += 1
+        self._power = before + max(NEWER, 1.0 / self._count) * (power - before)
+        self.square = float(self._power.mean())
+        return self.products(fits)
+
+    def products(self, fits: Sequence[RowFit]) -> Array:
+        """Return the products of both recordings' differences at each pixel, noisy frequencies reduced."""
+        first, second = self._relative(fits)
+        there = np.isfinite(first + second)
+        if self._power is not None:
+            reduced = 1.0 / np.sqrt(np.maximum(1.0, self._power))
+            first, second = (
+                np.fft.irfft(reduced * np.fft.rfft(np.where(there, one, 0.0)), n=one.size) for one in (first, second)
+            )
+        return np.where(there, first * second, np.nan)
+
+    def _relative(self, fits: Sequence[RowFit]) -> tuple[Array, Array]:
+        first, second = (
+            np.clip(fit.residual / np.hypot(self._flat_m, self._per_slope * fit.steepness), -CLIP_SIGMAS, CLIP_SIGMAS)
+            for fit in fits
+        )
+        return first, second
 
 
 @dataclass
@@ -266,17 +343,19 @@ class _Comparer:
     place: Place
     registration: RowRegistration
     jumps: int = 0  # of the sample, in this scan
+    before: RowFit | None = None  # the line before, without retrace
 
     def follow(self, row: int, line: Sequence[Array]) -> None:
         self.registration.follow(row, line[0])
 
     def fits(self, row: int, line: Sequence[Array]) -> list[RowFit]:
-        found = []
-        for template, values in zip(self.place.templates, line, strict=True):
-            fit = self.registration.fit(row, values, template)
-            if fit is not None:
-                found.append(fit)
-        return found
+        # two recordings of the image: trace and retrace, or a line and the one before; else none
+        found = [self.registration.fit(row, values, of) for of, values in zip(self.place.templates, line, strict=True)]
+        if len(line) == 1:
+            found.append(self.before)
+            self.before = found[0]
+        fits = [fit for fit in found if fit is not None]
+        return fits if len(fits) == 2 else []
 
 
 class ScanJudge:
@@ -290,8 +369,10 @@ class ScanJudge:
     def __init__(self, comparer: _Comparer, statistic: LineStatistic, what: str) -> None:
         self.alarm: Alarm | None = None
         self.fitted: dict[int, list[RowFit]] = {}
+        self._filter = NoiseFilter(statistic.flat_m, statistic.per_slope)
         self._comparer, self._statistic, self._what = comparer, statistic, what
         self._cusum = Cusum()
+        self._sums: list[float] = []  # since the CUSUM last left zero
         self._home = comparer.registration.shift
         self._followed = 0
         self._recent: list[tuple[int, list[Array]]] = []
@@ -306,6 +387,12 @@ class ScanJudge:
         """CUSUM relative to the threshold."""
         return self._cusum.value / self.threshold
 
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the newest lines' noise, relative to good scans; 1 before there are enough lines."""
+        enough = self._followed >= ACQUIRE + REMEMBERED
+        return math.sqrt(self._filter.square / self._statistic.noise) if enough else 1.0
+
     def add(self, row: int, line: Sequence[Array]) -> Alarm | None:
         """Judge a line; return an alarm if its level is higher than before, else None.
 
@@ -319,17 +406,20 @@ class ScanJudge:
         self._comparer.follow(row, level)
         self._recent = [*self._recent, (row, level)][-REMEMBERED:]
         self._followed += 1
-        # the scanner still creeps from its last move: the first lines only find the shift
-        fits = self._comparer.fits(row, level) if self._followed > ACQUIRE else []
+        fits = self._comparer.fits(row, level)
         if not fits:
             return None
+        products = self._filter.add(fits)
+        if self._followed <= ACQUIRE:
+            return None  # the scanner still creeps from its last move: the first lines only find the shift, and noise
         self.fitted[row] = fits
-        self._cusum.add(row, self._statistic.sigmas(fits))
+        self._cusum.add(row, self._statistic.sigmas(products))
+        self._sums = [*self._sums, self._cusum.value] if self._cusum.value else []
         found = self._level()
         if found is None or (self.alarm is not None and self.alarm.level in (found, AlarmLevel.STOP)):
             return None
         if self._has_jumped():
-            self._cusum = Cusum()
+            self._cusum, self._sums = Cusum(), []
             return None
         since = row if self._cusum.since is None else self._cusum.since
         basis = f"{self.evidence:.1f} times the threshold from {self._statistic.pairs} good pairs of scans"
@@ -338,9 +428,32 @@ class ScanJudge:
 
     def _level(self) -> AlarmLevel | None:
         suspects = sum(self._is_suspect(row) for row, _ in self._recent)
-        if self.evidence >= 1.0 and suspects >= FEWEST_STOP:
+        if self.evidence >= 1.0 and suspects >= FEWEST_STOP and (self._is_everywhere() or self._lasts()):
             return AlarmLevel.STOP
         return AlarmLevel.LOOK if self.evidence >= LOOK and suspects >= FEWEST_SUSPECT else None
+
+    def _is_everywhere(self) -> bool:
+        # whether the lines differ also outside of the few parts in which they differ most
+        suspects = [(row, line) for row, line in self._recent if self._is_suspect(row)]
+        products = [self._filter.products(fits) for row, _ in suspects if (fits := self.fitted.get(row))]
+        total = np.sum([np.nan_to_num(one) for one in products], axis=0)
+        return all(self._differ(suspects, _elsewhere(total, *parts)) for parts in PARTS)
+
+    def _lasts(self) -> bool:
+        rows = round(LASTING * len(self._comparer.place.templates[0].heights))
+        return len(self._sums) >= rows and self._sums[-1] > self._sums[-1 - rows // 4]
+
+    def _differ(self, lines: Sequence[tuple[int, Sequence[Array]]], where: NDArray[np.bool_]) -> bool:
+        # fitted again: an adsorbate moves the shift of its line, which then differs everywhere
+        again, cusum, highest = _Comparer(self._comparer.place, self._comparer.registration), Cusum(), 0.0
+        for row, line in lines:
+            if fits := again.fits(row, [np.where(where, values, np.nan) for values in line]):
+                cusum.add(row, self._sigmas(fits))
+                highest = max(highest, cusum.value)
+        return highest >= ELSEWHERE * self.threshold
+
+    def _sigmas(self, fits: Sequence[RowFit]) -> float:
+        return self._statistic.sigmas(self._filter.products(fits))
 
     def _has_jumped(self) -> bool:
         if self._comparer.jumps >= MOST_JUMPS:
@@ -351,7 +464,7 @@ class ScanJudge:
         newest = suspects[-max(NEWEST, (len(suspects) + 1) // 2) :]
         template, statistic = self._comparer.place.templates[0], self._statistic
         # a contaminated tip spoils some lines at any shift, and leaves the others as they were
-        odd = {row for row, _ in newest if (fits := self.fitted.get(row)) and statistic.sigmas(fits) > EXPLAINED}
+        odd = {row for row, _ in newest if (fits := self.fitted.get(row)) and self._sigmas(fits) > EXPLAINED}
         found: list[tuple[float, RowRegistration]] = []
         for lines in (newest, self._recent):
             traces = [(row, line[0]) for row, line in lines]
@@ -362,7 +475,7 @@ class ScanJudge:
                 again = _Comparer(self._comparer.place, RowRegistration(template, shift, NEAR, steady=1.0))
                 for row, line in lines:
                     again.follow(row, line)
-                sigmas = {row: statistic.sigmas(fits) for row, line in newest if (fits := again.fits(row, line))}
+                sigmas = {row: self._sigmas(fits) for row, line in newest if (fits := again.fits(row, line))}
                 off = max(_median(sigmas.values()), _median([of for row, of in sigmas.items() if row in odd]))
                 if 2 * len(sigmas) > len(newest) and off < EXPLAINED:
                     far = math.dist(again.registration.shift, self._home)
@@ -381,6 +494,17 @@ class ScanJudge:
         numbers = [number for number, _ in self._recent]
         since = self._cusum.since
         return since is None or since not in numbers or numbers.index(row) >= numbers.index(since)
+
+
+def _elsewhere(total: Array, parts: int, width: float) -> NDArray[np.bool_]:
+    # the pixels outside of the parts with the largest sums
+    elsewhere = np.ones(total.size, dtype=bool)
+    wide = max(1, round(width * total.size))
+    for _ in range(parts):
+        inside = np.convolve(np.where(elsewhere, total, 0.0), np.ones(wide), mode="valid")
+        first = int(inside.argmax())
+        elsewhere[first : first + wide] = False
+    return elsewhere
 
 
 def _median(values: Collection[float]) -> float:
@@ -467,8 +591,8 @@ class LineJudge:
             picture: heights in m, [y, x], of trace and, if recorded, retrace.
             at_s: end of the scan.
             downwards: whether the lines arrived from last to first.
-            again: whether the process has learnt from this scan before its restart; the scan then only becomes a
-                reference for its place.
+            again: whether the scan only becomes a reference for its place, as one from which the process has learnt
+                before its restart.
         """
         known = self._known(kind) or self._new(kind)
         self._kinds.remove(known)
@@ -508,6 +632,23 @@ class LineJudge:
                 return None
             known.note_shift(place, region, at_s, comparer.registration.shift)
         return odd
+
+    def agree(self, earlier: WholeScan, later: WholeScan) -> bool:
+        """Return whether a scan raises no alarm against an earlier one, and both show the same place."""
+        known = self._known(later.kind)
+        if known is None or len(known.pairs) < FEWEST_PAIRS or len(earlier.picture) != len(later.picture):
+            return False
+        place = Place(earlier.region, earlier.at_s, tuple(map(RowTemplate.of, earlier.picture)))
+        alone = replace(known, places=[place])
+        if not earlier.kind.fits(later.kind) or alone.place(later.region) is None:
+            return False
+        registration = RowRegistration(place.templates[0], alone.shift(place, later.region, later.at_s), REACH)
+        running = ScanJudge(_Comparer(place, registration), LineStatistic(known.pairs), "")
+        rows = range(len(later.picture[0]))
+        return all(
+            running.add(row, [values[row] for values in later.picture]) is None
+            for row in (reversed(rows) if later.downwards else rows)
+        )
 
     def state(self) -> Plain:
         """Return the statistics of each kind of scan as JSON data, to save. Earlier scans are left out."""
@@ -560,18 +701,23 @@ def _statistics(
     if len(fitted) < len(lines) // 2:
         return None
     flat_m, per_slope = _expected([fit for _, fits in fitted for fit in fits])
-    own = np.array([line_statistic(fits, flat_m, per_slope) for _, fits in fitted])
+    own, noise = [], []
+    filtering = NoiseFilter(flat_m, per_slope)
+    for _, fits in fitted:
+        own.append(float(np.nanmean(filtering.add(fits))))
+        noise.append(filtering.square)
     usual = float(np.median(own))
-    spread = max(float(np.quantile(own, 0.84)) - usual, 0.05)
-    pair = PairStatistics(flat_m, per_slope, usual, spread, 0.0)
+    spread = max(float(np.quantile(own, 0.84)) - usual, LEAST_SPREAD)
+    pair = PairStatistics(flat_m, per_slope, usual, spread, 0.0, float(np.median(noise)))
     # judged by the other pairs, as a running scan is
     statistic, cusum, highest = LineStatistic(before or [pair]), Cusum(), 0.0
+    filtering = NoiseFilter(statistic.flat_m, statistic.per_slope)
     for row, fits in fitted:
-        sigmas = statistic.sigmas(fits)
-        odd.note(row, fits, statistic, sigmas)
+        sigmas = statistic.sigmas(filtering.add(fits))
+        odd.note(row, fits[: len(comparer.place.templates)], statistic, sigmas)
         cusum.add(row, sigmas)
         highest = max(highest, cusum.value)
-    return PairStatistics(flat_m, per_slope, usual, spread, highest)
+    return replace(pair, highest=highest)
 
 
 def _expected(fits: Sequence[RowFit]) -> tuple[float, float]:

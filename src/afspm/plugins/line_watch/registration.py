@@ -145,7 +145,8 @@ class RowRegistration:
                 _row_at(picture, at, beside, order=1) for picture in (template.row_slopes, template.column_slopes)
             )
             basis = np.stack([np.ones(nx), np.linspace(-1.0, 1.0, nx), down_slope, along_slope], axis=1)
-            residual, more = _unexplained(row - expected, basis, inside, moved, rounds)
+            difference = np.where(inside, row - expected, 0.0)
+            residual, more = _unexplained(difference, basis, inside, moved, rounds)
             moved = np.clip(moved + more, -MOST_MOVED_PX, MOST_MOVED_PX)
         return RowFit(residual, np.hypot(down_slope, along_slope))
 
@@ -234,12 +235,13 @@ def likely_shifts(
 def levelled(rows: Array) -> Array:
     """Return rows without the offset of each row and the common tilt (z drift, mounting of the sample).
 
-    Holes are interpolated along the row; a row with at most half of its values becomes NaN.
+    Holes are interpolated along the row. A row with at most half of its values becomes NaN, and so does a row of one
+    value: some controllers fill lost rows with zeros.
     """
     rows = np.array(rows, dtype=np.float64, ndmin=2)
     there = np.isfinite(rows)
     for row, good in zip(rows, there, strict=True):
-        if good.mean() <= 0.5:
+        if good.mean() <= 0.5 or np.ptp(row[good]) == 0.0:
             row[:] = np.nan
         elif not good.all():
             x = np.arange(len(row))
