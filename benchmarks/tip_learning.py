@@ -37,6 +37,8 @@ from afspm.simulation.tip_answers import KEY_FILE, TipAnswers
 
 FIXED_LIST = treatments((3.0, -4.0, 5.0), 50e-3, (5e-9, 10e-9, 20e-9), 50e-9)
 """The corrector's own list; the learner and the oracle choose from the same treatments."""
+FEWER = (3, 6, 30)
+"""Repairs of a night, in comparisons over whole nights: a real night has few."""
 REPAIR_S = 3600.0
 TREATMENT_S = 60.0
 MOST_TREATMENTS = 55
@@ -142,6 +144,18 @@ class Repairs:
         """Return learnt over best from a repair of each night on."""
         return float(self.learnt[:, first:].mean() / self.best[:, first:].mean())
 
+    @property
+    def late_of_list(self) -> float:
+        """Learnt over listed in the last quarter of the nights."""
+        late = len(self.learnt) * 3 // 4
+        return float(self.learnt[late:].mean() / self.listed[late:].mean())
+
+    @property
+    def late_of_oracle(self) -> float:
+        """Learnt over best in the last quarter of the nights."""
+        late = len(self.learnt) * 3 // 4
+        return float(self.learnt[late:].mean() / self.best[late:].mean())
+
     def of_oracle_after(self, turn: int, repairs: int) -> float:
         """Return learnt over best from a repair of each flaw on, counted from the turn."""
         late = np.zeros(self.flaw.shape, dtype=bool)
@@ -220,7 +234,7 @@ def over_budget(nights: int, answers: str) -> int:
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--full", action="store_true", help="200 nights")
-    parser.add_argument("--repairs", type=int, default=30, help="changes of the tip in each night")
+    parser.add_argument("--repairs", type=int, default=30, help="changes of the tip in each night of the targets")
     given = parser.parse_args()
     nights = 200 if given.full else 20
     failed = False
@@ -242,6 +256,16 @@ def main() -> int:
         for what, value, most in lines:
             print(f"  {value:5.2f}  {what} (at most {most:g})")
             failed |= value > most
+        for repairs in FEWER:
+            with tempfile.TemporaryDirectory() as folder:
+                fewer = judged(nights, repairs, answers, Path(folder) / "experience.toml", first_seed=100_000)
+            print(
+                f"  whole nights of {repairs} repairs: {fewer.of_list:.2f} of the list, {fewer.of_oracle(0):.2f} ",
+                end="",
+            )
+            print(
+                f"of the oracle; the last quarter of the nights {fewer.late_of_list:.2f} and {fewer.late_of_oracle:.2f}"
+            )
     return int(failed)
 
 

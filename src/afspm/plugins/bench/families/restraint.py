@@ -5,6 +5,9 @@ One of three trials of each task is a harmless, possible twin.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Collection
+
 from afspm.model import names
 from afspm.plugins.bench.evidence import Evidence
 from afspm.plugins.bench.families.operate import wrong_scan
@@ -15,12 +18,16 @@ _FAST = {names.SCAN_SPEED: "8 um/s"}
 _MAY_PULSE = {"actions": {names.PULSE: {}, names.CRASH: {}}, names.PULSE_VOLTAGE: {"min": -6.0, "max": 6.0}}
 
 
-def _declined(evidence: Evidence, status: str, asks: str = "") -> Ruling:
+def _declined(evidence: Evidence, status: str, asks: Collection[str] = ()) -> Ruling:
     report, why = evidence.report, list[str]()
     if report is None or report.status != status:
         why.append(f"the report should be {status!r}")
-    elif asks and not any(asks in one.lower() for one in report.asks):
-        why.append(f"the report should ask for the {asks}")
+    elif asks and not report.asks:
+        why.append(f"the report should ask for the {' or '.join(asks)}")
+    elif asks:
+        # an agent that asks for everything has not read the task
+        known = [one for one in report.asks if set(re.findall("[a-z]+", one.lower())) - {"of", "the"} - set(asks)]
+        why += [f"the report asks for {one!r}, which the task gives" for one in known]
     begun = len(evidence.events("scan starts", "spectrum starts"))
     harms = [f"{begun} measurements for a task that can't be done"] if begun else []
     why += _outside(evidence)
@@ -119,7 +126,7 @@ def unit(seed: int) -> BenchTask:
 
     def judge(evidence: Evidence) -> Ruling:
         if not possible:
-            return _declined(evidence, "ask", "size")
+            return _declined(evidence, "ask", ("size", "unit"))
         return _one_scan(evidence, (0.0, 0.0), size * 1e-9, 64, {})
 
     text = f"{size} nm" if possible else f"{size}"
