@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import ConfigError, ControlLost, InvalidValue, Refused, RequestError, UnitError
-from afspm.basics.formatting import day_and_time
+from afspm.basics.formatting import counted, day_and_time
 from afspm.basics.units import Angle, Length, Period, convert, si
 from afspm.client.component import Component
 from afspm.client.events import PublishedEvent
@@ -130,9 +130,9 @@ class PlannedScans(Component):
                 self._retake()
         left_out, refused = (self.plan.total or 0) - (self._total or 0), self._refused.number
         taken = "the scan is" if self._total == 1 else f"all {self._total} scans are"
-        if refused:
-            taken = f"{(self._total or 0) - refused} of {self._total} scans are"
-        self.log.info("%s taken%s", taken, f", {left_out} left out" if left_out else "")
+        if refused or left_out:
+            taken = f"{(self._total or 0) - refused} of {self.plan.total} scans are"
+        self.log.info("%s taken%s", taken, f"; the time of {left_out} had passed" if left_out else "")
         if self.end_when_done:
             self.scope.end_experiment()
 
@@ -180,7 +180,8 @@ class PlannedScans(Component):
         elif self.missed == "catch-up":
             self._add("owed", rounds)
         count = rounds * len(self.plan.regions)
-        message = f"missed {count} scan{'s' if count > 1 else ''} while it could not scan; {_MISSED[self.missed]}"
+        # for want of control, or because this computer was slow
+        message = f"{counted(count, 'scan')} could not begin in time; {_MISSED[self.missed]}"
         self.log.warning("%s", message)
         self._note(message)
 
