@@ -13,6 +13,7 @@ import typer
 from typer.core import TyperGroup
 
 from afspm.basics.formatting import counted, duration_text, quantity
+from afspm.basics.plain_data import Plain
 from afspm.cli.arguments import RUNS, Files, OptionalFiles, Runs, opt
 
 if TYPE_CHECKING:
@@ -34,6 +35,10 @@ def check(
             help="Convert a file of another form, such as the published one, and explain each line.",
         ),
     ] = False,
+    as_json: Annotated[
+        bool,
+        typer.Option("--json", help="For programs: a list of findings, each with level, file, line, what and hint."),
+    ] = False,
 ) -> None:
     """Find every error of an experiment file, before anything starts.
 
@@ -45,6 +50,9 @@ def check(
 
     experiment = load(*files)
     findings = experiment.check()
+    if as_json:
+        typer.echo(json.dumps([_finding_as_json(one) for one in findings], ensure_ascii=False, indent=2))
+        raise typer.Exit(1 if any(finding.is_error for finding in findings) else 0)
     console = Console(stderr=expanded or explain, highlight=False)
     if explain and experiment.is_readable:
         _explain(experiment, console)
@@ -58,6 +66,14 @@ def check(
                 console.print(line, markup=False, soft_wrap=True)
     if any(finding.is_error for finding in findings):
         raise typer.Exit(1)
+
+
+def _finding_as_json(finding: Finding) -> Plain:
+    place = finding.place
+    return {
+        "level": finding.level.value, "file": place.file, "line": place.line or None, "what": finding.what,
+        "hint": finding.hint,
+    }  # fmt: skip
 
 
 def _explain(experiment: Experiment, console: Console) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
 
@@ -111,3 +112,17 @@ def test_check_estimates_the_work_and_the_end(runner: CliRunner, tmp_path: Path)
     assert result.exit_code == 0
     assert "series plans 7 scans, 2.8 mm scanned, 0.56 MB a channel before compression, 1 h 02 min" in result.output
     assert "(1 h 02 min, 1 min 01 s real)" in result.output
+
+
+def test_findings_are_json_for_programs(write: Write, runner: CliRunner) -> None:
+    write("size_of = 3\n" + CORRECTOR + 'volage = "3 V"\n')
+    result = runner.invoke(app, ["check", "--json", "night.toml"])
+    assert result.exit_code == 1
+    unused, wrong = sorted(json.loads(result.stdout), key=lambda one: one["line"])
+    assert unused == {
+        "level": "warning", "file": "night.toml", "line": 1, "what": "nothing uses the variable 'size_of'", "hint": "",
+    }  # fmt: skip
+    assert (wrong["level"], wrong["what"]) == ("error", "[repair] has no setting 'volage'")
+    write(CORRECTOR)
+    good = runner.invoke(app, ["check", "--json", "night.toml"])
+    assert (good.exit_code, json.loads(good.stdout)) == (0, [])
