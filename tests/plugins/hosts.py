@@ -15,7 +15,11 @@ from typing import IO, Any, Protocol
 from afspm.basics import entry_points
 
 HOST = "afspm.supervisor.host"
-IMPORTED = [HOST, "numpy", *entry_points.modules(entry_points.DRIVERS)]
+IMPORTED = [
+    HOST,
+    *("numpy", "h5py", "afspm.translator.translator", "afspm.transport.zmq_server"),
+    *entry_points.modules(entry_points.DRIVERS),
+]
 
 
 class Host(Protocol):
