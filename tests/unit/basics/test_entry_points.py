@@ -79,6 +79,7 @@ def test_an_experiment_file_names_drivers_and_components_of_a_plug_in(site: Path
     assert paths["counter"] == "example_plugin.counter.ExampleCounter"
 
 
+@pytest.mark.slow  # a whole experiment, as in `make test-all`
 def test_an_experiment_with_a_plug_in_runs(site: Path, tmp_path: Path) -> None:
     (tmp_path / "experiment.toml").write_text(EXPERIMENT)
     done = afspm(site, "run", "experiment.toml", cwd=tmp_path)
