@@ -79,7 +79,7 @@ def test_ended_component_loses_control_as_soon_as_its_supervisor_reports() -> No
 
 
 def test_long_run_prints_its_outcome(capsys: pytest.CaptureFixture[str]) -> None:
-    assert long_run.main(["--nights", "2", "--seed", "5"]) == 0
+    assert long_run.main(["--nights", "1", "--seed", "5"]) == 0
     assert "every invariant held" in capsys.readouterr().out
 
 
