@@ -11,11 +11,12 @@ from pathlib import Path
 import pytest
 from benchmarks.fuzz import fuzz
 from benchmarks.fuzz.nanosurf import NanosurfFuzzer
+from rotation import ALL
 
 from afspm.basics.clock import ExperimentClock
 from afspm.plugins.nanosurf.emulator import NanosurfEmulator
 
-CALLS = 1500
+CALLS = 1500 if ALL else 500
 
 
 def test_random_scripts_are_survived(tmp_path: Path) -> None:
