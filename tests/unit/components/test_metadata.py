@@ -278,8 +278,8 @@ def test_row_has_the_requested_bias_and_the_published_setpoint_at_the_beginning(
     lab.at(600.0, lab.kill)
     run(Metadata(), lab, run_dir=str(tmp_path))
     assert settings_of(tmp_path) == [
-        ("", "", "0.7", ""),
-        ("-0.05", "V", "0.7", ""),
+        ("", "", "0.7", "V"),
+        ("-0.05", "V", "0.7", "V"),
         ("1", "V", "0.5", "V"),
     ]
 

@@ -92,7 +92,7 @@ def test_killed_scheduler_that_corrects_drift_goes_on_with_it(file: Path) -> Non
 
 def test_killed_holders_of_arrays_go_on_as_if_nothing_had_been(file: Path) -> None:
     """Arrays of a saved state are restored by the types of its fields, which numpy 2.5 changed."""
-    judges = ("tip_classifier", "line_watch")
+    judges = {"tip_classifier": "judge", "line_watch": "line_judge"}
     parts = (
         '[series]\nevery = "1 min"\nscans = 6\n'
         '[tip_classifier]\ncomponent = true\nclass = "TipClassifier"\n'
@@ -110,7 +110,7 @@ def test_killed_holders_of_arrays_go_on_as_if_nothing_had_been(file: Path) -> No
     undisturbed, disturbed = ([scans.first.values for scans in bench.scans] for bench in nights)
     assert len(undisturbed) == 7, "one of them for the rescanner"
     np.testing.assert_array_equal(undisturbed, disturbed)
-    memories = [[bench.components[name].memory["judge"] for name in judges] for bench in nights]
+    memories = [[bench.components[name].memory[key] for name, key in judges.items()] for bench in nights]
     assert memories[0] == memories[1]
 
 

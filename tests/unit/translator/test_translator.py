@@ -52,12 +52,12 @@ def told(response: Any) -> tuple[str | None, str | None]:
 
 
 def test_at_the_start_everything_in_force_is_published(make_bench: Any) -> None:
-    assert make_bench().heard() == ["ScanParameters2d", "ZCtrlParameters", "ProbePosition", "ZCtrlUnits", "FREE"]
+    assert make_bench().heard() == ["ScanParameters2d", "ZCtrlParameters", "ProbePosition", "FREE"]
 
 
 def test_everything_is_published_again_for_a_new_scheduler(bench: Any) -> None:
     bench.translator.handle(SubscriberJoined())
-    assert bench.heard() == ["ScanParameters2d", "ZCtrlParameters", "ProbePosition", "ZCtrlUnits", "FREE"]
+    assert bench.heard() == ["ScanParameters2d", "ZCtrlParameters", "ProbePosition", "FREE"]
 
 
 def test_unchanged_values_are_not_published(bench: Any) -> None:
@@ -607,7 +607,7 @@ def test_lost_controller_is_logged_and_reconnected(bench: Any) -> None:
     assert (response.code, response.detail) == (ControlResponse.NO_RESPONSE, ResponseDetail.NOT_SENT)
     bench.microscope.lost = False
     bench.look(after_s=5.0)
-    assert bench.heard() == ["ScanParameters2d", "ZCtrlParameters", "ProbePosition", "ZCtrlUnits", "FREE"]
+    assert bench.heard() == ["ScanParameters2d", "ZCtrlParameters", "ProbePosition", "FREE"]
 
 
 def test_missing_controller_is_logged_once(make_bench: Any, tmp_path: Any) -> None:
@@ -990,7 +990,7 @@ def test_a_scan_that_ended_while_the_translator_was_down_is_delivered_once(bench
     bench.microscope.state = ScopeState.FREE
     bench.start()
     assert bench.heard() == [
-        "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "ZCtrlUnits", "SCANNING", "Scan2d", "FREE",
+        "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "SCANNING", "Scan2d", "FREE",
     ]  # fmt: skip
 
 
