@@ -100,10 +100,11 @@ class ScriptedPerson(Component):
         if not proposal.preflight or proposal.time_ns <= self.memory.get("newest_ns", -1):
             return  # not simulated yet, or approved before a restart
         self.memory["newest_ns"] = proposal.time_ns
-        grant, plan = of_plan(proposal, Frame.TIP)
+        facts = self.scope.approval_facts()  # as of what this person sees
+        grant, plan = of_plan(proposal, Frame.TIP, facts)
         self.log.info("approves %s of %s: %d requests", plan.id, proposal.who, len(grant.steps))
         self.scope.approve(grant)
-        self.scope.approve(of_table(GRANT, self.scope.approval_facts()))
+        self.scope.approve(of_table(GRANT, facts))
 
 
 def highest(numbers):
