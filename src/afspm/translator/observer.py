@@ -69,9 +69,7 @@ class Observer:
         self._live = LiveLines(driver)
         self.values: dict[str, Value] = {}
         self.panel = PanelWatch(state.kept, driver.table, driver.is_last_written)
-        self._published_tip: TipStatus | None = None
-        self._published_channels: ChannelRoles | None = None
-        self._published_units: FeedbackUnits | None = None
+        self._published_last: dict[type, object] = {}
         self._began_with: TipStatus | None = None
         self._acts: list[ActByHand] = []
         self._others_told = False
@@ -270,24 +268,24 @@ class Observer:
 
     def _publish_channels(self) -> None:
         # at constant height another channel shows the surface
-        channels = self._driver.channels.with_topography(feedback_on=setting_groups.feedback(self.values).on)
-        if channels not in (self._published_channels, ChannelRoles()):
-            self._published_channels = channels
-            self._port.publish(*wire.encode(channels), self._state.stamp()[0])
+        feedback = setting_groups.feedback(self.values)
+        self._publish_change(self._driver.channels.with_topography(feedback_on=feedback.on))
 
     def _publish_units(self) -> None:
         table = self._driver.table
         gains_and_setpoint = (names.ZCTRL_PGAIN, names.ZCTRL_IGAIN, names.ZCTRL_SETPOINT)
-        units = FeedbackUnits(*(table[name].si_unit if name in table else "" for name in gains_and_setpoint))
-        if units not in (self._published_units, FeedbackUnits()):
-            self._published_units = units
-            self._port.publish(*wire.encode(units), self._state.stamp()[0])
+        self._publish_change(
+            FeedbackUnits(*(table[name].si_unit if name in table else "" for name in gains_and_setpoint))
+        )
 
     def _publish_tip(self) -> None:
-        tip = self.panel.tip
-        if tip not in (self._published_tip, TipStatus()):
-            self._published_tip = tip
-            self._port.publish(*wire.encode(tip), self._state.stamp()[0])
+        self._publish_change(self.panel.tip)
+
+    def _publish_change(self, thing: ChannelRoles | FeedbackUnits | TipStatus) -> None:
+        kind = type(thing)
+        if thing not in (self._published_last.get(kind), kind()):
+            self._published_last[kind] = thing
+            self._port.publish(*wire.encode(thing), self._state.stamp()[0])
 
     def _tip_has_changed(self) -> bool:
         shown = [name for name in (names.ENGAGED, FEEDBACK_ON) if name in self._driver.table]
@@ -334,7 +332,7 @@ class Observer:
         """Publish the present settings and the published state again, for a newly connected scheduler."""
         for thing in setting_groups.messages(self.values).values():
             self.publish(thing)
-        self._published_tip = self._published_channels = self._published_units = None
+        self._published_last.clear()
         self._publish_channels()
         self._publish_units()
         self._publish_tip()
@@ -364,7 +362,6 @@ class Observer:
         self._take_in(values)
         if announce or values != old:
             self._publish_channels()
-            self._publish_units()
             before = setting_groups.messages(old)
             for name, thing in setting_groups.messages(values).items():
                 if name in announce or before.get(name) != thing:
