@@ -7,7 +7,7 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 DEV := .venv/.dev
 
-.PHONY: demo demo-drift dev test test-times test-all test-apart test-lowest mutants test-samples test-matrix coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
+.PHONY: demo demo-drift dev test test-times test-all test-slow test-power-cut test-apart test-lowest mutants test-samples test-matrix coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
 .PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift bench-guests soak chaos simulate replay-nights power-cut docs release-check test-plug-ins changelog clean
 .DEFAULT_GOAL := demo
 
@@ -65,9 +65,13 @@ test-times: test
 ## (root, compilers, an hour), has a target of its own, below
 # Fewer at a time than of the quick ones: each starts some ten processes, and more wait longer for each other than they gain
 SLOW_AT_A_TIME ?= 5
-# A power cut is tried alone: the scheduler publishes what a disk has not taken within 0.2 s, which may be lost
-test-all: $(COLLECTED)
+test-all: test-slow test-power-cut
+
+test-slow: $(COLLECTED)
 	@$(PYTEST) -n $(SLOW_AT_A_TIME) --dist worksteal -m slow $(addprefix --ignore ,$(APART) tests/system/hosts $(POWER_CUT))
+
+# A power cut is tried alone: the scheduler publishes what a disk has not taken within 0.2 s, which may be lost
+test-power-cut: $(COLLECTED)
 	@$(PYTEST) $(POWER_CUT)
 
 ## the page, the gateway, clients in other languages, the installed wheel, and each row of the benchmark once

@@ -50,7 +50,7 @@ history = {{ Scan2d = 20 }}
 """
 
 WITNESS = '''
-"""Writes down every scan that it gets, and ends the experiment when it has had all of them."""
+"""Writes down every scan that it gets, and ends the experiment when it has had all and the file `until` is there."""
 
 import threading
 from collections import Counter
@@ -63,9 +63,15 @@ from afspm.client.component import Component
 
 
 class Witness(Component):
-    def __init__(self, scans: int):
+    def __init__(self, scans: int, until: str = ""):
         self.scans = scans
+        self.until = until
         self.seen = Counter()
+        self.free = False
+
+    def end_if_done(self):
+        if self.free and self.seen and min(self.seen.values()) >= self.scans and Path(self.until).exists():
+            self.scope.end_experiment()
 
     def on_scan(self, scan):
         self.seen[scan.channel] += 1
@@ -74,8 +80,11 @@ class Witness(Component):
 
     def on_state(self, status):
         self.log.info("state %s", status.state.name)
-        if status.state is ScopeState.FREE and self.seen and min(self.seen.values()) >= self.scans:
-            self.scope.end_experiment()
+        self.free = status.state is ScopeState.FREE
+        self.end_if_done()
+
+    def on_control(self, control_state):
+        self.end_if_done()
 
 
 class Finisher(Component):

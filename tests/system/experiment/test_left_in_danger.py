@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -62,6 +63,7 @@ class Doctor(Component):
             self.scope.action("x-engage")
             self.scope.set("x-feedback-on", "true")
             self.scope.clear("device-malfunction")
+            Path(__file__).with_name("cleared").touch()
 """
 PARTS = """
 [control]
@@ -98,7 +100,9 @@ def test_tip_left_in_danger_is_retracted_and_blocks_measurements_until_cleared(
     run: Callable[..., AfspmRun], tmp_path: Path, kind: str
 ) -> None:
     (tmp_path / "danger.py").write_text(MODULE, encoding="utf-8")
-    one = run(more=PARTS.format(kind=kind) + DOCTOR, scans=6, speed=60.0)
+    # a busy computer may start the reckless one after the last scan: the run goes on until the doctor has cleared
+    over = f"[witness]\nuntil = {json.dumps(str(tmp_path / 'cleared'))}\n"
+    one = run(more=PARTS.format(kind=kind) + DOCTOR, over=over, scans=6, speed=60.0)
     assert one.end() == 0, one.output
     steps = [  # all of them lines of the scheduler: lines of two processes may be printed in another order
         "x-retract is sent to the microscope, since ",
