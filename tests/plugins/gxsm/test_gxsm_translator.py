@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_until_line
+from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_to_line, scan_until_line
 from tests.plugins.gxsm.raw_clients import client
-from tests.plugins.vendor_bench import FLAT, SHAPE, TURNED, moved, ready, scanned, scans, states
+from tests.plugins.vendor_bench import FLAT, SHAPE, TURNED, Peer, moved, ready, scanned, scans, states
 
 from afspm.model import (
     ControlRequest,
@@ -24,6 +24,7 @@ from afspm.model import (
     ScanLines,
     ScanParameters,
     ScopeState,
+    ScopeStatus,
     Spectrum,
     names,
 )
@@ -634,9 +635,8 @@ def test_scans_repeated_at_the_panel_are_published_one_by_one_and_a_stopped_one_
     found: list[str] = []
     for number in (1, 2, 3):
         received = peer.until(ScopeState.SCANNING)
-        made.at_panel(lambda emulator: scan_until_line(emulator.program, 1))
-        received += peer.until(FREE)
-        assert states(received) == ["SCANNING", "FREE"]
+        received += completed(made, peer)
+        assert set(states(received)) == {"SCANNING", "FREE"}
         assert {Path(scan.filename).name[4:7] for scan in scans(received)} == {f"00{number}"}
         found += [scan.channel for scan in scans(received)]
     assert len(found) == 3 * len(set(found)), "each channel of each scan, once"
@@ -652,6 +652,22 @@ def test_scans_repeated_at_the_panel_are_published_one_by_one_and_a_stopped_one_
     assert not scans(received)
 
 
+def completed(made: Bench, peer: Peer) -> list[Any]:
+    """Complete a held scan, and return the packets up to its end.
+
+    The translator knows complete scans from stopped ones by a poll in mid-scan, which a busy computer may miss: the
+    scan waits for it.
+    """
+    made.at_panel(lambda emulator: scan_to_line(emulator.program, 12))
+    received = peer.until(ScopeStatus(ScopeState.SCANNING, paused=True).__eq__)
+
+    def go_on(emulator: Any) -> None:
+        emulator.program.scan.activity.resume(made.clock.now_s())
+
+    made.at_panel(go_on)
+    return received + peer.until(FREE)
+
+
 def test_scan_restarted_at_once_is_published_as_two(bench: Make) -> None:
     # Stopped and restarted between two polls: the first scan is interrupted, the second complete.
     made = bench(speed=10.0)
@@ -660,7 +676,7 @@ def test_scan_restarted_at_once_is_published_as_two(bench: Make) -> None:
     scanned(peer)
 
     def begin(emulator: Any) -> None:
-        hold_scan(emulator.program, 1)
+        hold_scan(emulator.program, 1, 2)
         emulator.program.start_scan()
 
     made.at_panel(begin)
@@ -680,8 +696,8 @@ def test_scan_restarted_at_once_is_published_as_two(bench: Make) -> None:
     received = peer.until(FREE)
     assert states(received) == ["INTERRUPTED", "FREE"]
     assert not scans(received)
-    received = peer.until(FREE)
-    assert states(received) == ["SCANNING", "FREE"]
+    received = completed(made, peer)
+    assert set(states(received)) == {"SCANNING", "FREE"}
     assert len(scans(received)) == 4
     made.until_logged("its last row still holds the previous scan", "whether this one came to its end is unknown")
 
