@@ -8,6 +8,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Event
 
 import pytest
 from afspm_process import AFSPM
@@ -40,7 +41,7 @@ pixels = [32, 32]
 every = "1 s"
 scans = 3
 end_when_done = true
-parameters = { scan-speed = "1 um/s" }
+parameters = { scan-speed = "10 nm/s" }
 
 [control]
 stopped_by_hand = "pause"
@@ -48,6 +49,8 @@ stopped_by_hand = "pause"
 QUIET_S = 60.0
 """Experiment time in which nothing that acts may be sent."""
 STOP, UP = 1, 0
+LOOKS = 3
+"""Questions for the state of a scan after which the translator has seen it run."""
 
 
 @pytest.fixture
@@ -86,15 +89,35 @@ def scans(client: Client) -> bool:
     return bool(running)
 
 
+def looks(run: AfspmRun) -> int:
+    """Return how often the translator has asked whether a scan runs."""
+    return (run.folder / "controller.trace.jsonl").read_text(encoding="utf-8").count("Scan.StatusGet")
+
+
+def set_speed(client: Client, speed_m_s: float) -> None:
+    """Set the speed of later scans; the time of a line follows."""
+    line_s = 1e-6 / speed_m_s
+    assert client.Scan_SpeedSet(speed_m_s, speed_m_s, line_s, line_s, 1, 1.0)[0] == ""
+
+
+def _until_seen(run: AfspmRun, client: Client) -> None:
+    # a scan that the translator has not seen running may never have begun: how it ended is unknown then
+    pace = Event()
+    while not scans(client):
+        pace.wait(0.05)
+    asked = looks(run)
+    while looks(run) < asked + LOOKS:
+        pace.wait(0.05)
+
+
 def act(run: AfspmRun, do: Callable[[Client], object]) -> None:
-    """Act in the second scan; nothing follows until a person lets the run continue."""
-    run.wait_for("series .*scan 1 of 3")  # at its end
-    with join(run.folder, "watcher") as scope, panel(run) as client:
-        while not scans(client):
-            assert not run.said("scan 2 of 3")
-        # a scan that the translator has not seen running may never have begun: how it ended is unknown then
+    """Act in the first scan, which takes minutes; nothing follows until a person lets the run continue, and faster."""
+    run.wait_for("series is in control")
+    with join(run.folder, "watcher") as scope:
         assert scope.wait_until(lambda: scope.state is ScopeState.SCANNING, timeout_s=DEADLINE_S)
-        do(client)
+        with panel(run) as client:
+            _until_seen(run, client)
+            do(client)
         run.wait_for("at the microscope", "the mode is MANUAL, and nothing is sent to the microscope until")
         assert scope.wait_until(lambda: scope.state is ScopeState.FREE, timeout_s=DEADLINE_S)
         before = sent_by_requests(run)
@@ -102,6 +125,8 @@ def act(run: AfspmRun, do: Callable[[Client], object]) -> None:
         assert sent_by_requests(run) == before
         assert scope.state is ScopeState.FREE
         assert not scope.control_state.problems
+        with panel(run) as client:
+            set_speed(client, 1e-6)
 
 
 def test_nothing_is_sent_after_a_stop_until_a_person_lets_the_run_continue(run: AfspmRun) -> None:

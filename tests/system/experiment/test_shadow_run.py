@@ -13,7 +13,7 @@ import pytest
 from deadlines import DEADLINE_S
 from makers import MAKERS
 from tests.system.experiment.experiment_lab import AfspmRun
-from tests.system.experiment.test_at_the_panel import STOP, UP, panel
+from tests.system.experiment.test_at_the_panel import STOP, UP, panel, set_speed
 
 from afspm.client.connect import join
 from afspm.model import ControlRequest, ScopeState
@@ -66,6 +66,10 @@ def test_shadow_reports_a_persons_night_and_sends_no_command(run: AfspmRun) -> N
         assert scope.wait_until(lambda: scope.state is ScopeState.FREE, timeout_s=DEADLINE_S)
         with panel(run) as person:
             before = person.Bias_Get()[2][0]
+            journal = scope.events("JournalEntries", timeout_s=DEADLINE_S)
+            published = (entry for event in journal for entry in event.message.entries)
+            set_speed(person, 10e-9)  # the scan takes minutes
+            assert any("scan-speed" in entry.what for entry in published)
             person.Scan_Action(0, UP)
             assert scope.wait_until(lambda: scope.state is ScopeState.SCANNING, timeout_s=DEADLINE_S)
             # a detector flags a problem: it is noted, and the person answers by a stop
@@ -74,9 +78,7 @@ def test_shadow_reports_a_persons_night_and_sends_no_command(run: AfspmRun) -> N
             person.Scan_Action(STOP, UP)
             assert scope.wait_until(lambda: scope.state is ScopeState.FREE, timeout_s=DEADLINE_S)
             assert person.Bias_Get()[2][0] == before
-            journal = scope.events("JournalEntries", timeout_s=DEADLINE_S)
             person.Bias_Set(5.0)
-            published = (entry for event in journal for entry in event.message.entries)
             assert any("tip-bias-voltage" in entry.what for entry in published)
     run.process.send_signal(signal.SIGINT)
     run.end()
@@ -87,7 +89,9 @@ def test_shadow_reports_a_persons_night_and_sends_no_command(run: AfspmRun) -> N
     rows = list(csv.DictReader((run.folder / "shadow.csv").read_text(encoding="utf-8").splitlines()))
     assert [(row["kind"], bool(row["person"])) for row in rows if row["afspm"]] == [("problem", True), ("limit", True)]
     assert [row["afspm"].split(":")[0] for row in rows if row["kind"] == "limit"] == ["would have refused this"]
-    assert [row["person"].split(",")[0] for row in rows if not row["afspm"]] == [
+    slowed, *acts = [row["person"].split(",")[0] for row in rows if not row["afspm"]]
+    assert slowed.startswith("set at the microscope: scan-speed = 9.99")
+    assert acts[-3:] == [
         "a scan was begun at the microscope",
         "a scan ended before its last line",
         "set at the microscope: tip-bias-voltage = 5 V (before: 0.100000001490116 V)",
@@ -101,6 +105,7 @@ def test_shadow_reports_a_persons_night_and_sends_no_command(run: AfspmRun) -> N
 
 @pytest.mark.parametrize("run", [LINES], indirect=True, ids=["live lines"])
 def test_detectors_see_the_scans_and_lines_of_a_person(run: AfspmRun) -> None:
+    run.wait_for("waiting for control")
     with join(run.folder, "witness") as scope:
         assert scope.wait_until(lambda: scope.state is ScopeState.FREE, timeout_s=DEADLINE_S)
         lines = scope.events("ScanLines", timeout_s=DEADLINE_S)
