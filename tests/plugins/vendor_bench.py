@@ -41,7 +41,7 @@ from afspm.simulation.emulation.emulator import Emulator
 from afspm.simulation.faults import Fault
 from afspm.supervisor.ports import FreePorts
 
-PATIENT: Mapping[str, Any] = {"reply_timeout_s": 10.0}
+PATIENT: Mapping[str, Any] = {"reply_timeout_s": 120.0}
 """As long as a controller on a busy computer may need to answer."""
 
 SOON: Mapping[str, Any] = {"reply_timeout_s": 2.5}

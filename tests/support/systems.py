@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import psutil
 import pytest
+from deadlines import DEADLINE_S
 
 WINDOWS: Final = sys.platform == "win32"
 WINE: Final = sys.platform == "win32" and hasattr(ctypes.WinDLL("ntdll"), "wine_get_version")
@@ -52,8 +53,8 @@ def interrupt(process: subprocess.Popen[Any]) -> None:
         process.send_signal(signal.SIGINT)
 
 
-def wait_until_gone(pids: dict[str, int], seconds: float) -> None:
+def wait_until_gone(pids: dict[str, int]) -> None:
     """Wait for the end of processes started by others; fail with the names of the remaining ones."""
     processes = {psutil.Process(pid): name for name, pid in pids.items() if psutil.pid_exists(pid)}
-    _, alive = psutil.wait_procs(processes, seconds)
+    _, alive = psutil.wait_procs(processes, DEADLINE_S)
     assert not alive, f"{[processes[process] for process in alive]} live on"

@@ -1,4 +1,4 @@
-"""A controller that is not of the run, which records every byte that anybody sends it."""
+"""A controller that is not of the run, which records every byte that anybody sends it, and patience for busy runs."""
 
 from __future__ import annotations
 
@@ -10,6 +10,16 @@ from contextlib import ExitStack, contextmanager
 from threading import Thread
 
 import pytest
+from deadlines import DEADLINE_S
+
+from afspm.client import connect
+
+
+@pytest.fixture(autouse=True)
+def patient_joining(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let tests join a run whose scheduler is still starting, or busy; some of the terminal's join one that is gone."""
+    if request.path.parent.name != "cli":
+        monkeypatch.setattr(connect, "JOINED_WITHIN_S", DEADLINE_S)
 
 
 class Stranger:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deadlines import DEADLINE_S
 from mcp import Client, MCPError
 from PIL import Image
 from tests.simulation import agent_rig
@@ -147,7 +148,7 @@ def test_tip_is_retracted_after_a_plan_that_failed_with_the_feedback_off(monkeyp
             rig.later(0.1)
             await asyncio.sleep(0.01)
 
-    asyncio.run(asyncio.wait_for(whole(), 30.0))
+    asyncio.run(asyncio.wait_for(whole(), DEADLINE_S))
     assert rig.effects[-1].endswith(" x-retract")
 
 

@@ -208,7 +208,7 @@ def test_program_that_the_seal_keeps_from_starting_is_named(bench: Bench) -> Non
     program.write_text("#!/bin/sh\n")
     program.chmod(0o755)
     command = Seal(str(bench.own), ()).command(python_command("afspm.plugins.bench.sealing"), [str(program)])
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
     assert done.returncode
     assert f"{program} can't be started by a sealed process" in done.stderr
     assert "--read" in done.stderr

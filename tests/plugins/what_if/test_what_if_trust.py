@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import DEADLINE_S
 from tests.plugins.what_if import what_if_lab as lab
 from typer.testing import CliRunner
 
@@ -74,7 +75,9 @@ def refused(received: Received, name: str = "judge") -> str:
 def test_module_in_a_received_folder_is_never_imported(received: Received, tmp_path: Path, place: str) -> None:
     received.launches(**{"class": "own_.Own"})
     command = [sys.executable, "-P", "-m", "afspm", "what-if", str(received.night)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, cwd=tmp_path / place)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=DEADLINE_S, check=False, cwd=tmp_path / place
+    )
     assert done.returncode == INCOMPLETE, done.stderr
     assert "judge was not replayed" in done.stderr
     assert "own_ is not imported: this run is not known as one of yours" in done.stderr

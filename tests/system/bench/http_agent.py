@@ -18,7 +18,7 @@ def ask(method: str, path: str, content: object = None) -> Any:
     )
     request.add_header("Authorization", "Bearer agent:")
     request.add_header("Content-Type", "application/json")
-    with urllib.request.urlopen(request, timeout=60) as answer:
+    with urllib.request.urlopen(request, timeout=480) as answer:
         body = answer.read()
         return json.loads(body) if body else None
 

@@ -125,14 +125,14 @@ def test_a_plan_that_is_aborted_stops_its_scan_and_gives_control_back(scope: Any
         begun.join()
         with contextlib.suppress(RequestAbort):
             engine.abort("enough")
-        assert watcher.wait_until(lambda: watcher.state is ScopeState.FREE, timeout_s=20.0)
-        with watcher.control(timeout_s=20.0):
+        assert watcher.wait_until(lambda: watcher.state is ScopeState.FREE, timeout_s=DEADLINE_S)
+        with watcher.control(timeout_s=DEADLINE_S):
             assert watcher.in_control
     engine(bps.mv(scope.tip_bias_voltage, 0.3))  # and the next plan works
 
 
 def _pause_when_scanning(engine: RunEngine, watcher: afspm.Scope) -> None:
-    assert watcher.wait_until(lambda: watcher.state is ScopeState.SCANNING, timeout_s=60.0)
+    assert watcher.wait_until(lambda: watcher.state is ScopeState.SCANNING, timeout_s=DEADLINE_S)
     engine.request_pause(defer=False)
 
 

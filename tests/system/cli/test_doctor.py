@@ -68,7 +68,7 @@ def test_before_and_while_it_runs_all_is_fine(ports: dict[str, int], tmp_path: P
         assert run.stdout is not None
         try:
             next(line for line in run.stdout if "series is in control" in line)
-            code, told = doctor(tmp_path, listen_s=4.0)  # a supervisor tells every two seconds
+            code, told = doctor(tmp_path, listen_s=10.0)  # a supervisor tells every two seconds
         finally:
             run.terminate()
             run.stdout.read()

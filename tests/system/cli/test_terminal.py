@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -89,10 +90,10 @@ class Running:
 
     def until(self, holds: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         """The status, once something holds of it; each look waits for the scheduler's answer."""
-        for _ in range(40):
-            if holds(told := self.status()):
-                return told
-        raise AssertionError(f"never so: {told}")
+        until_s = time.monotonic() + DEADLINE_S
+        while not holds(told := self.status()):
+            assert time.monotonic() < until_s, f"never so: {told}"
+        return told
 
 
 @pytest.fixture(scope="module")

@@ -68,6 +68,7 @@ class Doctor(Component):
 PARTS = """
 [control]
 grace = "1 s"
+idle = "stay"
 
 [reckless]
 component = true
@@ -134,7 +135,7 @@ def test_tip_is_retracted_at_an_end_with_feedback_off_unless_the_file_forbids_it
         one.process.kill()
     else:
         interrupt(one.process)
-    wait_until_gone(translator, 10.0)
+    wait_until_gone(translator)
     assert engaged(one) is not retract
     if not killed:  # no scheduler is left for the report
         assert one.end() == 130, one.output

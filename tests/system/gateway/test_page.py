@@ -10,10 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import DEADLINE_S
 from tests.system.gateway.gateway_lab import SERIES, GatewayRun
 
 Started = Callable[..., GatewayRun]
 SAMPLE = Path(__file__).parents[3] / "experiments" / "gateway"
+
+DEADLINE_MS = 1000 * DEADLINE_S
 
 
 class _Quiet(SimpleHTTPRequestHandler):
@@ -34,10 +37,10 @@ def test_the_page_shows_each_new_scan(started: Started, browser: Any, served: st
     run = started(SERIES.format(every="2 min", scans=1000), speed=60.0, settings=f'origins = ["{served}"]')
     page = browser.new_page()
     page.goto(f"{served}/page.html?gateway={run.url}")
-    page.wait_for_function("document.querySelector('#scan').naturalWidth == 32", timeout=30_000)
+    page.wait_for_function("document.querySelector('#scan').naturalWidth == 32", timeout=DEADLINE_MS)
     first = page.get_attribute("#scan", "src")
-    page.wait_for_function(f"document.querySelector('#scan').src != '{first}'", timeout=30_000)
-    page.wait_for_function("/is in control/.test(document.querySelector('#state').textContent)", timeout=30_000)
+    page.wait_for_function(f"document.querySelector('#scan').src != '{first}'", timeout=DEADLINE_MS)
+    page.wait_for_function("/is in control/.test(document.querySelector('#state').textContent)", timeout=DEADLINE_MS)
     page.close()
 
 

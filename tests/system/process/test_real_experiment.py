@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import DEADLINE_S
 
 import afspm
 from afspm.basics.clock import ExperimentClock
@@ -127,11 +128,10 @@ def test_component_that_joins_at_the_end_gets_the_signal(experiment: Experiment,
 
 
 def test_a_notebook_joins_by_the_folder_of_the_run(experiment: Experiment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connect, "JOINED_WITHIN_S", 30.0)  # the scheduler may still be starting
     facts = {"name": "x", "guest": guest_facts(experiment.component_launch("some"))}
     (experiment.folder / "run.json").write_text(json.dumps(facts))
     with afspm.connect(experiment.folder) as scope:
-        scans = scope.scan(Region((0.0, 0.0), (1e-6, 1e-6)), shape=(8, 8), timeout_s=60.0)
+        scans = scope.scan(Region((0.0, 0.0), (1e-6, 1e-6)), shape=(8, 8), timeout_s=DEADLINE_S)
         assert scans.first.shape == (8, 8)
         assert scope.state is ScopeState.FREE
         assert scope.set("tip-bias-voltage", 250.0, "mV") == pytest.approx(250.0)
@@ -143,7 +143,7 @@ def test_a_notebook_joins_by_the_folder_of_the_run(experiment: Experiment, monke
             scope.scan(timeout_s=0.5)
         scope.end_experiment()
         with pytest.raises(ExperimentEnded):
-            scope.wait_until(lambda: False, timeout_s=20.0)
+            scope.wait_until(lambda: False, timeout_s=DEADLINE_S)
     experiment.scheduler.exit_code()  # it stays for a moment, to tell those who come late
     monkeypatch.setattr(connect, "JOINED_WITHIN_S", 1.0)
     with pytest.raises(NoResponse, match="the scheduler does not answer"):

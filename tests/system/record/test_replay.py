@@ -78,7 +78,7 @@ def test_notebook_joins_a_replay_and_its_requests_are_refused(
         published = {(packet.envelope, packet.time_ns): bytes(packet.payload) for packet in run.packets()}
     with afspm.connect(tmp_path / "runs") as scope:
         seen = []
-        for event in scope.events("Scan2d", timeout_s=20.0):
+        for event in scope.events("Scan2d", timeout_s=DEADLINE_S):
             seen.append(event)
             if event.message.values[0, 0] == SCANS - 1:
                 break

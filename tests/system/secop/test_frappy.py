@@ -172,13 +172,13 @@ def test_cryostat_and_magnet_are_set_flagged_and_recorded(server: Server, folder
         wait_until(lambda: not scope.control_state.problems)
         assert scope.get("cryo.temperature") == pytest.approx(4.2, abs=3.0)
         # the magnet rounds to 10 mT, and ramps at 1 T/min
-        assert scope.set("cryo.field", "60 mT", wait=True, timeout_s=120) == pytest.approx(60, abs=2)
+        assert scope.set("cryo.field", "60 mT", wait=True, timeout_s=DEADLINE_S) == pytest.approx(60, abs=2)
         with pytest.raises(Refused, match="above the highest allowed, 300 K"):
             scope.set("cryo.temperature", "301 K")
         with pytest.raises(Refused, match="has no unit"):
             scope.set("cryo.temperature", 5.0)
         wait_until(lambda: not scope.control_state.problems)
-        scope.scan(timeout_s=120)
+        scope.scan(timeout_s=DEADLINE_S)
         server.kill()
         wait_until(lambda: no_field in scope.control_state.problems)
         server.start()
