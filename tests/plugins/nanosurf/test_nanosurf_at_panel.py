@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from deadlines import DEADLINE_S
-from tests.plugins.by_hand import act_all_to_their_end, acts, set_all
+from tests.plugins.by_hand import act_all_to_their_end, acts, set_all, until_act
 from tests.plugins.nanosurf.nanosurf_bench import Bench
 from tests.plugins.vendor_bench import TURNED, Peer, moved, ready, scans, small, states
 
@@ -22,9 +22,9 @@ from afspm.translator.result_files import SCAN
 
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE
-LINES = 4096
+LINES = 1024
 LINE_S = 50.0
-"""A line of 0.5 s of real time: the scan outlasts the deadline of any test by far."""
+"""A line of 0.5 s of real time: the scan, of nine minutes, outlasts the deadline of any test."""
 IS_SCANNING = (b"return root.workflow.imaging.is_scanning(), 0", b"return afspm_seen.scanning, afspm_seen.started")
 ACTING = (b"imaging.start()", b"imaging.stop()", b"move_to", b"approach", b"withdraw", b"acquire", b"_set(", b"put(")
 """Parts of the scripts that do something."""
@@ -82,6 +82,8 @@ def slow_scan(made: Bench, **settings: Any) -> tuple[Peer, Scripts]:
     scripts = Scripts(made)
     assert peer.act(names.START_SCAN).ok
     scripts.until_lines_are_seen()
+    # the emulated Studio answers nothing while it waits for the lines of a stopped scan to be computed
+    until(made, lambda: made.emulator.rig.scan is not None and not made.emulator.rig.scan.drawing)
     return peer, scripts
 
 
@@ -170,13 +172,14 @@ def test_scan_whose_frame_was_changed_meanwhile_is_interrupted(bench: Make, path
     peer, _ = slow_scan(made)
     made.at_panel(partial(put, path=path, value=value))
     made.until_logged("this scan will not be published: its frame was changed at Studio's panel")
+    before = until_act(peer)  # all values are read less often than the frame
 
     def end(emulator: Any) -> None:
         scan = emulator.program.rig.scan
         scan.paused_s = emulator.program.now_s - scan.start_s - LINES * LINE_S  # its lines are complete
 
     made.at_panel(end)
-    received = peer.until(FREE)
+    received = before + peer.until(FREE)
     assert states(received) == ["SCANNING", "INTERRUPTED", "FREE"]
     assert set(acts(received)) <= {PanelAct.VALUES, PanelAct.STOP}
     assert PanelAct.VALUES in acts(received)
