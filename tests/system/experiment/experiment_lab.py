@@ -46,7 +46,7 @@ scans = {scans}
 
 # scans come twice a second: a component that is being restarted misses more than the last of them
 [cache]
-history = {{ Scan2d = 20 }}
+history = {{ Scan2d = 100 }}
 """
 
 WITNESS = '''
@@ -60,6 +60,31 @@ import psutil
 
 from afspm.model import ScopeState
 from afspm.client.component import Component
+from afspm.components.planned_scans import ScanSeries
+
+
+class LastingSeries(ScanSeries):
+    """Takes scans until the file `enough` is there, and ends the experiment once the witness has them all."""
+
+    def __init__(self, enough: str, **series):
+        super().__init__(**series)
+        self.enough = Path(enough)
+
+    def _await(self, step, rhythm):
+        is_begun = step.index in (0, self.memory.get("begun"))
+        return (is_begun or not self.enough.exists()) and super()._await(step, rhythm)
+
+    def run(self):
+        super().run()
+        taken = self.memory["done"]
+        (self.run_dir / "taken.txt").write_text(str(taken))
+        while min(self.witnessed().values(), default=0) < taken:
+            self.scope.sleep(1.0)
+        self.scope.end_experiment()
+
+    def witnessed(self):
+        file = self.run_dir / "witnessed.txt"
+        return Counter(line.split("|")[0] for line in file.read_text().splitlines()) if file.exists() else Counter()
 
 
 class Witness(Component):
@@ -120,12 +145,30 @@ class Late(Component):
 '''
 
 
+def lasting(folder: Path) -> str:
+    """Return an overlay: the series takes scans until the file `enough` is in the folder.
+
+    For tests in which something has to happen while the scans go on, however slow the computer is.
+    """
+    return f'[series]\nclass = "witness.LastingSeries"\nenough = {json.dumps(str(folder / "enough"))}\n'
+
+
 class AfspmRun(AfspmProcess):
     """A running `afspm run`, and its run folder."""
 
     def facts(self) -> dict[str, Any]:
         facts: dict[str, Any] = json.loads((self.folder / "run.json").read_text(encoding="utf-8"))
         return facts
+
+    def end_lasting(self) -> int:
+        """Let the series of a `lasting` run end; return how many scans were taken, with those of a tip's repair."""
+        (self.folder.parents[1] / "enough").touch()
+        assert self.end() == 0, self.output
+        with afspm.open_run(self.folder) as record:
+            rows = record.scans.where(lambda row: not row.interrupted)
+        of_series = [row for row in rows if row.holder != "tip_corrector"]
+        assert len(of_series) == int((self.folder / "taken.txt").read_text()), self.output
+        return len(rows)
 
     def witnessed(self) -> Counter[tuple[str, ...]]:
         """Return each (channel, time, file) that the witness received, with its number of times."""

@@ -8,7 +8,13 @@ from pathlib import Path
 import pytest
 from deadlines import DEADLINE_S
 from systems import can_interrupt, interrupt
-from tests.system.experiment.experiment_lab import AfspmRun, Run, require_each_once, require_each_row_once
+from tests.system.experiment.experiment_lab import (
+    AfspmRun,
+    Run,
+    lasting,
+    require_each_once,
+    require_each_row_once,
+)
 
 from afspm.client.connect import connect
 from afspm.model import ScopeState
@@ -35,47 +41,46 @@ class = "Metadata"
 """
 # without the processor time of other processes a frozen step is detected by its limit alone
 FROZEN = "no heartbeat|it is frozen" if sys.platform == "win32" else "no heartbeat"
-# the series last: what else is still being restarted has caught up when it has taken its last scan
 EACH = ("recorder", "metadata", "tip_classifier", "tip_corrector", "microscope", "scheduler", "series")
 
 
-def test_each_scan_is_taken_once_when_each_process_is_killed_in_turn(run: Run) -> None:
+def test_each_scan_is_taken_once_when_each_process_is_killed_in_turn(run: Run, tmp_path: Path) -> None:
     """While scanning, and between scans."""
-    one = run(more=MORE + QUICK, scans=40)
-    one.wait_for("scan 1 of 40")
+    one = run(more=MORE + QUICK, over=lasting(tmp_path), scans=1000)
+    one.wait_for("scan 1 of 1000")
     for times, state in ((2, "SCANNING"), (3, "FREE")):
         for name in EACH:
             one.wait_for_next(" witness ", f"state {state}")
             one.kill(name)
             one.wait_up(name, times)
-    assert one.end() == 0, one.output
-    require_each_once(one, 40)
-    require_each_row_once(one, 40)
+    scans = one.end_lasting()
+    require_each_once(one, scans)
+    require_each_row_once(one, scans)
     for name in EACH:
         one.wait_for(f"{name} was restarted twice")
 
 
-def test_each_scan_is_taken_once_when_a_frozen_process_is_replaced(run: Run) -> None:
-    one = run(more=QUICK, scans=10)
-    one.wait_for("scan 2 of 10")
+def test_each_scan_is_taken_once_when_a_frozen_process_is_replaced(run: Run, tmp_path: Path) -> None:
+    one = run(more=QUICK, over=lasting(tmp_path), scans=1000)
+    one.wait_for("scan 2 of 1000")
     for name in ("microscope", "scheduler", "series"):
         one.wait_for_next(" witness ", "state SCANNING")
         one.freeze(name)
         one.wait_for(f" {name} ", FROZEN)
         one.wait_up(name, times=2)
-    assert one.end() == 0, one.output
-    require_each_once(one, 10)
+    require_each_once(one, one.end_lasting())
 
 
-def test_each_scan_is_taken_once_when_all_processes_are_killed_at_once(run: Run) -> None:
-    one = run(more=MORE + QUICK, scans=5)
-    one.wait_for("scan 2 of 5")
+def test_each_scan_is_taken_once_when_all_processes_are_killed_at_once(run: Run, tmp_path: Path) -> None:
+    one = run(more=MORE + QUICK, over=lasting(tmp_path), scans=1000)
+    one.wait_for("scan 2 of 1000")
     one.wait_for_next(" witness ", "state SCANNING")
     for name in EACH:
         one.kill(name)
-    assert one.end() == 0, one.output
-    require_each_once(one, 5)
-    require_each_row_once(one, 5)
+    one.wait_up("series", times=2)
+    scans = one.end_lasting()
+    require_each_once(one, scans)
+    require_each_row_once(one, scans)
 
 
 def test_process_that_dies_or_freezes_at_the_end_is_restarted_to_finish(run: Run) -> None:
@@ -110,7 +115,7 @@ begun = '{tmp_path / "late has begun.txt"}'
     assert (one.folder / "late has them all.txt").exists(), one.output
 
 
-def test_experiment_ends_although_a_component_always_crashes(run: Run) -> None:
+def test_experiment_ends_although_a_component_always_crashes(run: Run, tmp_path: Path) -> None:
     more = """
 [hopeless]
 component = true
@@ -120,10 +125,9 @@ command = ["python", "-c", "raise SystemExit('no hope')"]
 [restart]
 budget = 2
 """
-    one = run(more=more)
-    assert one.end() == 0, one.output
-    require_each_once(one, 4)
+    one = run(more=more, over=lasting(tmp_path), scans=1000)
     one.wait_for("CRITICAL gave up hopeless; the rest goes on")
+    require_each_once(one, one.end_lasting())
     one.wait_for("hopeless was GIVEN UP")
 
 

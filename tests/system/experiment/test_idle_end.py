@@ -38,7 +38,7 @@ def notified(file: Path) -> list[str]:
 def test_run_with_a_finished_series_ends_like_an_announced_end(run: Run, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     calls = tmp_path / "calls.jsonl"
-    one: AfspmRun = run("--without", "witness", more=DRAWN + NOTIFY.format(file=str(calls)), scans=2)
+    one: AfspmRun = run("--without", "witness", more=DRAWN + NOTIFY.format(file=calls.as_posix()), scans=2)
     assert one.end() == 3, one.output
     assert one.facts()["how"] == "plans_done"
     assert 10.0 < one.facts()["real_s"] < 300.0
@@ -51,7 +51,7 @@ def test_run_with_a_finished_series_ends_like_an_announced_end(run: Run, tmp_pat
 def test_run_with_its_only_plan_given_up_ends_and_can_be_resumed(run: Run, afspm_run: Run, tmp_path: Path) -> None:
     (tmp_path / "rough.py").write_text(ROUGH, encoding="utf-8")
     calls = tmp_path / "calls.jsonl"
-    over = '[series]\nclass = "rough.Rough"\n' + NOTIFY.format(file=str(calls))
+    over = '[series]\nclass = "rough.Rough"\n' + NOTIFY.format(file=calls.as_posix())
     one: AfspmRun = run("--without", "witness", over=over)
     assert one.end() == 4, one.output
     assert one.facts()["how"] == "plans_lost"
@@ -65,8 +65,9 @@ def test_run_with_its_only_plan_given_up_ends_and_can_be_resumed(run: Run, afspm
 
 def test_a_run_in_manual_mode_does_not_end(run: Run) -> None:
     one: AfspmRun = run("--without", "witness", more='[control.roles]\nend_experiment = ["series"]\n', scans=1)
-    one.wait_for("series .*scan 1")
-    with afspm.connect(one.folder) as scope:
+    one.wait_up("scheduler", 1)
+    with afspm.connect(one.folder) as scope:  # joined before: the run ends ten seconds after the series
+        one.wait_for("series .*scan 1")
         scope.set_mode(ControlMode.MANUAL)
         one.wait_for("the experiment goes on as long as it is in use: the mode is MANUAL")
         scope.set_mode(ControlMode.AUTOMATED)

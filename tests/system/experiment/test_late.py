@@ -174,9 +174,10 @@ solved_by_hand = ["tip-shape-changed"]
 """
 )
 JUDGE = """
-import threading
+from contextlib import suppress
 
 from afspm import Component
+from afspm.basics.errors import ExperimentEnded
 
 
 class Judge(Component):
@@ -184,7 +185,8 @@ class Judge(Component):
 
     def on_scan(self, scan):
         if scan.time_ns >= self.memory.setdefault("last_ns", scan.time_ns) + 3_300_000_000_000:
-            threading.Event().wait(1.2)  # the series ends the experiment meanwhile
+            with suppress(ExperimentEnded):  # by the series
+                self.scope.wait_until(lambda: False)
             self.scope.flag("tip-shape-changed")
 """
 

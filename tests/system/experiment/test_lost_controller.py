@@ -15,7 +15,7 @@ TIMED = sorted(name for name, maker in MAKERS.items() if maker.takes("reply_time
 SCANS = 3
 OVERLAY = """
 [clock]
-speed = 30.0
+speed = 10.0
 
 [control]
 malfunction_after = "0.2 s"

@@ -63,10 +63,11 @@ def require_each_once(one: AfspmRun, targets: int, said: str = "") -> None:
 
 def test_survey_measures_each_target_once_over_kills_and_tip_repairs(afspm_run: Run, tmp_path: Path) -> None:
     one = afspm_run(str(SAMPLE), overlay(tmp_path, FEWER + SLOWER + BY_HAND), "--runs", str(tmp_path / "runs"))
-    one.wait_for("survey .*4 targets found")
-    one.kill("survey")
-    one.wait_for("target 1 of 4 .*measured")
-    with afspm.connect(one.folder, name="person") as scope:
+    one.wait_up("scheduler", 1)
+    with afspm.connect(one.folder, name="person") as scope:  # joined before: a target takes seconds
+        one.wait_for("survey .*4 targets found")
+        one.kill("survey")
+        one.wait_for("target 1 of 4 .*measured")
         scope.flag("tip-shape-changed")
         one.wait_for("survey .*waiting for control")
         one.kill("survey")
@@ -142,8 +143,9 @@ def test_zooms_outside_limits_are_refused_in_the_table_and_an_early_end_leaves_t
 def test_survey_with_a_bad_tip_ends_with_its_results_so_far(afspm_run: Run, tmp_path: Path) -> None:
     ends = '[control]\nend_on = ["tip-shape-changed"]\n'
     one = afspm_run(str(SAMPLE), overlay(tmp_path, FEWER + SLOWER + ends), "--runs", str(tmp_path / "runs"))
-    one.wait_for("target 2 of 4 .*measured")
+    one.wait_up("scheduler", 1)
     with suppress(ExperimentEnded), afspm.connect(one.folder, name="classifier") as scope:
+        one.wait_for("target 2 of 4 .*measured")
         scope.flag("tip-shape-changed")
     assert one.end() == 0, one.output
     assert outcomes(one.folder)[:2] == ["measured", "measured"]

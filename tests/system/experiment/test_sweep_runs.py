@@ -14,7 +14,7 @@ from afspm.record import report
 SAMPLE = Path(__file__).parents[3] / "experiments" / "sweep" / "experiment.toml"
 FEWER = """
 [clock]
-speed = 60.0
+speed = 20.0
 [sweep]
 pixels = [32, 32]
 order = "random"

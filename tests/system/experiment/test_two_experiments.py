@@ -8,7 +8,7 @@ import socket
 from pathlib import Path
 
 import pytest
-from tests.system.experiment.experiment_lab import AfspmRun, Run
+from tests.system.experiment.experiment_lab import AfspmRun, Run, lasting
 
 import afspm
 from afspm.basics.errors import ConfigError
@@ -41,12 +41,12 @@ def test_second_experiment_on_the_same_ports_ends_at_once_and_leaves_the_first_r
     run: Run, tmp_path: Path
 ) -> None:
     where = addresses()
-    first = run(over=where, scans=30)
+    first = run(over=where + lasting(tmp_path), scans=1000)
     first.wait_for("series .*scan 1")
-    second = run(over=where, scans=30, where=tmp_path)
+    second = run(over=where, scans=1000, where=tmp_path)
     assert "another program listens at tcp://127.0.0.1:" in refused(second)
     assert len(list((tmp_path / "runs").glob("*-*/run.json"))) == 1
-    assert first.end() == 0, first.output
+    first.end_lasting()
     assert set(first.witnessed().values()) == {1}
 
 
@@ -58,7 +58,7 @@ def test_port_of_another_program_ends_the_run_too(run: Run) -> None:
 
 def test_request_for_another_run_is_refused(run: Run, tmp_path: Path) -> None:
     """A notebook whose run has ended finds another experiment at the same address."""
-    first = run(over=addresses(), scans=6)
+    first = run(over=addresses() + lasting(tmp_path), scans=1000)
     first.wait_for("series .*scan 1")
     facts = first.facts()
     assert facts["run"] == facts["guest"]["run"]
@@ -71,4 +71,4 @@ def test_request_for_another_run_is_refused(run: Run, tmp_path: Path) -> None:
         scope.get("scan-speed")
     with afspm.connect(first.folder, "another") as scope:
         assert scope.get("scan-speed")
-    assert first.end() == 0, first.output
+    first.end_lasting()

@@ -121,7 +121,7 @@ def test_garbage_from_strangers_is_answered_or_ignored(run: Any, seed: int) -> N
             stranger.send_multipart(frames)
             if is_request:
                 asked += 1
-                assert stranger.poll(1000 * DEADLINE_S), frames
+                assert stranger.poll(int(1000 * DEADLINE_S)), frames
                 assert stranger.recv_multipart()[1][0] in range(13)
                 answered += 1
     assert answered == asked > 1000
