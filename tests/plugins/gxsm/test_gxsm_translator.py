@@ -612,6 +612,9 @@ def test_the_approach_is_a_coarse_motor(bench: Make) -> None:
 
 # --- at the panel ---
 
+RESULT_S = 600.0
+"""A minute of real time: a busy computer takes more than eight seconds to read all files of a scan."""
+
 
 @pytest.mark.parametrize(
     ("kind", "saving"),
@@ -623,7 +626,7 @@ def test_scans_repeated_at_the_panel_are_published_one_by_one_and_a_stopped_one_
 ) -> None:
     # GXSM never stops scanning: the next scan runs already.
     made = bench(speed=10.0, **kind)
-    peer = made.start(saving=saving)
+    peer = made.start(saving=saving, result_timeout_s=RESULT_S)
     ready(peer, shape=(24, 32))
 
     def begin(emulator: Any) -> None:
@@ -671,7 +674,7 @@ def completed(made: Bench, peer: Peer) -> list[Any]:
 def test_scan_restarted_at_once_is_published_as_two(bench: Make) -> None:
     # Stopped and restarted between two polls: the first scan is interrupted, the second complete.
     made = bench(speed=10.0)
-    peer = made.start()
+    peer = made.start(result_timeout_s=RESULT_S)
     ready(peer, shape=(24, 32))
     scanned(peer)
 
