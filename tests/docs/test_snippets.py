@@ -55,6 +55,7 @@ def snippets(page: Path) -> list[Snippet]:
     return [Snippet(m[1], m[2], text[: m.start()].count("\n") + 2) for m in BLOCK.finditer(text)]
 
 
+@pytest.mark.timeout(4 * DEADLINE_S)  # a page has up to twenty commands; each has a deadline of its own
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_snippet_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connect, "JOINED_WITHIN_S", DEADLINE_S)  # of a run that a busy computer is still starting
