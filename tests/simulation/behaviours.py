@@ -159,6 +159,16 @@ class Crasher(Experiment):
             self.kill(0 if self.timeline.chance(0.3) else -11)
 
 
+class Freezer(Experiment):
+    """Gets control, and freezes in its block each time; it is killed and restarted."""
+
+    def behave(self) -> Doing:
+        while not (yield from self.regain(Problem.NONE)):
+            pass
+        self.freeze(1e6)
+        yield 0.0
+
+
 class Careless(Experiment):
     """Switches the feedback off for a measurement, and sometimes disappears before it switches the feedback on.
 

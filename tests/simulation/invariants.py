@@ -23,6 +23,7 @@ from afspm.model import (
     names,
 )
 from afspm.scheduler.control.arbitration import ArbitrationState
+from afspm.scheduler.control.holder_timeout import MOST_RESTARTS
 from afspm.scheduler.events import (
     Disconnected,
     Effect,
@@ -89,6 +90,8 @@ class Invariants:
         self._holder: str | None = None
         self._held_since_s = 0.0
         self._absent_since_s: dict[str, float | None] = {}
+        self._tenure: tuple[str | None, int, int] = (None, 0, 0)
+        self._restarts = 0
         self._idle_since_ns: int | None = None
         self._used_ns = 0
         self._last_ns = -1
@@ -164,6 +167,7 @@ class Invariants:
         self._panel(host, event, effects)
         self._control(host)
         self._presence(host)
+        self._restarted(host)
         self._lease(host)
         self._answered_in_time(host)
 
@@ -231,6 +235,20 @@ class Invariants:
         since_s = max(absent_since_s, self._held_since_s, host.since_s)
         self._must(
             now_s - since_s <= allowed_s, f"{holder} has been dead for {now_s - since_s:.1f} s and is in control"
+        )
+
+    def _restarted(self, host: SchedulerHost) -> None:
+        # a component that freezes in its block each time does not keep the others out for ever
+        holder = host.core.control.holder
+        starts = next((one.starts for one in self.components if one.name == one.identity == holder), 0)
+        (*tenure, before), self._tenure = self._tenure, (holder, host.life, starts)
+        if [holder, host.life] != tenure:
+            self._restarts = 0
+        elif self._microscope.alive and self._microscope.state is ScopeState.FREE:
+            self._restarts += starts - before
+        # the first report may come a restart late, and the last one a restart after it
+        self._must(
+            self._restarts <= MOST_RESTARTS + 2, f"{holder} was restarted {self._restarts} times, and is in control"
         )
 
     def _lease(self, host: SchedulerHost) -> None:

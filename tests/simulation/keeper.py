@@ -55,7 +55,7 @@ class Keeper:
     def states(self) -> tuple[ProcessState, ...]:
         """Return the states of all processes, with the fields that decisions use."""
         return tuple(
-            ProcessState(process.name, "", _OVER.get(watch.phase, ProcessCondition.ALIVE), 0, starts=process.life)
+            ProcessState(process.name, "", _OVER.get(watch.phase, ProcessCondition.ALIVE), 0, starts=process.starts)
             for process, watch in self._children.values()
         )
 

@@ -62,6 +62,7 @@ CAST = {
     "adjuster": behaviours.Adjuster,
     "forgetful": behaviours.Forgetful,
     "babbler": behaviours.Babbler,
+    "freezer": behaviours.Freezer,
 }
 _TROUBLE = (
     "greedy",
@@ -74,6 +75,7 @@ _TROUBLE = (
     "adjuster",
     "forgetful",
     "babbler",
+    "freezer",
 )
 _ALWAYS = ("experiment", "classifier", "corrector", "feedback", "person")
 _PEOPLE = ("operator", "person", "dawn")
@@ -146,7 +148,8 @@ class Plan:
 def plan(seed: int, hours: float = 8.0) -> Plan:
     """Return the night of a seed: from a quiet one to one with nearly all faults."""
     chance = SimulatedTime(seed * 7919 + 1).random
-    others = [name for name in CAST if name not in _ALWAYS]
+    # the freezer is in no drawn night, where it would keep the others out for most of the time
+    others = [name for name in CAST if name not in (*_ALWAYS, "freezer")]
     lease_s = chance.choice((None, 900.0, 1800.0))
     cast = [*_ALWAYS, *(name for name in others if chance.random() < 0.5)]
     if lease_s is None and "greedy" in cast:
@@ -211,6 +214,7 @@ FINDERS = [
         # they end while the tip is in danger, the first while the translator does not answer
         for faults in ((Fault("freeze", "translator", 0.98, 14.0),), ())
     ),
+    Plan(6, 5.0, cast=("experiment", "freezer"), lease_s=None),
 ]
 """The nights in which all mutants of the scheduler are found, those that find most first.
 

@@ -94,6 +94,10 @@ def no_lease(patch: Patch) -> None:
     patch.setattr(Lease, "deadline_ns", lambda self, is_free: None)
 
 
+def restarts_of_the_holder_are_not_counted(patch: Patch) -> None:
+    patch.setattr(Lease, "is_restarted_too_often", lambda self, starts: False)
+
+
 def no_holder_is_ever_dead(patch: Patch) -> None:
     patch.setattr(HolderTimeout, "dead_at_s", lambda self, *args: None)
 
@@ -401,6 +405,7 @@ MUTANTS = [
     any_component_commands,
     the_dead_keep_control,
     no_lease,
+    restarts_of_the_holder_are_not_counted,
     no_holder_is_ever_dead,
     an_impostor_is_let_in,
     ids_are_forgotten,

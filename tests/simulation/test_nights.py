@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from rotation import ALL, rotated
 
 from afspm.model import ProcessCondition
+from afspm.scheduler.control.holder_timeout import MOST_RESTARTS
 from tests.simulation import long_run
+from tests.simulation.behaviours import Experiment
 from tests.simulation.night import CAST, FAULTS, FINDERS, PANEL_NIGHTS, Fault, Night, Plan, panel_night, plan
 
 _ALIVE = ProcessCondition.ALIVE
@@ -76,6 +78,14 @@ def test_ended_component_loses_control_as_soon_as_its_supervisor_reports() -> No
             over_s = min(over_s, night.timeline.monotonic_s())
             assert night.timeline.monotonic_s() - over_s < night.settings.control.grace_s / 2.0
     assert over_s < math.inf
+
+
+def test_component_that_freezes_in_control_each_time_lets_another_measure() -> None:
+    night = Night(Plan(seed=6, hours=5.0, cast=("experiment", "freezer"), lease_s=None))
+    night.run()
+    assert night.components["freezer"].starts > MOST_RESTARTS
+    assert isinstance(experiment := night.components["experiment"], Experiment)
+    assert experiment.done
 
 
 def test_long_run_prints_its_outcome(capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,6 +20,7 @@ from afspm.model import (
 from afspm.scheduler.control import control_change
 from afspm.scheduler.control.arbitration import ArbitrationEvent, ArbitrationState, ControlInput
 from afspm.scheduler.control.control_change import TRANSLATOR
+from afspm.scheduler.control.holder_timeout import MOST_RESTARTS
 from afspm.scheduler.coordinate_frame import (
     TIP_FRAME,
     AskMicroscope,
@@ -70,6 +71,7 @@ from afspm.scheduler.state import Environment, SchedulerState, StateDraft, resto
 from afspm.wire.messages import JOURNAL
 
 _MALFUNCTION = Problem.DEVICE_MALFUNCTION
+_SICK = "it crashes in its block each time, or does something there that takes longer than its longest_step_s"
 _AT_ONCE_S = 0.0  # in real monotonic time: always past
 
 
@@ -105,6 +107,7 @@ def due_s(state: SchedulerState) -> float | None:
         _entries_due_s(state),
         _holder_dead_at_s(state),
         _lease_ends_at_s(state),
+        _AT_ONCE_S if _is_restarted_too_often(state) else None,
     )
     return min((one_s for one_s in dues if one_s is not None), default=None)
 
@@ -388,6 +391,11 @@ def _handle_deadlines(draft: StateDraft) -> None:
             return
     if (holder := draft.control.holder) is not None and _is_due(_holder_dead_at_s(draft), draft.now_s):
         control_change.decide(draft, ControlInput(ArbitrationEvent.DEAD, holder))
+    elif holder is not None and _is_restarted_too_often(draft):
+        draft.log(
+            "ERROR", f"{holder} was restarted {MOST_RESTARTS} times without giving control back, and loses it: {_SICK}"
+        )
+        control_change.decide(draft, ControlInput(ArbitrationEvent.DEAD, holder))
     lease_ns = draft.lease.deadline_ns(is_free=draft.microscope.is_free)
     is_idle = (lease_ns is not None and draft.now_ns >= lease_ns) or _is_due(_lease_ends_at_s(draft), draft.now_s)
     if (holder := draft.control.holder) is not None and is_idle:
@@ -450,6 +458,14 @@ def _holder_dead_at_s(state: SchedulerState | StateDraft) -> float | None:
         return None
     dead_at_s = state.peers.dead_at_s(holder)
     return dead_at_s if dead_at_s is None or told_at_s is None else max(dead_at_s, told_at_s)
+
+
+def _is_restarted_too_often(state: SchedulerState | StateDraft) -> bool:
+    # not during a scan, which a restarted component waits for and keeps
+    holder = state.control.holder
+    if holder is None or state.barrier.until_s is not None or not state.microscope.is_free:
+        return False
+    return state.lease.is_restarted_too_often(state.peers.supervisors.starts_of(component_of(holder)))
 
 
 def _lease_ends_at_s(state: SchedulerState | StateDraft) -> float | None:

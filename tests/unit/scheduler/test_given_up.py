@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 from tests.unit.scheduler.logic_lab import Lab, killed, published
 
-from afspm.model import ControlRequest, ProcessCondition, ProcessState
+from afspm.model import ControlRequest, ProcessCondition, ProcessState, ScopeState
+from afspm.scheduler.control.holder_timeout import MOST_RESTARTS
 from afspm.scheduler.control.supervisor_registry import SILENT_S
-from afspm.scheduler.events import TranslatorCaughtUp, TranslatorUp
+from afspm.scheduler.events import Tick, TranslatorCaughtUp, TranslatorUp
 from afspm.scheduler.settings import SchedulerSettings
 
 ALIVE, RESTARTING = ProcessCondition.ALIVE, ProcessCondition.RESTARTING
@@ -86,6 +87,26 @@ def test_holder_restarted_by_order_that_ends_again_loses_control_again(lab: Lab)
         lab.is_gone("series")
         lab.tell(state(GIVEN_UP, starts=starts))
         assert lab.holder is None
+
+
+def test_holder_restarted_again_and_again_loses_control_once_the_microscope_is_free(lab: Lab) -> None:
+    lab.scope_is(ScopeState.SCANNING)
+    for starts in range(2, MOST_RESTARTS + 2):
+        assert lab.holder == "series"
+        lab.tell(state(ALIVE, starts=starts))
+    assert lab.holder == "series"  # a restarted component waits for its scan, and keeps it
+    lab.scope_is(ScopeState.FREE)
+    lab.step(Tick())
+    assert lab.holder is None
+
+
+def test_restarts_before_control_was_given_do_not_count(lab: Lab) -> None:
+    lab.tell(state(ALIVE, starts=MOST_RESTARTS))
+    lab.ask("series", ControlRequest.RELEASE_CTRL)
+    lab.take_control("series")
+    for starts in range(MOST_RESTARTS, 2 * MOST_RESTARTS):
+        lab.tell(state(ALIVE, starts=starts))
+        assert lab.holder == "series"
 
 
 def test_holder_moved_to_another_computer_stays_in_control(lab: Lab) -> None:

@@ -1,4 +1,4 @@
-"""Timeouts of the holder of control: a lease for an idle holder, a grace period for a disconnected holder."""
+"""Limits of the holder of control: a lease if it is idle, a grace period if disconnected, a number of restarts."""
 
 from __future__ import annotations
 
@@ -7,6 +7,12 @@ from dataclasses import dataclass
 
 from afspm.basics.frozen import replace
 from afspm.model.sessions import SessionTable
+
+MOST_RESTARTS = 3
+"""Restarts of the holder's process, since it was granted control, after which control is revoked.
+
+Each restart is within the grace period, so nothing else bounds how long a component that freezes in its block each time
+keeps the others out. One or two restarts are worth their continuation: the measurement so far is kept."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +28,8 @@ class Lease:
         asked_s: longest idle time that the holder requested, real; None: no such request.
         token: the session token of the process that was granted control.
         announced: the holder named last in the log.
+        starts: how often the holder's process had been started when its supervisor first reported it in control; None:
+            no report yet. Lost at a restart of the scheduler, from which on restarts are then counted.
     """
 
     lease_ns: int | None = None
@@ -31,6 +39,7 @@ class Lease:
     idle_since_ns: int = 0
     asked_s: float | None = None
     idle_since_s: float = 0.0
+    starts: int | None = None
 
     def held_by(self, holder: str | None, now_ns: int) -> Lease:
         """Register the holder; a new holder starts without idle time and without a requested lease.
@@ -38,7 +47,9 @@ class Lease:
         Args:
             holder: the component in control; None: no component.
         """
-        return self if holder == self.holder else replace(self, holder=holder, idle_since_ns=now_ns, asked_s=None)
+        if holder == self.holder:
+            return self
+        return replace(self, holder=holder, idle_since_ns=now_ns, asked_s=None, starts=None)
 
     def used(self, now_ns: int) -> Lease:
         """Restart the idle time in experiment time: the microscope began or ended an activity."""
@@ -51,6 +62,18 @@ class Lease:
     def asked(self, lease_s: float | None, now_s: float) -> Lease:
         """Begin or renew the lease that the holder requests; None: end it."""
         return replace(self, asked_s=lease_s, idle_since_s=now_s)
+
+    def reported(self, starts: int | None) -> Lease:
+        """Register the number of starts of the holder's process; only the first since it got control counts."""
+        return self if self.holder is None or self.starts is not None else replace(self, starts=starts)
+
+    def is_restarted_too_often(self, starts: int | None) -> bool:
+        """Return whether the holder's process was restarted `MOST_RESTARTS` times since it got control.
+
+        Args:
+            starts: number of starts of the process by now; None: no supervisor reports it.
+        """
+        return starts is not None and self.starts is not None and starts - self.starts >= MOST_RESTARTS
 
     def asked_until_s(self) -> float | None:
         """Return the real time at which the lease requested by the holder expires; None without such a lease."""

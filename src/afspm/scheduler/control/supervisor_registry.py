@@ -94,6 +94,11 @@ class SupervisorRegistry:
         known = self.supervisors.get(supervisor)
         return known.states if known is not None else ()
 
+    def starts_of(self, process: str) -> int | None:
+        """Return how often a process has been started, by the newest report about it; None without a report."""
+        newest = reversed(list(self.supervisors.values()))
+        return next((state.starts for one in newest for state in one.states if state.name == process), None)
+
     def over_since_s(self, process: str) -> float | None:
         """Return the real time since which a process has ended for good.
 

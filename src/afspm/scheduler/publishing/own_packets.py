@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from afspm import wire
 from afspm.basics.frozen import replace
-from afspm.model import HAS_ENDED, ControlResponse, ProcessStates, ResponseDetail
+from afspm.model import HAS_ENDED, ControlResponse, ProcessStates, ResponseDetail, component_of
 from afspm.scheduler.control.arbitration import may
 from afspm.scheduler.control.supervisor_registry import SupervisorRegistry, announcement
 from afspm.scheduler.events import Publish, RequestIn
@@ -65,6 +65,8 @@ def _take_report(draft: StateDraft, supervisor: str, report: ProcessStates) -> N
     speed = float(draft.env.settings.run.clock.get("speed", 1.0))
     compared, warning = reported.clock_compared(supervisor, report.time_ns, draft.now_ns, speed)
     _replace_supervisors(draft, compared)
+    if (holder := draft.control.holder) is not None:
+        draft.lease = draft.lease.reported(compared.starts_of(component_of(holder)))
     if warning:
         draft.log("WARNING", warning)
 

@@ -52,6 +52,7 @@ class Process:
         sockets: connections from other processes, including broken connections not yet noticed.
         since_s: the time of its start or of the end of its last freeze.
         step_age_s: the reported age of its current step.
+        starts: number of its starts.
     """
 
     def __init__(self, timeline: SimulatedTime, name: str) -> None:
@@ -60,7 +61,7 @@ class Process:
         self.alive = False
         self.frozen = False
         self.step_age_s = 0.0
-        self.life = 0
+        self.life = self.starts = 0
         self.banned = False
         self.since_s = 0.0
         self.exited: Callable[[int], None] = lambda code: None
@@ -77,6 +78,7 @@ class Process:
             return
         self.alive, self.frozen = True, False
         self.life += 1
+        self.starts += 1
         self.step_age_s = 0.0
         self.since_s = self.timeline.monotonic_s()
         self._waiting.clear()
