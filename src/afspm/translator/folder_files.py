@@ -7,15 +7,13 @@ from pathlib import Path
 
 from afspm.basics.errors import AfspmError, FileError
 from afspm.basics.plain_data import PlainMapping
-from afspm.model import Region, Scan, Spectrum
+from afspm.model import Scan, Spectrum
 from afspm.translator.result_files import (
+    NEW_FRAME,
     SCAN,
     Content,
     Entry,
-    FilePrecision,
     ResultFiles,
-    as_list,
-    as_region,
     missing_text,
     modified_ns,
     newest,
@@ -28,11 +26,9 @@ class FolderFiles(ResultFiles):
 
     Attributes:
         pattern: pattern of the file names, as in `Path.glob`.
-        precision: precision of the numbers in the files.
     """
 
     pattern: str = "*"
-    precision: FilePrecision
 
     def begin(self, what: str, folder: Path, taken: PlainMapping) -> None:
         """Record the start of a measurement.
@@ -46,17 +42,6 @@ class FolderFiles(ResultFiles):
     def look(self, folder: Path) -> int:
         """Register the files in a folder as no results; return the time of the newest file, in ns."""
         return self.newest_ns(folder, self._files(folder))
-
-    def see_frame(self, region: Region) -> None:
-        """Register the frame in force during a scan, for a controller that may move the running scan to a new frame.
-
-        A scan during which the frame was changed has no result.
-        """
-        running = self._kept["running"]
-        if running is None or running["what"] != SCAN:
-            return
-        if not self.precision.same(as_region(running.setdefault("under_way", as_list(region))), region):
-            running["new_frame"] = True
 
     def end(self, now_ns: int) -> None:
         if self._kept["running"] is not None:
@@ -118,7 +103,7 @@ class FolderFiles(ResultFiles):
             self.broken_off, self.missing = True, missing
             return True
         if measured.get("new_frame"):
-            self._log.error("%s is not published: its frame was changed at the panel while it ran", paths[0].name)
+            self._log.error("%s is not published: %s", paths[0].name, NEW_FRAME)
             self.broken_off = True
             return True
         self.check(paths[0], content[0], measured)

@@ -23,6 +23,7 @@ from afspm.translator.trace import TRACE
 
 SCAN: Final = "scan"
 """The kind of a scan; a spectrum has the name of its own kind."""
+NEW_FRAME: Final = "its frame was changed at the panel while it ran"
 _LISTED: Final = 16
 _OF_A_RESULT: Final = ("what", "frame", "position", "end_ns")
 
@@ -42,7 +43,10 @@ class ResultFiles(ABC):
     Attributes:
         broken_off: True if the ended measurement was interrupted at the controller; until the next `results`.
         missing: what the last interrupted measurement lacks, in words; empty: nothing, or that is not known.
+        precision: precision of the numbers in the files.
     """
+
+    precision: FilePrecision
 
     def __init__(self, kept: Entry, log: logging.Logger) -> None:
         self._kept = kept
@@ -71,6 +75,17 @@ class ResultFiles(ABC):
         """The frame of the running scan (`as_list`); None without a scan."""
         running = self._kept["running"]
         return None if running is None else running.get("frame")
+
+    def see_frame(self, region: Region) -> None:
+        """Register the frame in force during a scan, for a controller that may move the running scan to a new frame.
+
+        A scan during which the frame was changed ("new_frame") has no result.
+        """
+        running = self._kept["running"]
+        if running is None or running["what"] != SCAN:
+            return
+        if not self.precision.same(as_region(running.setdefault("under_way", as_list(region))), region):
+            running["new_frame"] = True
 
     def forget(self) -> None:
         """Discard the running or ended measurement after an interruption."""

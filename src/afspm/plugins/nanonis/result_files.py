@@ -10,16 +10,16 @@ from typing import Final
 import numpy as np
 
 from afspm.basics.errors import AfspmError, FileError
-from afspm.model import Region, Spectrum
+from afspm.model import Spectrum
 from afspm.plugins.nanonis import fetched
 from afspm.translator.driver_base import LOST
 from afspm.translator.result_files import (
+    NEW_FRAME,
     SCAN,
     Content,
     Entry,
     FilePrecision,
     ResultFiles,
-    as_region,
     lines_missing,
     missing_text,
     newest,
@@ -28,8 +28,6 @@ from afspm.translator.result_files import (
 
 _PRECISION: Final = FilePrecision(part=2e-6, angle_rad=1e-3, positions=True)
 """Scan files have seven digits of a length, and four digits of an angle in degrees: errors of up to 0.05 degrees."""
-
-_NEW_FRAME: Final = "its frame was changed at the panel while it ran"
 
 Fetch = Callable[[Entry], Content]
 
@@ -42,6 +40,8 @@ class NanonisFiles(ResultFiles):
         own_folder: folder for fetched data.
         patience_s: longest wait for a file before the data is fetched, experiment time.
     """
+
+    precision = _PRECISION
 
     def __init__(
         self,
@@ -68,7 +68,10 @@ class NanonisFiles(ResultFiles):
         """
         folder = self._session_dir or Path(session)
         newest_ns = self.newest_ns(folder, _files(folder, what), what)
-        self._begins(what, {"seen": what != SCAN, "folder": str(folder), "newest_ns": newest_ns, **taken})
+        # the frame is read right before the start, so a change before the first poll is seen as well
+        under_way = {"under_way": taken["frame"]} if what == SCAN else {}
+        facts = {"folder": str(folder), "newest_ns": newest_ns, **taken, **under_way}
+        self._begins(what, {"seen": what != SCAN, **facts})
 
     def look(self, folder: Path) -> None:
         """Register the files that are there before a measurement: they are not its results."""
@@ -87,15 +90,6 @@ class NanonisFiles(ResultFiles):
         """Record that Nanonis has reported the measurement as running."""
         if self._kept["running"] is not None:
             self._kept["running"]["seen"] = True
-
-    def see_frame(self, region: Region) -> None:
-        """Register the frame in force during a scan: a scan whose frame a person changes has no result.
-
-        It is unknown whether Nanonis moves the running scan then, or waits for the next one.
-        """
-        running = self._kept["running"]
-        if running is not None and not _PRECISION.same(as_region(running["frame"]), region):
-            running["new_frame"] = True
 
     def end(self, now_ns: int, now_s: float, path: str | None = None) -> None:
         """Register the end of the running measurement, and the reported file of the ended measurement.
@@ -160,7 +154,7 @@ class NanonisFiles(ResultFiles):
             file = self._file(ended)
             if file is not None and (content := self._whole(file, ended)) is not None:
                 if ended.get("new_frame"):
-                    self._log.error("%s is not published: %s", file, _NEW_FRAME)
+                    self._log.error("%s is not published: %s", file, NEW_FRAME)
                     self._kept["ended"], self.broken_off = None, True
                 else:
                     self._take(file, ended, content)
@@ -187,7 +181,7 @@ class NanonisFiles(ResultFiles):
                 self.missing = missing
                 raise FileError(missing)
             if ended.get("new_frame"):
-                raise FileError(_NEW_FRAME)
+                raise FileError(NEW_FRAME)
         except LOST:
             self._kept["ended"] = dict(ended)  # to fetch after the next connection
             raise
@@ -206,7 +200,7 @@ class NanonisFiles(ResultFiles):
         file = self._file(followed)
         if followed.get("new_frame"):
             self._kept["followed"] = None
-            self._log.error("the scan before the present one is not published: %s", _NEW_FRAME)
+            self._log.error("the scan before the present one is not published: %s", NEW_FRAME)
         elif file is not None and (content := self._whole(file, followed)) is not None:
             self._add(str(file), followed, {}, content)
             self._kept["followed"], self._has_followed = None, True
