@@ -357,6 +357,9 @@ class FakeMicroscope(Process):
             self._turn_by_hand(names.TIP_BIAS_VOLTAGE, self.timeline.random.choice((1.0, 2.0, 12.0)))
         elif what == "setpoint":
             self._turn_by_hand(names.ZCTRL_SETPOINT, self.timeline.random.uniform(0.5, 2.0))
+        elif what == "frame" and self.alive:
+            self._is_spoiled = self._is_spoiled or self.state is ScopeState.SCANNING  # its lines may be from two places
+            self._tell(PanelAct.VALUES, ChangedValue(names.SCAN_ANGLE, "0", "0.5"))
 
     def go_on_by_hand(self) -> None:
         """Let a paused scan go on."""

@@ -34,13 +34,13 @@ class MakerPanel:
 PANELS: Final = {
     "nanonis": MakerPanel(),
     "asylum": MakerPanel(stop_withdraws=True, withdrawal_ends_scan=True, start_engages=True),
-    "gxsm": MakerPanel(shows_tip=False, shows_feedback=False, ends_scans=0.1),
-    "nanosurf": MakerPanel(shows_feedback=False, withdrawal_ends_scan=True),
-    "park": MakerPanel(shows_tip=False, shows_feedback=False, withdrawal_ends_scan=True),
+    "gxsm": MakerPanel(shows_tip=False, ends_scans=0.1),
+    "nanosurf": MakerPanel(shows_tip=False, shows_feedback=False, withdrawal_ends_scan=True),
+    "park": MakerPanel(shows_tip=False, withdrawal_ends_scan=True),
 }
 ACTS: Final = (
     *("stop", "stop and scan", "scan", "pause", "pause for ever"),
-    *("withdraw", "feedback off", "bias", "setpoint"),
+    *("withdraw", "feedback off", "bias", "setpoint", "frame"),
 )
 PAUSING: Final = frozenset({PanelAct.STOP, PanelAct.WITHDRAW, PanelAct.FEEDBACK_OFF})
 """Acts after which nothing is sent until a person lets the run continue."""

@@ -96,6 +96,7 @@ def test_the_page_is_marked_simulated_and_shows_the_facts_of_a_scan(
     facts = dict(zip(*(page.locator(f".facts {tag}").all_inner_texts() for tag in ("dt", "dd")), strict=True))
     assert (facts["Angle"], facts["Pixels"], facts["Size"]) == ("22.92°", "72 × 48", "800 × 500 nm")
     assert facts["Bias"] == "100 mV"
+    assert facts["Tip"] == "at the sample, feedback on"
     assert {"Scan", "Finished", "Took", "Speed", "Setpoint"} <= facts.keys()
     keep(page, "watching")
 

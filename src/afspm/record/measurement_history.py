@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from afspm.basics.units import convert, same_kind
-from afspm.model import Frame, Region, RegistrationOutcome, Scan, Spectrum
+from afspm.model import Frame, MeasurementConditions, Region, RegistrationOutcome, Scan, Spectrum
 from afspm.model.geometry import XY
 from afspm.record.drift_mapping import drift_at, drift_knowledge
 from afspm.record.running_scan import DoneScan, RunningScan
@@ -131,6 +131,7 @@ class MeasurementHistory:
         self._done: deque[DoneScan] = deque(maxlen=20)
         self._scans: dict[tuple[object, ...], ScanSummary] = {}
         self._spectra: dict[tuple[object, ...], SpectrumSummary] = {}
+        self._conditions: dict[int, MeasurementConditions] = {}
         self._drift: dict[int, DriftPoint] = {}
         self._places: dict[str, tuple[FoundPlace, ...]] = {}
 
@@ -209,6 +210,13 @@ class MeasurementHistory:
             spectrum.filename, holder,
         )  # fmt: skip
         _keep(self._spectra, (measured_ns, spectrum.kind, spectrum.position_m), summary)
+
+    def add_conditions(self, conditions: MeasurementConditions) -> None:
+        _keep(self._conditions, conditions.time_ns, conditions)
+
+    def conditions(self, time_ns: int) -> MeasurementConditions | None:
+        """Return the tip at both ends of the scan or spectrum of this time; None if not published."""
+        return self._conditions.get(time_ns)
 
     def add_drift(self, message: DriftMapping) -> None:
         """Add a displacement of the sample; a message without a mapping is ignored."""

@@ -13,6 +13,7 @@ from afspm import wire
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import WireError
 from afspm.model import (
+    ActByHand,
     Approvals,
     ChannelRoles,
     ControlEvent,
@@ -25,6 +26,7 @@ from afspm.model import (
     JournalEntry,
     LogLine,
     LogLines,
+    MeasurementConditions,
     Note,
     ProbePosition,
     Problem,
@@ -188,7 +190,7 @@ class Overview:
         approvals: the approvals in force.
         of_conditions: the numbers of the problems flagged by conditions.
         set_ns: the time of the last accepted request that set each parameter.
-        log, alarms, notes, entries, refusals: newest last, bounded.
+        log, alarms, notes, entries, refusals, acts: newest last, bounded; acts are those at the microscope itself.
     """
 
     def __init__(self, problems: ProblemNames | None = None, *, most_entries: int = MOST_ENTRIES) -> None:
@@ -212,6 +214,7 @@ class Overview:
         self.notes: deque[Note] = deque(maxlen=most_entries)
         self.entries: deque[JournalEntry] = deque(maxlen=most_entries)
         self.refusals: deque[JournalEntry] = deque(maxlen=most_entries)
+        self.acts: deque[ActByHand] = deque(maxlen=most_entries)
         self.timelines = Timelines()
         self.process_history = ProcessHistory(most_entries)
         self._measured = MeasurementHistory()
@@ -242,6 +245,10 @@ class Overview:
     @property
     def running(self) -> RunningScan | None:
         return self._measured.running
+
+    def conditions(self, time_ns: int) -> MeasurementConditions | None:
+        """Return the tip at both ends of the scan or spectrum of this time; None if not published."""
+        return self._measured.conditions(time_ns)
 
     @property
     def waiting(self) -> list[Proposal]:
@@ -384,6 +391,12 @@ class Overview:
 
     def _on_tip_status(self, status: TipStatus, time_ns: int) -> None:
         self.tip = status
+
+    def _on_measurement_conditions(self, conditions: MeasurementConditions, time_ns: int) -> None:
+        self._measured.add_conditions(conditions)
+
+    def _on_act_by_hand(self, act: ActByHand, time_ns: int) -> None:
+        self.acts.append(act)
 
     def _on_channel_roles(self, roles: ChannelRoles, time_ns: int) -> None:
         self.channels = roles

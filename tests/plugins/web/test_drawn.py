@@ -395,6 +395,7 @@ def test_a_spectrum_is_drawn_with_those_before_it_behind() -> None:
     assert len(lines(chart.options)) == 3
     assert [one["lineStyle"].get("opacity") for one in chart.options["series"]] == [0.4, 0.4, 1.0]
     assert chart.options["yAxis"]["name"] == "I / nA"
+    assert "Tip: &lt;away&gt;" in spectrum_chart(spectra, "I", [("Tip", "<away>")]).words
 
 
 def test_a_spectrum_of_one_variable_is_no_error() -> None:

@@ -9,7 +9,20 @@ from typing import Any
 import numpy as np
 
 from afspm.basics.clock import ExperimentClock
-from afspm.model import ControlMode, ControlState, Feedback, Region, Scan, ScopeState, ScopeStatus
+from afspm.model import (
+    ActByHand,
+    ControlMode,
+    ControlState,
+    Feedback,
+    MeasurementConditions,
+    PanelAct,
+    Region,
+    Scan,
+    ScanLines,
+    ScopeState,
+    ScopeStatus,
+    TipStatus,
+)
 from afspm.plugins.web.dashboard.actions import ActionResult
 from afspm.plugins.web.dashboard.conditions import Conditions
 from afspm.plugins.web.dashboard.pictures import SIDE_PX, Thumbnails
@@ -68,6 +81,36 @@ def test_a_scan_before_the_page_s_start_has_its_recorded_setpoint() -> None:
     assert [one["Setpoint"] for one in facts] == ["0.7", "0.5"]
     read = {"Setpoint": "700 mV"}
     assert dict(scan_facts(frames[0], overview, read, 90 * S))["Setpoint"] == "700 mV"
+
+
+def test_scan_has_its_tip_at_both_ends_and_the_acts_at_the_microscope_meanwhile() -> None:
+    here, away = TipStatus(engaged=True, feedback_on=True), TipStatus(engaged=False, feedback_on=False)
+    act = ActByHand(45 * S, PanelAct.WITHDRAW, "seen")
+    told = [
+        ("MeasurementConditions", MeasurementConditions(20 * S, "", here, here), 20 * S),
+        ("ActByHand", act, 45 * S),
+        ("MeasurementConditions", MeasurementConditions(50 * S, "", here, away, (act,)), 50 * S),
+    ]
+    overview = overview_of(sorted([*a_scan(10), *a_scan(40), *told], key=lambda packet: packet[2]))
+    good, bad = (
+        scan_facts(ChannelFrame(1, "Height", "m", REGION, VALUES, at_s * S, None, 2), overview, {}, 60 * S)
+        for at_s in (20, 50)
+    )
+    assert dict(good)["Tip"] == "at the sample, feedback on"
+    assert "By hand" not in dict(good)
+    assert dict(bad)["Tip"] == "at the sample, feedback on → withdrawn, feedback off"
+    assert dict(bad)["By hand"] == "the tip was withdrawn at the microscope (seen)"
+
+
+def test_interrupted_scan_has_the_acts_of_its_time_alone() -> None:
+    acts = [("ActByHand", ActByHand(at_s * S, PanelAct.STOP, f"at {at_s}"), at_s * S) for at_s in (30, 45, 70)]
+    ended = states((ScopeState.SCANNING, 40), (ScopeState.INTERRUPTED, 50))
+    lines = ScanLines(REGION, (2, 4), "Height", "m", 0, VALUES[:1], began_ns=40 * S)
+    packets = [*a_scan(10), *acts, *ended, ("ScanLines", lines, 44 * S)]
+    overview = overview_of(sorted(packets, key=lambda packet: packet[2]))
+    frame = ChannelFrame(1, "Height", "m", REGION, VALUES, None, 40 * S, 1, 0)
+    facts = [text for label, text in scan_facts(frame, overview, {}, 80 * S) if label == "By hand"]
+    assert facts == ["the measurement was stopped at the microscope (at 45)"]
 
 
 def test_a_growing_scan_has_its_expected_end() -> None:

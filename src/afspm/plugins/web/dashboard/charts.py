@@ -73,11 +73,14 @@ def _drift_words(point: DriftPoint, registered: str) -> str:
     return f'<p>{at}</p><p class="alarm">The last scan is {what}{sd}: {escape(point.reason)}</p>{count}'
 
 
-def spectrum_chart(spectra: Sequence[tuple[int, Spectrum]], variable: str) -> Chart:
+def spectrum_chart(
+    spectra: Sequence[tuple[int, Spectrum]], variable: str, facts: Sequence[tuple[str, str]] = ()
+) -> Chart:
     """Return the last of `spectra`, with up to `BEFORE` earlier spectra of the same variables behind it.
 
     Args:
         variable: variable drawn against the first; the second is drawn if the spectrum has no variable of this name.
+        facts: pairs of label and text about the last of `spectra`.
     """
     if not spectra:
         return Chart('<p class="nothing">No spectrum has been taken.</p>')
@@ -93,7 +96,8 @@ def spectrum_chart(spectra: Sequence[tuple[int, Spectrum]], variable: str) -> Ch
     curves.append(Curve(last.values[:, 0], last[variable], "var(--t0)"))
     series = [_line(curve, x.scaled[0], y.scaled[0]) for curve in curves]
     where = "" if last.position_m is None else f" at {typeset_position(last.position_m)}"
-    words = f"<p>{escape(last.kind or 'Spectrum')}{where}, {time_of_day(time_ns)}</p>"
+    more = "".join(f"<br>{escape(label)}: {escape(text)}" for label, text in facts)
+    words = f"<p>{escape(last.kind or 'Spectrum')}{where}, {time_of_day(time_ns)}{more}</p>"
     return Chart(words, _options(series, {"type": "value", "scale": True, "name": x.scaled[1]}, y))
 
 

@@ -17,7 +17,7 @@ from afspm.plugins.web.dashboard.access import Visitor
 from afspm.plugins.web.dashboard.actions import ActionResult, Steering
 from afspm.plugins.web.dashboard.charts import Chart, spectrum_chart
 from afspm.plugins.web.dashboard.content import NO_REPORT
-from afspm.plugins.web.dashboard.scan_facts import summary_of
+from afspm.plugins.web.dashboard.scan_facts import summary_of, tip_facts
 from afspm.plugins.web.dashboard.steering_panel import ask_restart
 from afspm.plugins.web.dashboard.steering_session import SteeringSession, button
 from afspm.plugins.web.watch import Watch
@@ -65,10 +65,11 @@ class SpectraPanel:
 
     def show(self) -> bool:
         """Update the chart; return whether there is a spectrum."""
-        with self._watch.reading():
+        with self._watch.reading() as overview:
             store = self._watch.spectra
             picked = None if self._picked_ns is None else store.at(self._picked_ns)
             spectra = store.newest(8) if picked is None or self._picked_ns is None else [(self._picked_ns, picked)]
+            conditions = overview.conditions(spectra[-1][0]) if spectra else None
         names = list(spectra[-1][1].names[1:]) if spectra else []
         if self._variable.options != names:
             self._variable.set_options(names, value=names[0] if names else None)
@@ -76,7 +77,8 @@ class SpectraPanel:
         wanted = (*(time_ns for time_ns, _ in spectra), self._variable.value)
         if wanted != self._shown:
             self._shown = wanted
-            self._chart.show(spectrum_chart(spectra, str(self._variable.value or "")))
+            facts = [] if conditions is None else tip_facts((conditions.begin, conditions.end), conditions.acts)
+            self._chart.show(spectrum_chart(spectra, str(self._variable.value or ""), facts))
         return bool(spectra)
 
     def _pick(self, event: events.GenericEventArguments) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.formatting import duration_text, scale, time_of_day, typeset, typeset_area
+from afspm.model import ActByHand, TipStatus
 from afspm.model.geometry import XY
 from afspm.plugins.web.frames import ChannelFrame
 from afspm.record.overview import Overview, ScanSummary
@@ -31,8 +32,37 @@ def scan_facts(frame: ChannelFrame, overview: Overview, conditions: Mapping[str,
         *angle,
         ("Pixels", f"{columns} × {rows}"),
         *(conditions or _recorded(frame, overview)).items(),
+        *_tip_of_scan(frame, overview),
         *(("Note", note.text) for note in overview.notes if frame.time_ns and note.scan_ns == frame.time_ns),
     ]
+
+
+def tip_facts(ends: Sequence[TipStatus | None], acts: Iterable[ActByHand]) -> Facts:
+    """Return the tip and its feedback at the begin and the end, and each act at the microscope meanwhile.
+
+    Args:
+        ends: the known states, in their order; equal ones are shown once.
+    """
+    known = dict.fromkeys(text for status in ends if status is not None and (text := _tip_text(status)))
+    tip = [("Tip", " → ".join(known))] if known else []
+    return [*tip, *(("By hand", str(act)) for act in acts)]
+
+
+def _tip_text(status: TipStatus) -> str:
+    tip = {True: "at the sample", False: "withdrawn", None: ""}[status.engaged]
+    feedback = {True: "feedback on", False: "feedback off", None: ""}[status.feedback_on]
+    return ", ".join(filter(None, (tip, feedback)))
+
+
+def _tip_of_scan(frame: ChannelFrame, overview: Overview) -> Facts:
+    if frame.time_ns is not None:
+        one = overview.conditions(frame.time_ns)
+        return [] if one is None else tip_facts((one.begin, one.end), one.acts)
+    # a scan that is interrupted has no conditions: its acts are those between its begin and its interruption
+    last = overview.scans[-1] if overview.running is None and overview.scans else None
+    until_ns = last.time_ns if last is not None and last.interrupted else overview.newest_ns
+    began_ns = overview.newest_ns if frame.began_ns is None else frame.began_ns
+    return tip_facts((), (act for act in overview.acts if began_ns <= act.time_ns <= until_ns))
 
 
 def _when(frame: ChannelFrame, overview: Overview, now_ns: int) -> Facts:
