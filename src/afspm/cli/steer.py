@@ -13,8 +13,6 @@ from afspm.cli.joining import acting, looking
 if TYPE_CHECKING:
     from afspm.model import ControlMode
 
-TIP_UNKNOWN = "the microscope does not report its tip: look whether it is at the sample"
-
 
 def pause(where: Where = RUNS) -> None:
     """Pause a running experiment: MANUAL, so that no component commands the microscope.
@@ -36,12 +34,12 @@ def go_on(
     Shows why it is paused and how the tip is, and then asks. It is refused while the tip is withdrawn, or the feedback
     off, by hand. The experiment must be running: after a kill or a power cut use `afspm run --resume RUN`.
     """
-    from afspm.model import ControlMode
+    from afspm.model import ControlMode, TipStatus
 
     with looking(where) as follower:
         seen = follower.overview
     if seen.by_hand:
-        typer.echo(f"{seen.by_hand}; now {seen.tip or TIP_UNKNOWN}")
+        typer.echo(f"{seen.by_hand}; now {(seen.tip or TipStatus()).to_continue_with}")
         if not yes:
             typer.confirm("Let the run continue?", abort=True)
     _set_mode(where, ControlMode.AUTOMATED, "the experiment goes on (AUTOMATED)")

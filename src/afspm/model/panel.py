@@ -94,6 +94,11 @@ class TipStatus:
         return f"{tip[self.engaged]}, {feedback[self.feedback_on]}"
 
     @property
+    def to_continue_with(self) -> str:
+        """The state in words, for a person who lets the run continue and sees what the controller does not report."""
+        return str(self) if self.engaged is not None else f"{self}: look whether the tip is at the sample"
+
+    @property
     def remedy(self) -> str:
         """What a person has to do before anything is measured; empty: nothing."""
         if not self.by_hand:

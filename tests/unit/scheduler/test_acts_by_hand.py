@@ -16,11 +16,13 @@ from afspm.model import (
     ControlResponse,
     PanelAct,
     Parameter,
+    ProcessCondition,
+    ProcessState,
     ScopeState,
     TipStatus,
     names,
 )
-from afspm.scheduler.control.arbitration import Rules
+from afspm.scheduler.control.arbitration import RoleTable, Rules
 from afspm.scheduler.events import Log, Tick
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit
 from afspm.scheduler.settings import ControlSettings, SchedulerSettings
@@ -141,6 +143,17 @@ def test_agent_does_not_let_a_run_continue() -> None:
     lab.mode("person", MANUAL)
     assert lab.mode("agent", AUTOMATED) is ControlResponse.FAILURE
     assert lab.core.control.mode is MANUAL
+
+
+def test_component_lets_a_run_continue_only_with_the_role() -> None:
+    for roles, wanted in ((RoleTable(), ControlResponse.FAILURE), (RoleTable(set_mode=("series",)), OK)):
+        lab = Lab(SchedulerSettings(rules=Rules(roles)))
+        lab.translator()
+        lab.tell(ProcessState("series", "component", ProcessCondition.ALIVE, 1))
+        hand(lab, PanelAct.STOP)
+        assert lab.mode("series", AUTOMATED) is wanted
+        if wanted is not OK:
+            assert lab.mode("dashboard:Ada", AUTOMATED) is OK
 
 
 def test_waiting_stop_of_a_flag_is_dropped_when_a_person_acts() -> None:

@@ -210,6 +210,9 @@ def _refusal_to_continue(draft: StateDraft, event: RequestIn) -> str:
         return ""
     if draft.env.settings.rules.is_agent(event.name):
         return "a person lets the run continue, and never an agent"
+    is_process = draft.peers.supervisors.starts_of(event.name) is not None  # a person has a name of the form "page:Ada"
+    if draft.panel.why and is_process and draft.env.settings.rules.roles.set_mode is None:
+        return f"a person lets the run continue, unless [control.roles] set_mode names {event.name}"
     if draft.panel.outside and not draft.panel.tip.remedy:  # a value may have been set back unseen
         for name in draft.panel.outside:
             _read(draft, name, ReadAhead(name))

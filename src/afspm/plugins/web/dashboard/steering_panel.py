@@ -11,7 +11,7 @@ from nicegui import events, ui
 
 from afspm.basics.formatting import time_of_day, typeset_position
 from afspm.basics.plain_data import PlainMapping
-from afspm.model import ControlMode, Region
+from afspm.model import ControlMode, Region, TipStatus
 from afspm.plugins.web.dashboard.actions import Actions
 from afspm.plugins.web.dashboard.content import Content
 from afspm.plugins.web.dashboard.flags import Flag
@@ -49,8 +49,8 @@ class ModeButtons:
     async def _hand_back(self) -> None:
         content = self._session.content
         if content.by_hand:
-            tip = content.tip or "the microscope does not report its tip"
-            text = f"{content.by_hand[:1].upper()}{content.by_hand[1:]}. Now {tip}. Components will measure again."
+            now = (content.tip or TipStatus()).to_continue_with
+            text = f"{content.by_hand[:1].upper()}{content.by_hand[1:]}. Now {now}. Components will measure again."
             if not await asked("Let the run continue?", text, "Continue"):
                 return
         self._set(ControlMode.AUTOMATED)
