@@ -26,6 +26,7 @@ from afspm.model import (
     TipStatus,
     names,
 )
+from afspm.model.microscope_status import feedback_of
 from afspm.storage.disk import is_full
 from afspm.translator import setting_groups
 from afspm.translator.driver_base import LOST, MEASURING, DriverBase
@@ -217,7 +218,8 @@ class Observer:
 
     def asked(self, request: Request) -> None:
         """Note that a request of the run is about to change something."""
-        self.panel.asked(str(request.subject) if request.kind == ControlRequest.ACTION else "")
+        action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
+        self.panel.asked(action, sets_feedback=feedback_of(request) is not None)
         self._others_told = False
 
     def look_before_start(self) -> None:

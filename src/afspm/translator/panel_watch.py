@@ -9,11 +9,16 @@
 The client repeats an unknown one within bounds, as after a fault. So an act counts as done by hand only if two
 successive readings of the controller differ, the microscope was free or scanning at both, and no request and no
 restored setting of the run lies between them. For the tip, a start of a measurement may lie between them.
+
+During a spectrum the controller itself changes the bias, and may hold the feedback. So a reading of after a spectrum is
+compared with the last one of before it, once two readings in a row show the microscope at rest or scanning again: by
+then the controller has put back what it changed. A request in between makes the settings uncertain, but not the
+feedback, which no request but its own switches off.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Final
 
 from afspm.model import ActByHand, ChangedValue, PanelAct, ScopeState, TipStatus, names
@@ -60,6 +65,7 @@ class PanelWatch:
         self._last: ScopeState | None = None
         self._still: ScopeState | None = None
         self._tip_is_moved = False
+        self._before_spectrum: dict[str, Value] = {}
         self.is_certain = False
         self.tip = TipStatus(by_hand=kept.get("tip_by_hand", ""))
 
@@ -68,12 +74,13 @@ class PanelWatch:
         """Whether the tip was at the sample at any reading of this run."""
         return bool(self._kept.get("was_engaged"))
 
-    def asked(self, action: str = "") -> None:
+    def asked(self, action: str = "", *, sets_feedback: bool = False) -> None:
         """Note that the run changes something: what the next reading shows may be its doing.
 
         Args:
             action: the action that it asks for, if it asks for one. Its effect on the tip may show later, but not after
                 a measurement has begun.
+            sets_feedback: whether it switches the z feedback.
         """
         # the tip is looked at right before each start
         self._last, self._still = None, _STARTED.get(action)
@@ -81,10 +88,14 @@ class PanelWatch:
             self._tip_is_moved = False
         elif action and action not in STARTS.values():
             self._tip_is_moved = True
+        if action != names.START_SPEC:
+            stays = FEEDBACK_ON in self._before_spectrum and not (self._tip_is_moved or sets_feedback)
+            self._before_spectrum = {FEEDBACK_ON: self._before_spectrum[FEEDBACK_ON]} if stays else {}
 
     def lost(self) -> None:
         """Note a restart or a lost controller: until the microscope is free, nothing is certain."""
         self._last, self._still, self.is_certain = None, None, False
+        self._before_spectrum = {}
 
     def read(
         self, before: Mapping[str, Value], now: Mapping[str, Value], state: ScopeState, now_ns: int, withdrew: str = ""
@@ -98,11 +109,19 @@ class PanelWatch:
         last, self._last = self._last, state
         still, self._still = self._still, state if state in _STILL else self._still
         acts = []
+        if state is ScopeState.SPEC:
+            self._before_spectrum = {**before, **self._before_spectrum}
+        is_calm = still in _CALM and state in _CALM
+        is_after_spectrum = is_calm and bool(self._before_spectrum)
+        if is_calm:
+            before, self._before_spectrum = {**before, **self._before_spectrum}, {}
         # a withdrawal takes time, and the controller may show it as a state of its own until it is over
         if still is not None and not withdrew:
-            act = self._tip_act(before, now, now_ns, is_calm=still in _CALM and state in _CALM)
+            act = self._tip_act(before, now, now_ns, is_calm=is_calm)
             acts += [] if act is None else [act]
-        if last in _CALM and state in _CALM and (changes := self._changes(before, now, state)):
+        # a running scan moves the tip, and a spectrum may
+        watched = _SETTINGS if state is ScopeState.SCANNING or is_after_spectrum else _SETTINGS | set(POSITION)
+        if last in _CALM and state in _CALM and (changes := self._changes(before, now, watched)):
             acts.append(ActByHand(now_ns, PanelAct.VALUES, changes=changes))
         self._see_tip(now)
         return acts
@@ -131,10 +150,8 @@ class PanelWatch:
         self.tip = TipStatus(None if engaged is None else bool(engaged), None if on is None else bool(on), by_hand)
 
     def _changes(
-        self, before: Mapping[str, Value], now: Mapping[str, Value], state: ScopeState
+        self, before: Mapping[str, Value], now: Mapping[str, Value], watched: Collection[str]
     ) -> tuple[ChangedValue, ...]:
-        # a running scan moves the tip
-        watched = _SETTINGS if state is ScopeState.SCANNING else _SETTINGS | set(POSITION)
         return tuple(
             self._change(name, before[name], value)
             for name, value in now.items()

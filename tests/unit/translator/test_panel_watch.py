@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from afspm.model import (
@@ -13,8 +14,10 @@ from afspm.model import (
     Feedback,
     MeasurementConditions,
     PanelAct,
+    Parameter,
     ScopeState,
     ScopeStatus,
+    Spectrum,
     TipStatus,
     names,
 )
@@ -88,6 +91,43 @@ def test_a_tip_withdrawn_in_a_scan_spoils_it_and_begins_nothing(bench: Any, scan
     bench.microscope.values["Engaged"] = True
     bench.look()
     assert bench.ask(ACTION, names.START_SCAN).code == OK
+
+
+def take_spectrum(bench: Any, meanwhile: dict[str, Any], afterwards: dict[str, Any]) -> None:
+    """Take a spectrum, in which the controller shows some values, and later others."""
+    assert bench.ask(ACTION, names.START_SPEC).code == OK
+    bench.microscope.values |= meanwhile
+    bench.look(2.0)
+    assert acts(bench) == []
+    bench.microscope.files["a"] = [Spectrum((0.0, 0.0), "IV", ("V", "I"), ("V", "A"), np.ones((4, 2)))]
+    bench.microscope.values |= afterwards
+    bench.microscope.state = ScopeState.FREE
+
+
+def test_a_value_changed_in_a_spectrum_is_told_once_the_controller_has_put_back_its_own(bench: Any) -> None:
+    take_spectrum(bench, {"Setpoint": 2.0, "Loop": False}, {"Loop": True})
+    for _ in range(4):
+        bench.look(2.0)
+    assert acts(bench) == [PanelAct.VALUES]
+
+
+def test_a_feedback_switched_off_in_a_spectrum_is_told_although_another_request_follows(bench: Any) -> None:
+    take_spectrum(bench, {"Loop": False}, {})
+    bench.look(2.0)
+    assert acts(bench) == []
+    assert bench.ask(PARAM, Parameter("zctrl-setpoint", "2e-9")).code == OK
+    for _ in range(3):
+        bench.look(2.0)
+    assert acts(bench) == [PanelAct.FEEDBACK_OFF]
+
+
+def test_a_feedback_that_the_run_switches_off_after_a_spectrum_is_no_act_by_hand(bench: Any) -> None:
+    take_spectrum(bench, {"Loop": False}, {})
+    bench.look(2.0)
+    assert bench.ask(PARAM, Parameter(names.FEEDBACK_ON, "false")).code == OK
+    for _ in range(3):
+        bench.look(2.0)
+    assert acts(bench) == []
 
 
 @pytest.mark.parametrize("name", ["Engaged", "Loop"])
