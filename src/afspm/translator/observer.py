@@ -259,7 +259,9 @@ class Observer:
             self._log.warning("by hand: %s", act)
             if self._state.sequence.published.state in MEASURING:
                 self._acts.append(act)
-                if act.act in (PanelAct.WITHDRAW, PanelAct.FEEDBACK_OFF):
+                # a spectrum may be taken without feedback, and is over when its end is seen to have left it off
+                is_scanning = self._state.sequence.published.state is ScopeState.SCANNING
+                if act.act is PanelAct.WITHDRAW or (act.act is PanelAct.FEEDBACK_OFF and is_scanning):
                     self._state.kept["spoiled"] = str(act)
                     self._live.end()
         if acts:
