@@ -19,13 +19,16 @@ from afspm.cli import (
     status,
     steer,
 )
-from afspm.cli.arguments import AFTERWARDS, BEFORE, MEANWHILE, MICROSCOPES, PLUGINS
+from afspm.cli.arguments import AFTERWARDS, BEFORE, MEANWHILE, MICROSCOPES, PLUGINS, HelpWhenBare
 
 if TYPE_CHECKING:
     from typer._click.core import Command
 
+# options that typer adds to each app; only those of `afspm` itself install something
+_COMPLETION = ("install_completion", "show_completion")
 
-class DeclaredCommands(TyperGroup):
+
+class DeclaredCommands(HelpWhenBare):
     """Commands of afspm and of other packages; a package's command is loaded for the help, and when called."""
 
     def list_commands(self, ctx: object) -> list[str]:
@@ -39,8 +42,6 @@ class DeclaredCommands(TyperGroup):
 app = typer.Typer(
     name="afspm",
     cls=DeclaredCommands,
-    no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode="markdown",  # paragraphs are wrapped, and [security] stays text
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -101,10 +102,11 @@ def _declared(name: str) -> Command | None:
     if found is None:
         return None
     if not isinstance(found, typer.Typer):
-        function, found = found, typer.Typer(add_completion=False, rich_markup_mode="markdown")
+        function, found = found, typer.Typer(rich_markup_mode="markdown")
         found.command()(function)
     command = typer.main.get_command(found)
     command.name = name
+    command.params = [one for one in command.params if one.name not in _COMPLETION]
     if isinstance(command, TyperCommand | TyperGroup):  # typer sets the panel only in add_typer
         command.rich_help_panel = found.rich_help_panel if isinstance(found.rich_help_panel, str) else PLUGINS
     return command

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 _FILES = "The experiment file; each further file overrides those before it, and needs to hold only what differs."
 _WHERE = "The folder of a run, a folder of runs (its newest is meant), or the experiment file."
@@ -21,6 +22,18 @@ RecordedRun = Annotated[
     Path, typer.Argument(metavar="RUN", help="The folder of a run, or of all runs: its newest is meant.")
 ]
 Runs = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Where to make the run's folder.")]
+
+
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+NoProgress = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
+"""For commands whose printed text is the result."""
+
+
+class HelpWhenBare(TyperGroup):
+    """Command group that shows its help if nothing is asked of it, and ends with 0 as with --help."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        return super().parse_args(ctx, args or [ctx.help_option_names[0]])
 
 
 def opt(help_text: str, *flags: str, **more: Any) -> object:

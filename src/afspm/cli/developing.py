@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from afspm.cli.arguments import RUNS, CheckSpeed, Runs, WithinFrame, names_in, opt
+from afspm.cli.arguments import RUNS, CheckSpeed, HelpWhenBare, Runs, WithinFrame, names_in, opt
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -262,7 +262,7 @@ Name = Annotated[str, typer.Argument(metavar="NAME", help="Of it and of its fold
 Into = Annotated[Path, typer.Option("--into", metavar="DIR", help="Where to make its folder.")]
 
 new_app = typer.Typer(
-    no_args_is_help=True, rich_markup_mode="markdown", help="Make an experiment, component or driver to begin with."
+    cls=HelpWhenBare, rich_markup_mode="markdown", help="Make an experiment, component or driver to begin with."
 )
 
 

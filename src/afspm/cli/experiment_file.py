@@ -14,7 +14,7 @@ from typer.core import TyperGroup
 
 from afspm.basics.formatting import counted, duration_text, quantity
 from afspm.basics.plain_data import Plain
-from afspm.cli.arguments import RUNS, Files, OptionalFiles, Runs, opt
+from afspm.cli.arguments import RUNS, Files, OptionalFiles, Quiet, Runs, opt
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -142,6 +142,7 @@ def keys(
         Path | None, opt("Where to put them. Default: [security] keys of the file, else keys/ beside it.", "--folder")
     ] = None,
     also: Annotated[list[str] | None, opt("A person who gets a key. Repeatable.", "--also", metavar="NAME")] = None,
+    quiet: Quiet = False,
 ) -> None:
     """Make a key pair for each process of an experiment, for the supervisors, and for the people named.
 
@@ -155,6 +156,8 @@ def keys(
     experiment = load(*files)
     target = folder or experiment.keys_folder or experiment.folder / "keys"
     written = generate(target, [*experiment.component_names, SUPERVISOR, *(also or ())])
+    if quiet:
+        return
     for file in written:
         typer.echo(file)
     if not written:

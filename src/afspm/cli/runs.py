@@ -11,7 +11,7 @@ import typer
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.formatting import counted, day_and_time, duration_text, quantity
-from afspm.cli.arguments import RUNS, RecordedRun, Where, opt
+from afspm.cli.arguments import RUNS, Quiet, RecordedRun, Where, opt
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -97,15 +97,19 @@ _COLUMNS: Final[dict[str, Callable[[RunSummary], str]]] = {
 }
 
 
-def report(where: Where = RUNS) -> None:
+def report(where: Where = RUNS, quiet: Quiet = False) -> None:
     """Write report.html, and figures, into the folder of a run, from its record.
 
     Works during a run, too: the report then shows events up to now. The page needs no other file.
     """
+    from afspm.basics.progress_line import ProgressLine
     from afspm.client.connect import find_run
     from afspm.record.report import write
 
-    typer.echo(write(find_run(where)))
+    with ProgressLine("writing the report", quiet=quiet) as line:
+        written = write(find_run(where), line.step)
+    if not quiet:
+        typer.echo(written)
 
 
 def export(
@@ -120,18 +124,25 @@ def export(
     ] = "gwy",
     out: Annotated[Path | None, opt("Where to write. Default: export in the folder of the run.", metavar="DIR")] = None,
     scans: Annotated[str | None, opt("Only these scans, by their numbers; 7-: from 7 on.", metavar="1-5,8")] = None,
+    quiet: Quiet = False,
 ) -> None:
     """Write the scans and spectra of a recorded run in another format.
 
     Works during a run, and for a run that was killed. Interrupted scans are included as far as they were recorded.
     """
+    from afspm.basics.progress_line import ProgressLine
     from afspm.record.export import export as exported
     from afspm.record.run import open_run
 
-    with open_run(run) as record:
+    count = 0
+    with open_run(run) as record, ProgressLine(f"writing {to}", quiet=quiet) as line:
         folder = out or record.folder / "export" / to
-        written = list(exported(record, to, folder, scans, lambda text: typer.echo(f"left out: {text}", err=True)))
-    typer.echo(f"{len(written)} file{'s' if len(written) != 1 else ''} in {folder}")
+        for count, file in enumerate(
+            exported(record, to, folder, scans, lambda text: line.say(f"left out: {text}")), 1
+        ):
+            line.step(f"{count} files, {file.name}")
+    if not quiet:
+        typer.echo(f"{counted(count, 'file')} in {folder}")
 
 
 def probes(

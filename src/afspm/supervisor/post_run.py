@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import logging
+import math
 import os
 import subprocess
 import threading
@@ -16,6 +17,7 @@ from afspm.basics.clock import Clock
 from afspm.basics.errors import ConfigError, FileError
 from afspm.basics.formatting import duration_text
 from afspm.basics.interpreter import python_command, python_environment
+from afspm.basics.progress_line import ProgressLine
 from afspm.components import notifications
 from afspm.components.notifications import END, GIVEN_UP, NotDelivered, Notification, Targets, Way
 from afspm.experiment import Role, implied_parts
@@ -27,14 +29,14 @@ from afspm.storage.disk import DiskTimeout, run_bounded
 from afspm.supervisor.supervision.run_end import EndReason
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from afspm.experiment import Experiment, ProcessStart
     from afspm.supervisor.log import RunLog
     from afspm.supervisor.supervisor import RunOutcome
 
 # each of these bounds the wait for a hanging disk, network or program: the terminal returns in any case
-REPORT_WITHIN_S = 120.0
+REPORT_STALLED_S = 120.0
 TOLD_WITHIN_S = 30.0
 COUNTED_WITHIN_S = 20.0
 TABLE = "metadata.csv"  # written by the component Metadata
@@ -129,34 +131,62 @@ def _times(count: int) -> str:
 
 
 def report(folder: Path, log: RunLog) -> None:
-    """Write the report of a recorded run, in a separate process within REPORT_WITHIN_S; log a failure."""
+    """Write the report of a recorded run, in a separate process; log a failure.
+
+    The process is given up only if it has used no processor for `REPORT_STALLED_S`, as on a disk that hangs: on a busy
+    computer the report of a long night takes long.
+    """
     if not (folder / JOURNAL_FILE).is_file():
         return  # no record, no report
     log.write(LOGGED_AS, logging.INFO, "writing the report …")
     command = [*python_command("afspm.record.report"), str(folder)]
     environment = {**os.environ, **python_environment(), "MPLBACKEND": "agg"}
     try:
-        done = subprocess.run(
-            command,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            timeout=REPORT_WITHIN_S,
-            env=environment,
-            check=False,
-        )
+        with ProgressLine("writing the report"):
+            exit_code, output = _until_done(command, environment)
     except subprocess.TimeoutExpired:
-        log.write(LOGGED_AS, logging.WARNING, f"no report: it took longer than {REPORT_WITHIN_S:g} s; try afspm report")
+        stalled = f"its process has not worked for {REPORT_STALLED_S:g} s, as if the disk did not answer"
+        log.write(LOGGED_AS, logging.WARNING, f"no report: {stalled}; try afspm report")
         return
     except OSError as error:
         log.write(LOGGED_AS, logging.WARNING, f"no report: {error}")
         return
-    if done.returncode:
-        output = done.stderr.decode(errors="replace").strip().splitlines()
-        log.write(LOGGED_AS, logging.WARNING, f"no report: {output[-1] if output else f'exit code {done.returncode}'}")
+    if exit_code:
+        lines = output.decode(errors="replace").strip().splitlines()
+        log.write(LOGGED_AS, logging.WARNING, f"no report: {lines[-1] if lines else f'exit code {exit_code}'}")
     else:
         from afspm.record.report import REPORT_FILE
 
         log.write(LOGGED_AS, logging.INFO, f"the report is {folder / REPORT_FILE}")
+
+
+def _until_done(command: Sequence[str], environment: Mapping[str, str]) -> tuple[int, bytes]:
+    # raises TimeoutExpired once the process has used no processor for REPORT_STALLED_S
+    none, pipe = subprocess.DEVNULL, subprocess.PIPE
+    with subprocess.Popen(command, stdin=none, stdout=none, stderr=pipe, env=environment) as process:
+        used_s = -1.0
+        while True:
+            try:
+                _, errors = process.communicate(timeout=REPORT_STALLED_S)
+                return process.returncode, errors
+            except subprocess.TimeoutExpired:
+                before_s, used_s = used_s, _processor_s(process.pid)
+                if used_s <= before_s:
+                    process.kill()
+                    raise
+            except BaseException:  # Ctrl-C must not leave the process behind
+                process.kill()
+                raise
+
+
+def _processor_s(pid: int) -> float:
+    import psutil
+
+    try:
+        times = psutil.Process(pid).cpu_times()
+    except psutil.Error:
+        return math.inf  # it has just ended: `communicate` has its result
+    return float(times.user + times.system)
 
 
 def tell(ended: EndedRun, targets: Targets, on: tuple[str, ...], clock: Clock, log: RunLog) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
 from pathlib import Path
 
@@ -95,6 +96,33 @@ def test_the_report_is_written_by_another_process(tmp_path: Path) -> None:
     post_run.report(tmp_path, log)  # type: ignore[arg-type]
     assert (tmp_path / REPORT_FILE).is_file()
     assert log.lines[-1] == (logging.INFO, f"the report is {tmp_path / REPORT_FILE}")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no FIFOs")
+@pytest.mark.parametrize("works", [True, False])
+def test_report_is_given_up_only_if_its_process_does_not_work(
+    works: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    RecordStore(tmp_path).close()
+    gate, used_s = tmp_path / "gate", [0.0]
+    os.mkfifo(gate)
+
+    def processor_s(_: int) -> float:
+        if works:
+            used_s[0] += 1.0
+        if used_s[0] == 3.0:
+            gate.write_bytes(b"")  # the process, which waits for this, ends now
+        return used_s[0]
+
+    waiting = [sys.executable, "-c", f"open({str(gate)!r}).read()"]
+    monkeypatch.setattr(post_run, "REPORT_STALLED_S", 0.05)
+    monkeypatch.setattr(post_run, "_processor_s", processor_s)
+    monkeypatch.setattr(post_run, "python_command", lambda _: waiting)
+    log = Log()
+    post_run.report(tmp_path, log)  # type: ignore[arg-type]
+    level, text = log.lines[-1]
+    assert (level == logging.INFO) is works
+    assert ("has not worked for" in text) is not works
 
 
 def test_run_without_a_record_has_no_report_and_no_warning(tmp_path: Path) -> None:

@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
-from afspm.cli.arguments import PLUGINS
+from afspm.cli.arguments import PLUGINS, HelpWhenBare
 
 app = typer.Typer(
-    no_args_is_help=True,
+    cls=HelpWhenBare,
     rich_markup_mode="markdown",
     rich_help_panel=PLUGINS,
     help="AFMBench-Sim: try agents and algorithms on simulated tasks with known truth.",

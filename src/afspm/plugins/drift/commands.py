@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
-from afspm.cli.arguments import AFTERWARDS
+from afspm.cli.arguments import AFTERWARDS, HelpWhenBare, NoProgress
 
 _FILES = "files"
 
 
-class FilesUnlessNamed(TyperGroup):
+class FilesUnlessNamed(HelpWhenBare):
     """Command group that runs `afspm drift a.sxm` as `afspm drift files a.sxm`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -25,8 +24,6 @@ class FilesUnlessNamed(TyperGroup):
 
 app = typer.Typer(
     cls=FilesUnlessNamed,
-    no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode="markdown",
     rich_help_panel=AFTERWARDS,
     help="Follow drift in recorded scans (afspm drift FILE…; its options: afspm drift files --help), or study settings "
@@ -57,6 +54,7 @@ def files(
     tracker: Annotated[str, typer.Option(help="How drift is followed from scan to scan.")] = "bank",
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where to write.")] = Path("drift"),
     jobs: Jobs = None,
+    quiet: NoProgress = False,
 ) -> None:
     """Follow drift in recorded scans.
 
@@ -71,7 +69,7 @@ def files(
     # only for a class of one's own: the current folder may be a download, with a module named like a library's
     folders = [Path.cwd()] if "." in estimator + tracker else []
     with importing_from(folders):
-        drift_files.run(paths, channel, estimator, tracker, output, jobs)
+        drift_files.run(paths, channel, estimator, tracker, output, jobs, quiet=quiet)
 
 
 @app.command("study")
@@ -90,6 +88,7 @@ def study(
         str, typer.Option(metavar="ADDRESS", help="The scheduler of a Dask cluster to work on.", show_default=False)
     ] = "",
     jobs: Jobs = None,
+    quiet: NoProgress = False,
 ) -> None:
     """Simulate many nights over a grid of settings, rank the settings, and check whether the defaults hold."""
     _one_thread_a_process()
@@ -97,7 +96,7 @@ def study(
     from afspm.plugins.drift import study_commands as drift_study
 
     with importing_from([Path.cwd()]):
-        drift_study.run(settings or [], nights, seed, cluster, jobs)
+        drift_study.run(settings or [], nights, seed, cluster, jobs, quiet=quiet)
 
 
 def _one_thread_a_process() -> None:

@@ -19,6 +19,7 @@ from rich.table import Table
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import AfspmError, FileError, InvalidValue
 from afspm.basics.formatting import counted, day_and_time
+from afspm.basics.progress_line import ProgressLine
 from afspm.model import RegistrationOutcome
 from afspm.plugins.drift.estimators import estimator
 from afspm.plugins.drift.offline import Stack, against_first, corrected, followed
@@ -54,7 +55,9 @@ class Analysis:
     estimates: DriftRecord
 
 
-def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Path, jobs: int | None) -> None:
+def run(
+    paths: Sequence[Path], channel: str, by: str, following: str, output: Path, jobs: int | None, *, quiet: bool
+) -> None:
     """Analyse files, print the table, and write the results.
 
     Raises:
@@ -62,7 +65,8 @@ def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Pa
             `written`.
     """
     console, aside = Console(file=sys.stdout, highlight=False), Console(stderr=True, highlight=False)
-    contents, unreadable = read_all(paths)
+    with ProgressLine("reading the files", quiet=quiet):
+        contents, unreadable = read_all(paths)
     for reason in unreadable:
         aside.print(f"left out: {reason}", markup=False, soft_wrap=True)
     if not contents:
@@ -72,11 +76,13 @@ def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Pa
         aside.print(f"left out: {reason}", markup=False, soft_wrap=True)
     begun = day_and_time(round(found.scans[0].mid_s * NS_PER_S), UTC, seconds=False)
     console.print(f"{counted(len(found.scans), 'scan')} of {found.channel} from {begun} on", markup=False)
-    analysis = analysed(found.scans, by, following, jobs, aside)
+    analysis = analysed(found.scans, by, following, jobs, aside, quiet=quiet)
     console.print(as_table(analysis.record))
     console.print(analysis.record.summary())
     truth_m = true_drift(paths[0], found.scans) if len(paths) == 1 else None  # only a single run has one truth
-    for path in written(found, analysis, truth_m, output, aside):
+    with ProgressLine("drawing the figures", quiet=quiet):
+        files = list(written(found, analysis, truth_m, output, aside))
+    for path in files:
         console.print(str(path), markup=False, soft_wrap=True)
 
 
@@ -109,7 +115,9 @@ def register_pair(by: str, reference: DriftScan, scan: DriftScan) -> Registratio
     return estimator(by).register(reference, scan)
 
 
-def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int | None, console: Console) -> Analysis:
+def analysed(
+    scans: Sequence[DriftScan], by: str, following: str, jobs: int | None, console: Console, *, quiet: bool
+) -> Analysis:
     """Track drift through the scans, and register each later scan with the first in parallel.
 
     The tracker runs in this process. Registrations run in other processes, or with a single job in a thread.
@@ -118,7 +126,10 @@ def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int | No
     wanted = processes(jobs, sum(scan.values.size for scan in scans))
     others = 1 if wanted == 1 else max(wanted - 1, 2)  # processes that register pairs; 1: this process
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as progress, ThreadPoolExecutor(1) as beside:
+    with (
+        Progress(*columns, console=console, transient=True, disable=quiet) as progress,
+        ThreadPoolExecutor(1) as beside,
+    ):
         track = progress.add_task("followed", total=len(scans))
         pair = progress.add_task("compared with the first", total=len(scans) - 1)
         work = beside.submit(_pairs, scans, by, others, lambda: progress.advance(pair))

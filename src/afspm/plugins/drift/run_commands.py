@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from afspm.plugins.drift.remount import Remount
     from afspm.record.run import Run
 
-compare_app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
-find_app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
+compare_app = typer.Typer(rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
+find_app = typer.Typer(rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
 
 
 @compare_app.command()

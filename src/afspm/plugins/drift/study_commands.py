@@ -45,7 +45,7 @@ def metrics_of(settings: NightSettings, seed: int) -> Mapping[str, float]:
     return night(settings, seed).metrics()
 
 
-def run(given: Sequence[str], nights: int, seed: int, cluster: str, jobs: int | None) -> None:
+def run(given: Sequence[str], nights: int, seed: int, cluster: str, jobs: int | None, *, quiet: bool) -> None:
     """Run a study and print its results."""
     combinations = dict(SettingsGrid.of(given).settings())
     tasks = [(settings, seed + k) for k in range(nights) for settings in combinations.values()]
@@ -54,7 +54,7 @@ def run(given: Sequence[str], nights: int, seed: int, cluster: str, jobs: int | 
     metrics: dict[str, list[Mapping[str, float]]] = defaultdict(list)
     failed: dict[str, list[str]] = defaultdict(list)
     work = on_cluster(metrics_of, tasks, address=cluster) if cluster else on_cores(metrics_of, tasks, jobs=here)
-    for outcome in _shown(work, len(tasks)):
+    for outcome in _shown(work, len(tasks), quiet=quiet):
         label = labels[outcome.index % len(labels)]
         if outcome.error:
             failed[label].append(outcome.error)
@@ -63,9 +63,9 @@ def run(given: Sequence[str], nights: int, seed: int, cluster: str, jobs: int | 
     show(summarised(labels, metrics, failed), Console(file=sys.stdout, highlight=False))
 
 
-def _shown(outcomes: Iterator[TaskOutcome], total: int) -> Iterator[TaskOutcome]:
+def _shown(outcomes: Iterator[TaskOutcome], total: int, *, quiet: bool) -> Iterator[TaskOutcome]:
     columns = (TextColumn("nights"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=quiet) as progress:
         task = progress.add_task("nights", total=total)
         for outcome in outcomes:
             progress.advance(task)

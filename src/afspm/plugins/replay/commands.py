@@ -10,7 +10,7 @@ import typer
 from afspm.basics.formatting import counted
 from afspm.cli.arguments import AFTERWARDS, RUNS, RecordedRun, names_in, opt
 
-app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
+app = typer.Typer(rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
 
 
 @app.command()

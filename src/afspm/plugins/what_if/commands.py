@@ -14,7 +14,7 @@ import typer
 from afspm.basics.clock import iso_utc
 from afspm.basics.errors import AfspmError
 from afspm.basics.formatting import counted, day_and_time
-from afspm.cli.arguments import AFTERWARDS, names_in, opt
+from afspm.cli.arguments import AFTERWARDS, NoProgress, names_in, opt
 
 if TYPE_CHECKING:
     from afspm.plugins.what_if.alignment import Difference, Output
@@ -27,7 +27,7 @@ INCOMPLETE = 1
 _MOST_SHOWN = 10
 GivenChanges: TypeAlias = dict[str, dict[str, object]] | Path | None
 """The changed experiment file, or new settings by component."""
-app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
+app = typer.Typer(rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
 
 
 @app.command()
@@ -62,6 +62,7 @@ def what_if(
     page: Annotated[
         Path | None, opt("Write the result as one HTML page, too.", "--page", metavar="FILE", dir_okay=False)
     ] = None,
+    quiet: NoProgress = False,
 ) -> None:
     """Replay recorded nights with a change, and show the differences.
 
@@ -76,7 +77,7 @@ def what_if(
         differs = [_rerun(folder, changes, runs) for folder in folders]
         code = DIFFERS if any(differs) else 0
     else:
-        code = _replay(folders, changes, names_in(component), page, import_from or [], as_json=as_json)
+        code = _replay(folders, changes, names_in(component), page, import_from or [], as_json=as_json, quiet=quiet)
     if code:
         raise typer.Exit(code)
 
@@ -127,14 +128,17 @@ def _replay(
     import_from: list[Path],
     *,
     as_json: bool,
+    quiet: bool,
 ) -> int:
+    from afspm.basics.progress_line import ProgressLine
     from afspm.plugins.what_if.page import DifferencePage
     from afspm.plugins.what_if.what_if import what_if
 
     page, differs, is_whole = DifferencePage(changes), False, True
     for folder in folders:
         try:
-            result = what_if(folder, changes, only=only, import_from=import_from)
+            with ProgressLine(folder.name, quiet=quiet) as line:
+                result = what_if(folder, changes, only=only, import_from=import_from, step=line.step)
         except AfspmError as error:
             if len(folders) == 1:
                 raise

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC
@@ -190,7 +190,12 @@ class WhatIf:
 
 
 def what_if(
-    run: str | Path, changes: Changes = None, *, only: Collection[str] = (), import_from: Sequence[str | Path] = ()
+    run: str | Path,
+    changes: Changes = None,
+    *,
+    only: Collection[str] = (),
+    import_from: Sequence[str | Path] = (),
+    step: Callable[[str], None] = lambda _: None,
 ) -> WhatIf:
     """Replay a recorded run with changed components, and compare their outputs with the recorded outputs.
 
@@ -211,6 +216,7 @@ def what_if(
             run's. None: only the installed version differs.
         only: names of processes to replay; empty: all.
         import_from: folders with trusted modules.
+        step: called with each step of the work, for a line of progress.
 
     Raises:
         FileError: the run has no recorded requests, those of a changed or chosen process can't be read, or the
@@ -236,6 +242,7 @@ def what_if(
             if only and name not in only:
                 result.left_out[name] = "only others were chosen"
                 continue
+            step(f"replaying {name}")
             try:
                 if path.name.endswith(step_log.SUFFIX):
                     _replay_scheduler(result, name, path, changed.get(name))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -63,10 +63,18 @@ class FigurePicture:
     ratio: float
 
 
-def of_scans(run: Run, rows: Sequence[ScanRow], bad_ns: Collection[int] = ()) -> list[TopographyPicture]:
-    """Return the scans with pictures; `bad_ns`: the times of the bad scans."""
+def of_scans(
+    run: Run,
+    rows: Sequence[ScanRow],
+    bad_ns: Collection[int] = (),
+    step: Callable[[str], None] = lambda _: None,
+) -> list[TopographyPicture]:
+    """Return the scans with pictures; `bad_ns`: times of the bad scans; `step`: called with a text before each scan."""
     changed = run.changed_rows()
-    read = [_read(run, row) for row in rows]
+    read = []
+    for count, row in enumerate(rows, 1):
+        step(f"reading scan {count} of {len(rows)}")
+        read.append(_read(run, row))
     compared: dict[tuple[str, float], list[Array]] = {}
     for one, values in read:
         if one.thumbnail is not None and values is not None:
