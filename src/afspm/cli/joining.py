@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import json
 import platform
 import sys
 from collections.abc import Iterable, Iterator
@@ -36,24 +37,25 @@ def person() -> str:
 
 
 @contextmanager
-def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
+def looking(where: Path, *, lines: bool = False, as_json: bool = False) -> Iterator[Follower]:
     """Open a follower of the run at `where`; if no run goes on there, end the command with `NOT_RUNNING`.
 
     Args:
         where: the folder of a run, a folder of runs (its newest) or an experiment file (its newest run).
         lines: whether to follow lines of unfinished scans, too.
+        as_json: whether a program reads the output, also that no run goes on.
     """
     from afspm import wire
     from afspm.cli.follower import Follower
     from afspm.wire.messages import SCAN_LINES
 
-    folder = _running(where)
+    folder = _running(where, as_json=as_json)
     envelopes = (*wire.messages_without_values(), *([SCAN_LINES.name] if lines else []))
     with Follower(folder, TERMINAL, envelopes) as follower:
-        with _only_if_running(folder):
+        with _only_if_running(folder, as_json=as_json):
             follower.catch_up()
         if follower.ended:
-            say_nothing_runs(f"{folder.resolve().name} has just ended")
+            say_nothing_runs(f"{folder.resolve().name} has just ended", as_json=as_json)
         yield follower
 
 
@@ -62,8 +64,8 @@ def acting(where: Path) -> Iterator[Scope]:
     """Connect to the run at `where`, as for `looking`, in the user's name; end the command if no run goes on there."""
     from afspm.client.connect import join
 
-    folder = _running(where)
-    with _only_if_running(folder):
+    folder = _running(where, as_json=False)
+    with _only_if_running(folder, as_json=False):
         scope = join(folder, person())
     with scope:
         yield scope
@@ -97,20 +99,27 @@ def can_show_blocks() -> bool:
     return True
 
 
-def say_nothing_runs(why: str) -> NoReturn:
+def say_nothing_runs(why: str, *, as_json: bool = False) -> NoReturn:
     """End the command because no run goes on: raises typer.Exit."""
-    typer.echo(f"afspm: nothing runs here: {why}", err=True)
-    raise typer.Exit(NOT_RUNNING)
+    _end_without_run(f"nothing runs here: {why}", as_json=as_json, running=False)
 
 
-def say_unreachable(folder: Path, computer: str) -> NoReturn:
+def say_unreachable(folder: Path, computer: str, *, as_json: bool = False) -> NoReturn:
     """End the command because a run on another computer does not answer: raises typer.Exit."""
     what = f"{folder.resolve().name} was started on {computer}, and does not answer to this computer"
-    typer.echo(f"afspm: {what} ({platform.node()}): run this command there", err=True)
+    _end_without_run(f"{what} ({platform.node()}): run this command there", as_json=as_json, running=None)
+
+
+def _end_without_run(why: str, *, as_json: bool, running: bool | None) -> NoReturn:
+    # running: null where it is not known
+    if as_json:
+        typer.echo(json.dumps({"running": running, "why": why}, indent=2, ensure_ascii=False))
+    else:
+        typer.echo(f"afspm: {why}", err=True)
     raise typer.Exit(NOT_RUNNING)
 
 
-def _running(where: Path) -> Path:
+def _running(where: Path, *, as_json: bool) -> Path:
     from afspm.basics.errors import FileError
     from afspm.client.connect import find_run
     from afspm.record.run_json import ENDED, read_run_json
@@ -118,15 +127,15 @@ def _running(where: Path) -> Path:
     try:
         folder = find_run(where)
     except FileError as error:
-        say_nothing_runs(str(error))
+        say_nothing_runs(str(error), as_json=as_json)
     ended = read_run_json(folder).get(ENDED)
     if ended:
-        say_nothing_runs(f"{folder.resolve().name} has ended ({ended})")
+        say_nothing_runs(f"{folder.resolve().name} has ended ({ended})", as_json=as_json)
     return folder
 
 
 @contextmanager
-def _only_if_running(folder: Path) -> Iterator[None]:
+def _only_if_running(folder: Path, *, as_json: bool) -> Iterator[None]:
     from afspm.basics.errors import ExperimentEnded, NoResponse
     from afspm.record.run_json import run_json_or_empty
     from afspm.record.run_lock import cut_off_message, other_computer
@@ -134,16 +143,16 @@ def _only_if_running(folder: Path) -> Iterator[None]:
     try:
         yield
     except ExperimentEnded as error:
-        say_nothing_runs(str(error))
+        say_nothing_runs(str(error), as_json=as_json)
     except NoResponse:
         if told := cut_off_message(folder):
-            say_nothing_runs(f"no scheduler answers in {folder.resolve().name}; {told}")
+            say_nothing_runs(f"no scheduler answers in {folder.resolve().name}; {told}", as_json=as_json)
         if name := other_computer(folder):
-            say_unreachable(folder, name)
+            say_unreachable(folder, name, as_json=as_json)
         said = f"no scheduler answers in {folder.resolve().name}, though it has not ended"
         if (run_json_or_empty(folder).get("guest") or {}).get("keys"):
             said += f"; perhaps its scheduler lacks the public key of {TERMINAL}"
-        say_nothing_runs(said)
+        say_nothing_runs(said, as_json=as_json)
 
 
 def plain_table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> Table:

@@ -31,7 +31,7 @@ def status(
 
     Ends with 3 if no experiment runs.
     """
-    with looking(where) as follower:
+    with looking(where, as_json=as_json) as follower:
         text = _text(follower)
         if as_json:
             typer.echo(json.dumps(text.as_json(), indent=2, ensure_ascii=False))

@@ -58,6 +58,19 @@ def flagged(seen: Overview) -> Iterator[tuple[int, str, Span | None]]:
         yield number, seen.problems.name(number), seen.timelines.problems[number].now
 
 
+def problems_as_json(seen: Overview) -> list[dict[str, object]]:
+    """Return the flagged problems for programs."""
+    return [
+        {
+            "number": number,
+            "name": name,
+            "since": _iso(span.start_ns if span else None),
+            "by": span.by if span else "",
+        }
+        for number, name, span in flagged(seen)
+    ]
+
+
 def log_line(line: LogLine) -> Text:
     from rich.text import Text
 
@@ -247,6 +260,7 @@ class StatusText:
         seen, run = self._seen, self._run
         control, running, end_ns = seen.control, seen.scan_progress(self._now_ns), self._end_ns()
         return {
+            "running": True,
             "experiment": run.name,
             "folder": run.folder,
             "simulated": run.simulated,
@@ -257,15 +271,7 @@ class StatusText:
             "since": _iso(seen.control_since_ns),
             "by_hand": seen.by_hand or None,
             "tip": None if seen.tip is None else {"engaged": seen.tip.engaged, "feedback_on": seen.tip.feedback_on},
-            "problems": [
-                {
-                    "number": number,
-                    "name": name,
-                    "since": _iso(span.start_ns if span else None),
-                    "by": span.by if span else "",
-                }
-                for number, name, span in flagged(seen)
-            ],
+            "problems": problems_as_json(seen),
             "state": seen.status.state.name if seen.status else None,
             "scan": None if running is None else {"part": round(running[0], 4), "remaining_s": _seconds(running[1])},
             "progress": {name: self._progress_json(report) for name, report in seen.progress_reports.items()},

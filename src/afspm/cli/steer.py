@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -76,6 +77,7 @@ def problems(
         list[str] | None, typer.Option("--clear", metavar="NAME", help="Remove its flag.", show_default=False)
     ] = None,
     clear_all: Annotated[bool, typer.Option("--clear-all", help="Remove the flags of all problems.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="List them for programs.")] = False,
 ) -> None:
     """List the flagged problems, with the sources and times of their flags; or flag and clear problems.
 
@@ -85,14 +87,15 @@ def problems(
         with acting(where) as scope:
             for name in flag or ():
                 scope.flag(name)
-                typer.echo(f"flagged {name}")
+                typer.echo(f"flagged {name}", err=as_json)
             for name in clear or ():
                 scope.clear(name)
-                typer.echo(f"cleared {name}")
+                typer.echo(f"cleared {name}", err=as_json)
             for name in scope.clear_all() if clear_all else ():
-                typer.echo(f"cleared {name}")
-        return
-    _list(where)
+                typer.echo(f"cleared {name}", err=as_json)
+        if not as_json:
+            return
+    _list(where, as_json=as_json)
 
 
 def note(
@@ -133,12 +136,17 @@ def note(
     typer.echo("noted" if row is None else f"noted on scan {row.number}")
 
 
-def _list(where: Path) -> None:
+def _list(where: Path, *, as_json: bool) -> None:
     from afspm.basics.clock import NS_PER_S
     from afspm.basics.formatting import duration_text
-    from afspm.cli.status_text import flagged
+    from afspm.cli.status_text import flagged, problems_as_json
 
-    with looking(where) as follower:
+    with looking(where, as_json=as_json) as follower:
+        if as_json:
+            known = list(follower.overview.problems)
+            facts = {"running": True, "problems": problems_as_json(follower.overview), "known": known}
+            typer.echo(json.dumps(facts, indent=2, ensure_ascii=False))
+            return
         now_ns, found = follower.clock.now_ns(), list(flagged(follower.overview))
         for _, name, span in found:
             since = f", for {duration_text((now_ns - span.start_ns) / NS_PER_S)}" if span else ""

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from deadlines import DEADLINE_S
+from published_schemas import require_valid
 from systems import can_interrupt, interrupt, kill
 from typer.testing import CliRunner
 
@@ -86,6 +87,7 @@ class Running:
 
     def status(self) -> dict[str, Any]:
         told: dict[str, Any] = json.loads(afspm_here("status", self.runs, "--json").stdout)
+        require_valid("status", told)
         return told
 
     def until(self, holds: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
@@ -138,6 +140,10 @@ def test_pause_and_continue_are_manual_and_automated(night: Running) -> None:
 def test_a_problem_is_flagged_and_cleared_by_the_person(night: Running) -> None:
     assert afspm_here("problems", night.runs, "--flag", "thermal-drift").exit_code == 0
     listed = afspm("problems", night.runs).stdout
+    told = json.loads(afspm_here("problems", night.runs, "--json").stdout)
+    require_valid("problems", told)
+    assert [one["name"] for one in told["problems"]] == ["thermal-drift"]
+    assert "tip-shape-changed" in told["known"]
     assert "thermal-drift, for" in listed
     assert f"flagged by {person()}" in listed
     assert afspm_here("problems", night.runs, "--clear", "thermal-drift").exit_code == 0

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import pytest
 import typer
+from published_schemas import require_valid
+from typer.testing import CliRunner
 
 from afspm.basics.errors import NoResponse
+from afspm.cli.app import app
 from afspm.cli.joining import NOT_RUNNING, acting, looking, plain_console
 from afspm.record.run_lock import cut_off_message, describe_state, lock_run
 
@@ -46,6 +50,18 @@ def test_message_on_a_run_that_was_cut_off_names_resume_and_on_a_running_one_the
     assert (f"it was cut off; `afspm run --resume {tmp_path / 'night-1'}` goes on with it" in said) is not runs
     assert ("though it has not ended" in said) is runs
     assert ("lacks the public key of terminal" in said) is (runs and keys != "null")
+
+
+@pytest.mark.parametrize("command", ["status", "problems"])
+def test_program_learns_that_a_run_has_ended(command: str, tmp_path: Path) -> None:
+    folder = tmp_path / "night-1"
+    folder.mkdir()
+    (folder / "run.json").write_text('{"name": "night", "ended": "all plans are done"}', encoding="utf-8")
+    result = CliRunner().invoke(app, [command, str(folder), "--json"])
+    told = json.loads(result.stdout)
+    require_valid(command, told)
+    assert (result.exit_code, told["running"]) == (NOT_RUNNING, False)
+    assert "night-1 has ended (all plans are done)" in told["why"]
 
 
 def test_run_of_another_computer_is_not_called_cut_off(

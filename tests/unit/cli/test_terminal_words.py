@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from published_schemas import require_valid
 from rich.console import Console
 
 from afspm import model
@@ -173,6 +174,7 @@ def test_status_without_packets_shows_that_nothing_is_known() -> None:
 
 def test_json_has_the_same_facts_as_the_text(night: Overview) -> None:
     told = json.loads(json.dumps(StatusText(night, ABOUT, START + 160 * S).as_json()))
+    require_valid("status", told)
     assert (told["mode"], told["holder"], told["simulated"]) == ("AUTOMATED", "series", True)
     assert [(one["name"], one["by"]) for one in told["problems"]] == [("tip-shape-changed", "judge")]
     assert told["scan"] == {"part": 0.5, "remaining_s": 50.0}

@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from published_schemas import require_valid
 from typer.testing import CliRunner
 
 from afspm.cli.app import app
@@ -77,6 +78,29 @@ def test_keys_makes_a_pair_for_each_process_and_person_and_leaves_old_ones(
     assert (tmp_path / "keys" / "public" / "ana.key").read_text() == before
 
 
+@pytest.mark.parametrize(
+    ("words", "some"),
+    [
+        (("afspm", ""), {"run", "export", "drift", "what-if", "bench"}),
+        (("afspm", "drift", ""), {"files", "study"}),
+        (("afspm", "new", "d"), {"driver"}),
+        (("afspm", "what-if", "--"), {"--component", "--closed"}),
+    ],
+)
+def test_shell_completes_commands_of_all_packages_and_their_options(
+    words: tuple[str, ...], some: set[str], runner: CliRunner
+) -> None:
+    asked = {"_AFSPM_COMPLETE": "complete_bash", "COMP_WORDS": " ".join(words), "COMP_CWORD": str(len(words) - 1)}
+    assert some <= {*runner.invoke(app, [], prog_name="afspm", env=asked).stdout.split()}
+
+
+@pytest.mark.parametrize("group", [(), ("new",), ("drift",), ("bench",)])
+def test_bare_group_of_commands_shows_its_help_and_ends_with_0(group: tuple[str, ...], runner: CliRunner) -> None:
+    bare, helped = runner.invoke(app, [*group]), runner.invoke(app, [*group, "--help"])
+    assert (bare.exit_code, bare.stdout) == (0, helped.stdout)
+    assert ("--install-completion" in bare.stdout) is not group, "completion is installed for all commands at once"
+
+
 def test_help_keeps_names_in_brackets_and_fills_its_paragraphs(runner: CliRunner) -> None:
     helped = " ".join(runner.invoke(app, ["keys", "--help"]).output.replace("│", " ").split())
     assert "Default: [security] keys of the file" in helped
@@ -123,6 +147,7 @@ def test_findings_are_json_for_programs(write: Write, runner: CliRunner) -> None
         "level": "warning", "file": "night.toml", "line": 1, "what": "nothing uses the variable 'size_of'", "hint": "",
     }  # fmt: skip
     assert (wrong["level"], wrong["what"]) == ("error", "[repair] has no setting 'volage'")
+    require_valid("check", [unused, wrong])
     write(CORRECTOR)
     good = runner.invoke(app, ["check", "--json", "night.toml"])
     assert (good.exit_code, json.loads(good.stdout)) == (0, [])
