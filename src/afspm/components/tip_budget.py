@@ -12,6 +12,9 @@ from afspm.storage.memory import Memory
 
 _ROUNDING = 1e-9  # relative: five crashes of 4 nm fit into 20 nm
 
+# names in the experiment file
+_SETTINGS = {"pulses": "night_pulses", "depth_m": "night_depth", "area_m2": "night_places", "time_s": "night_time"}
+
 
 @dataclass(frozen=True)
 class RepairCost:
@@ -55,7 +58,7 @@ class RepairBudget:
     def __post_init__(self) -> None:
         negative = [one.name for one in fields(self) if (getattr(self, one.name) or 0.0) < 0.0]
         if negative:
-            raise ConfigError(f"a budget can't be negative: {', '.join(negative)}")
+            raise ConfigError("a budget can't be negative", where=_SETTINGS[negative[0]])
 
     def exceeded_by(self, cost: RepairCost) -> tuple[str, ...]:
         """Return the names of the bounds that a cost exceeds."""
@@ -104,8 +107,8 @@ class RepairAccount:
 
     def why_over(self, treatment: Treatment) -> str:
         cost = self.spent.plus(cost_of(treatment, self._spacing_m)).after(self.step_s)
-        over = self._budget.exceeded_by(cost)
-        return f"the budget of the night is spent: no {treatment} is left in {', '.join(over)}"
+        over = [_SETTINGS[name] for name in self._budget.exceeded_by(cost)]
+        return f"the budget of the night is spent: a {treatment} does not fit into the rest of {' and '.join(over)}"
 
     def charge(self, treatment: Treatment, tenure: int) -> None:
         """Charge a treatment before it is attempted; after a kill it counts as done.

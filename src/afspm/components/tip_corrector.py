@@ -108,14 +108,15 @@ class TipCorrector(Component):
         night_time: Duration | None = None,
     ) -> None:
         self.test_center = None if test_center is None else pair(test_center)
-        # `afspm check` compares them with the limits
-        self.positions = tuple(place for place in (pair(workshop_center), self.test_center) if place is not None)
+        # `afspm check` compares them with the limits, and with the regions of the scans
+        self.pulse_voltages, self.workshop_center = pulse_voltages, pair(workshop_center)
+        self.positions = tuple(place for place in (self.workshop_center, self.test_center) if place is not None)
         self.allowed = treatments(pulse_voltages, pulse_duration, crash_depths, crash_speed)
         pulses = (names.PULSE,) if pulse_voltages else ()
         crashes = (names.CRASH,) if crash_depths else ()
         self.needs_actions = (names.START_SCAN, *pulses, *crashes)
         self.problem = problem
-        self.places = TreatmentPlaces(pair(workshop_center), place_spacing, keep_away)
+        self.places = TreatmentPlaces(self.workshop_center, place_spacing, keep_away)
         self.pairing = ChannelPairing(channel, retrace_channel)
         self.judge = TipJudge(reference_scans) if judge == "self" or policy == "learn" else None
         self.clears = judge == "self"
@@ -362,7 +363,8 @@ class TipCorrector(Component):
             self.log.warning("the experiment's region could not be set again: %s", refused.reason)
 
     def _give_up(self, why: str) -> None:
-        self.log.error("the tip can't be repaired: %s; nothing is scanned until a person clears the problem", why)
+        cure = "until a person clears the problem, or ends the run (`afspm end`)"
+        self.log.error("the tip can't be repaired: %s; nothing is scanned %s", why, cure)
         self.scope.flag(Problem.DEVICE_MALFUNCTION)
         self._wait_flag(Problem.DEVICE_MALFUNCTION, flagged=True)
         self.memory["given_up"] = True

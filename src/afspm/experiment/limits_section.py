@@ -200,12 +200,16 @@ class LimitsReader:
             what, near = f"[limits.roles] there is no component {component_of(name)!r}", component_of(name)
             self.document.error(what, *path, hint=nearest(near, self.components))
         plain = dict(table) if isinstance(table, Mapping) else {}
-        given = parse(RoleSection, ".".join(path), plain, self.document)
+        given = parse(RoleSection, ".".join(path), plain, self.document, path)
         ranges = {one: self._range(one, pair, path) for one, pair in (given.parameters or {}).items()}
-        for action in (*(given.actions or ()), *(given.per_hour or ())):
+        places: list[tuple[str, tuple[str | int, ...]]] = [
+            *((action, ("actions", number)) for number, action in enumerate(given.actions or ())),
+            *((action, ("per_hour", action)) for action in given.per_hour or ()),
+        ]
+        for action, place in places:
             if action not in self._known_actions and (self.actions is not None or not action.startswith("x-")):
                 what = f"[{'.'.join(path)}] there is no action {action!r}"
-                self.document.error(what, *path, hint=nearest(action, self._known_actions))
+                self.document.error(what, *path, *place, hint=nearest(action, self._known_actions))
         source = str(self.document.place(*path))
         return RoleLimits(
             ExperimentLimits(

@@ -36,6 +36,8 @@ class PlannedMeasurements:
         kind: kind of the spectra; None: the kind in force.
         placed_later: scans at places that are found in the run, by the setting that gives their size; here anywhere in
             the planned regions.
+        pulse_voltages: voltages of the planned pulses of the tip, in V.
+        workshop_center: (x, y) in m about which the tip is treated; None: it is not treated.
     """
 
     regions: tuple[Region, ...] = ()
@@ -52,6 +54,8 @@ class PlannedMeasurements:
     sweep: SweepPlan | None = None
     kind: str | None = None
     placed_later: Mapping[str, ScanParameters] = field(default_factory=dict)
+    pulse_voltages: tuple[float, ...] = ()
+    workshop_center: XY | None = None
 
     def sets(self, name: str) -> bool:
         """Return whether the plan sets this parameter."""
@@ -126,6 +130,8 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
         sweep if isinstance(sweep := getattr(made, "sweep", None), SweepPlan) else None,
         made.kind if names.SPEC_KIND in getattr(made, "needs_parameters", ()) and hasattr(made, "kind") else None,
         getattr(made, "placed_later", {}),
+        tuple(getattr(made, "pulse_voltages", ())),
+        getattr(made, "workshop_center", None),
     )
 
 
@@ -182,12 +188,12 @@ def _refusals_by(name: str, planned: PlannedMeasurements, limits: ExperimentLimi
         hint = 'list values between them, or leave `order` at "snake"'
         check(ControlRequest.PARAM, after, ("parameters", after.name), hint)
     guard = LimitChecker(limits.fixed)
-    cure = _remedy(planned, limits.region)
+    cure, of_parameters = _remedy(planned, limits.region), len(found)
     for number, region in enumerate(planned.regions):
         wanted, where = ScanParameters(region, planned.shape), ("regions", number)
         if planned.is_listed:
             check(ControlRequest.SET_SCAN_PARAMS, wanted, where, _nearest_text(region, limits.region))
-        elif not found:  # of a grid outside, one reason is enough
+        elif len(found) == of_parameters:  # of a grid outside, one reason is enough
             check(ControlRequest.SET_SCAN_PARAMS, wanted, hint=cure)
     for setting, scan in planned.placed_later.items():
         check(ControlRequest.SET_SCAN_PARAMS, scan, (setting,))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from dataclasses import replace
 
 from afspm import wire
@@ -30,6 +31,7 @@ from afspm.experiment.wiring_classes import BoundSocket
 from afspm.model import HIGHEST_PROBLEM, STOPPED_BY_AGENT, ChannelRoles, PacketHeader, Parameter, ProblemNames, Role
 from afspm.scheduler.publishing.envelopes import CacheSettings, Envelopes
 
+_WORDS = re.compile(r"[\w-]+")
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 FROM_SECTIONS = ("control", "limits", "cache", "conditions")
 """Arguments of a scheduler's constructor, filled from the sections of these names."""
@@ -144,6 +146,7 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
             continue
         if process.wrong is not None:
             _report_errors_inside(process, process.component, resolved)
+            _report_errors_beside(process, process.component, process.wrong, resolved)
         else:
             _resolve_plan(process, process.component, resolved, has)
         if has is not None:
@@ -202,10 +205,50 @@ def _report_errors_inside(process: ResolvedProcess, component: type, resolved: R
         return
 
 
-def _report(name: str, error: AfspmError, resolved: ResolvedExperiment) -> None:
+def _report_errors_beside(
+    process: ResolvedProcess, component: type, wrong: Collection[str], resolved: ResolvedExperiment
+) -> None:
+    # A constructor raises its first error. Without the setting at fault it raises the next, so that a person need not
+    # mend and check again for each. An error that names a setting left out here may come from that: it can wait.
+    remaining, left_out = dict(process.settings), {*wrong}
+    while left_out & remaining.keys():
+        remaining = {key: value for key, value in remaining.items() if key not in left_out}
+        try:
+            planned_measurements.plan_of(component, remaining)
+        except AfspmError as error:
+            for one in individual_errors(error):
+                inside = _at_fault(component, remaining, one)
+                named = {*_WORDS.findall(f"{one.what} {one.hint}")}
+                if len(inside) == 1 and inside[0] in remaining and not named & left_out:
+                    _report(process.name, one, resolved, inside)
+                left_out |= {str(key) for key in inside[:1]}
+        except Exception:  # without a setting that it needs, a constructor may raise anything
+            return
+
+
+def _at_fault(component: type, given: Table, error: AfspmError) -> tuple[str | int, ...]:
+    # the setting that the error names, or without which the constructor does not raise it
+    if (inside := _inside(error)) and inside[0] in given:
+        return inside
+    needed = []
+    for name in given:
+        others = {key: value for key, value in given.items() if key != name}
+        try:
+            planned_measurements.plan_of(component, others)
+        except AfspmError as another:
+            if all(str(one) != str(error) for one in individual_errors(another)):
+                return (name,)
+        except Exception:  # a setting that it needs is left out
+            needed.append(name)
+        else:
+            return (name,)
+    return tuple(needed) if len(needed) == 1 else ()
+
+
+def _report(name: str, error: AfspmError, resolved: ResolvedExperiment, location: tuple[str | int, ...] = ()) -> None:
     inside = _inside(error)
     message = f"{validation_messages.name_of((name, *inside))}{':' if inside else ''} {error.what}"
-    resolved.document.error(message, name, *inside, hint=error.hint)
+    resolved.document.error(message, name, *(location or inside), hint=error.hint)
 
 
 def _inside(error: AfspmError) -> tuple[str | int, ...]:
@@ -222,8 +265,12 @@ def _resolve_plan(
     try:
         plan = planned_measurements.plan_of(component, process.settings)
     except AfspmError as error:
+        wrong = set()
         for one in individual_errors(error):
-            _report(name, one, resolved)
+            inside = _at_fault(component, process.settings, one)
+            _report(name, one, resolved, inside)
+            wrong |= {str(key) for key in inside[:1]}
+        _report_errors_beside(process, component, wrong, resolved)
         return
     except Exception as error:  # the constructor may be the user's, and raise anything
         resolved.document.error(f"[{name}] refuses its settings: {type(error).__name__}: {error}", name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import is_dataclass
 from datetime import datetime
 from functools import partial
@@ -153,8 +153,11 @@ def read_sections(tables: Mapping[str, Settings], document: Document) -> Experim
 S = TypeVar("S")
 
 
-def parse(kind: type[S], name: str, table: Settings, document: Document) -> S:
-    """Return the section `[name]`, a model or a dataclass; after errors, report them and return the defaults.
+def parse(kind: type[S], name: str, table: Settings, document: Document, path: tuple[str, ...] | None = None) -> S:
+    """Return the section `[name]`, a model or a dataclass; report errors, and use the defaults of the wrong keys.
+
+    Args:
+        path: the path of the table in the file; None: (name,).
 
     Raises:
         TypeError: a field of the class has no default.
@@ -162,11 +165,26 @@ def parse(kind: type[S], name: str, table: Settings, document: Document) -> S:
     if required := _required(kind):
         # found at the first file, and not only at one with an error in this section
         raise TypeError(f"{kind.__name__}.{required[0]} needs a default, which takes the place of a faulty [{name}]")
+    adapter = pydantic.TypeAdapter(kind)
     try:
-        return pydantic.TypeAdapter(kind).validate_python(table)
+        return adapter.validate_python(table)
     except pydantic.ValidationError as error:
-        report(error, table, (name,), document, partial(_fields_at, kind))
+        right = table
+        for place in report(error, table, (name,), document, partial(_fields_at, kind), path):
+            right = _without(right, place, kind)
+    try:
+        return adapter.validate_python(right)  # further checks see the right keys: all errors are found at once
+    except pydantic.ValidationError:
         return kind()
+
+
+def _without(table: Settings, place: Sequence[str | int], kind: type) -> Settings:
+    # of a mapping the wrong entry is left out; a section within a section, and a list, are right as a whole or not
+    key, *inside = place or (None,)
+    below = table.get(key) if isinstance(key, str) else None
+    if isinstance(below, dict) and inside and not any(_sections_in(keys_of(kind).get(str(key)))):
+        return {**table, str(key): {name: value for name, value in below.items() if name != inside[0]}}
+    return {name: value for name, value in table.items() if name != key}
 
 
 def keys_of(kind: type) -> dict[str, object]:

@@ -12,6 +12,7 @@ from typing import Final
 from afspm import wire
 from afspm.basics.addresses import EXAMPLE, hint_on, is_address, reaches
 from afspm.basics.errors import InvalidValue
+from afspm.basics.formatting import quantity
 from afspm.client.component import Component
 from afspm.experiment import class_loader, settings
 from afspm.experiment.findings import Finding, Level, closest, nearest
@@ -36,6 +37,8 @@ _OF_EACH_RUN = ("experiment.toml", "journal.sqlite", "log.txt", "report.html", "
 ADDRESS: Final = "address"
 """Usual name of a translator's setting for the address of its controller."""
 _WORD = re.compile(r"[A-Za-z_][\w-]*")
+_USUAL_PULSE_V = 10.0
+"""Outputs of the usual controllers reach 10 V; a larger voltage is likely to be in another unit."""
 # high, so that an unrelated method named on_… is no typo of a handler
 _HANDLER_CUTOFF = 0.8
 _CALLED_METHODS = ("run", *(name for name in vars(Component) if name.startswith("on_")))
@@ -438,6 +441,22 @@ def check_treatments(resolved: ResolvedExperiment) -> None:
             resolved.document.warning(what, name, hint=hint)
 
 
+def check_meant_treatments(resolved: ResolvedExperiment) -> None:
+    """Warn of pulses and places of treatments that are hardly meant; a limit on pulses says which are meant."""
+    for name, plan in resolved.plans.items():
+        for number, voltage in enumerate(plan.pulse_voltages):
+            if abs(voltage) > _USUAL_PULSE_V and names.PULSE_VOLTAGE not in resolved.limits.parameters:
+                what = f"[{name}] pulse_voltages[{number}] is {quantity(voltage, 'V')}: tips are pulsed with some volts"
+                hint = f"if it is meant, allow it: [limits.{names.PULSE_VOLTAGE}] min = …, max = …"
+                resolved.document.warning(what, name, "pulse_voltages", number, hint=hint)
+        for other, scanned in resolved.plans.items():
+            place = plan.workshop_center
+            if place is not None and any(region.contains(place) for region in scanned.regions):
+                what = f"[{name}] workshop_center lies in the region that [{other}] scans"
+                hint = "choose a place beside it: pulses and crashes change the sample there"
+                resolved.document.warning(what, name, "workshop_center", hint=hint)
+
+
 def check_handlers(resolved: ResolvedExperiment) -> None:
     """Check the names and arguments of methods that look like handlers."""
     for process in resolved.with_role(Role.COMPONENT):
@@ -502,6 +521,7 @@ ALWAYS: Final[tuple[Check, ...]] = (
     check_replaced_choices,
     check_needs,
     check_treatments,
+    check_meant_treatments,
     check_handlers,
     check_notify,
 )

@@ -47,11 +47,14 @@ def report(
     path: SettingPath,
     document: Document,
     known: Callable[[SettingPath], Iterable[str]] = lambda place: (),
-) -> None:
-    """Report pydantic's errors about the value at `path` of the document, one for each place.
+    location: SettingPath | None = None,
+) -> list[SettingPath]:
+    """Report pydantic's errors about a value of the document, one for each place; return the places in the value.
 
     Args:
+        path: name of the value in the texts.
         known: returns the valid names of settings at a place.
+        location: path of the value in the document; None: `path`.
     """
     by_place: dict[SettingPath, list[ErrorDetails]] = {}
     for one in error.errors(include_url=False):
@@ -61,7 +64,8 @@ def report(
             continue  # another member of the union fits better: its error lies deeper
         full = (*path, *place)
         what, hint = _sentence(errors, name_of(full), known(place))
-        document.error(what, *full, hint=hint)
+        document.error(what, *(path if location is None else location), *place, hint=hint)
+    return list(by_place)
 
 
 def name_of(path: SettingPath) -> str:
