@@ -306,7 +306,8 @@ def _show(examined: Examination) -> None:
     from rich.text import Text
 
     console = Console(highlight=False)
-    for one in examined.found:
+    # the lists of what the packages offer come last: they tell nothing of this experiment
+    for one in sorted(examined.found, key=lambda one: (one.code, one.severity.value) == ("package", "fine")):
         word = one.severity.value
         line = Text.assemble((f"{word:8}", _COLOURS[word]), (one.where, "bold"), f": {one.what}")
         if one.remedy:

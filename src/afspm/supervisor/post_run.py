@@ -96,9 +96,17 @@ def summary(outcome: RunOutcome, folder: Path) -> list[str]:
     except DiskTimeout as error:
         lines.append(f"what was measured can't be counted: {error}")
     lines.append(f"everything is in {folder}")
-    if outcome.why in (EndReason.STOPPED, EndReason.PLANS_LOST):
+    if outcome.why is EndReason.PLANS_LOST and _would_fail_again(outcome):
+        lines.append("resumed, it would fail again: correct the experiment file, and begin a new run with it")
+    elif outcome.why in (EndReason.STOPPED, EndReason.PLANS_LOST):
         lines.append(f"{resume_command(folder)} goes on with it")
     return lines
+
+
+def _would_fail_again(outcome: RunOutcome) -> bool:
+    # a resumed run has the settings with which it began
+    given_up = [report for report in outcome.reports if report.given_up]
+    return bool(given_up) and all(report.misconfigured for report in given_up)
 
 
 def _counts_of_record(folder: Path) -> list[str]:

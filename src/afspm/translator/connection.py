@@ -128,7 +128,10 @@ class Connection:
         self.why_lost = _reason(error)
         if not starts and (stood or self.why_lost != self._logged):
             self._logged = self.why_lost
-            self._log.error("lost contact with the controller: %s; retrying", self._logged)
+            if self.ever_stood:
+                self._log.error("lost contact with the controller: %s; retrying", self._logged)
+            else:  # it may be started later, by a person or by afspm
+                self._log.warning("no contact with the controller yet: %s; retrying", self._logged)
         if stood or not self._loss_published:
             self._loss_published = True
             self._on_lost()

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from afspm import wire
 from afspm.model import Packet, Region, Scan, ScopeState, ScopeStatus, Spectrum
@@ -63,6 +64,17 @@ def test_without_a_table_the_record_is_counted(tmp_path: Path) -> None:
 def test_a_table_that_can_not_be_read_is_no_reason_to_fail(tmp_path: Path) -> None:
     (tmp_path / "metadata.csv").write_bytes(b"\xff\xfe\x00,\x00")
     assert summary(RunOutcome(EndReason.EXPERIMENT_ENDED, "", (), 1.0), tmp_path)[-1] == f"everything is in {tmp_path}"
+
+
+@pytest.mark.parametrize("misconfigured", [True, False])
+def test_resuming_is_not_offered_where_it_can_only_fail_again(misconfigured: bool, tmp_path: Path) -> None:
+    reports = (
+        ProcessReport("survey", 1, given_up=True, last_exit="no channel Z", misconfigured=misconfigured),
+        ProcessReport("judge", 1, given_up=False, last_exit="the experiment has ended"),
+    )
+    told = summary(RunOutcome(EndReason.PLANS_LOST, "nothing is left to run", reports, 1.0), tmp_path)
+    assert ("would fail again" in told[-1]) is misconfigured
+    assert ("--resume" in told[-1]) is not misconfigured
 
 
 def test_summary_of_a_stopped_run_names_the_command_to_resume(tmp_path: Path) -> None:

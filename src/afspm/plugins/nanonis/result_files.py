@@ -171,7 +171,7 @@ class NanonisFiles(ResultFiles):
         return _content(Path(entry["result"]), entry)
 
     def _fetch(self, fetch: Fetch, ended: Entry, file: Path | None) -> None:
-        missed = str(file or ended["reported"] or f"in {ended['folder']}")
+        missed, missing = str(file or ended["reported"] or f"in {ended['folder']}"), ""
         try:
             if not ended.get("seen", True):
                 raise FileError("the controller never reported it as running")
@@ -186,7 +186,11 @@ class NanonisFiles(ResultFiles):
             self._kept["ended"] = dict(ended)  # to fetch after the next connection
             raise
         except AfspmError as error:
-            self._log.error("the %s has no file (%s), and can't be fetched over TCP: %s", ended["what"], missed, error)
+            if missing:  # it was stopped, which is no fault of a file
+                self._log.warning("the %s was stopped, and has no file: %s", ended["what"], missing)
+            else:
+                what = ended["what"]
+                self._log.error("the %s has no file (%s), and can't be fetched over TCP: %s", what, missed, error)
             self.broken_off = True
             return
         if ended["reported"] != "":

@@ -117,6 +117,7 @@ class SupervisedChild:
         advised: whether the remedy for a crash has been logged.
         last_exit: description of the last exit.
         unfinished: description of a stop before the process had finished; otherwise empty.
+        misconfigured: whether the last exit was for settings that can't work.
     """
 
     spec: ChildSpec
@@ -129,6 +130,7 @@ class SupervisedChild:
     advised: bool = False
     last_exit: str = ""
     unfinished: str = ""
+    misconfigured: bool = False
 
     @property
     def is_over(self) -> bool:
@@ -154,7 +156,12 @@ class SupervisedChild:
 
 @dataclass(frozen=True)
 class ProcessReport:
-    """Summary of one process for the end of a run; `ordered` counts the restarts ordered by a person."""
+    """Summary of one process for the end of a run.
+
+    Attributes:
+        ordered: number of restarts ordered by a person.
+        misconfigured: whether it was given up for settings that can't work.
+    """
 
     name: str
     starts: int
@@ -162,3 +169,4 @@ class ProcessReport:
     last_exit: str
     ordered: int = 0
     unfinished: str = ""
+    misconfigured: bool = False

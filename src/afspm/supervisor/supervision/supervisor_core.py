@@ -167,7 +167,15 @@ class SupervisorCore:
 
     def reports(self) -> tuple[ProcessReport, ...]:
         return tuple(
-            ProcessReport(name, child.starts, child.given_up, child.last_exit, child.ordered, child.unfinished)
+            ProcessReport(
+                name,
+                child.starts,
+                child.given_up,
+                child.last_exit,
+                child.ordered,
+                child.unfinished,
+                child.misconfigured,
+            )
             for name, child in self.children.items()
         )
 
@@ -222,6 +230,7 @@ class SupervisorCore:
             if code == ExitCode.ENDED:
                 self._end_announced()
             elif code == ExitCode.CONFIG:
+                child.misconfigured = True
                 self._give_up(child, exited.last_error or "its settings can't work")
             elif code == ExitCode.DONE and child.spec.essential:
                 self._end(EndReason.EXPERIMENT_ENDED, f"{child.spec.name} is done")
@@ -237,8 +246,11 @@ class SupervisorCore:
             return
         if not self._idle.is_logged:
             self._idle.is_logged = True
-            then = "" if self._idle.ends else "; Ctrl-C or `afspm end` ends the experiment"
-            self._log(LOGGED_AS, "INFO", f"nothing is left to run: {describe_idle(self.children.values())}{then}")
+            if not self._idle.ends:  # otherwise the end says so
+                why = describe_idle(self.children.values())
+                self._log(
+                    LOGGED_AS, "INFO", f"nothing is left to run: {why}; Ctrl-C or `afspm end` ends the experiment"
+                )
         if self._idle.asks(self._now_s):
             self._effects.append(AskUse())
 
@@ -248,7 +260,9 @@ class SupervisorCore:
         if why:
             if not self._idle.is_postponed:
                 self._idle.is_postponed = True
-                self._log(LOGGED_AS, "INFO", f"the experiment goes on as long as it is in use: {why}")
+                over = describe_idle(self.children.values())
+                goes_on = f"nothing is left to run: {over}; the experiment goes on as long as it is in use: {why}"
+                self._log(LOGGED_AS, "INFO", goes_on)
         elif any(child.given_up for child in self.children.values() if child.spec.acts):
             self._end(EndReason.PLANS_LOST, f"nothing is left to run: {describe_idle(self.children.values())}")
         else:
@@ -341,8 +355,8 @@ class SupervisorCore:
             # the scheduler announces the end to all others; a translator does not subscribe to it
             if child.spec.role is Role.TRANSLATOR and child.life:
                 self._command(ProcessAction.CLOSE_INPUT, child)
-        # the summary reports a regular end in a moment
-        levels = {EndReason.STOPPED: "INFO", EndReason.LOST: "CRITICAL", EndReason.PLANS_LOST: "CRITICAL"}
+        # the summary reports other ends in a moment; that a plan was given up is in the log already
+        levels = {EndReason.STOPPED: "INFO", EndReason.LOST: "CRITICAL"}
         self._log(LOGGED_AS, levels.get(why, "DEBUG"), text)
 
     # --- the end ---
