@@ -100,7 +100,7 @@ def test_on_loopback_a_viewer_looks_at_once_and_gives_a_name_to_steer(served: Se
     browser = served()
     assert browser.get("/").json() == {"person": ""}
     answer = browser.post("/login", data={"person": "Ada"})
-    assert (answer.status_code, answer.headers["location"]) == (303, "/")
+    assert (answer.status_code, answer.headers["location"]) == (303, "./")
     cookie = answer.headers["set-cookie"].lower()
     assert "httponly" in cookie
     assert "samesite=strict" in cookie
@@ -111,7 +111,8 @@ def test_on_loopback_a_viewer_looks_at_once_and_gives_a_name_to_steer(served: Se
 
 def test_beyond_loopback_everything_but_the_sign_in_page_is_closed(served: Served) -> None:
     browser = served("0.0.0.0", KEPT, "http://lab:8080")
-    assert browser.get("/", headers={"accept": "text/html"}).headers["location"] == "/login"
+    assert browser.get("/", headers={"accept": "text/html"}).headers["location"] == "login"
+    assert browser.get("/night/report", headers={"accept": "text/html"}).headers["location"] == "../login"
     assert browser.get("/", headers={"accept": "image/png"}).status_code == 401
     assert browser.post("/act").status_code == 401
     assert browser.talk("http://lab:8080") == ["close"]
@@ -150,7 +151,7 @@ def test_a_link_with_a_token_signs_no_person_in(served: Served) -> None:
     """Another site's page may contain such a link: its reader would steer under the name of its author."""
     browser = served("0.0.0.0", KEPT, "http://lab:8080")
     answer = browser.get("/?token=analytical&name=Ada", headers={"accept": "text/html"})
-    assert (answer.status_code, answer.headers["location"]) == (303, "/login")
+    assert (answer.status_code, answer.headers["location"]) == (303, "login")
     assert "set-cookie" not in answer.headers
     assert browser.get("/?token=analytical&name=Ada").status_code == 401
 

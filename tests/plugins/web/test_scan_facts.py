@@ -10,7 +10,9 @@ import numpy as np
 
 from afspm.basics.clock import ExperimentClock
 from afspm.model import (
+    HEIGHT_RETRACE,
     ActByHand,
+    ChannelRoles,
     ControlMode,
     ControlState,
     Feedback,
@@ -66,21 +68,30 @@ def test_channels_of_one_scan_share_one_number() -> None:
 def test_a_finished_scan_has_number_time_holder_place_and_parameters() -> None:
     overview = overview_of([*a_scan(10), *a_scan(40)])
     frame = ChannelFrame(1, "Height", "m", REGION, VALUES, 50 * S, None, 2)
-    facts = dict(scan_facts(frame, overview, {"Bias": "100 mV"}, 60 * S))
+    facts = dict(scan_facts(frame, overview, {"Bias": "100 mV"}, 60 * S, ChannelRoles()))
     assert {name: facts[name] for name in ("Scan", "Took", "By", "Size", "Centre", "Angle", "Pixels", "Bias")} == {
         "Scan": "no. 2", "Took": "10 s", "By": "series", "Size": "1 × 0.5 µm", "Centre": "(1, −0.5) µm",
         "Angle": "5.73°", "Pixels": "4 × 2", "Bias": "100 mV",
     }  # fmt: skip
 
 
+def test_channel_is_named_and_a_retrace_is_called_one() -> None:
+    roles = ChannelRoles({HEIGHT_RETRACE: ("ZB", "Height Retrace")})
+    shown = []
+    for channel in ("Height", "ZB", "Height Retrace"):
+        frame = ChannelFrame(1, channel, "m", REGION, VALUES, 50 * S, None, 2)
+        shown.append(dict(scan_facts(frame, overview_of([]), {}, 60 * S, roles))["Channel"])
+    assert shown == ["Height", "ZB, retrace", "Height Retrace"]
+
+
 def test_a_scan_before_the_page_s_start_has_its_recorded_setpoint() -> None:
     feedback = [("ZCtrlParameters", Feedback(setpoint=value), time_s * S) for value, time_s in ((0.7, 5), (0.5, 45))]
     overview = overview_of(sorted([*a_scan(10), *a_scan(40), *a_scan(70), *feedback], key=lambda packet: packet[2]))
     frames = [ChannelFrame(1, "Height", "m", REGION, VALUES, time_s * S, None, 2) for time_s in (50, 80)]
-    facts = [dict(scan_facts(frame, overview, {}, 90 * S)) for frame in frames]
+    facts = [dict(scan_facts(frame, overview, {}, 90 * S, ChannelRoles())) for frame in frames]
     assert [one["Setpoint"] for one in facts] == ["0.7", "0.5"]
     read = {"Setpoint": "700 mV"}
-    assert dict(scan_facts(frames[0], overview, read, 90 * S))["Setpoint"] == "700 mV"
+    assert dict(scan_facts(frames[0], overview, read, 90 * S, ChannelRoles()))["Setpoint"] == "700 mV"
 
 
 def test_scan_has_its_tip_at_both_ends_and_the_acts_at_the_microscope_meanwhile() -> None:
@@ -93,7 +104,9 @@ def test_scan_has_its_tip_at_both_ends_and_the_acts_at_the_microscope_meanwhile(
     ]
     overview = overview_of(sorted([*a_scan(10), *a_scan(40), *told], key=lambda packet: packet[2]))
     good, bad = (
-        scan_facts(ChannelFrame(1, "Height", "m", REGION, VALUES, at_s * S, None, 2), overview, {}, 60 * S)
+        scan_facts(
+            ChannelFrame(1, "Height", "m", REGION, VALUES, at_s * S, None, 2), overview, {}, 60 * S, ChannelRoles()
+        )
         for at_s in (20, 50)
     )
     assert dict(good)["Tip"] == "at the sample, feedback on"
@@ -109,14 +122,14 @@ def test_interrupted_scan_has_the_acts_of_its_time_alone() -> None:
     packets = [*a_scan(10), *acts, *ended, ("ScanLines", lines, 44 * S)]
     overview = overview_of(sorted(packets, key=lambda packet: packet[2]))
     frame = ChannelFrame(1, "Height", "m", REGION, VALUES, None, 40 * S, 1, 0)
-    facts = [text for label, text in scan_facts(frame, overview, {}, 80 * S) if label == "By hand"]
+    facts = [text for label, text in scan_facts(frame, overview, {}, 80 * S, ChannelRoles()) if label == "By hand"]
     assert facts == ["the measurement was stopped at the microscope (at 45)"]
 
 
 def test_a_growing_scan_has_its_expected_end() -> None:
     overview = overview_of([*a_scan(10), *states((ScopeState.SCANNING, 40))])
     frame = ChannelFrame(1, "Height", "m", REGION, VALUES, None, 40 * S, 1, 0)
-    facts = dict(scan_facts(frame, overview, {}, 44 * S))
+    facts = dict(scan_facts(frame, overview, {}, 44 * S, ChannelRoles()))
     assert facts["Scan"] == "no. 2"
     assert facts["Lines"] == "1 of 2"
     assert facts["Ends"].endswith("(in 7 s)")

@@ -54,7 +54,7 @@ def test_a_night_by_http_alone_is_in_the_record_under_its_name(started: Started)
     assert ada.ask("POST", "/actions/x-no-such").code == "not-supported"
 
     begun = ada.ask("POST", "/scans", {"region": REGION, "shape": [16, 24], "key": "first"})
-    assert (begun.status, begun.headers["location"]) == (202, "/v1/measurements/first")
+    assert (begun.status, begun.headers["location"]) == (202, "measurements/first")
     done = ada.until_measured("first")
     assert done["state"] == "done"
     assert ada.done("POST", "/scans", {"region": REGION, "shape": [16, 24], "key": "first"}) == done

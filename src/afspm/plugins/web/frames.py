@@ -142,6 +142,11 @@ class FrameStore:
         frame = self._of(channel)
         return frame if frame is None or frame.complete else replace(frame, values=frame.values.copy())
 
+    @property
+    def last_number(self) -> int:
+        """The number of the newest frame of all channels; 0 if there is none."""
+        return self._number
+
     def newest_number(self, channel: str | None = None) -> tuple[int, bool]:
         """Return (number, True if finished) of the newest frame, without a copy; 0 if there is none."""
         frame = self._of(channel)

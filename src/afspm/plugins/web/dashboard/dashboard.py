@@ -78,7 +78,7 @@ class Dashboard(WebComponent):
                 self._watch,
                 allowed_region(self.run_dir),
                 adjustable_parameters(self.run_dir),
-                f"/live/thumbnail/{secrets.token_hex(4)}",
+                f"live/thumbnail/{secrets.token_hex(4)}",
                 allowed_bands(self.run_dir),
                 agents_in(self.run_dir),
             ),

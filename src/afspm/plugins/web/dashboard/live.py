@@ -24,7 +24,7 @@ from afspm.record.drawing.curves import profile
 from afspm.record.drawing.palette import DIVERGING, LEVELS, PALETTES
 from afspm.record.drawing.raster import png
 
-POLL_S = 20.0  # then the browser repeats its request: proxies may close a connection that is silent for longer
+POLL_S = 1.0  # then the browser waits for news on the page's socket: it has few connections for all its tabs
 GROWING_S = 0.2  # between two pictures of a growing scan
 FINISHED_S = 0.004  # between two pictures of finished scans, times the number of waiting viewers (at least ten)
 
@@ -167,7 +167,7 @@ class Live:
     def _facts(self, frame: ChannelFrame) -> Facts:
         with self._watch.reading() as overview:
             conditions = self._conditions.at(began_ns(frame, overview))
-            return scan_facts(frame, overview, conditions, self._watch.clock.now_ns())
+            return scan_facts(frame, overview, conditions, self._watch.clock.now_ns(), self._watch.frames.roles)
 
     def _finished(self, time_ns: int, channel: str) -> ChannelFrame | None:
         with self._watch.reading():

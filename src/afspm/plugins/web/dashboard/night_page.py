@@ -41,7 +41,7 @@ from afspm.record.report import REPORT_FILE, write
 from afspm.record.run_lock import describe_state
 from afspm.record.tables import ScanRow
 
-_HEAD = """<link rel="stylesheet" href="/assets/night.css"><script type="module" src="/assets/night.js"></script>"""
+_HEAD = """<link rel="stylesheet" href="assets/night.css"><script type="module" src="assets/night.js"></script>"""
 
 
 class NightPage(Page):
@@ -61,7 +61,7 @@ class NightPage(Page):
     def _header(self) -> None:
         super()._header()
         ended = escape(describe_state(self._night.folder))
-        report = '<a href="/night/report" target="_blank">Report of the night</a>'
+        report = '<a href="night/report" target="_blank">Report of the night</a>'
         ui.html(f'<p class="how-ended">Recorded: {ended}. {report}</p>{_asset("scrubber")}', sanitize=False)
 
     def _add_more(self) -> None:

@@ -30,8 +30,9 @@ ASSETS = Path(__file__).with_name("assets")
 REFRESH_S = 0.5
 ANSWER_S = 5.0  # a browser that has not drawn the last update within this time gets no more until it has
 THEMES = {"": None, "light": False, "dark": True}
-_HEAD = f"""<style>{timeline.CSS}</style><link rel="stylesheet" href="/assets/dashboard.css">
-<script type="module" src="/assets/page.js"></script>"""
+# relative addresses: behind a proxy the page may lie on a path of its own
+_HEAD = f"""<style>{timeline.CSS}</style><link rel="stylesheet" href="assets/dashboard.css">
+<script type="module" src="assets/page.js"></script>"""
 LEVELLINGS = {Levelling.LINES: "line by line"}
 """Labels of levellings whose value is no word."""
 SIMULATED = "SIMULATED: this is not a real microscope"
@@ -108,10 +109,10 @@ class Page:
 
     def _sign_in_or_out(self) -> None:
         if not self._visitor.person:
-            ui.html('<a class="sign" href="/login">Sign in</a>', sanitize=False)
+            ui.html('<a class="sign" href="login">Sign in</a>', sanitize=False)
             return
         ui.html(
-            f'<form method="post" action="/logout"><span class="person">{escape(self._visitor.person)}</span> '
+            f'<form method="post" action="logout"><span class="person">{escape(self._visitor.person)}</span> '
             '<button type="submit" class="sign">Sign out</button> '
             '<button type="submit" class="sign" name="everywhere" value="yes">everywhere</button></form>',
             sanitize=False,
@@ -142,8 +143,11 @@ class Page:
             self._stop()
 
     def _state(self, content: Content) -> dict[str, object]:
+        with self._services.watch.reading():
+            newest = self._services.watch.frames.last_number
         return {
             "channels": content.channels,
+            "newest": newest,
             "trouble": content.trouble,
             "ended": content.ended,
             "may_measure": self._session.may_measure,

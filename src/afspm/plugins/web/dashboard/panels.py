@@ -272,7 +272,7 @@ class NotesPanel:
                 self._on = ui.select([SCAN, MOMENT], value=SCAN, label="on").props("dense outlined")
                 ui.button("Note", on_click=self._write, color=None).props("no-caps outline")
         else:
-            ui.html('<p class="quiet"><a href="/login">Sign in</a> to write a note.</p>', sanitize=False)
+            ui.html('<p class="quiet"><a href="login">Sign in</a> to write a note.</p>', sanitize=False)
         self._list = ui.html("", sanitize=False).classes("scrolled").props('tabindex="0"')
 
     def show(self, notes: str) -> None:

@@ -72,7 +72,7 @@ def serve(settings: RecordedSettings, tell: Callable[[str], object], stopped: th
     bound = listening(settings.host, settings.port or None, (*_port_before(state, settings.name), *usual))
     watch, archive = NightWatch(night), Archive(night.folder)
     steering = NightSteering(night, access, settings.name)
-    pictures = f"/live/thumbnail/{secrets.token_hex(4)}"
+    pictures = f"live/thumbnail/{secrets.token_hex(4)}"
     services = Services(
         watch, Contents(watch, allowed_region(night.folder), pictures=pictures), steering, Audience(), access,
         night.title, night.simulated, Conditions(watch, partial(steering.do, Visitor())), night.folder,

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.formatting import duration_text, scale, time_of_day, typeset, typeset_area
-from afspm.model import ActByHand, TipStatus
+from afspm.model import ActByHand, ChannelRoles, TipStatus
+from afspm.model.channels import RETRACE
 from afspm.model.geometry import XY
 from afspm.plugins.web.frames import ChannelFrame
 from afspm.record.overview import Overview, ScanSummary
@@ -16,16 +17,20 @@ Facts = list[tuple[str, str]]
 """Pairs of label and text."""
 
 
-def scan_facts(frame: ChannelFrame, overview: Overview, conditions: Mapping[str, str], now_ns: int) -> Facts:
+def scan_facts(
+    frame: ChannelFrame, overview: Overview, conditions: Mapping[str, str], now_ns: int, roles: ChannelRoles
+) -> Facts:
     """Return the facts about a scan, by label.
 
     Args:
         conditions: label and text of the parameters read at its start. Without any, the recorded setpoint is used.
+        roles: the microscope's channels by their roles, which tell a retrace.
     """
     region, (rows, columns) = frame.region, frame.values.shape
     size = ("Size", typeset_area(region.size_m))
     angle = [("Angle", f"{math.degrees(region.angle_rad):.4g}°")] if region.angle_rad else []
     return [
+        ("Channel", _channel(frame.channel, roles)),
         *_when(frame, overview, now_ns),
         size,
         ("Centre", _centre(region.center_m)),
@@ -63,6 +68,11 @@ def _tip_of_scan(frame: ChannelFrame, overview: Overview) -> Facts:
     until_ns = last.time_ns if last is not None and last.interrupted else overview.newest_ns
     began_ns = overview.newest_ns if frame.began_ns is None else frame.began_ns
     return tip_facts((), (act for act in overview.acts if began_ns <= act.time_ns <= until_ns))
+
+
+def _channel(name: str, roles: ChannelRoles) -> str:
+    is_retrace = any(role.endswith(RETRACE) for role in roles.of(name))
+    return name + RETRACE if is_retrace and RETRACE.strip(", ") not in name.lower() else name
 
 
 def _when(frame: ChannelFrame, overview: Overview, now_ns: int) -> Facts:

@@ -64,7 +64,8 @@ class Guard:
         if visitor is None and scope["path"] not in PUBLIC:
             wants_page = scope.get("method") == "GET" and "text/html" in asked.headers.get("accept", "")
             if wants_page:
-                await RedirectResponse(SIGN_IN, 303)(scope, receive, send)
+                up = "../" * (scope["path"].count("/") - 1)
+                await RedirectResponse(f"{up}{SIGN_IN[1:]}", 303)(scope, receive, send)
             else:
                 await _refuse(401, "sign in first", scope, receive, send)
             return
@@ -92,11 +93,11 @@ def add_sign_in(app: FastAPI, access: Access, title: str, *, encrypted: bool, on
             wait_s = access.wait_s(name, address)
             later = f"Too many failed attempts: try again in {wait_s:.0f} s." if wait_s else WRONG
             return page(person, later, 429 if wait_s else 403)
-        return _set_cookie(RedirectResponse("/", 303), cookie, secure=encrypted)
+        return _set_cookie(RedirectResponse("./", 303), cookie, secure=encrypted)
 
     async def leave(request: Request, everywhere: str = Form("")) -> Response:
         await asyncio.to_thread(access.leave, request.cookies.get(COOKIE), everywhere=bool(everywhere))
-        return _set_cookie(RedirectResponse(SIGN_IN, 303), "", secure=encrypted)
+        return _set_cookie(RedirectResponse(SIGN_IN[1:], 303), "", secure=encrypted)
 
     app.get(SIGN_IN, response_model=None)(show)
     app.post(SIGN_IN, response_model=None)(enter)
@@ -109,7 +110,7 @@ def _page(access: Access, title: str, person: str, wrong: str, hint: str) -> str
         person=html.escape(person),
         password="" if access.is_open else _PASSWORD,
         wrong=f'<p class="wrong" role="alert">{html.escape(wrong)}</p>' if wrong else "",
-        look='<a href="/">Watch without signing in</a>'
+        look='<a href="./">Watch without signing in</a>'
         if access.lets_look
         else "<small>Without a name you can watch but not steer.</small>",
         hint=f'<p class="hint">{html.escape(hint)}</p>' if hint else "",

@@ -195,7 +195,7 @@ class CommandRoutes:
     async def _measure(self, asked: Request, answer: HttpResponse, key: str | None, target: Target) -> MeasurementModel:
         begin = self._services.measurements.take(self._services.who(asked), key, target)
         begun: Measurement = await self._services.do(asked, begin)
-        answer.headers["Location"] = f"/v1/measurements/{begun.key}"
+        answer.headers["Location"] = f"measurements/{begun.key}"  # relative: a proxy may serve this on another path
         return begun.model()
 
     def _problem(self, name: str) -> int:

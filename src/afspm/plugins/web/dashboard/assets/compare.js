@@ -39,9 +39,9 @@ export class Comparison {
     if (!first || !second) return;
     const look = { channel: this.find("channel").value, levelling: this.find("levelling").value };
     const asked = [[first, second], [second, first]].map(([scan, other]) =>
-      this.pictures.get("/live/image", { ...look, time: scan.time, beside: other.time }));
+      this.pictures.get("live/image", { ...look, time: scan.time, beside: other.time }));
     const change = this.mode !== "difference" ? null
-      : this.pictures.get("/night/difference", { ...look, first: first.time, second: second.time });
+      : this.pictures.get("night/difference", { ...look, first: first.time, second: second.time });
     const [left, right, difference] = await Promise.all([...asked, change]);
     if (turn !== this.turn) return;
     this.pair = [left, right];

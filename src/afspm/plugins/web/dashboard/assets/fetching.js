@@ -1,15 +1,39 @@
 // Requests to the dashboard: one at a time of each kind, and always the newest.
 
-/** A loop that fetches the newest picture; `show(head, bitmap)` draws a picture, `tell(text)` shows an error. */
+const QUIET_MS = 20000;
+
+/**
+ * A loop that fetches the newest picture; `show(head, bitmap)` draws a picture, `tell(text)` shows an error.
+ *
+ * A browser allows six connections to one server, for all its tabs together. So a tab that nobody sees asks for nothing,
+ * and without a new picture no request is held open: the page's own socket, which does not count, says what is new.
+ */
 export class Pictures {
   constructor(show, tell) {
-    Object.assign(this, { show, tell, asked: null, turn: 0 });
+    Object.assign(this, { show, tell, asked: null, turn: 0, newest: 0, wake: null });
+    document.addEventListener("visibilitychange", () => (document.hidden ? this.asked?.abort() : this.wake?.()));
+  }
+
+  /** Take the number of the newest picture. */
+  hear(newest) {
+    if (newest === this.newest) return;
+    this.newest = newest;
+    this.wake?.();
+  }
+
+  async #sleep(longest_ms) {
+    await new Promise((done) => {
+      this.wake = done;
+      setTimeout(done, longest_ms);
+    });
+    this.wake = null;
   }
 
   /** Fetch pictures with these parameters of /live/image from now on. */
   want(query) {
     this.turn += 1;
     this.asked?.abort();
+    this.wake?.();
     this.#follow(this.turn, query);
   }
 
@@ -17,11 +41,13 @@ export class Pictures {
     let after = 0, wait = 0;
     while (turn === this.turn) {
       if (wait) await new Promise((done) => setTimeout(done, wait));
+      while (document.hidden && turn === this.turn) await this.#sleep(QUIET_MS);
       if (turn !== this.turn) return;
+      const heard = this.newest;
       this.asked = new AbortController();
       const late = setTimeout(() => this.asked.abort(), 30000);
       try {
-        const answer = await fetch(`/live/image?${new URLSearchParams({ ...query, after })}`, { signal: this.asked.signal });
+        const answer = await fetch(`live/image?${new URLSearchParams({ ...query, after })}`, { signal: this.asked.signal });
         if (answer.status === 401) window.location.reload();
         if (turn !== this.turn) return;
         if (answer.status === 200) {
@@ -32,12 +58,14 @@ export class Pictures {
           this.show(head, bitmap);
         } else if (answer.status !== 204) {
           this.tell(await answer.text());
+        } else if (heard === this.newest) {
+          await this.#sleep(QUIET_MS);
         }
         wait = 0;
         if (query.time) return; // a finished scan doesn't change
       } catch {
         if (turn !== this.turn) return;
-        wait = 1000; // the dashboard is not reachable; page.js shows the lost connection
+        wait = document.hidden ? 0 : 1000; // the dashboard is not reachable; page.js shows the lost connection
       } finally {
         clearTimeout(late);
       }

@@ -39,7 +39,7 @@ export class Flipbook {
   async show() {
     const turn = (this.turn += 1), scan = this.scans[Number(this.slider.value)];
     this.loading = true;
-    const picture = await this.pictures.get("/live/image", { time: scan.time, channel: this.find("channel").value });
+    const picture = await this.pictures.get("live/image", { time: scan.time, channel: this.find("channel").value });
     if (turn !== this.turn) return;
     this.loading = false;
     Object.assign(this, { scan, picture });

@@ -22,8 +22,8 @@ export class ImageView {
     this.bar = new Image();
     this.bar.onload = () => this.draw();
     this.pictures = new Pictures((head, bitmap) => this.show(head, bitmap), (text) => this.say(text));
-    this.values = new Questions("/live/value", (found, asked) => this.showValue(found, asked));
-    this.profiles = new Questions("/live/profile", (found) => this.showProfile(found));
+    this.values = new Questions("live/value", (found, asked) => this.showValue(found, asked));
+    this.profiles = new Questions("live/profile", (found) => this.showProfile(found));
     this.#listen();
     new ResizeObserver(() => this.draw()).observe(this.find("stage"));
     new MutationObserver(() => this.draw()).observe(document.body, { attributeFilter: ["class"] });
@@ -40,7 +40,7 @@ export class ImageView {
     const palette = this.find("palette").value;
     if (this.bar.dataset.name !== palette) {
       this.bar.dataset.name = palette;
-      this.bar.src = `/live/palette/${palette}.png`;
+      this.bar.src = `live/palette/${palette}.png`;
     }
     this.pictures.want(this.look());
   }
@@ -58,6 +58,11 @@ export class ImageView {
   /** Offer these channels; one that a person has chosen stays, if it is among them, else the first is shown. */
   setChannels(channels) {
     if (channels.join("\n") !== this.#channels().join("\n")) this.#offer(channels);
+  }
+
+  /** Take the number of the newest picture of any channel. */
+  hear(newest) {
+    this.pictures.hear(newest);
   }
 
   /** Allow or forbid the choice of places for scans and spectra, and of the place of a grant for an agent. */

@@ -9,7 +9,7 @@ const update = window.afspm.update;
 let scrubber = null, asked = false;
 
 async function begin() {
-  const night = await (await fetch("/night/scans")).json();
+  const night = await (await fetch("night/scans")).json();
   scrubber ??= new Scrubber(document.querySelector("#scrubber"), night);
   if (night.scans.length) {
     window.afspm.comparison = new Comparison(document.querySelector("#compare"), night);

@@ -16,6 +16,7 @@ function update(state) {
   const root = document.querySelector("#image");
   if (!image && root) image = new ImageView(root);
   image?.setChannels(state.channels);
+  image?.hear(state.newest);
   image?.setSteering(state.may_measure, state.may_grant);
   if (!document.querySelector("[role=tab][aria-selected=true]")) chooseTab(document.body.dataset.tab);
   showTrouble(state.trouble);

@@ -36,7 +36,7 @@ const bars = new Map();
 function colourBar(palette, loaded) {
   if (!bars.has(palette)) {
     const bar = new Image();
-    bar.src = `/live/palette/${palette}.png`;
+    bar.src = `live/palette/${palette}.png`;
     bars.set(palette, bar);
   }
   const bar = bars.get(palette);
