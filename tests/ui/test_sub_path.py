@@ -25,6 +25,7 @@ def test_page_works_on_a_path_of_its_own_behind_a_proxy(night: Night, opened: Op
         page.click("button")
         page.wait_for_selector("text=Take over: MANUAL")
         assert page.url == proxy.url
+        page.wait_for_selector(".picture[data-number]")
         page.locator(".picture").focus()
         page.keyboard.press("ArrowRight")
         page.wait_for_selector(".readout[data-value]")

@@ -18,7 +18,19 @@ from tests.simulation import agent_rig
 from tests.simulation.agent_rig import ADA, AGENT, STOP, UM, AgentRig
 
 from afspm.basics.formatting import escaped
-from afspm.model import GRANT_REQUEST, Frame, Proposal, Region, Request, Scan, ScopeState, ScopeStatus, names
+from afspm.model import (
+    GRANT_REQUEST,
+    Frame,
+    JournalEntries,
+    JournalEntry,
+    Proposal,
+    Region,
+    Request,
+    Scan,
+    ScopeState,
+    ScopeStatus,
+    names,
+)
 from afspm.plugins.agent.approval import of_plan
 from afspm.plugins.agent.plan import read_plan
 from afspm.plugins.agent.tools import AgentTools
@@ -208,6 +220,28 @@ def test_unreadable_proposal_hides_no_other() -> None:
         f"the preflight of {'b' * 16} is no JSON object",
     ]
     assert (good["id"], good["untrusted"]["title"]) == (plan.id, "look")
+
+
+def test_many_proposals_of_one_agent_hide_none_of_another() -> None:
+    rig = AgentRig()
+    plan = read_plan({"title": "look", "steps": [{"do": "move", "to": ["0 nm", "0 nm"]}]})
+    rig.place.take(Proposal(1, "agent:claude", plan.id, plan.canonical()), 1)
+    for number in range(60):
+        rig.place.take(Proposal(2 + number, "agent:rival", f"{number:016x}", "no JSON"), 2 + number)
+    shown = facts(called(rig, "proposals", {}))["proposals"]
+    assert [one["id"] for one in shown] == [plan.id, *(f"{number:016x}" for number in range(40, 60))]
+
+
+def test_journal_has_what_others_did_and_not_the_reads_of_the_server() -> None:
+    rig = AgentRig()
+    assert not called(rig, "capabilities", {}).is_error  # reads parameters
+    entries = (
+        JournalEntry(5, "request", "agent:.reader", "reads scan-speed"),
+        JournalEntry(6, "request", "series", "x"),
+    )
+    rig.place.watch.take("JournalEntries", JournalEntries(entries), 6, "JournalEntries")
+    assert "series" in (who := [one["untrusted"]["who"] for one in facts(called(rig, "journal", {}))["entries"]])
+    assert "agent:.reader" not in who
 
 
 @pytest.mark.parametrize(

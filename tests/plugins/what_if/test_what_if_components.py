@@ -376,20 +376,25 @@ def test_hazards_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     for name, (_, words) in planted.items():
         assert any(words in hazard for hazard in result.hazards[name]), (name, result.hazards[name])
         assert result.components[name].first is not None
+    read = f"reads the environment variable {lab.OUTSIDE} (what_if_lab.py:"
+    assert any(read in hazard for hazard in result.hazards["outside_file"])
 
 
-def test_order_of_a_set_is_named(tmp_path: Path) -> None:
+def test_order_of_a_set_and_the_process_are_named(tmp_path: Path) -> None:
     """Recorded by another process, as every night: the seed of the hashes of this one is another."""
     code = (
         "import sys, pathlib\nfrom tests.plugins.what_if import what_if_lab as lab\n"
-        "lab.record(pathlib.Path(sys.argv[1]), {'set_order': lab.SetOrder()}, until='15 min')"
+        "judges = {'set_order': lab.SetOrder(), 'process': lab.ProcessNumber()}\n"
+        "lab.record(pathlib.Path(sys.argv[1]), judges, until='15 min')"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "PYTHONHASHSEED": "7"}
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, env=environment)
-    result = afspm.what_if(tmp_path, only=["set_order"])
+    result = afspm.what_if(tmp_path, only=["set_order", "process"])
     assert result.first is not None
+    of_process = "depends on its process, as by id() or os.getpid(): two processes give other outputs"
     assert result.hazards == {
-        "set_order": ["depends on the order of a set: two hash seeds give other outputs, first its output 1"]
+        "set_order": ["depends on the order of a set: two hash seeds give other outputs, first its output 1"],
+        "process": [f"{of_process}, first its output 1"],
     }
 
 

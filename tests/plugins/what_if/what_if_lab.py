@@ -163,6 +163,11 @@ class SetOrder(Remarks):
         return " ".join({f"word{number}" for number in range(30)})
 
 
+class ProcessNumber(Remarks):
+    def remark(self, scan: Scan) -> str:
+        return str(os.getpid())
+
+
 class OutsideFile(Remarks):
     def remark(self, scan: Scan) -> str:
         return Path(os.environ[OUTSIDE]).read_text()

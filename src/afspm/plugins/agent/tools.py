@@ -8,7 +8,7 @@ import json
 import logging
 import math
 import tomllib
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,7 +21,7 @@ from afspm.basics.clock import iso_utc
 from afspm.basics.errors import AfspmError
 from afspm.basics.formatting import escaped
 from afspm.basics.plain_data import Plain
-from afspm.model import ControlMode, ControlResponse, ControlState, names
+from afspm.model import ControlMode, ControlResponse, ControlState, Proposal, names
 from afspm.model.line_levelling import Levelling, levelled
 from afspm.plugins.agent import arguments
 from afspm.plugins.agent.approval import preflight_of
@@ -49,6 +49,7 @@ Content = dict[str, object] | tuple[dict[str, object], bytes]
 Tool = Callable[[str, object], Awaitable[Content]]
 # a model gives the number of a scan where its id belongs, or a quantity without its unit
 _IN_WORDS = {"string_type": 'this is text in quotes: an id of `scans`, a quantity as "100 nm", or a word'}
+_MOST_PROPOSALS = 20
 _READS = types.ToolAnnotations(read_only_hint=True)
 _PROPOSES = types.ToolAnnotations(destructive_hint=False)
 _ACTS = types.ToolAnnotations(destructive_hint=True)
@@ -173,7 +174,9 @@ class AgentTools:
 
     async def _journal(self, person: str, given: arguments.Journal) -> Content:
         with self._place.watch.reading() as overview:
-            entries = [one for one in overview.entries if one.time_ns > int(given.since or 0)][-given.count :]
+            # this server's own reads for its tools would be most of the journal
+            others = [one for one in overview.entries if not one.who.endswith(f":{READER}")]
+            entries = [one for one in others if one.time_ns > int(given.since or 0)][-given.count :]
         return {
             "entries": [
                 {
@@ -212,7 +215,7 @@ class AgentTools:
     async def _proposals(self, person: str, given: arguments.Nothing) -> Content:
         approved = {one.plan for one in self._place.approvals.approvals if one.plan}
         found = []
-        for one in list(self._place.proposals.values())[-20:]:
+        for one in _newest_of_each(self._place.proposals.values()):
             try:
                 preflight, title = preflight_of(one), plan_of(one.plan).title
             except AfspmError as error:  # another agent's unreadable proposal must not hide the readable ones
@@ -361,6 +364,16 @@ def _run(run: PlanRun) -> dict[str, object]:
         "id": run.id, "proposal": run.plan or None, "state": run.state, "step": run.step, "steps": run.steps,
         "results": run.results, "code": refusal.get("code"), **untrusted({"reason": reason}),
     }  # fmt: skip
+
+
+def _newest_of_each(proposals: Iterable[Proposal]) -> list[Proposal]:
+    # of each agent as many: one that proposes much hides no other
+    of_agents: dict[str, list[Proposal]] = {}
+    proposals = list(proposals)
+    for one in proposals:
+        of_agents.setdefault(one.who, []).append(one)
+    shown = {id(one) for of_agent in of_agents.values() for one in of_agent[-_MOST_PROPOSALS:]}
+    return [one for one in proposals if id(one) in shown]
 
 
 def _scan(channels: list[ScanSummary]) -> dict[str, object]:

@@ -1,4 +1,7 @@
-"""Replays under two of Python's hash seeds: they differ if a component depends on the order of a set."""
+"""Replays in processes of their own, twice under one of Python's hash seeds and once under another.
+
+If equal seeds differ, the component depends on its process; if only another seed differs, on the order of a set.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +17,13 @@ from afspm.plugins.what_if import component_replay
 from afspm.plugins.what_if.port_replay import read_lives
 from afspm.record.run import open_run
 
-_SEEDS = ("1", "2")
+_SEEDS = ("1", "1", "2")
 _WITHIN_S = 600.0
 _log = logging.getLogger("afspm.what_if")
 
 
 def hazards(run: Path, name: str) -> list[str]:
-    """Return a description if the outputs of an unchanged component depend on the hash seed.
+    """Return a description if the outputs of an unchanged component depend on its process or on the hash seed.
 
     Empty if they do not, or if a replay fails.
     """
@@ -48,10 +51,19 @@ def hazards(run: Path, name: str) -> list[str]:
             )
             return []
         lines.append(done.stdout.splitlines())
-    if lines[0] == lines[1]:
-        return []
-    at = next((n for n, (one, other) in enumerate(zip(*lines, strict=False)) if one != other), min(map(len, lines)))
-    return [f"depends on the order of a set: two hash seeds give other outputs, first its output {at + 1}"]
+    first, again, other = lines
+    if first != again:
+        what = "on its process, as by id() or os.getpid(): two processes give other outputs"
+        return [f"depends {what}, first its output {_first_difference(first, again)}"]
+    if first != other:
+        what = "on the order of a set: two hash seeds give other outputs"
+        return [f"depends {what}, first its output {_first_difference(first, other)}"]
+    return []
+
+
+def _first_difference(one: list[str], other: list[str]) -> int:
+    differing = (number for number, pair in enumerate(zip(one, other, strict=False), 1) if pair[0] != pair[1])
+    return next(differing, min(len(one), len(other)) + 1)
 
 
 def main() -> None:

@@ -30,6 +30,8 @@ import zmq
 _CLOCKS = {"time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns", "now", "utcnow", "today"}
 _SILENT = ("logging", "tempfile", "threading", "importlib", "traceback", "linecache")
 """Modules of Python that read clocks, random bytes and files for purposes of their own."""
+_READS_ENVIRONMENT = type(os.environ).__getitem__.__code__
+"""Code of the method through which `os.environ[…]`, `os.environ.get` and `os.getenv` read."""
 _IMPORT = "<frozen importlib"
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_TRUNC
 _PROGRAMS = {"subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "os.startfile"}
@@ -194,6 +196,8 @@ class HazardGuard:
     def _profile(self, frame: FrameType, event: str, called: object) -> None:
         if event == "c_call" and (what := _hazard(called)) and (place := _place(frame)):
             self.seen.setdefault(f"{what} ({place})")
+        elif event == "call" and frame.f_code is _READS_ENVIRONMENT and (place := _place(frame)):
+            self.seen.setdefault(f"reads the environment variable {frame.f_locals['key']} ({place})")
 
     def _profile_thread(self, frame: FrameType, event: str, called: object) -> None:
         sys.setprofile(self._profile if _guard_here() is self else None)
