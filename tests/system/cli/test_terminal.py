@@ -203,6 +203,8 @@ def test_run_whose_supervisor_was_killed_is_cut_off_in_every_command(tmp_path: P
         assert said.exit_code == NOT_RUNNING
         assert told in said.stderr
     page = Path(afspm_here("report", folder).stdout.strip()).read_text(encoding="utf-8")
+    assert afspm_here("report", folder, "--quiet").output == ""
+    assert afspm_here("export", folder, "--to", "csv", "--quiet").output == ""
     assert told in html.unescape(page)
 
 

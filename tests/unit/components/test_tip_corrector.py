@@ -588,6 +588,8 @@ def test_budget_of_the_night_holds_over_several_repairs(
     assert len(lab.actions) == most
     assert lab.problems == (TIP, MALFUNCTION)
     assert "the budget of the night is spent" in caplog.text
+    assert any(f"into the rest of {name}" in caplog.text for name in budget)  # the setting's name in the file
+    assert "`afspm end`" in caplog.text
 
 
 @pytest.mark.parametrize("policy", ["list", "learn"])

@@ -76,6 +76,7 @@ def test_keys_makes_a_pair_for_each_process_and_person_and_leaves_old_ones(
     result = runner.invoke(app, ["keys", "night.toml", "--also", "ana"])
     assert "there already" in result.output
     assert (tmp_path / "keys" / "public" / "ana.key").read_text() == before
+    assert runner.invoke(app, ["keys", "night.toml", "-q"]).output == ""
 
 
 @pytest.mark.parametrize(

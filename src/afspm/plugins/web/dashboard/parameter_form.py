@@ -86,7 +86,9 @@ class ParameterForm:
         result = await self._session.carry_out(lambda a: a.set(wanted, shown))
         if self._rows.is_deleted:
             return
-        self._session.say(result)
+        refused = [name for name, one in result.each.items() if not one.ok]
+        # each reason is below its field
+        self._session.say(ActionResult(f"Refused: {', '.join(refused)}.", ok=False) if refused else result)
         for name, one in result.each.items():
             if not one.ok:
                 self._fields[name].props("error").props["error-message"] = one.text
