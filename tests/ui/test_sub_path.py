@@ -50,6 +50,21 @@ def test_hidden_tab_asks_for_no_picture_until_it_is_seen_again(night: Night, ope
         page.evaluate(HIDE, False)
 
 
+def test_tab_without_the_focus_holds_no_request_open(night: Night, opened: Opened) -> None:
+    asked: list[str] = []
+    page = opened(night.url)
+    page.wait_for_selector(".picture[data-number]")
+    with page.expect_event("response", lambda answer: "patient=false" in answer.url and answer.status == 204):
+        page.evaluate("document.hasFocus = () => false; window.dispatchEvent(new Event('blur'))")
+    page.on("request", lambda request: asked.append(request.url))
+    for _ in range(3):
+        page.evaluate("window.before = afspm.updated")
+        page.wait_for_function("afspm.updated > window.before")
+    assert not [url for url in asked if "live/image" in url]
+    with page.expect_request("**/live/image**"):
+        page.evaluate("afspm.image.hear(1e9)")
+
+
 @pytest.mark.parametrize("width", [1440, 1024, 390])
 def test_nothing_is_cut_or_covered_on_a_screen(
     width: int, night: Night, opened: Opened, keep: Callable[[Any, str], None]

@@ -24,7 +24,7 @@ from afspm.record.drawing.curves import profile
 from afspm.record.drawing.palette import DIVERGING, LEVELS, PALETTES
 from afspm.record.drawing.raster import png
 
-POLL_S = 1.0  # then the browser waits for news on the page's socket: it has few connections for all its tabs
+POLL_S = 20.0  # then the browser repeats its request: proxies may close a connection that is silent for longer
 GROWING_S = 0.2  # between two pictures of a growing scan
 FINISHED_S = 0.004  # between two pictures of finished scans, times the number of waiting viewers (at least ten)
 
@@ -80,9 +80,9 @@ class Live:
         app.get("/live/value", response_model=None)(self._value)
         app.get("/live/profile", response_model=None)(self._profile)
 
-    async def _image(self, asked: Asked, after: int = 0) -> Response:
+    async def _image(self, asked: Asked, after: int = 0, patient: bool = True) -> Response:
         # a picture newer than number `after`, or of one finished scan; 204: nothing new yet
-        if not asked.time and not await self._wait_for_newer(asked.channel, after):
+        if not asked.time and not await self._wait_for_newer(asked.channel, after, POLL_S if patient else 0.0):
             return Response(status_code=204)
         drawn = await asyncio.to_thread(self._drawn, asked)
         if drawn is None:
@@ -130,17 +130,18 @@ class Live:
             return Response(status_code=404)
         return Response(png(np.arange(LEVELS, dtype=np.uint8)[:, None], name), media_type="image/png")
 
-    async def _wait_for_newer(self, channel: str, after: int) -> bool:
+    async def _wait_for_newer(self, channel: str, after: int, within_s: float) -> bool:
         loop = asyncio.get_running_loop()
         now_s = loop.time()
-        end_s, growing_s = now_s + POLL_S, now_s + GROWING_S
+        end_s, growing_s = now_s + within_s, now_s + GROWING_S
         self._waiting += 1
         try:
             # with many viewers each gets fewer pictures, so that the experiment keeps its processor time
             finished_s = now_s + FINISHED_S * max(10, self._waiting)
             while True:
                 number, complete = self._newest(channel)
-                due_s = now_s if not after else finished_s if complete else growing_s
+                at_once = not after or not within_s  # who does not wait asks only when something is new
+                due_s = now_s if at_once else finished_s if complete else growing_s
                 now_s = loop.time()
                 if number > after and now_s >= due_s:
                     return True

@@ -1,17 +1,22 @@
 // Requests to the dashboard: one at a time of each kind, and always the newest.
 
 const QUIET_MS = 20000;
+const isWatched = () => !document.hidden && document.hasFocus();
 
 /**
  * A loop that fetches the newest picture; `show(head, bitmap)` draws a picture, `tell(text)` shows an error.
  *
- * A browser allows six connections to one server, for all its tabs together. So a tab that nobody sees asks for nothing,
- * and without a new picture no request is held open: the page's own socket, which does not count, says what is new.
+ * A browser allows six connections to one server, for all its tabs together. So only the tab with the focus holds a
+ * request open until a picture is new. Another tab that is seen asks when the page's own socket, which does not count,
+ * says that one is new; a hidden tab asks for nothing.
  */
 export class Pictures {
   constructor(show, tell) {
     Object.assign(this, { show, tell, asked: null, turn: 0, newest: 0, wake: null });
-    document.addEventListener("visibilitychange", () => (document.hidden ? this.asked?.abort() : this.wake?.()));
+    const look = () => (isWatched() ? this.wake?.() : this.asked?.abort());
+    document.addEventListener("visibilitychange", look);
+    window.addEventListener("focus", look);
+    window.addEventListener("blur", look);
   }
 
   /** Take the number of the newest picture. */
@@ -43,11 +48,11 @@ export class Pictures {
       if (wait) await new Promise((done) => setTimeout(done, wait));
       while (document.hidden && turn === this.turn) await this.#sleep(QUIET_MS);
       if (turn !== this.turn) return;
-      const heard = this.newest;
+      const heard = this.newest, patient = isWatched();
       this.asked = new AbortController();
       const late = setTimeout(() => this.asked.abort(), 30000);
       try {
-        const answer = await fetch(`live/image?${new URLSearchParams({ ...query, after })}`, { signal: this.asked.signal });
+        const answer = await fetch(`live/image?${new URLSearchParams({ ...query, after, patient })}`, { signal: this.asked.signal });
         if (answer.status === 401) window.location.reload();
         if (turn !== this.turn) return;
         if (answer.status === 200) {
@@ -58,14 +63,14 @@ export class Pictures {
           this.show(head, bitmap);
         } else if (answer.status !== 204) {
           this.tell(await answer.text());
-        } else if (heard === this.newest) {
+        } else if (!patient && heard === this.newest) {
           await this.#sleep(QUIET_MS);
         }
         wait = 0;
         if (query.time) return; // a finished scan doesn't change
       } catch {
         if (turn !== this.turn) return;
-        wait = document.hidden ? 0 : 1000; // the dashboard is not reachable; page.js shows the lost connection
+        wait = isWatched() ? 1000 : 0; // the dashboard is not reachable; page.js shows the lost connection
       } finally {
         clearTimeout(late);
       }
