@@ -215,11 +215,14 @@ class MeasurementRunner:
         is_new = task.watch is None
         if task.watch is not None and task.watch.is_over():
             return  # the measurement had begun, and ended during the wait for control
+        reached = self._setup.reach(target, until_s)  # takes hours, in which the clock goes on
+        if not self._control.held:
+            return  # lost on the way: the targets are set again
         if is_new:
             task.attempt = task.attempt + 1 if task.key is None else self._results.next_attempt(task.attempt)
             self._write_down(task)
         with link.clock.late():
-            self._setup.prepare(target, task.key or "", until_s)
+            self._setup.prepare(target, task.key or "", until_s, reached)
         states, task.acts_seen = link.view.count("ScopeStateMsg"), link.view.count(ACT_BY_HAND.name)
         watch = task.watch = task.watch or _Watch(
             link, target, Cycle(target.busy, target.fits, since_ns=link.view.newest_ns)

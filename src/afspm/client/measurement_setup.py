@@ -4,8 +4,19 @@ from __future__ import annotations
 
 from afspm.client.command_retry import CommandRetry
 from afspm.client.experiment_link import PublishedState
+from afspm.client.instrument_targets import InstrumentTargets
 from afspm.client.targets import FITS, SAME, XY, ScanTarget, Target, is_set
-from afspm.model import ControlRequest, Feedback, Frame, Parameter, ProbePosition, Region, ScanParameters, names
+from afspm.model import (
+    ControlRequest,
+    Feedback,
+    Frame,
+    Parameter,
+    ProbePosition,
+    Region,
+    ScanParameters,
+    is_of_instrument,
+    names,
+)
 
 
 class MeasurementSetup:
@@ -18,13 +29,25 @@ class MeasurementSetup:
         view: the published settings in force.
     """
 
-    def __init__(self, view: PublishedState, commands: CommandRetry) -> None:
+    def __init__(self, view: PublishedState, commands: CommandRetry, targets: InstrumentTargets) -> None:
         self._view = view
         self._commands = commands
+        self._targets = targets
         self._rounded: tuple[ScanParameters, ScanParameters | None] | None = None
 
-    def prepare(self, target: Target, key: str, until_s: float | None) -> None:
-        """Set all settings of a target, and publish its sweep parameters with the values in force."""
+    def reach(self, target: Target, until_s: float | None) -> tuple[Parameter, ...]:
+        """Set the parameters of other instruments, wait until they have arrived, and return their targets in force.
+
+        Raises as `InstrumentTargets.reach`; returns early if control is lost.
+        """
+        return tuple(self._targets.reach(one, until_s) for one in target.settings if is_of_instrument(one.name))
+
+    def prepare(self, target: Target, key: str, until_s: float | None, reached: tuple[Parameter, ...] = ()) -> None:
+        """Set all settings of a target, and publish its sweep parameters with the values in force.
+
+        Args:
+            reached: the targets of other instruments, as `reach` returned them.
+        """
         if isinstance(target, ScanTarget):
             self.set_scan(target.parameters, until_s)
         else:
@@ -33,8 +56,9 @@ class MeasurementSetup:
             if target.at_m is not None:
                 self.move_probe(target.at_m, until_s)
         if target.settings:
-            in_force = tuple(self._commands.set_parameter(one, until_s) for one in target.settings)
-            self._commands.publish_settings(in_force, key)
+            of_microscope = (one for one in target.settings if not is_of_instrument(one.name))
+            in_force = tuple(self._commands.set_parameter(one, until_s) for one in of_microscope)
+            self._commands.publish_settings((*reached, *in_force), key)
 
     def move_probe(self, xy_m: XY, until_s: float | None) -> None:
         """Move the probe to (x, y) in m, unless it is there already."""

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
 from afspm import wire
-from afspm.basics.errors import ExperimentEnded, InvalidValue, NoResponse, Refused, RequestError
+from afspm.basics.errors import ExperimentEnded, InvalidValue, Refused, RequestError
 from afspm.basics.plain_data import Plain
-from afspm.client.command_retry import PATIENCE_S, CommandRetry, refused
+from afspm.client.command_retry import CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.events import Events, PublishedEvent
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.experiment_view import ExperimentView
+from afspm.client.instrument_targets import InstrumentTargets
 from afspm.client.keyed_results import KeyedResults, check_key
 from afspm.client.measurement import MeasurementRunner
 from afspm.client.measurement_setup import MeasurementSetup
@@ -56,9 +56,6 @@ __all__ = ["Events", "PublishedEvent", "Scope"]
 Place = tuple[float | str, float | str]
 SET_BACK_WITHIN_S = 60.0
 """Limit on the wait for control after a failed sweep, real time."""
-_LOOK_S = 0.5
-"""Real time between two readings of a value that has not arrived at its target."""
-_ROUNDED = 1e-3  # relative: an instrument may round a target, also at the end of a ramp in steps
 ANSWER_S = 60.0  # default of readings; calls that wait for control or a measurement have no limit by default
 
 
@@ -98,7 +95,8 @@ class Scope(ExperimentView):
         self._begun: tuple[int, float] | None = None  # finished parts and time at the first `progress`
         self._control = ControlHold(link, self.problems)
         self._commands = CommandRetry(link, self._control)
-        self._setup = MeasurementSetup(link.view, self._commands)
+        self._targets = InstrumentTargets(link, self._control, self._commands)
+        self._setup = MeasurementSetup(link.view, self._commands, self._targets)
         self._results = KeyedResults(state_dir, link.name)
         self._runner = MeasurementRunner(link, self._control, self._commands, self._setup, self._results)
 
@@ -173,7 +171,8 @@ class Scope(ExperimentView):
         Control is kept over all points. If control is lost, to a tip repair for instance, the parameters of the present
         point are set again, and the point is measured again. When the block ends, even by an error, the parameters are
         set back to their earlier values; not after the end of the experiment or a stop of the process. In the record
-        the parameters are columns of `run.scans` and `run.spectra`.
+        the parameters are columns of `run.scans` and `run.spectra`. A parameter of another instrument, such as a
+        temperature, is set as its target; each point waits until the value has arrived.
 
         Args:
             parameters: values of each parameter: a list, or a range such as {"from": "0.5 um/s", "to": "4 um/s",
@@ -196,7 +195,7 @@ class Scope(ExperimentView):
         )
         sweep = ParameterSweep(
             plan, target, key and check_key(key), link=self._link, control=self._control, commands=self._commands,
-            runner=self._runner, results=self._results,
+            targets=self._targets, runner=self._runner, results=self._results,
         )  # fmt: skip
         until_s = self._link.until(timeout_s)
         with self._control.hold(until_s=until_s):
@@ -261,46 +260,10 @@ class Scope(ExperimentView):
         with self._call():
             asked, until_s = to_parameter(parameter, value, unit), self._link.until(timeout_s)
             if wait:
-                self._await_reading(asked, until_s)
+                self._targets.first_reading(asked.name, until_s)
             response = self._commands.in_control(ControlRequest.PARAM, asked, until_s)
             in_force = value_in(response, asked, asked.unit)
-            return self._arrived(asked, float(in_force), until_s) if wait else in_force
-
-    def _await_reading(self, asked: Parameter, until_s: float | None) -> None:
-        # an instrument that is not connected yet, as when a run begins, would refuse the setting
-        link = self._link
-        give_up_s = link.earlier(PATIENCE_S, until_s)
-        while self._read_again(asked.name, asked.unit, until_s)[0] is None and link.clock.monotonic_s() < give_up_s:
-            link.wait(lambda: False, link.earlier(_LOOK_S, until_s))
-
-    def _arrived(self, asked: Parameter, target: float, until_s: float | None) -> Value:
-        link, name = self._link, asked.name
-        lost_s: float | None = None
-        while True:
-            found = {part: self._read_again(f"{name}.{part}", asked.unit, until_s)[0] for part in ("target", "busy")}
-            if found["target"] is not None and not math.isclose(float(found["target"]), target, rel_tol=_ROUNDED):
-                what = f"{name} does not go to {asked.value} {asked.unit or ''} any more"
-                raise NoResponse(what, where=link.name, hint=f"its target is {found['target']:g} now")
-            value, why = self._read_again(name, asked.unit, until_s)
-            if found["busy"] is False and found["target"] is not None and value is not None:
-                return value
-            now_s = link.clock.monotonic_s()
-            lost_s = None if value is not None else now_s if lost_s is None else lost_s
-            if lost_s is not None and now_s - lost_s > PATIENCE_S:
-                what = f"{name} has had no value for {PATIENCE_S:g} s on its way to {asked.value} {asked.unit or ''}"
-                raise NoResponse(what, where=link.name, hint=why)
-            link.wait(lambda: False, link.earlier(_LOOK_S, until_s))
-            if until_s is not None and link.clock.monotonic_s() >= until_s:
-                raise NoResponse(f"{name} has not arrived at {asked.value} {asked.unit or ''} in time", where=link.name)
-
-    def _read_again(self, name: str, unit: str | None, until_s: float | None) -> tuple[Value | None, str]:
-        # None, and why, while the instrument has no recent reading: the wait outlasts a restart of its server
-        response = self._commands.read(ControlRequest.PARAM, Parameter(name), until_s)
-        if response.code == ControlResponse.PARAM_ERROR:
-            return None, response.reason
-        if not response.ok:
-            raise refused(ControlRequest.PARAM, response, name)
-        return value_in(response, Parameter(name), unit), ""
+            return self._targets.arrival(asked, float(in_force), until_s) if wait else in_force
 
     def get(self, parameter: str, unit: str | None = None, *, timeout_s: float | None = ANSWER_S) -> Value:
         """Return a parameter's value in `unit`; without `unit`, in SI for base parameters, else as received."""

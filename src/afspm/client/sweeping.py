@@ -11,10 +11,11 @@ from afspm.basics.units import convert
 from afspm.client.command_retry import CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
+from afspm.client.instrument_targets import InstrumentTargets
 from afspm.client.keyed_results import KeyedResults, MeasurementResult
 from afspm.client.measurement import MeasurementRunner
 from afspm.client.targets import Target
-from afspm.model import ControlRequest, Parameter, ScanSet, Spectrum
+from afspm.model import ControlRequest, Parameter, ScanSet, Spectrum, is_of_instrument
 from afspm.model.sweep_plan import SweepPlan, SweptValue
 
 
@@ -66,11 +67,12 @@ class ParameterSweep:
         link: ExperimentLink,
         control: ControlHold,
         commands: CommandRetry,
+        targets: InstrumentTargets,
         runner: MeasurementRunner,
         results: KeyedResults,
     ) -> None:
         self._plan, self._target, self._key = plan, target, key
-        self._link, self._control, self._commands = link, control, commands
+        self._link, self._control, self._commands, self._targets = link, control, commands, targets
         self._runner, self._results = runner, results
         self._before = None if key is None else results.before_sweep(key)
 
@@ -88,6 +90,8 @@ class ParameterSweep:
 
     def set_back(self, until_s: float | None) -> None:
         """Set the parameters to their values before the sweep; a value that the microscope refuses is logged.
+
+        Other instruments get their targets from before; nothing waits until they have arrived.
 
         Raises:
             ControlLost, NoResponse: the parameters are not set back by `until_s`. A later call can still do so, with a
@@ -139,6 +143,8 @@ class ParameterSweep:
         return [self._in_force(axis.name, until_s) for axis in self._plan.axes]
 
     def _in_force(self, name: str, until_s: float | None) -> Parameter:
+        if is_of_instrument(name):
+            return self._targets.in_force(name, until_s)
         response = self._commands.read(ControlRequest.PARAM, Parameter(name), until_s)
         if not response.ok:
             raise refused(ControlRequest.PARAM, response, name)

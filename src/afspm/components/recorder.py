@@ -113,7 +113,7 @@ def _about(context: ProcessContext, run_dir: Path, *, scans: bool) -> RecordSett
         "frame": frame.value,
         METADATA: run_json_or_empty(run_dir).get(METADATA, {}),
     }
-    return RecordSettings(facts, context.problems, frame, measured=scans)
+    return RecordSettings(facts, context.problems, frame, measured=scans, speed=1.0 / context.clock.real_s(1.0))
 
 
 def _seeds(file: Path) -> Plain:

@@ -35,7 +35,8 @@ class Sweep(Component):
     Args:
         parameters: the values of each parameter: a list, such as ["50 pA", "100 pA"], or a range, such as {from =
             "0.5 um/s", to = "4 um/s", points = 4, spacing = "log"}, or with `step` instead of `points`. The first
-            parameter changes least often.
+            parameter changes least often. A parameter of another instrument, such as "cryo.temperature", is set as its
+            target; each point waits until the value has arrived.
         measure: the measurement at each point.
         order: "snake": from point to point one parameter changes, to a neighbouring value; "listed": nested loops over
             the values as listed; "random": shuffled by `seed`.

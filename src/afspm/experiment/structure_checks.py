@@ -6,6 +6,7 @@ import contextlib
 import inspect
 import re
 from collections.abc import Callable, Collection, Iterator
+from itertools import filterfalse
 from pathlib import Path
 from typing import Final
 
@@ -20,7 +21,7 @@ from afspm.experiment.implied_parts import NO_PROGRAM, RECORDS, check_notify, is
 from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.wiring_classes import WIRE_SETTINGS, BoundSocket, wire_of
-from afspm.model import Role, component_of, is_process_name, names
+from afspm.model import Role, component_of, is_of_instrument, is_process_name, names
 from afspm.model.events import LONGEST_PROCESS_NAME, PERSON
 from afspm.transport.network import is_local
 from afspm.wire.messages import SCAN_LINES
@@ -412,7 +413,15 @@ def _texts(value: object, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[s
 
 
 def check_needs(resolved: ResolvedExperiment) -> None:
-    """Require the actions and parameters that components need, if the microscope's capabilities are known."""
+    """Require the parameters of instruments that components need, and those of the microscope and actions if known."""
+    of_instruments = tuple(one for parameters in resolved.instruments.values() for one in parameters)
+    for name, process in resolved.processes.items():
+        for one in filter(is_of_instrument, process.declared.needs_parameters):
+            if one not in of_instruments:
+                what = f"[{name}] needs {one!r}, which is a parameter of no instrument"
+                resolved.document.error(
+                    what, name, hint=nearest(one, of_instruments) or "see `parameters` of the instrument"
+                )
     for translator in resolved.with_role(Role.TRANSLATOR):
         has = translator.capabilities()
         if has is None:
@@ -421,7 +430,7 @@ def check_needs(resolved: ResolvedExperiment) -> None:
             declared = process.declared
             for kind, needed, offered in (
                 ("action", declared.needs_actions, has.actions),
-                ("parameter", declared.needs_parameters, has.parameters),
+                ("parameter", [*filterfalse(is_of_instrument, declared.needs_parameters)], has.parameters),
             ):
                 for one in [one for one in needed if one not in offered]:
                     what = f"[{name}] needs the {kind} {one!r}, which [{translator.name}] does not have"

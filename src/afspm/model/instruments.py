@@ -24,6 +24,11 @@ def is_of_instrument(parameter: str) -> bool:
     return bool(instrument_of(parameter)) and not parameter.startswith("x-")  # the name of a driver's may have a dot
 
 
+def target_of(parameter: str) -> str:
+    """Return the name under which the target of a parameter is read."""
+    return f"{parameter}{SEPARATOR}{PARTS[0]}"
+
+
 @dataclass(frozen=True, slots=True)
 class InstrumentReading:
     """One value of an instrument.

@@ -44,14 +44,8 @@ class SweepAxis:
         """Read the values of a parameter from a list or a range.
 
         Raises:
-            InvalidValue, UnitError: there are no values, a value twice, values that this parameter can't have, or a
-                parameter of another instrument.
+            InvalidValue, UnitError: there are no values, a value twice, or values that this parameter can't have.
         """
-        if is_of_instrument(name):
-            raise InvalidValue(
-                f"{name} is a parameter of another instrument, and a sweep does not wait for it",
-                hint=f'set it with scope.set("{name}", ..., wait=True), and take a scan or a sweep at each value',
-            )
         if isinstance(given, Mapping):
             unit, values = (
                 _unit_of(name, [given[end] for end in ("from", "to") if end in given]),
@@ -64,6 +58,10 @@ class SweepAxis:
             values = tuple(_in_unit(name, value, unit) for value in given)
         if not values:
             raise InvalidValue(f"{name} has no value to be swept over", hint="list one at least")
+        if is_of_instrument(name) and not all(isinstance(value, float) for value in values):
+            raise InvalidValue(
+                f"{name}: targets of an instrument are numbers", hint='with their unit: ["4.2 K", "10 K"]'
+            )
         if len(set(values)) < len(values):
             raise InvalidValue(f"{name} has a value twice: {list(values)}", hint="list each value once")
         return cls(name, values, unit)

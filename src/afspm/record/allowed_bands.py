@@ -1,4 +1,4 @@
-"""The values that [conditions] allows, for drawings; the scheduler reads and enforces the conditions itself."""
+"""The values that [conditions] allows, for drawings and tables; the scheduler enforces the conditions itself."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.units import si
+from afspm.model.names import START_SCAN, START_SPEC
 from afspm.record.drawing.timeline import DrawnBand, TimelineCurve
 from afspm.record.overview import Overview
 from afspm.record.run_json import EXPERIMENT_FILE
@@ -17,11 +18,30 @@ from afspm.record.run_json import EXPERIMENT_FILE
 
 @dataclass(frozen=True)
 class WrittenBand:
-    """The bounds of one parameter in a condition, as the experiment file has them; None: no bound."""
+    """The bounds of one parameter in a condition, as the experiment file has them; None: no bound.
+
+    Attributes:
+        within: the largest distance from the target.
+        actions: the actions that the condition guards.
+    """
 
     condition: str
-    low: str | float | None
-    high: str | float | None
+    low: str | float | None = None
+    high: str | float | None = None
+    within: str | float | None = None
+    actions: tuple[str, ...] = (START_SCAN, START_SPEC)
+
+    def contains(self, value: float | None, target: float | None, unit: str) -> bool:
+        """Return whether a value is inside; an unknown value, or a missing target, is not.
+
+        A bound that can't be converted to `unit` bounds nothing: the scheduler has refused each measurement then.
+        """
+        if value is None:
+            return False
+        low, high, within = (_number(bound, unit) for bound in (self.low, self.high, self.within))
+        if (low is not None and value < low) or (high is not None and value > high):
+            return False
+        return within is None or (target is not None and abs(value - target) <= within)
 
 
 AllowedBands = Mapping[str, tuple[WrittenBand, ...]]
@@ -29,10 +49,7 @@ AllowedBands = Mapping[str, tuple[WrittenBand, ...]]
 
 
 def allowed_bands(folder: Path) -> AllowedBands:
-    """Return the bands with a lower or upper bound in the expanded experiment file of a run.
-
-    Empty without such bands, or if the file can't be read.
-    """
+    """Return the bands in the expanded experiment file of a run; empty without bands, or without a readable file."""
     try:
         document = tomllib.loads((folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -40,9 +57,11 @@ def allowed_bands(folder: Path) -> AllowedBands:
     found: dict[str, tuple[WrittenBand, ...]] = {}
     conditions = document.get("conditions")
     for name, condition in conditions.items() if isinstance(conditions, dict) else ():
+        actions = tuple(condition.get("while") or WrittenBand.actions) if isinstance(condition, dict) else ()
         for parameter, table in condition.items() if isinstance(condition, dict) else ():
-            if isinstance(table, dict) and ("from" in table or "to" in table):
-                found[parameter] = (*found.get(parameter, ()), WrittenBand(name, table.get("from"), table.get("to")))
+            if isinstance(table, dict):
+                band = WrittenBand(name, table.get("from"), table.get("to"), table.get("within"), actions)
+                found[parameter] = (*found.get(parameter, ()), band)
     return found
 
 
@@ -58,11 +77,15 @@ def instrument_curves(overview: Overview, bands: AllowedBands) -> list[TimelineC
 
 def _converted(band: WrittenBand, unit: str) -> DrawnBand | None:
     # None: no band in this unit; a drawing without a band is better than none, and the scheduler refuses such a file
-    found = []
-    for bound, unbounded in ((band.low, -math.inf), (band.high, math.inf)):
-        try:
-            found.append(unbounded if bound is None else si(bound, unit))
-        except AfspmError:
-            return None
-    low, high = found
+    low, high = _number(band.low, unit), _number(band.high, unit)
+    if (low is None and high is None) or (low, high).count(None) != (band.low, band.high).count(None):
+        return None
+    low, high = -math.inf if low is None else low, math.inf if high is None else high
     return DrawnBand(band.condition, low, high) if low < high else None
+
+
+def _number(bound: str | float | None, unit: str) -> float | None:
+    try:
+        return None if bound is None else si(bound, unit)
+    except AfspmError:
+        return None

@@ -32,15 +32,22 @@ class MeasuredFiles:
     Args:
         folder: the folder of the run.
         facts: facts of the run, written into every file.
+        speed: experiment seconds per real second.
     """
 
     def __init__(
-        self, folder: Path, journal: sqlite3.Connection, facts: Mapping[str, object], problems: ProblemNames
+        self,
+        folder: Path,
+        journal: sqlite3.Connection,
+        facts: Mapping[str, object],
+        problems: ProblemNames,
+        speed: float = 1.0,
     ) -> None:
         self._folder = folder
         self._journal = journal
         self._facts = facts
         self._problems = problems
+        self._speed = speed
         self._batch = FileBatch(PART)
         for kind in (SCANS, SPECTRA):
             for half in (folder / kind).glob(f"*{SUFFIX}{PART}"):  # of a process that was killed
@@ -216,7 +223,7 @@ class MeasuredFiles:
     ) -> dict[str, object]:
         since_ns = stood.began_ns
         found = {
-            "instruments": provenance.instruments(self._journal, published_ns, since_ns),
+            "instruments": provenance.instruments(self._journal, published_ns, since_ns, self._speed),
             "tip": provenance.tip(self._journal, published_ns, since_ns, filenames, measured_ns),
         }
         return {name: facts for name, facts in found.items() if facts}

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     import xarray
 
     from afspm.model import Scan
+    from afspm.record.allowed_bands import AllowedBands
+    from afspm.record.instrument_values import RecordedReadings
     from afspm.record.spectrum_stack import Quantity, SpectrumStack
 
 R = TypeVar("R", ScanRow, SpectrumRow)
@@ -40,6 +42,7 @@ _PUBLISHED = {
     "scans": "SELECT scan, min(time_ns) FROM packets WHERE message = 'Scan2d' GROUP BY scan",
     "spectra": "SELECT spectrum, min(time_ns) FROM packets WHERE message = 'Spec1d' GROUP BY spectrum",
 }
+_ACTIONS = {"scans": names.START_SCAN, "spectra": names.START_SPEC}
 _HAS_STARTS = "SELECT 1 FROM sqlite_master WHERE name = 'starts'"
 
 
@@ -145,26 +148,32 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
         return SpectrumTable(rows, self._read)
 
 
-def read_scans(query: Query, verdicts: Iterable[tuple[int, float]]) -> KeyedTable[ScanRow]:
+def read_scans(
+    query: Query, verdicts: Iterable[tuple[int, float]], readings: RecordedReadings, bands: AllowedBands
+) -> KeyedTable[ScanRow]:
     found = query("SELECT * FROM scans ORDER BY number")
-    keys = _keys(query, "scans", names.START_SCAN, found)
+    keys = _keys(query, "scans", found)
     positions = _positions(query)
     rows = [scan_row(row, keys.get(row[0], ""), *positions.get(row[0], (None, None))) for row in found]
     scores = last_scores((row.time_ns for row in rows), verdicts)
     rows = [replace(row, tip_score=scores.get(row.time_ns)) for row in rows]
+    rows = _with_instruments(query, "scans", rows, readings, bands)
     return KeyedTable(_with_settings(query, "scans", rows), ScanRow)
 
 
-def read_spectra(query: Query, read: Callable[[SpectrumRow], Spectrum]) -> SpectrumTable:
+def read_spectra(
+    query: Query, read: Callable[[SpectrumRow], Spectrum], readings: RecordedReadings, bands: AllowedBands
+) -> SpectrumTable:
     found = query("SELECT * FROM spectra ORDER BY number")
-    keys = _keys(query, "spectra", names.START_SPEC, found)
+    keys = _keys(query, "spectra", found)
     rows = [spectrum_row(row, keys.get(row[0], "")) for row in found]
+    rows = _with_instruments(query, "spectra", rows, readings, bands)
     return SpectrumTable(_with_settings(query, "spectra", rows), read)
 
 
-def _keys(query: Query, table: str, action: str, rows: Sequence[Row]) -> dict[int, str]:
+def _keys(query: Query, table: str, rows: Sequence[Row]) -> dict[int, str]:
     # the log has no link from a request to its measurement: each start belongs to the next published measurement
-    starts = query(f"SELECT sent_ns, key FROM starts WHERE action = '{action}'") if query(_HAS_STARTS) else []
+    starts = query(f"SELECT sent_ns, key FROM starts WHERE action = '{_ACTIONS[table]}'") if query(_HAS_STARTS) else []
     if not any(key for _, key in starts):
         return {}
     published: dict[int, int] = dict(query(_PUBLISHED[table]))
@@ -215,6 +224,23 @@ def _with_settings(query: Query, table: str, rows: list[R]) -> list[R]:
         if (found := newest.get(component_of(row.holder or ""))) is not None and found.key in ("", row.key):
             made[row.number] = tuple(map(_swept, found.parameters))
     return [replace(row, settings=made.get(row.number, ())) for row in rows]
+
+
+def _with_instruments(
+    query: Query, table: str, rows: list[R], readings: RecordedReadings, bands: AllowedBands
+) -> list[R]:
+    readings.read_on(query)
+    if not readings.of:
+        return rows
+    # by the time of publication, as in the files: it has the clock of the readings
+    published: dict[int, int] = dict(query(_PUBLISHED[table]))
+    made = []
+    for row in rows:
+        end_ns = published.get(row.number, row.time_ns)
+        values = readings.values(end_ns, row.began_ns, bands, _ACTIONS[table])
+        outside = tuple(dict.fromkeys(name for one in values for name in one.outside))
+        made.append(replace(row, instruments=values, outside=outside))
+    return made
 
 
 def _swept(parameter: Parameter) -> SweptSetting:

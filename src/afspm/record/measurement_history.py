@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 from typing import TYPE_CHECKING, TypeVar
@@ -40,6 +40,7 @@ class ScanSummary:
         interrupted: the scan is incomplete.
         setpoint: the feedback setpoint at the start, in the unit of the operating mode; None if not published.
         number: the number of the scan in the run, as in its record: from 1, the same for all its channels.
+        outside: the conditions whose band did not contain a value of an instrument during the scan.
     """
 
     time_ns: int
@@ -53,6 +54,7 @@ class ScanSummary:
     interrupted: bool = False
     setpoint: float | None = None
     number: int = 0
+    outside: tuple[str, ...] = ()
 
     def is_of_scan(self, other: ScanSummary) -> bool:
         """Return whether both are channels of one scan."""
@@ -181,15 +183,21 @@ class MeasurementHistory:
             self._done.append(DoneScan(running.parameters, time_ns - running.began_ns))
         self.running = None
 
-    def add_scan(self, scan: Scan, time_ns: int, holder: str | None) -> None:
-        """Add a channel of a scan; `holder` counts only where no scan is running."""
-        began_ns = None
+    def add_scan(self, scan: Scan, time_ns: int, holder: str | None, outside: Iterable[str] = ()) -> None:
+        """Add a channel of a scan; `holder` counts only where no scan is running.
+
+        Args:
+            outside: the conditions that do not hold now.
+        """
+        began_ns, outside = None, set(outside)
         if self.running is not None:
             began_ns, holder = self.running.began_ns, self.running.holder
             self.running.published = True
+            outside |= self.running.outside
         summary = ScanSummary(
-            scan.time_ns or time_ns, began_ns, scan.channel, scan.unit, scan.region, scan.shape, scan.filename, holder
-        )
+            scan.time_ns or time_ns, began_ns, scan.channel, scan.unit, scan.region, scan.shape, scan.filename, holder,
+            outside=tuple(sorted(outside)),
+        )  # fmt: skip
         self._add_channel(summary)
 
     def _add_channel(self, summary: ScanSummary) -> None:

@@ -48,6 +48,7 @@ from afspm.model import (
 )
 from afspm.model.events import PERSON
 from afspm.model.grants import with_proposal
+from afspm.model.names import START_SCAN
 from afspm.model.problems import CONDITIONS
 from afspm.record.measurement_history import (
     SOON_NS,
@@ -61,6 +62,7 @@ from afspm.record.running_scan import RunningScan
 from afspm.record.timeline import Span, Timeline, Timelines
 
 if TYPE_CHECKING:
+    from afspm.record.allowed_bands import AllowedBands
     from afspm.wire.messages import DriftMapping, DriftRescan, SpatialPointWithScoreList
 
 MOST_POINTS = 4000
@@ -180,6 +182,7 @@ class Overview:
 
     Args:
         problems: the names of the experiment's problems.
+        bands: the bands of [conditions], by parameter; scans outside are marked.
 
     Attributes:
         newest_ns: the time of the newest packet; 0 before the first.
@@ -193,8 +196,16 @@ class Overview:
         log, alarms, notes, entries, refusals, acts: newest last, bounded; acts are those at the microscope itself.
     """
 
-    def __init__(self, problems: ProblemNames | None = None, *, most_entries: int = MOST_ENTRIES) -> None:
+    def __init__(
+        self,
+        problems: ProblemNames | None = None,
+        *,
+        most_entries: int = MOST_ENTRIES,
+        bands: AllowedBands | None = None,
+    ) -> None:
         self.problems = problems or ProblemNames()
+        self._bands = bands or {}
+        self._outside: dict[str, tuple[str, ...]] = {}
         self.newest_ns = 0
         self.status: ScopeStatus | None = None
         self.control: ControlState | None = None
@@ -406,7 +417,9 @@ class Overview:
             self.running.take(lines)
 
     def _on_scan(self, scan: Scan, time_ns: int) -> None:
-        self._measured.add_scan(scan, time_ns, self._holder)
+        # readings are published when they change: the last ones are true until the next
+        outside = (name for names in self._outside.values() for name in names)
+        self._measured.add_scan(scan, time_ns, self._holder, outside)
 
     def _on_spectrum(self, spectrum: Spectrum, time_ns: int) -> None:
         self._measured.add_spectrum(spectrum, time_ns, self._holder)
@@ -415,7 +428,15 @@ class Overview:
         for one in report.readings:
             curve = self.instruments.setdefault(one.name, ReadingCurve())
             curve.unit = one.unit or curve.unit
-            curve.add(time_ns, one.value if one.value is not None and one.is_number else math.nan)
+            value = one.value if one.is_number else None
+            curve.add(time_ns, math.nan if value is None else value)
+            self._outside[one.name] = tuple(
+                band.condition
+                for band in self._bands.get(one.name, ())
+                if START_SCAN in band.actions and not band.contains(value, one.target, one.unit)
+            )
+            if self.running is not None:
+                self.running.outside.update(self._outside[one.name])
 
     def _on_proposal(self, proposal: Proposal, time_ns: int) -> None:
         self.proposals = with_proposal(self.proposals, proposal, MOST_PROPOSALS)

@@ -14,8 +14,6 @@ from afspm.model import (
     ActByHand,
     ControlState,
     Feedback,
-    InstrumentReading,
-    InstrumentReadings,
     MeasurementConditions,
     ProblemNames,
     ScopeState,
@@ -23,11 +21,12 @@ from afspm.model import (
     TipStatus,
 )
 from afspm.record.drift_mapping import drift_knowledge
+from afspm.record.instrument_values import RecordedReadings, earliest_ns
 
 _BACK = 20
 """The number of earlier states that are searched for the start of a measurement."""
-_READINGS_NS = 60 * 10**9
-"""Readings of instruments are published every 10 s at least; older readings come from a lost instrument."""
+_IN_FILES = ("name", "value", "unit", "target", "age_s", "reason", "lowest", "highest")
+"""The facts of an instrument's value that each file has."""
 
 
 @dataclass(frozen=True)
@@ -110,35 +109,25 @@ def drift(journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filen
     }
 
 
-def instruments(journal: sqlite3.Connection, time_ns: int, since_ns: int | None) -> list[Plain]:
-    """Return the last values of other instruments in the minute before `time_ns`, and their ranges since `since_ns`."""
-    first_ns = time_ns - _READINGS_NS if since_ns is None else min(since_ns, time_ns - _READINGS_NS)
+def instruments(journal: sqlite3.Connection, time_ns: int, since_ns: int | None, speed: float) -> list[Plain]:
+    """Return the last values of other instruments in the real minute before `time_ns`, and their ranges.
+
+    Args:
+        time_ns: the time of publication.
+        since_ns: the start of the measurement, and of the ranges; None: unknown.
+        speed: experiment seconds per real second.
+    """
+    first_ns = earliest_ns(time_ns, speed)
+    first_ns = first_ns if since_ns is None else min(since_ns, first_ns)
     rows = journal.execute(
         "SELECT time_ns, payload FROM packets WHERE message = 'InstrumentReadings' AND time_ns > ? AND time_ns <= ?"
         " ORDER BY time_ns",
         (first_ns, time_ns),
     )
-    newest, seen = dict[str, tuple[int, InstrumentReading]](), dict[str, list[float]]()
+    readings = RecordedReadings(speed)
     for at_ns, payload in rows:
-        report = _decoded("InstrumentReadings", payload)
-        for one in report.readings if isinstance(report, InstrumentReadings) else ():
-            newest[one.name] = at_ns, one
-            if since_ns is not None and at_ns >= since_ns and one.value is not None and one.is_number:
-                seen.setdefault(one.name, []).append(one.value)
-    return [
-        {
-            "name": name,
-            "value": one.value if one.is_number else None,
-            "unit": one.unit,
-            "target": one.target,
-            "age_s": None if one.age_s is None else one.age_s + (time_ns - at_ns) * 1e-9,
-            "reason": one.reason,
-            "lowest": min(seen[name]) if name in seen else None,
-            "highest": max(seen[name]) if name in seen else None,
-        }
-        for name, (at_ns, one) in newest.items()
-        if at_ns > time_ns - _READINGS_NS
-    ]
+        readings.take(at_ns, payload)
+    return [{name: getattr(one, name) for name in _IN_FILES} for one in readings.values(time_ns, since_ns)]
 
 
 def tip(

@@ -31,6 +31,7 @@ from afspm.model import (
 )
 from afspm.record import journal
 from afspm.record.bad_scans import LINE_VERDICT_MESSAGE, VERDICT_MESSAGE, read_verdict
+from afspm.record.instrument_values import RecordedReadings
 from afspm.record.journal import SCHEDULER
 from afspm.record.measured_tables import (
     KeyedTable,
@@ -49,6 +50,7 @@ from afspm.record.treatment_ledger import KEEP_AWAY_M, TreatmentLedger, treatmen
 from afspm.wire.messages import SpatialROIWithScoreList, TipVerdict
 
 if TYPE_CHECKING:
+    from afspm.record.allowed_bands import AllowedBands
     from afspm.record.film import Film
     from afspm.record.overview import DriftPoint, Overview
     from afspm.storage.formats.content import FileContent
@@ -87,18 +89,19 @@ class Run:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._journal = journal.open_to_read(folder)
+        self._readings = RecordedReadings(float((self.facts.get("clock") or {}).get("speed", 1.0)))
 
     # --- measurements ---
 
     @property
     def scans(self) -> KeyedTable[ScanRow]:
         """One row for each scan, also if interrupted, in the order of recording."""
-        return read_scans(self._query, self.verdicts())
+        return read_scans(self._query, self.verdicts(), self._readings, self._bands)
 
     @property
     def spectra(self) -> SpectrumTable:
         """One row for each spectrum, in the order of recording."""
-        return read_spectra(self._query, self.spectrum)
+        return read_spectra(self._query, self.spectrum, self._readings, self._bands)
 
     def scan(self, which: int | str | ScanRow) -> ScanSet:
         """Return all channels of a scan: by its index in `scans` (-1: the last), its key, or its row.
@@ -337,7 +340,7 @@ class Run:
         """
         from afspm.record.overview import Overview
 
-        overview = Overview(problems or self.problem_names)
+        overview = Overview(problems or self.problem_names, bands=self._bands)
         for packet, message, thing in self.messages(messages):
             overview.take(message, thing, packet.time_ns or 0, packet.envelope)
         return overview
@@ -424,6 +427,12 @@ class Run:
     def __repr__(self) -> str:
         scans, spectra = (self._query(f"SELECT count(*) FROM {kind}")[0][0] for kind in ("scans", "spectra"))
         return f"<Run {self.folder.name}: {counted(scans, 'scan')}, {counted(spectra, 'spectrum', 'spectra')}>"
+
+    @cached_property
+    def _bands(self) -> AllowedBands:
+        from afspm.record.allowed_bands import allowed_bands  # imports numpy, which the supervisor avoids
+
+        return allowed_bands(self.folder)
 
     def _query(self, sql: str, values: Sequence[object] = ()) -> list[Row]:
         with self._naming_damage():

@@ -41,6 +41,7 @@ class RunningScan:
         setpoint: the feedback setpoint at the start; None if not published.
         channels: received lines of each channel, where the microscope delivers lines.
         published: whether a whole channel was published.
+        outside: the conditions whose band did not contain a value of an instrument so far.
     """
 
     began_ns: int | None
@@ -49,6 +50,7 @@ class RunningScan:
     setpoint: float | None = None
     channels: dict[str, ChannelLines] = field(default_factory=dict)
     published: bool = False
+    outside: set[str] = field(default_factory=set)
 
     def take(self, lines: ScanLines) -> None:
         if self.began_ns is None:

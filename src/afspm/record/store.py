@@ -60,12 +60,14 @@ class RecordSettings:
         problems: the names of the experiment's problems.
         frame: the coordinate frame of published positions; of the sample only where drift is corrected.
         measured: write scans and spectra; otherwise only the journal.
+        speed: experiment seconds per real second.
     """
 
     facts: dict[str, object] = field(default_factory=dict)
     problems: ProblemNames = field(default_factory=ProblemNames)
     frame: Frame = Frame.TIP
     measured: bool = True
+    speed: float = 1.0
 
 
 class RecordStore:
@@ -92,7 +94,7 @@ class RecordStore:
             raise
 
     def _begin(self, about: RecordSettings) -> None:
-        self._files = MeasuredFiles(self._folder, self._journal, about.facts, about.problems)
+        self._files = MeasuredFiles(self._folder, self._journal, about.facts, about.problems, about.speed)
         self._gathering = ScanAssembler(provenance.last_state(self._journal))
         self._is_corrected = provenance.is_corrected(self._journal)
         self._roles = ChannelRoles()

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     import xarray
     from numpy.typing import NDArray
 
+    from afspm.record.instrument_values import InstrumentValue
+
 
 T = TypeVar("T")
 
@@ -67,6 +69,9 @@ class ScanRow:
         position_sd_m: standard deviation of the position along its most uncertain axis; None if unknown.
         settings: parameters that a sweep had set for the scan, as the microscope reported them; a column for each.
         tip_score: the last verdict on the tip: 1 good, 0.5 unclear, 0 bad; None if the scan was not judged.
+        instruments: values of other instruments at the end; two columns each: "cryo.temperature [K]" and its age,
+            "cryo.temperature.age [s]".
+        outside: the conditions of [conditions] that did not hold all the time; the scan counts all the same.
     """
 
     number: int
@@ -86,6 +91,8 @@ class ScanRow:
     position_sd_m: float | None = None
     settings: tuple[SweptSetting, ...] = ()
     tip_score: float | None = None
+    instruments: tuple[InstrumentValue, ...] = ()
+    outside: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +115,8 @@ class SpectrumRow:
     file: str
     key: str = ""
     settings: tuple[SweptSetting, ...] = ()
+    instruments: tuple[InstrumentValue, ...] = ()
+    outside: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,8 +196,8 @@ class Table(Sequence[T], Generic[T]):
     def columns(self) -> dict[str, list[Any]]:
         """Return each column by name, as numbers and texts; positions are split (`center_x_m` …), times are ns."""
         taken_apart = [_apart(row) for row in self._rows]
-        swept = dict.fromkeys(one.column for row in self._rows for one in getattr(row, _SETTINGS, ()))
-        return {name: [row.get(name) for row in taken_apart] for name in (*_names(self._kind), *swept)}
+        more = dict.fromkeys(name for row in self._rows for name in _own_columns(row))
+        return {name: [row.get(name) for row in taken_apart] for name in (*_names(self._kind), *more)}
 
     def to_numpy(self) -> NDArray[Any]:
         """Return a structured array: times as datetime64[ns], unknown numbers as NaN or -1."""
@@ -235,14 +244,18 @@ _COLUMNS = {
     "rate_m_s": ("rate_x_m_s", "rate_y_m_s"),
 }
 """Attributes that are split into several columns."""
-_SETTINGS = "settings"
-"""The attribute with a column for each parameter of a sweep."""
+_WITH_OWN_COLUMNS = frozenset({"settings", "instruments"})
+"""The attributes with columns for each parameter of a sweep, or of an instrument."""
 
 
 def _names(kind: type) -> list[str]:
-    return [
-        name for field in fields(kind) if field.name != _SETTINGS for name in _COLUMNS.get(field.name, (field.name,))
-    ]
+    shared = (field.name for field in fields(kind) if field.name not in _WITH_OWN_COLUMNS)
+    return [name for attribute in shared for name in _COLUMNS.get(attribute, (attribute,))]
+
+
+def _own_columns(row: Any) -> dict[str, object]:
+    swept = {one.column: one.value for one in getattr(row, "settings", ())}
+    return swept | {name: value for one in getattr(row, "instruments", ()) for name, value in one.columns.items()}
 
 
 def _apart(row: Any) -> dict[str, object]:
@@ -251,8 +264,8 @@ def _apart(row: Any) -> dict[str, object]:
         name, value = field.name, getattr(row, field.name)
         if name in _COLUMNS:
             made |= zip(_COLUMNS[name], _parts(value, len(_COLUMNS[name])), strict=True)
-        elif name == _SETTINGS:
-            made |= {one.column: one.value for one in value}
+        elif name in _WITH_OWN_COLUMNS:
+            continue
         elif name == "channels":
             made[name] = ";".join(f"{channel} [{unit}]" for channel, unit in value)
         elif isinstance(value, tuple):
@@ -261,7 +274,7 @@ def _apart(row: Any) -> dict[str, object]:
             made[name] = value.name.lower()
         else:
             made[name] = value
-    return made
+    return made | _own_columns(row)
 
 
 def _parts(value: Any, count: int) -> tuple[object, ...]:

@@ -198,3 +198,60 @@ def test_a_key_with_other_values_is_refused_before_anything_is_set(tmp_path: Pat
         list(points)
     assert len(lab.measured) == 4
     assert lab.in_force == BEFORE
+
+
+class SourceLab(SweepLab):
+    """A microscope beside a voltage source, whose value arrives some readings after a new target."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.values |= {"source.bias": "4.2", "source.bias.target": "4.2", "source.bias.busy": "false"}
+        self.readings_left = 0
+        self.at_volt: list[str] = []
+        self.targets: list[str | None] = []
+
+    def _execute(self, request: Request) -> Response:
+        subject = request.subject
+        if isinstance(subject, Parameter) and subject.name.startswith("source.bias"):
+            if subject.value is not None:
+                self.targets.append(subject.value)
+                self.values |= {"source.bias.target": subject.value, "source.bias.busy": "true"}
+                self.readings_left = 5
+            elif subject.name == "source.bias.busy" and self.values["source.bias.busy"] == "true":
+                self.readings_left -= 1
+                if self.readings_left == 0:
+                    self.values |= {"source.bias": self.values["source.bias.target"], "source.bias.busy": "false"}
+        return super()._execute(request)
+
+    def _finish_scan(self) -> None:
+        self.at_volt.append(self.values["source.bias"])
+        super()._finish_scan()
+
+
+BIASES: dict[str, SweptValues] = {"source.bias": ["4.2 V", "10 V"], "zctrl-igain": [1, 2]}
+
+
+def test_target_of_an_instrument_is_set_once_awaited_and_set_back() -> None:
+    lab = SourceLab()
+    assert [point.values["source.bias"] for point in sweep(scope_of(lab), None, BIASES)] == [4.2, 4.2, 10.0, 10.0]
+    assert lab.at_volt == ["4.2", "4.2", "10", "10"]
+    assert lab.targets == ["10", "4.2"], "a target in force is not set again"
+    assert lab.values["source.bias.target"] == "4.2"
+    *published, _ = [wire.decode(one.message, one.payload) for one in lab.told("MeasurementSettings")]
+    assert [one.parameters[0].name for one in published if isinstance(one, MeasurementSettings)] == [
+        "source.bias.target"
+    ] * 4
+
+
+def test_target_that_another_set_while_control_was_lost_is_set_again() -> None:
+    lab = SourceLab()
+
+    def taken_over() -> None:
+        lab.flag(Problem.TIP_SHAPE_CHANGED)
+        lab.values |= {"source.bias.target": "77", "source.bias": "77", "source.bias.busy": "false"}
+
+    lab.at(SCAN_S + 1.0, taken_over)
+    lab.at(SCAN_S + 40.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    sweep(scope_of(lab), None, {"source.bias": ["4.2 V", "10 V"]})
+    assert lab.at_volt == ["4.2", "10"]
+    assert lab.targets == ["10", "10", "4.2"]

@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,8 @@ from afspm.model import (
     Scan,
     ScopeState,
 )
+from afspm.record import report
+from afspm.record.run_json import EXPERIMENT_FILE
 from afspm.record.store import _PROCESS, RecordSettings, RecordStore
 from afspm.storage import formats
 from afspm.storage.formats import read
@@ -461,3 +464,48 @@ def test_scan_has_the_readings_of_its_time(night: Night, store: RecordStore, tmp
     assert number == 1
     assert (reading["value"], reading["lowest"], reading["highest"]) == (4.3, 4.1, 4.3)
     assert 0.25 < reading["age_s"] < 0.3
+
+
+def test_rows_have_the_values_of_instruments_and_name_the_condition_that_did_not_hold(
+    night: Night, store: RecordStore, tmp_path: Path
+) -> None:
+    bands = '"cryo.temperature" = { from = "4 K", to = "4250 mK" }\n[conditions.settled]\n'
+    bands += '"cryo.temperature" = { within = "0.3 K" }\nwhile = ["start-spec"]\n'
+    (tmp_path / EXPERIMENT_FILE).write_text(f"[conditions.cold]\n{bands}", encoding="utf-8")
+    store.take([night.control(), *night.whole_scan(1)])
+    store.take([readings(night, 4.4), night.state(ScopeState.SCANNING), readings(night, 4.1), readings(night, 4.2)])
+    store.take([*night.scans(2), night.state(ScopeState.FREE)])
+    store.take([night.state(ScopeState.SCANNING), readings(night, 4.3), readings(night, 4.2), *night.scans(3)])
+    store.take([night.state(ScopeState.FREE), night.state(ScopeState.SCANNING), readings(night, None)])
+    store.take([*night.scans(4), night.state(ScopeState.FREE)])
+    store.take([readings(night, 4.6), night.state(ScopeState.SPEC), night.spectrum()])
+    store.flush()
+    run = afspm.open_run(tmp_path)
+    columns = run.scans.columns()
+    assert columns["cryo.temperature [K]"] == [None, 4.2, 4.2, None]
+    assert columns["outside"] == ["", "", "cold", "cold"]
+    assert [one is not None and 0.25 < one < 0.3 for one in columns["cryo.temperature.age [s]"]] == [False, *[True] * 3]
+    assert [(one.lowest, one.highest) for one in run.scans[2].instruments] == [(4.2, 4.3)]
+    assert run.spectra[0].outside == ("cold", "settled")
+    assert [scan.outside for scan in run.overview().scans if scan.channel == "Height"] == [(), (), ("cold",), ("cold",)]
+    page = report.write(tmp_path).read_text(encoding="utf-8")
+    assert "outside: cold" in page
+    assert "4.1 K to 4.6 K" in page
+    store.take([readings(night, 4.2), *night.whole_scan(5)])
+    store.flush()
+    assert run.scans[-1].instruments[0].value == 4.2, "the table is read on while the run grows"
+
+
+def test_readings_are_as_old_as_real_time_says(night: Night, tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text('{"clock": {"speed": 60.0}}', encoding="utf-8")
+    with closing(RecordStore(tmp_path, RecordSettings(speed=60.0))) as store:
+        store.take([night.control(), readings(night, 4.2)])
+        night.now_ns += 600 * 10**9  # ten seconds
+        store.take(night.whole_scan(1))
+        store.flush()
+    run = afspm.open_run(tmp_path)
+    (row,) = run.scans
+    (found,) = row.instruments
+    assert found.value == 4.2
+    assert found.age_s == pytest.approx(10.25, abs=0.1)
+    assert run.about(row)["instruments"][0]["age_s"] == pytest.approx(found.age_s)

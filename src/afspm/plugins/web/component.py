@@ -11,6 +11,7 @@ from afspm.client.component import Component
 from afspm.plugins.web.archive import Archive
 from afspm.plugins.web.server import STALLED_S, WebServer, listening, url_of
 from afspm.plugins.web.watch import Watch
+from afspm.record.allowed_bands import allowed_bands
 from afspm.record.expected_end import plans_of
 from afspm.record.run_json import run_json_or_empty
 from afspm.record.run_lock import cut_off_message
@@ -86,6 +87,7 @@ class WebComponent(Component):
             self.clock, problems, archive.past(problems), lambda: cut_off_message(self.run_dir),
             plans=plans_of(run_json_or_empty(self.run_dir)) if launch.run_dir else None,
             began_ns=round(float(launch.clock["start_s"]) * NS_PER_S) if launch.clock else None,
+            bands=allowed_bands(self.run_dir) if launch.run_dir else None,
         )  # fmt: skip
         return archive, watch
 

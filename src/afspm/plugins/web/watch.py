@@ -16,6 +16,7 @@ from afspm.components.tip_verdict import OF_LINES, read_line_verdict
 from afspm.model import ChannelRoles, ProblemNames, Scan, ScanLines, ScopeState, Spectrum
 from afspm.model.line_levelling import Array
 from afspm.plugins.web.frames import FrameStore
+from afspm.record.allowed_bands import AllowedBands
 from afspm.record.expected_end import Plans, expected_end_ns
 from afspm.record.overview import Overview
 
@@ -58,6 +59,7 @@ class Watch:
         cut_off: returns a text if the experiment's processes are gone, else an empty text.
         plans: planned work of each component; None: no estimate.
         began_ns: experiment time at the start of the run; None: unknown.
+        bands: required value ranges of other instruments.
     """
 
     def __init__(
@@ -68,12 +70,14 @@ class Watch:
         cut_off: Callable[[], str] = str,
         plans: Plans | None = None,
         began_ns: int | None = None,
+        bands: AllowedBands | None = None,
     ) -> None:
         self.clock = clock
         self.problems = problems or ProblemNames()
         self.cut_off = cut_off
         self._plans, self._began_ns = plans or {}, began_ns
-        self.overview = past or Overview(self.problems)
+        self._bands = bands
+        self.overview = past or Overview(self.problems, bands=bands)
         self.frames = FrameStore()
         self.spectra = SpectrumStore()
         self.tip_to_sample: Array | None = None

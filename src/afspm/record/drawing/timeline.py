@@ -31,6 +31,7 @@ CSS = """
 .lane i{font-style:normal;font-size:11px;line-height:17px}
 .strip>div{height:auto;aspect-ratio:14/1;background:none}
 .strip span{background:none;padding:1px}
+.strip img.outside{outline:2px solid #d0342c;outline-offset:-2px}
 .strip img{width:100%;height:100%;object-fit:cover;display:block;border-radius:2px;cursor:pointer}
 .curve>div{height:70px}
 .curve svg{position:absolute;left:0;right:0;top:17px;bottom:0;width:100%;height:53px}

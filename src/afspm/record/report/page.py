@@ -19,7 +19,10 @@ from afspm.record.report.curves import SpectrumGroup
 from afspm.record.report.markup import PageTimes, document, section, table
 from afspm.record.report.pictures import FigurePicture, TopographyPicture
 from afspm.record.report.story import MOST_ROWS, RunStory, colours, sentence, states_in_words, timeline_rows
+from afspm.record.tables import ScanRow
 from afspm.record.timeline import Timeline
+
+MOST_NAMED = 40
 
 
 def html(
@@ -41,6 +44,7 @@ def html(
         section("Critical messages", _alarms(story, clock)),
         section("Treatments of the tip", _treatments(story)),
         section("Parameters changed", parameters.html(story.changes, clock)),
+        section("Other instruments", _instruments(story)),
         section("Agents", agents.html(story.agents, clock)),
         section("Drift", _drift(story, clock)),
         section("Notes", _notes(story, clock)),
@@ -231,6 +235,32 @@ def _treatments(story: RunStory) -> str:
     if ledger.unknown:
         rows.append(["with a size that the record does not show", f"{ledger.unknown}, not in these sums"])
     return table(["what", "how much"], rows)
+
+
+def _instruments(story: RunStory) -> str:
+    rows = []
+    for name in dict.fromkeys(one.name for row in story.beside_instruments for one in row.instruments):
+        at = [(row, one) for row in story.beside_instruments for one in row.instruments if one.name == name]
+        known = [bound for _, one in at for bound in (one.lowest, one.value, one.highest) if bound is not None]
+        unit = next((one.unit for _, one in at if one.unit), "")
+        outside = [row for row, one in at if one.outside]
+        links = [
+            f'<a href="#{sample.name_of(row)}">{row.number}</a>'
+            if isinstance(row, ScanRow)
+            else f"spectrum {row.number}"
+            for row in outside
+        ]
+        more = "" if len(links) <= MOST_NAMED else f" … {len(links)} in all"
+        extent = (min(known), max(known)) if known else None
+        rows.append(
+            [
+                escape(name),
+                counted(len(at), "measurement"),
+                "unknown" if extent is None else f"{quantity(extent[0], unit)} to {quantity(extent[1], unit)}",
+                f"<b>{', '.join(links[:MOST_NAMED])}{more}</b>" if links else "none",
+            ]
+        )
+    return table(["parameter", "known beside", "values meanwhile", "outside a condition"], rows)
 
 
 def _notes(story: RunStory, clock: PageTimes) -> str:

@@ -190,6 +190,8 @@ def _figure(
     mark = " <b>interrupted</b>" if row.interrupted else ""
     if row.registration is not None and row.registration is not RegistrationOutcome.REGISTERED:
         mark += f" <b>{row.registration.label}</b>"
+    if row.outside:
+        mark += f" <b>outside: {escape(', '.join(row.outside))}</b>"
     noted = " ✎" if any(note.scan == row.number for note in story.notes) else ""
     size = f"<br>{typeset_area(region.size_m)}" if region else ""
     caption = (
@@ -233,6 +235,9 @@ def _facts(one: TopographyPicture, story: RunStory, clock: PageTimes) -> Iterato
     if one.image is not None:
         span = one.image.span
         yield "shown", f"{escape(one.channel)}, {quantity(span.high - span.low, one.unit, 3)} from dark to light"
+    for value in row.instruments:
+        outside = f", outside: {', '.join(value.outside)}" if value.outside else ""
+        yield escape(value.name), escape(f"{value.text}{outside}")
     yield "in control", escape(row.holder or "none")
     yield "problems", escape(", ".join(row.problems))
     yield "interrupted", "yes" if row.interrupted else ""

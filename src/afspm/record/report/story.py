@@ -27,7 +27,7 @@ from afspm.record.report.work_comparison import WorkComparison, compare
 from afspm.record.run import Run
 from afspm.record.run_json import REAL_S, UNFINISHED
 from afspm.record.run_lock import describe_state
-from afspm.record.tables import NoteRow, ScanRow
+from afspm.record.tables import NoteRow, ScanRow, SpectrumRow
 from afspm.record.timeline import Span, Timeline
 from afspm.record.treatment_ledger import TreatmentLedger, treatments_once
 
@@ -67,6 +67,7 @@ class RunStory:
         bands: the values of other instruments that the conditions allowed.
         shadow: decisions of a run in shadow mode beside the person's acts.
         unfinished: how each unfinished component was stopped, as text by name.
+        beside_instruments: the scans and spectra with values of other instruments.
     """
 
     name: str
@@ -91,6 +92,7 @@ class RunStory:
     bands: AllowedBands = field(default_factory=dict)
     shadow: shadow.ShadowNight = field(default_factory=shadow.ShadowNight)
     unfinished: Mapping[str, str] = field(default_factory=dict)
+    beside_instruments: Sequence[ScanRow | SpectrumRow] = ()
 
     @property
     def end_ns(self) -> int:
@@ -161,7 +163,7 @@ class RunStory:
 
 
 def read(run: Run) -> RunStory:
-    overview, scans, late = run.overview(), run.scans, _late_flags(run.journal)
+    overview, scans, spectra, late = run.overview(), run.scans, run.spectra, _late_flags(run.journal)
     clock = run.facts.get("clock") or {}
     # a resumed run has recorded only the clock of its last part
     starts_ns = [*_first_ns(overview, scans), *([round(float(clock["start_s"]) * 1e9)] if clock else [])]
@@ -177,7 +179,7 @@ def read(run: Run) -> RunStory:
         frame=run.frame,
         overview=overview,
         scans=[_without_routine(scan, overview) for scan in scans],
-        spectra=len(run.spectra),
+        spectra=len(spectra),
         # late flags are listed with the problems instead
         refusals=gathered([entry for entry in run.refusals if entry not in late]),
         ledger=run.ledger(),
@@ -188,12 +190,13 @@ def read(run: Run) -> RunStory:
         ],
         notes=list(run.notes),
         seen_late=list({entry.problem: entry for entry in reversed(late)}.values()),
-        comparisons=compare(plans_of(run.facts), scans, run.spectra),
+        comparisons=compare(plans_of(run.facts), scans, spectra),
         agents=agents.read(run),
         changes=parameters.read(run),
         bands=allowed_bands(run.folder),
         shadow=shadow.read(run),
         unfinished=run.facts.get(UNFINISHED) or {},
+        beside_instruments=[row for row in (*scans, *spectra) if row.instruments],
     )
 
 

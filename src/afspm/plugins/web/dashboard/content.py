@@ -196,11 +196,15 @@ class Contents:
         for one in overview.scans:
             if one.number != number and self._pictures and not one.interrupted:
                 number = one.number
-                title = escape(f"no. {number}: {typeset_area(one.region.size_m)} at {time_of_day(one.time_ns)}")
+                outside = f", outside: {', '.join(one.outside)}" if one.outside else ""
+                title = escape(
+                    f"no. {number}: {typeset_area(one.region.size_m)} at {time_of_day(one.time_ns)}{outside}"
+                )
+                mark = ' class="outside"' if one.outside else ""
                 yield (
                     one.time_ns,
                     (
-                        f'<img src="{picture_url(self._pictures, one)}" alt="{title}" title="{title}" '
+                        f'<img{mark} src="{picture_url(self._pictures, one)}" alt="{title}" title="{title}" '
                         f'data-time="{one.time_ns}" data-channel="{escape(one.channel)}">'
                     ),
                 )

@@ -18,6 +18,7 @@ from afspm.model.geometry import XY
 from afspm.model.line_levelling import Array
 from afspm.plugins.web.frames import FrameStore
 from afspm.plugins.web.watch import SpectrumStore, Watch
+from afspm.record.allowed_bands import allowed_bands
 from afspm.record.overview import Overview
 from afspm.record.packets import RecordPlayback
 from afspm.record.run import Run, open_run
@@ -120,7 +121,7 @@ class NightWatch(Watch):
 
     def __init__(self, night: Night) -> None:
         self.moment = StoppedClock(night.end_ns, night.speed)
-        super().__init__(self.moment, night.problems)
+        super().__init__(self.moment, night.problems, bands=allowed_bands(night.folder))
         self._night = night
         self._events: Sequence[NightEvent] = ()
         self._playback: RecordPlayback[NightEvent] = RecordPlayback(())
@@ -161,7 +162,7 @@ class NightWatch(Watch):
         if time_ns < self.moment.time_ns or not self.is_current:
             self._events = self._night.events
             self._playback = RecordPlayback(self._events)
-            self.overview, self.frames = Overview(self.problems), ChannelNames()
+            self.overview, self.frames = Overview(self.problems, bands=self._bands), ChannelNames()
             self.tip_to_sample = None
         self.moment.time_ns = time_ns
         for event in self._playback.due(time_ns):

@@ -84,6 +84,8 @@ def _when(frame: ChannelFrame, overview: Overview, now_ns: int) -> Facts:
         facts.append(("Took", duration_text((summary.time_ns - summary.began_ns) / NS_PER_S)))
     if summary is not None and summary.holder:
         facts.append(("By", summary.holder))
+    if summary is not None and summary.outside:
+        facts.append(("Outside", ", ".join(summary.outside)))
     return [fact for fact in facts if fact[1]]
 
 
