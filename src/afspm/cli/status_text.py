@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from afspm import wire
 from afspm.basics.clock import NS_PER_S, utc_time
 from afspm.basics.formatting import area_text, day_and_time, duration_text, time_of_day
 from afspm.model import LogLine, ProcessCondition, ProcessState, Progress, Region, ScopeState
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 BAR = 24
+LONGEST_MESSAGE = 200
 # processes in these conditions share one line; all others have a line each
 WELL = (ProcessCondition.ALIVE, ProcessCondition.BUSY)
 BAD = (ProcessCondition.SILENT, ProcessCondition.GIVEN_UP, ProcessCondition.RESTARTING)
@@ -105,6 +107,7 @@ class StatusText:
         ]
         lines += self._processes()
         lines += self._refusals()
+        lines += self._announced()
         lines += self._notes()
         lines += map(log_line, list(self._seen.log)[-log_lines:] if log_lines > 0 else ())
         for line in lines:
@@ -252,6 +255,11 @@ class StatusText:
             on = f" on scan {numbers[note.scan_ns]}" if note.scan_ns in numbers else ""
             yield _label("note").append(f"{time_of_day(note.time_ns)} {note.who}{on}: {note.text}")
 
+    def _announced(self) -> Iterator[Text]:
+        for envelope, (time_ns, message) in self._seen.announced.items():
+            text = " ".join(str(message).split())
+            yield _label("message").append(f"{time_of_day(time_ns)} {envelope}: {text[:LONGEST_MESSAGE]}")
+
     def as_json(self) -> dict[str, object]:
         """Return the status for programs.
 
@@ -281,6 +289,10 @@ class StatusText:
                 {"time": _iso(one.time_ns), "who": one.who, "what": one.what, "reason": one.reason}
                 for one in seen.refusals
             ],
+            "messages": {
+                envelope: {"time": _iso(time_ns), "content": wire.as_plain(message)}
+                for envelope, (time_ns, message) in seen.announced.items()
+            },
             "notes": [
                 {"time": _iso(one.time_ns), "who": one.who, "text": one.text, "scan": _iso(one.scan_ns)}
                 for one in seen.notes

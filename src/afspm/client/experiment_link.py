@@ -22,7 +22,6 @@ from afspm.model import (
     ActByHand,
     ChannelRoles,
     ControlMode,
-    ControlRequest,
     ControlState,
     Feedback,
     FeedbackUnits,
@@ -434,7 +433,7 @@ class ExperimentLink:
             hint="the request may or may not have been carried out",
         )
 
-    def send_only(self, kind: ControlRequest, subject: object = None) -> None:
+    def send_only(self, kind: int, subject: object = None) -> None:
         """Send a request without waiting for the answer; without a connection the request is lost."""
         self.requests.send_only(kind, subject)
 

@@ -19,7 +19,7 @@ from afspm.client.experiment_link import ExperimentLink
 from afspm.client.keyed_results import kept_in
 from afspm.client.port_log import RecordedPort, recorded
 from afspm.client.scope import Scope
-from afspm.model import Frame, Packet, Problem
+from afspm.model import RELAY_REQUEST, Frame, Packet, Problem, RelayedMessage
 from afspm.storage.memory import Memory
 from afspm.transport.process import failure
 from afspm.transport.process.context import ProcessContext
@@ -200,6 +200,15 @@ class ComponentLoop:
 
     def _publish(self, message: object, envelope: str | None) -> None:
         name, payload = wire.encode(message)
+        if wire.is_relayed(name):
+            if envelope is not None:
+                what = f"{name} is relayed, and has the envelope {name}_{self._context.name}, not {envelope!r}"
+                raise ConfigError(what, where=self._context.name, hint="publish it without an envelope")
+            try:
+                self._component.scope.announce(message)
+            except ExperimentEnded:  # the last scan is handled after the end, and its results are recorded
+                self._link.send_only(RELAY_REQUEST, RelayedMessage(name, payload))
+            return
         if envelope is not None and wire.message_of(envelope) != name:
             raise ConfigError(
                 f"the envelope {envelope!r} does not begin with the message's name {name!r}",

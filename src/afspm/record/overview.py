@@ -189,6 +189,7 @@ class Overview:
         status, control, tip: the newest state of the microscope, of control and of the tip; None before the first.
         processes, progress_reports: the newest state and progress of each process, by name.
         instruments: the curve of each instrument parameter, by its name.
+        announced: time and newest message of each envelope that the scheduler relays for a component.
         proposals: the proposals of agents by id, newest last, bounded.
         approvals: the approvals in force.
         of_conditions: the numbers of the problems flagged by conditions.
@@ -215,6 +216,7 @@ class Overview:
         self.processes: dict[str, ProcessState] = {}
         self.instruments: dict[str, ReadingCurve] = {}
         self.progress_reports: dict[str, Progress] = {}
+        self.announced: dict[str, tuple[int, object]] = {}
         self.proposals: dict[str, Proposal] = {}
         self.approvals = Approvals()
         self._approved_ns: dict[str, int] = {}
@@ -379,6 +381,8 @@ class Overview:
         handler: Callable[[object, int], None] | None = getattr(self, f"_{_handler(message)}", None)
         if handler is not None:
             handler(thing, time_ns)
+        elif wire.is_relayed(message):
+            self.announced[key] = time_ns, thing
 
     @property
     def _holder(self) -> str | None:

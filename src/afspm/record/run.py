@@ -47,6 +47,7 @@ from afspm.record.packets import PacketLookup, packets, without_reading_files
 from afspm.record.run_json import EXPERIMENT_FILE, METADATA, REPLAY_OF, latest_run, run_json_or_empty
 from afspm.record.tables import ControlRow, NoteRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
 from afspm.record.treatment_ledger import KEEP_AWAY_M, TreatmentLedger, treatment_ledger
+from afspm.wire.message_types import register_all
 from afspm.wire.messages import SpatialROIWithScoreList, TipVerdict
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ if TYPE_CHECKING:
 _SAME_SCAN_NS = 1_000_000_000
 
 
-def open_run(path: str | Path = "runs") -> Run:
+def open_run(path: str | Path = "runs", *, messages: Sequence[str] = ()) -> Run:
     """Open the record of a run, also of a running or killed one.
 
         run = afspm.open_run("runs/tip_repair-20261120-040000")
@@ -68,10 +69,13 @@ def open_run(path: str | Path = "runs") -> Run:
 
     Args:
         path: the folder of the run, or of all runs: then the newest run. For a replay, the replayed run is opened.
+        messages: modules and .proto files with message types of your own, as in the experiment file.
 
     Raises:
         FileError: the record is missing or damaged.
+        ConfigError: `messages` can't be imported.
     """
+    register_all(messages)
     return Run(_folder(Path(path)))
 
 

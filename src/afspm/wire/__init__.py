@@ -14,7 +14,7 @@ handler of a component for it. Every other list of messages is derived from the 
 
 from __future__ import annotations
 
-from afspm.wire.codec import decode, encode, header
+from afspm.wire.codec import as_plain, decode, encode, header
 from afspm.wire.frames import (
     BEAT,
     CLOSE,
@@ -40,6 +40,7 @@ from afspm.wire.messages import (
     declare,
     declared,
     followed_messages,
+    is_relayed,
     known_messages,
     message_of,
     message_type,
@@ -59,6 +60,7 @@ __all__ = [
     "Buffer",
     "MessageDeclaration",
     "MessageKind",
+    "as_plain",
     "declaration",
     "declare",
     "declared",
@@ -80,6 +82,7 @@ __all__ = [
     "followed_messages",
     "header",
     "id_of",
+    "is_relayed",
     "known_messages",
     "message_of",
     "message_type",

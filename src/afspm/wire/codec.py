@@ -10,6 +10,7 @@ from google.protobuf.message import Message
 
 from afspm import model
 from afspm.basics.errors import AfspmError, InvalidValue, UnitError, WireError
+from afspm.basics.plain_data import Plain
 from afspm.basics.units import convert as convert_unit
 from afspm.wire import unit_conversion
 from afspm.wire.generated import analysis_pb2, lines_pb2, scan_pb2, spectroscopy_pb2
@@ -20,6 +21,14 @@ from afspm.wire.split import Buffer, doubles, nested, packed, split
 _VALUES_OF_SCAN = _VALUES_OF_LINES = 4
 _DATA_OF_SPECTRUM = 4
 _VALUES_OF_DATA = 5
+
+
+def as_plain(message: Any) -> Plain:
+    """Return a message of a generated class in JSON's types, by the names in its .proto file."""
+    from google.protobuf.json_format import MessageToDict  # slow to import, and rarely needed
+
+    plain: Plain = MessageToDict(message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
+    return plain
 
 
 def encode(thing: object) -> tuple[str, bytes]:

@@ -90,6 +90,8 @@ class MessageDeclaration:
         set_by: the request that sets the content of the message.
         event: kind of the event in the gateway; empty: not streamed.
         in_past: whether an overview of an earlier part of a run needs all packets instead of only the newest.
+        relayed: whether the scheduler publishes the message for the component, as `<name>_<component>`: programs that
+            follow the scheduler alone then get it, such as `afspm status`, `afspm.connect` and `Run.messages`.
         name: name of the message, with which its envelopes begin.
     """
 
@@ -104,6 +106,7 @@ class MessageDeclaration:
     set_by: ControlRequest | None = None
     event: str = ""
     in_past: bool = False
+    relayed: bool = False
     name: str = field(init=False)
 
     def __post_init__(self) -> None:
@@ -111,6 +114,8 @@ class MessageDeclaration:
         object.__setattr__(self, "name", self.type.DESCRIPTOR.name)
         if not self.handler:
             object.__setattr__(self, "handler", f"on_{snake_case(self.name)}")
+        if self.relayed and self.has_values:
+            raise InvalidValue(f"{self.name} has values of a measurement, and can't be relayed", hint="kind = RESULT")
 
     @property
     def has_values(self) -> bool:
@@ -370,6 +375,11 @@ def register(message: type[Message]) -> type[Message]:
 def declared() -> tuple[MessageDeclaration, ...]:
     """Return the declarations of all messages, including users' messages."""
     return tuple(_declared.values())
+
+
+def is_relayed(name: str) -> bool:
+    """Return whether the scheduler publishes the message `name` for components; False if it is not declared."""
+    return name in _declared and _declared[name].relayed
 
 
 def declaration(name: str) -> MessageDeclaration:

@@ -9,16 +9,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from google.protobuf.wrappers_pb2 import DoubleValue
 from published_schemas import require_valid
 from rich.console import Console
 
-from afspm import model
+from afspm import model, wire
 from afspm.basics.clock import utc_time
 from afspm.basics.formatting import day_and_time
 from afspm.cli.status_text import RunDescription, StatusText, bar
 from afspm.model import ControlMode, ControlState, ProcessCondition, ScopeState
 from afspm.model.planned_work import PlannedWork
 from afspm.record.overview import Overview
+from afspm.wire import messages
 
 S = 1_000_000_000
 START = 1_700_000_000 * S
@@ -194,3 +196,16 @@ def test_status_shows_the_end_of_the_experiment(night: Overview) -> None:
     assert found == {"time": iso(START + 600 * S), "remaining_s": 440.0}
     later: Any = StatusText(night, about, START + 700 * S).as_json()["end"]
     assert later["remaining_s"] == 0.0
+
+
+def test_newest_relayed_message_of_each_component_is_shown(night: Overview, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = wire.MessageDeclaration(type=DoubleValue, relayed=True)
+    monkeypatch.setitem(messages._declared, own.name, own)  # for this test alone
+    for after_s, name, value in ((1, "level", 0.5), (2, "level", 0.25), (2, "other", 0.0)):
+        night.take(own.name, DoubleValue(value=value), START + (200 + after_s) * S, f"{own.name}_{name}")
+    assert "DoubleValue_level: value: 0.25" in " ".join(shown(night).split())
+    found: Any = StatusText(night, ABOUT, START + 300 * S).as_json()["messages"]
+    assert found == {
+        "DoubleValue_level": {"time": iso(START + 202 * S), "content": 0.25},
+        "DoubleValue_other": {"time": iso(START + 202 * S), "content": 0.0},
+    }

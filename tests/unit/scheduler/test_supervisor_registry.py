@@ -26,6 +26,7 @@ from afspm.model import (
     RelayedMessage,
     Response,
     ResponseDetail,
+    ScopeState,
     ScopeStatus,
 )
 from afspm.model.events import LONGEST_ANNOUNCEMENT
@@ -270,3 +271,16 @@ def test_delay_of_a_report_in_fast_time_is_no_difference_of_clocks() -> None:
     made = Lab(SchedulerSettings(run=RunFacts(clock={"speed": 480.0})))
     made.translator()
     assert not reports(made, -100.0, -100.0)
+
+
+def test_declared_message_of_a_component_is_published_under_its_name_each_time(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    message = lab.codec.encode(ScopeStatus(ScopeState.FREE))
+    relayed = RelayedMessage("ScopeStateMsg", message)
+    assert replies(lab.ask("level", RELAY_REQUEST, relayed))[-1].response.code == ControlResponse.FAILURE
+    monkeypatch.setattr(wire, "is_relayed", lambda name: name == "ScopeStateMsg")
+    before = len(published(lab.effects))
+    for _ in range(2):
+        assert replies(lab.ask("level", RELAY_REQUEST, relayed))[-1].response.code == OK
+    assert [one.envelope for one in published(lab.effects)[before:]] == ["ScopeStateMsg_level"] * 2

@@ -9,7 +9,6 @@ from datetime import UTC
 from typing import NamedTuple
 
 import numpy as np
-from google.protobuf.json_format import MessageToDict
 from google.protobuf.message import Message
 
 from afspm import wire
@@ -78,7 +77,7 @@ def _fields(output: Output | None) -> dict[str, str]:
     except AfspmError:  # a request, or a message of a package that is not installed here
         return {}
     if isinstance(thing, Message):
-        thing = MessageToDict(thing, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
+        thing = wire.as_plain(thing)
     return dict(_flat("", thing))
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from afspm import wire
 from afspm.basics.formatting import duration_text
 from afspm.basics.frozen import replace
 from afspm.model import (
@@ -190,11 +191,13 @@ class Announcement:
         envelope: the envelope of the packet; empty if the message is refused.
         why: the reason of the refusal.
         reported: the states of a supervisor's processes, if the message reports them.
+        may_repeat: whether the same content may be published twice: a component's result may be equal to its last.
     """
 
     envelope: str
     why: str = ""
     reported: ProcessStates | None = None
+    may_repeat: bool = False
 
 
 def announcement(event: RequestIn, codec: Codec) -> Announcement:
@@ -221,6 +224,8 @@ def announcement(event: RequestIn, codec: Codec) -> Announcement:
     if isinstance(thing, MeasurementSettings) and subject.message == "MeasurementSettings":
         mine = thing.who == event.name
         return Announcement(subject.message) if mine else Announcement("", f"{event.name} is not {thing.who[:80]!r}")
+    if thing is not None and wire.is_relayed(subject.message):
+        return replace(_named(subject.message, component_of(event.name)), may_repeat=True)
     if not isinstance(thing, ProcessStates | LogLines) or type(thing).__name__ != subject.message:
         return Announcement("", f"a {subject.message[:80]} can't be relayed, or can't be read")
     if event.user not in (None, SUPERVISOR):

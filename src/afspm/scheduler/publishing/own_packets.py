@@ -54,7 +54,7 @@ def publish_for_process(draft: StateDraft, event: RequestIn) -> None:
     _replace_supervisors(draft, supervisors)
     payload = event.request.subject.payload
     # a retry of a message that was published already: a kill came before its answer
-    if not draft.env.cache.holds(announced.envelope, payload):
+    if announced.may_repeat or not draft.env.cache.holds(announced.envelope, payload):
         publish(draft, announced.envelope, payload)
     answers.answer(draft, event, ControlResponse.SUCCESS, payload=wire.encode_orders(orders))
     draft.end = draft.end.processes_reported(draft.peers.supervisors.states_of(event.name), draft.now_s)

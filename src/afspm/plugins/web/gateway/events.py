@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from google.protobuf.json_format import MessageToDict
 from google.protobuf.message import Message
 
 from afspm import wire
@@ -191,7 +190,7 @@ def _data(thing: object, time_ns: int, problems: ProblemNames) -> dict[str, obje
         case JournalEntries():
             return {"entries": [_entry(one, problems) for one in thing.entries]}
         case Message():
-            return MessageToDict(thing, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
+            return wire.as_plain(thing)
     plain: dict[str, object] = _without_large_numbers(to_plain(thing, lists=True))
     return plain
 
