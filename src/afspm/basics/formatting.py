@@ -148,12 +148,16 @@ def scale(largest: float, unit: str) -> tuple[float, str]:
     return 1.0 / power, prefix + unit
 
 
+_PLAIN_DIGITS = 7
+
+
 def quantity(value: float | None, unit: str, digits: int = 4) -> str:
     """Return a number with its unit, "12.34 nm"; "–" for None, NaN and infinity."""
     if value is None or not math.isfinite(value):
         return "–"
     factor, shown = scale(value, unit)
-    return f"{value * factor:.{digits}g} {shown}".strip()
+    rounded = float(f"{value * factor:.{digits}g}")  # and then 20000, not 2e+04
+    return f"{rounded:.{max(digits, _PLAIN_DIGITS)}g} {shown}".strip()
 
 
 def typeset_position(xy_m: tuple[float, float]) -> str:

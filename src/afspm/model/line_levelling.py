@@ -8,9 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 # standard deviation of a normal distribution, in median absolute deviations
 _SD_PER_MAD = 1.4826
 _OUTLIERS_SD = 4.0
+_LINE_LEFT = 0.01
+"""Largest line that is left in a row, in parts of the row's spread, if a line was subtracted from it."""
+_LEAST_ROWS = 16
+_LEAST_BESIDE = 0.1  # of a row, for its line
+_FOOT_PIXELS = 4
+_FEATURE = 0.2
+"""Least height of a feature, in parts of the range of the scan."""
+_ROUNDS = 8
+_NEVER_NONE = 1e-9
 
 
 class Levelling(Enum):
@@ -38,21 +48,84 @@ def levelled(values: Array, how: Levelling) -> Array:
 
 
 def flattened(values: Array) -> Array:
-    """Return values [y, x] with rows aligned in height and a plane subtracted, for small pictures.
+    """Return values [y, x] with rows aligned in height and a plane subtracted, for pictures.
 
-    The plane is fitted without outliers: neither a scar nor a high particle tilts its neighbours.
+    The plane is fitted without outliers: neither a scar nor a high particle tilts its neighbours. Rows from which the
+    controller has subtracted a straight line are tilted beside a high feature; their lines are fitted again without it.
     """
-    flat = levelled(levelled(values, Levelling.DIFFERENCES), Levelling.PLANE)
+    finite = np.isfinite(values)
+    if _are_lines_subtracted(values, finite):
+        return _without_plane(values - _lines_beside_features(values, finite))
+    return _without_plane(levelled(values, Levelling.DIFFERENCES))
+
+
+def _without_plane(values: Array) -> Array:
+    flat = levelled(values, Levelling.PLANE)
     finite = np.isfinite(flat)
     if not finite.any():
         return flat
+    # at least half of the values are no outliers, so there is always a plane through them
+    return flat - _plane(flat, finite & ~_outliers(flat, finite))
+
+
+def _outliers(flat: Array, finite: Mask) -> Mask:
     from_middle = np.abs(flat - np.median(flat[finite]))
-    near = finite & (from_middle <= _OUTLIERS_SD * _SD_PER_MAD * np.median(from_middle[finite]))
-    # at least half of the values are within this limit, so there is always a plane through them
-    return flat - _plane(flat, near)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(from_middle > _OUTLIERS_SD * _SD_PER_MAD * np.median(from_middle[finite]))
 
 
-def _plane(values: Array, finite: NDArray[np.bool_]) -> Array:
+def _are_lines_subtracted(values: Array, finite: Mask) -> bool:
+    # noise alone gives a row of n pixels a line of 1 / sqrt(n) of its spread: 3 % in a thousand pixels
+    whole = values[finite.all(axis=1)] if values.ndim == 2 else values[:0]
+    if len(whole) < _LEAST_ROWS or whole.shape[1] < _LEAST_ROWS:
+        return False
+    line = _lines(whole, np.ones(whole.shape, dtype=bool))
+    ratio = line.std(axis=1) / np.maximum((whole - line).std(axis=1), np.finfo(np.float64).tiny)
+    return bool(np.percentile(ratio, 95.0) < _LINE_LEFT)
+
+
+def _lines_beside_features(values: Array, finite: Mask) -> Array:
+    # from row to row a feature changes little, so the differences give the lines well enough to find the features;
+    # their errors add up from row to row, so the lines that count are fitted to the rows beside the features
+    lines = np.zeros(values.shape)
+    lines[1:] = np.cumsum(
+        _robust_lines(np.diff(np.where(finite, values, 0.0), axis=0), finite[1:] & finite[:-1]), axis=0
+    )
+    known = np.where(finite, values, 0.0)
+    for _ in range(2):
+        flat = _without_plane(levelled(np.where(finite, values - lines, np.nan), Levelling.DIFFERENCES))
+        low, middle, high = np.percentile(flat[finite], (1.0, 50.0, 99.0))
+        with np.errstate(invalid="ignore"):
+            beside = finite & ~_widened(np.abs(flat - middle) > _FEATURE * (high - low))
+        fits = beside.mean(axis=1) >= _LEAST_BESIDE
+        lines[fits] = _lines(known[fits], beside[fits].astype(np.float64))
+    return lines
+
+
+def _robust_lines(steps: Array, there: Mask) -> Array:
+    # first by least absolute deviations, then by Tukey's biweight with the noise of all rows, which no edge reaches
+    lines = _lines(steps, there)
+    for _ in range(_ROUNDS):
+        left = np.abs(steps - lines)
+        usual = np.median(left, axis=1, keepdims=True)
+        lines = _lines(steps, there / np.maximum(left, 0.05 * usual + np.finfo(np.float64).tiny))
+    reach = _OUTLIERS_SD * _SD_PER_MAD * np.median(np.abs(steps - lines)[there]) if there.any() else 0.0
+    for _ in range(_ROUNDS if reach > 0.0 else 0):
+        part = np.minimum(np.abs(steps - lines) / reach, 1.0)
+        lines = _lines(steps, there * ((1.0 - part**2) ** 2 + _NEVER_NONE))
+    return lines
+
+
+def _widened(mask: Mask) -> Mask:
+    # the foot of a feature is no outlier, and would still tilt the row
+    wide = mask.copy()
+    for shift in range(1, _FOOT_PIXELS + 1):
+        wide[:, shift:] |= mask[:, :-shift]
+        wide[:, :-shift] |= mask[:, shift:]
+    return wide
+
+
+def _plane(values: Array, finite: Mask) -> Array:
     # normal equations in coordinates about the mean position, which keep the sums small
     weights = finite.astype(np.float64)
     known = np.where(finite, values, 0.0)
@@ -70,10 +143,12 @@ def _plane(values: Array, finite: NDArray[np.bool_]) -> Array:
     return np.asarray(mean + slope_x * x[None, :] + slope_y * y[:, None])
 
 
-def _lines(values: Array, finite: NDArray[np.bool_]) -> Array:
+def _lines(values: Array, finite: Mask | Array) -> Array:
+    # `finite` may also hold weights
     weights = finite.astype(np.float64)
-    known = np.where(finite, values, 0.0)
-    count = np.maximum(weights.sum(axis=1), 1.0)
+    known = weights * np.where(weights > 0.0, values, 0.0)
+    count = weights.sum(axis=1)
+    count[count == 0.0] = 1.0
     x = np.arange(values.shape[1], dtype=np.float64)
     middle = weights @ x / count
     offset = x[None, :] - middle[:, None]
@@ -83,7 +158,7 @@ def _lines(values: Array, finite: NDArray[np.bool_]) -> Array:
     return np.asarray(mean[:, None] + slope[:, None] * offset)
 
 
-def _medians(values: Array, finite: NDArray[np.bool_]) -> Array:
+def _medians(values: Array, finite: Mask) -> Array:
     measured = finite.mean(axis=1)
     if not ((measured > 0.0) & (measured < 1.0)).any():
         return _row_medians(values, finite)
@@ -94,7 +169,7 @@ def _medians(values: Array, finite: NDArray[np.bool_]) -> Array:
     return _row_medians(values - (float(np.median(known)) if known.size else 0.0) * x, finite)
 
 
-def _row_medians(values: Array, finite: NDArray[np.bool_]) -> Array:
+def _row_medians(values: Array, finite: Mask) -> Array:
     medians = np.zeros((len(values), 1))
     # numpy warns of a median over no values
     some = finite.any(axis=1)
@@ -102,7 +177,7 @@ def _row_medians(values: Array, finite: NDArray[np.bool_]) -> Array:
     return medians
 
 
-def _differences(values: Array, finite: NDArray[np.bool_]) -> Array:
+def _differences(values: Array, finite: Mask) -> Array:
     some = finite.any(axis=1)  # rows without values are skipped: the previous row is the last with values
     known, there = np.where(finite, values, 0.0)[some], finite[some]
     offsets = np.zeros((len(values), 1))

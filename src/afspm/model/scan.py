@@ -218,8 +218,8 @@ class Scan:
             axes: axes to draw into; for a surface they need `projection="3d"`. None: a new figure.
             colorbar: whether to draw the colour bar, as high as the picture. Beside other axes it needs the space that
                 `plt.subplots(…, layout="constrained")` makes.
-            vmin, vmax: values at the ends of the colours, in the unit of the values; None: the robust range of this
-                scan, 1 to 99 %. Give both to compare scans.
+            vmin, vmax: values at the ends of the colours, in the unit of the values; None: those of the first scan in
+                these axes, else the robust range of this scan, 1 to 99 %. Give both to compare scans in several axes.
 
         Returns:
             The axes. Their coordinates are in m, with ticks in a suitable unit: another scan, or

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, cast
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -10,7 +12,7 @@ from afspm.basics.errors import InvalidValue
 from afspm.basics.formatting import scale, typeset_length
 from afspm.record.drawing.image_html import round_length_m
 from afspm.record.drawing.palette import PALETTES, colour_map
-from afspm.record.drawing.raster import value_range
+from afspm.record.drawing.raster import ValueRange, value_range
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,6 +22,17 @@ if TYPE_CHECKING:
 
 KINDS: Final = ("image", "contour", "surface")
 _LEVELS: Final = 12
+
+
+@dataclass(frozen=True)
+class _Colours:
+    # the range of the first scan in some axes, and the factor of its unit
+    span: ValueRange
+    factor: float
+    unit: str
+
+
+_COLOURS: Final[WeakKeyDictionary[Axes, _Colours]] = WeakKeyDictionary()
 
 
 def draw(
@@ -36,7 +49,11 @@ def draw(
         raise InvalidValue(f"a scan can't be drawn as {kind!r}", hint=f"one of {', '.join(KINDS)}")
     if not scan.values.size or not np.isfinite(scan.values).any():
         raise InvalidValue(f"the scan {scan.channel!r} has no values to draw")
-    span = value_range(scan.values)
+    drawn_before = _COLOURS.get(axes) if axes is not None else None
+    if drawn_before is not None and drawn_before.unit == scan.unit:
+        span, factor = drawn_before.span, drawn_before.factor  # the colour bar of the first scan holds for all
+    else:
+        span, factor = value_range(scan.values), None
     low, high = span.low if vmin is None else vmin, span.high if vmax is None else vmax
     if not low <= high:
         raise InvalidValue(f"colours from {low:g} to {high:g} {scan.unit}", hint="vmin is below vmax")
@@ -47,9 +64,11 @@ def draw(
         given = plt.figure(layout="constrained").add_subplot(projection="3d" if kind == "surface" else None)
         given.set_title(_title(scan), fontsize=9)
     is_first = not given.has_data()
-    factor, unit = scale(max(abs(low), abs(high)), scan.unit)
+    own, unit = scale(max(abs(low), abs(high)), scan.unit)
+    factor = own if factor is None else factor
     drawn = _fill(scan, kind, given, factor, (low, high))
     if is_first:
+        _COLOURS[given] = _Colours(ValueRange(low, high), factor, scan.unit)
         _explain(scan, drawn, given, f"{scan.channel} / {unit}" if unit else scan.channel, colorbar=colorbar)
     return cast("Axes", given)
 

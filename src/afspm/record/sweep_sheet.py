@@ -66,7 +66,7 @@ def draw_sheet(scans: Sequence[tuple[tuple[SweptSetting, ...], Scan]], path: Pat
 
     across, down = _sorted(one[-1:] for one, _ in scans), _sorted(one[:-1] for one, _ in scans)
     last, others = scans[0][0][-1], scans[0][0][:-1]
-    left_in = 0.2 + _CHARACTER_IN * max([0, *(len(_label(row)) for row in down), len(_names(others))])
+    left_in = 0.2 + _CHARACTER_IN * max([0, *map(len, "\n".join((*map(_label, down), _names(others))).split("\n"))])
     pitch_in = _PANEL_IN + _GAP_IN
     width_in = left_in + max(len(across) * pitch_in, 2.4) + _RIGHT_IN
     height_in = _TOP_IN + len(down) * pitch_in + _BOTTOM_IN
@@ -134,8 +134,8 @@ def _sorted(settings: Iterable[tuple[SweptSetting, ...]]) -> list[tuple[SweptSet
 
 
 def _names(settings: tuple[SweptSetting, ...]) -> str:
-    return ", ".join(one.name for one in settings)
+    return "\n".join(one.name for one in settings)
 
 
 def _label(settings: tuple[SweptSetting, ...]) -> str:
-    return ", ".join(typeset(one.text) for one in settings)
+    return "\n".join(typeset(one.text) for one in settings)

@@ -8,7 +8,7 @@ import pytest
 from afspm.basics.errors import InvalidValue
 from afspm.model import Region, Scan
 from afspm.model.levelling import FITS
-from afspm.model.line_levelling import Levelling
+from afspm.model.line_levelling import Levelling, flattened
 from afspm.model.line_levelling import levelled as line_levelled
 
 SHAPE = (48, 64)
@@ -102,3 +102,36 @@ def test_missing_rows_change_no_other_row() -> None:
     rows = values - np.median(values, axis=1, keepdims=True)
     values[10:20] = np.nan
     np.testing.assert_array_equal(line_levelled(values, Levelling.MEDIANS)[20:], rows[20:])
+
+
+def _with_particle(middle: float, noise: float) -> np.ndarray:
+    y, x = np.mgrid[-1.0:1.0:96j, -1.0:1.0:96j]
+    particle: np.ndarray = 100.0 / (1.0 + np.exp(40.0 * (np.hypot(0.6 * (x - middle), y) - 0.3)))
+    particle += np.random.default_rng(4).normal(0.0, noise, x.shape)
+    return particle
+
+
+@pytest.mark.parametrize("middle", [0.2, 0.7], ids=["inside", "over the border"])
+def test_particle_throws_no_shadow_where_the_controller_has_fitted_a_line_to_each_row(middle: float) -> None:
+    true = _with_particle(middle, 0.5)
+    delivered = line_levelled(true, Levelling.LINES)
+    beside = true < 5.0
+    assert delivered[beside].min() < -30.0, "the line of a row with the particle lies above the surface beside it"
+    found = flattened(delivered)
+    off = found - true - np.median((found - true)[beside])
+    assert np.percentile(np.abs(off[beside]), 99.0) < 8.0
+    assert np.median(off[true > 95.0]) == pytest.approx(0.0, abs=6.0)
+
+
+def test_rows_without_a_subtracted_line_are_aligned_by_their_heights_alone() -> None:
+    values = _with_particle(0.2, 0.5) + np.linspace(0.0, 20.0, 96)
+    aligned = line_levelled(values, Levelling.DIFFERENCES)
+    found = flattened(values)
+    surface = aligned - found  # a plane: the second differences along both sides vanish
+    assert np.abs(np.diff(surface, 2, axis=0)).max() < 1e-9
+    assert np.abs(np.diff(surface, 2, axis=1)).max() < 1e-9
+
+
+def test_noise_alone_with_subtracted_lines_stays_flat() -> None:
+    delivered = line_levelled(np.random.default_rng(5).normal(0.0, 1.0, (96, 96)), Levelling.LINES)
+    assert flattened(delivered).std() == pytest.approx(delivered.std(), rel=0.05)

@@ -31,6 +31,18 @@ def test_scan_is_drawn_at_its_position(kind: str) -> None:
     mpl.pyplot.close(axes.figure)
 
 
+def test_scan_over_another_has_its_colours_so_that_the_bar_holds_for_both() -> None:
+    axes = Scan(SCAN.region, "Height", "m", VALUES).plot()
+    Scan(SCAN.region, "Height", "m", 1e-3 * VALUES).plot(axes=axes)  # alone it would be drawn in pm
+    Scan(SCAN.region, "Height", "m", VALUES).plot(axes=axes, vmin=0.0, vmax=1e-9)
+    first, second, third = axes.collections
+    assert second.get_clim() == first.get_clim() == pytest.approx((0.11, 10.89))
+    assert np.nanmax(np.asarray(second.get_array(), dtype=float)) == pytest.approx(0.011)
+    assert third.get_clim() == pytest.approx((0.0, 1.0))
+    assert isinstance(axes.figure, Figure)
+    mpl.pyplot.close(axes.figure)
+
+
 def test_scan_over_another_is_drawn_at_its_position_without_a_second_colour_bar() -> None:
     axes = Scan(Region((0.0, 0.0), (5e-6, 5e-6)), "Height", "m", VALUES).plot()
     assert SCAN.plot(axes=axes) is axes

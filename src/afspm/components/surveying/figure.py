@@ -33,7 +33,7 @@ Floats = NDArray[np.float64]
 MOST_ZOOMS: Final = 15
 _COLUMNS: Final = 5
 _SURVEY_IN, _ZOOM_IN, _CURVE_IN = 4.6, 1.28, 0.8
-_LEFT_IN, _TOP_IN, _BOTTOM_IN, _RIGHT_IN = 0.15, 0.42, 0.55, 0.75
+_LEFT_IN, _TOP_IN, _BOTTOM_IN, _RIGHT_IN = 0.15, 0.42, 0.55, 0.15
 _BAR_IN, _GAP_IN, _ROW_IN = 0.1, 0.08, 0.22
 _TEXT: Final = 9.0  # readable where the whole picture is shown 800 px wide
 _MARK: Final = CATEGORICAL[3]
@@ -73,11 +73,11 @@ class _Picture:
 
     def save(self, path: Path, title: str, *, simulated: bool) -> None:
         self._head(title, simulated=simulated)
-        self._survey()
-        zooms = [visit.zoom for visit in self._shown if visit.zoom]
+        # one range for the survey and its zooms: the targets are the highest of the survey, and compared with it
+        zooms = [flattened(visit.zoom, 1) for visit in self._shown if visit.zoom]
+        colours = self._survey(zooms)
         if zooms:
-            images, left_in = [flattened(zoom, 1) for zoom in zooms], self._columns * (_ZOOM_IN + _GAP_IN)
-            self._zooms(*self._colour_bar(images, zooms[0], self._zooms_in + left_in, _ZOOM_IN))
+            self._zooms(*colours)
         self._figure.savefig(path, dpi=200)
 
     def _axes(self, left_in: float, top_in: float, width_in: float, height_in: float) -> Axes:
@@ -101,14 +101,15 @@ class _Picture:
             right = 1 - _LEFT_IN / self._width_in
             self._figure.text(right, y, "SIMULATED", size=10, weight="bold", color=PROBLEM, ha="right", va="center")
 
-    def _survey(self) -> None:
+    def _survey(self, zooms: Sequence[Floats]) -> tuple[float, Normalize]:
         scan = self._record.survey
         values = flattened(scan, 2)
-        factor, colours = self._colour_bar([values], scan, _LEFT_IN + _SURVEY_IN + _GAP_IN, _SURVEY_IN)
+        factor, colours = self._colour_bar([values, *zooms], scan, _LEFT_IN + _SURVEY_IN + _GAP_IN, _SURVEY_IN)
         axes = self._image(scan, values * factor, colours, (_LEFT_IN, 0.0, _SURVEY_IN))
         self._bar_below(scan, axes)
         for visit in self._record.visits:
             self._mark(axes, visit)
+        return factor, colours
 
     def _bar_below(self, scan: Scan, axes: Axes) -> None:
         # under the survey, where it hides no target
@@ -159,9 +160,10 @@ class _Picture:
         axes.text(0.04, 0.95, f"{visit.number}", transform=axes.transAxes, size=9, weight="bold", va="top",
                   color="white", path_effects=_OUTLINE)  # fmt: skip
         if visit.registration is not None and not visit.registration.is_registered:
-            sd = "" if visit.position_sd_m is None else f" ± {typeset_length(float(f'{visit.position_sd_m:.2g}'))}"
-            axes.text(0.96, 0.95, f"dead reckoning{sd}", transform=axes.transAxes, size=_TEXT, ha="right", va="top",
-                      color="white", path_effects=_OUTLINE)  # fmt: skip
+            sd = "" if visit.position_sd_m is None else f"\n± {typeset_length(float(f'{visit.position_sd_m:.2g}'))}"
+            # in lines beside the number: one line is wider than a zoom
+            axes.text(0.96, 0.96, f"dead\nreckoning{sd}", transform=axes.transAxes, size=0.8 * _TEXT, ha="right",
+                      va="top", linespacing=1.0, color="white", path_effects=_OUTLINE)  # fmt: skip
         if label:
             axes.text(0.5, 0.5, label, transform=axes.transAxes, size=_TEXT, ha="center", va="center",
                       bbox={"facecolor": "white", "alpha": 0.8, "pad": 2.0, "edgecolor": "none"})  # fmt: skip

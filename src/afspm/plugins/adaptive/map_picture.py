@@ -16,7 +16,7 @@ from afspm.basics.formatting import counted, scale
 from afspm.model import Region
 from afspm.plugins.adaptive.mapping import MapProgress
 from afspm.record.drawing.palette import CATEGORICAL, PROBLEM
-from afspm.record.drawing.raster import value_range
+from afspm.record.drawing.raster import Contrast, value_range
 from afspm.record.plotting import draw_scale_bar, gold
 
 Floats = NDArray[np.float64]
@@ -46,7 +46,8 @@ def draw_map(found: MapProgress, region: Region, path: Path, *, title: str = "",
     _panel(right, errors, size_um, "expected error", unit, "viridis", low=0.0)
     x, y = _in_region(found.map.model.positions_m, region).T
     for axes, colour in ((left, CATEGORICAL[0]), (right, "white")):
-        axes.plot(1e6 * x, 1e6 * y, ".", color=colour, markersize=4.0, markeredgewidth=0.0)
+        # whole at the border, too
+        axes.plot(1e6 * x, 1e6 * y, ".", color=colour, markersize=4.0, markeredgewidth=0.0, clip_on=False)
     draw_scale_bar(left, region.size_m, (-size_um[0] / 2, -size_um[1] / 2), 1e6, font=_TEXT)
     head = ", ".join(filter(None, (title, of, counted(len(found.measured), "spectrum", "spectra"))))
     figure.text(0.015, 1.0 - 0.2 / height_in, head, size=10, va="center")
@@ -66,7 +67,8 @@ def _panel(
     low: float | None = None,
 ) -> None:
     factor, shown_unit = scale(float(np.abs(values).max()), unit)
-    span = value_range(values * factor)
+    # all of a map: it is computed, and has no outliers to leave out
+    span = value_range(values * factor, Contrast.FULL)
     width, height = size_um
     drawn = axes.imshow(
         values * factor, origin="lower", cmap=colours, vmin=span.low if low is None else low, vmax=span.high,
@@ -74,7 +76,7 @@ def _panel(
     )  # fmt: skip
     axes.set_axis_off()
     bar = axes.figure.colorbar(drawn, ax=axes, fraction=0.045, pad=0.02)
-    bar.set_label(f"{name} ({shown_unit})" if shown_unit else name, size=_TEXT)
+    bar.set_label(f"{name} / {shown_unit}" if shown_unit else name, size=_TEXT)
     bar.ax.tick_params(labelsize=_TEXT)
 
 

@@ -75,13 +75,14 @@ def draw_offsets(
             over_x.set_title("correction: off ¦ on", loc="center", color=BLUE)
         time_axis(over_x, label=False)
         time_axis(over_y)
+        over_y.set_xlabel(f"time / h; bars: ± 2 sd, {_at_most(2 * sd, unit)}")
         made.colorbar(dots, ax=plane, label="time / h")
     return made
 
 
 def _dots(ax: Axes, across: Array, up: Array, hours: Array) -> PathCollection:
     ax.plot(across, up, color=GREY, linewidth=0.5, zorder=1)
-    return ax.scatter(across, up, c=hours, cmap=TIME_COLOURS, s=12, linewidths=0, zorder=3)
+    return ax.scatter(across, up, c=hours, cmap=TIME_COLOURS, s=12, linewidths=0, zorder=3, label="estimated")
 
 
 _PAIR_INCHES = 2.2
@@ -161,7 +162,7 @@ def draw_estimates(record: DriftRecord, *, title: str = "", truth_m: Array | Non
         unit, factor = unit_of(moved[record.matched])
         for axis, (name, colour, marker) in enumerate((("x", BLUE, "o"), ("y", ORANGE, "s"))):
             _estimates(
-                ax, record, hours, moved[:, axis] * factor, record.sd_m[:, axis] * factor, (name, colour, marker)
+                ax, record, hours, moved[:, axis] * factor, record.sd_m[:, axis] * factor, (name, colour, marker), unit
             )
             if truth_m is not None:
                 ax.plot(hours, truth_m[:, axis] * factor, color=colour, linewidth=0.8, label=f"{name}, true")
@@ -173,7 +174,14 @@ def draw_estimates(record: DriftRecord, *, title: str = "", truth_m: Array | Non
     return made
 
 
-def _estimates(ax: Axes, record: DriftRecord, hours: Array, at: Array, sd: Array, how: tuple[str, str, str]) -> None:
+def _at_most(bars: Array, unit: str) -> str:
+    # bars smaller than the markers can't be seen
+    return f"at most {three_digits(float(np.max(bars, initial=0.0, where=np.isfinite(bars))))} {unit}"
+
+
+def _estimates(
+    ax: Axes, record: DriftRecord, hours: Array, at: Array, sd: Array, how: tuple[str, str, str], unit: str
+) -> None:
     (name, colour, marker), good = how, record.matched
     ax.errorbar(
         hours[good],
@@ -183,7 +191,7 @@ def _estimates(ax: Axes, record: DriftRecord, hours: Array, at: Array, sd: Array
         color=colour,
         markersize=3,
         elinewidth=0.6,
-        label=f"{name} ± 2 sd",
+        label=f"{name} ± 2 sd, {_at_most(2 * sd[good], unit)}",
     )
 
 
@@ -194,6 +202,8 @@ def _refused(ax: Axes, hours: Array) -> None:
 
 
 _MOST_BINS = 100
+_LEAST_BINNED = 12
+"""Fewer values are drawn one by one: bins of three would show a shape that is not there."""
 
 
 def draw_histogram(record: DriftRecord, *, title: str = "") -> Figure:
@@ -209,7 +219,8 @@ def draw_histogram(record: DriftRecord, *, title: str = "") -> Figure:
         )  # fmt: skip
         for ax, values, name, colour in columns:
             _histogram(ax, values * factor, colour, unit)
-            ax.set(xlabel=f"{name} / {unit}", ylabel="scans" if name == "x" else "")
+            counted_scans = "scans" if len(values) >= _LEAST_BINNED else "scans up to this value"
+            ax.set(xlabel=f"{name} / {unit}", ylabel=counted_scans if name == "x" else "")
         made.suptitle(title, size=7)
     return made
 
@@ -244,7 +255,11 @@ def _histogram(ax: Axes, values: Array, colour: str, unit: str) -> None:
     if values.size == 0:
         ax.text(0.5, 0.5, "no pair was accepted", ha="center", transform=ax.transAxes)
         return
-    ax.hist(values, round_bins(values).tolist(), color=colour, edgecolor="white", linewidth=0.5)
+    if len(values) < _LEAST_BINNED:
+        ax.plot(np.sort(values), np.arange(1, len(values) + 1), "o", color=colour, markersize=3)
+        ax.set_ylim(0.0, len(values) + 1.0)
+    else:
+        ax.hist(values, round_bins(values).tolist(), color=colour, edgecolor="white", linewidth=0.5)
     ax.axvline(float(np.median(values)), color="black", linewidth=0.8)
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
     median, rms = (three_digits(float(value)) for value in (np.median(values), np.sqrt(np.mean(values**2))))
@@ -348,11 +363,13 @@ def _misplaced(ax: Axes, off_m: Array, hours: Array) -> None:
 
 def _known(ax: Axes, record: DriftRecord, truth_m: Array, hours: Array) -> None:
     error_m = record.drift_m - record.drift_m[:1] - truth_m
-    unit, factor = unit_of(error_m)
-    for axis, (name, colour) in enumerate((("x", BLUE), ("y", ORANGE))):
-        sd = record.sd_m[1:, axis] * factor  # displacements are counted from the first scan
-        ax.fill_between(hours[1:], -2 * sd, 2 * sd, color=colour, alpha=0.15, linewidth=0, label=f"± 2 sd, {name}")
+    unit, factor = unit_of(error_m, 2 * record.sd_m)
+    for axis, (name, colour, style) in enumerate((("x", BLUE, ":"), ("y", ORANGE, "--"))):
         ax.plot(hours, error_m[:, axis] * factor, color=colour, linewidth=0.9, label=f"{name}, estimated − true")
+        sd = record.sd_m[1:, axis] * factor  # displacements are counted from the first scan
+        # lines: two bands of nearly the same width would lie on each other as grey
+        for side, label in ((-2, ""), (2, f"± 2 sd, {name}")):
+            ax.plot(hours[1:], side * sd, color=colour, linewidth=0.7, linestyle=style, label=label or None)
     ax.axhline(0.0, color=GREY, linewidth=0.4)
     ax.set_ylabel(f"error of the estimate / {unit}")
     if len(error_m) > 1:

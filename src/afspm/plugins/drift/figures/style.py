@@ -100,10 +100,11 @@ def show_scan(ax: Axes, scan: DriftScan, span: ValueRange) -> AxesImage:
 
 
 def colour_bar(ax: Axes, image: AxesImage, unit: str) -> None:
-    """Draw a colour bar with the unit of the values, as high as the image; draw nothing without a unit."""
+    """Draw a colour bar with quantity and unit, as high as the image; draw nothing without a unit."""
     if not unit:
         return
-    factor, label = scale(max(abs(end) for end in image.get_clim()), unit)
+    factor, shown = scale(max(abs(end) for end in image.get_clim()), unit)
+    label = f"height / {shown}" if unit == "m" else shown
     bar = ax.figure.colorbar(image, cax=ax.inset_axes((1.04, 0.0, 0.05, 1.0)), label=label)
     bar.formatter = FuncFormatter(lambda value, _: f"{value * factor:.6g}".replace("-", "−"))
     bar.update_ticks()
