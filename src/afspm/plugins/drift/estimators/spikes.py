@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from afspm.plugins.drift.estimators.images import (
     SCAR_PX,
     Image,
+    Mask,
     levelled,
     mended_rows,
+    rows_with_scars,
     scarred,
     spread_of,
     standing_out,
@@ -53,25 +55,45 @@ def _unscarred(image: Image, other: Image, theta: Array) -> Image:
     dx, dy = theta[:2, None, None] + np.tensordot(theta[LINEAR].reshape(2, 2), np.stack([x, y]), 1)
     there, known = Spline.of(other.values, other.known).at(x + dx, y + dy)
     known &= image.known
-    own, shared = levelled(image.values), np.flatnonzero(known.mean(axis=1) > LEAST_SHARED)
+    shared = np.flatnonzero(known.mean(axis=1) > LEAST_SHARED)
     if shared.size <= SCAR_ROWS + 1:
         return image
     rows = slice(int(shared[0]), int(shared[-1]) + 1)
-    masked = np.where(known, image.values - np.exp(-theta[GAIN]) * there, np.nan)[rows]
-    offsets = np.nan_to_num(np.nanmedian(np.where(known[rows].any(axis=1, keepdims=True), masked, 0.0), axis=1))
-    difference = np.nan_to_num(masked - offsets[:, None])
+    difference, known = (image.values - np.exp(-theta[GAIN]) * there)[rows], known[rows]
+    difference = np.where(known, difference - _row_medians(difference, known)[:, None], 0.0)
     scar = np.zeros(image.values.shape, dtype=bool)
+    own: Array | None = None  # computed once a row may have a scar, which is rare
     for thick in range(1, SCAR_ROWS + 1):
         up, down, apart = standing_out(difference, thick)
-        inside = apart[known[rows][1:-thick]]
+        inside = apart[known[1:-thick]]
         if not inside.size:
             continue
-        least, both = SCAR_SD * spread_of(inside), _along(apart)
-        alone = np.sign(both) * _along(standing_out(own[rows], thick)[2]) > OWN * np.abs(both)
-        scar[rows] |= scarred((up > least) & alone, (down > least) & alone, thick)
-    if not scar.any():
+        least = SCAR_SD * spread_of(inside)
+        up, down = up > least, down > least
+        some = rows_with_scars(up) | rows_with_scars(down)
+        if not some.any():
+            continue
+        own = levelled(image.values) if own is None else own
+        both = _along(apart[some])
+        alone = np.sign(both) * _along(standing_out(own[rows], thick)[2][some]) > OWN * np.abs(both)
+        up[some] &= alone
+        down[some] &= alone
+        scar[rows] |= scarred(up, down, thick)
+    if own is None or not scar.any():
         return image
     return Image(mended_rows(image.values, own, scar), image.known, scar)
+
+
+def _row_medians(values: Array, known: Mask) -> Array:
+    # numpy's nanmedian takes many times as long; 0 for a row without known pixels
+    if known.all():
+        return np.asarray(np.median(values, axis=1))
+    ordered = np.sort(np.where(known, values, np.inf), axis=1)
+    count, every = known.sum(axis=1), np.arange(len(values))
+    middle = (
+        ordered[every, np.maximum(count - 1, 0) // 2] + ordered[every, np.minimum(count // 2, values.shape[1] - 1)]
+    ) / 2
+    return np.where(count > 0, middle, 0.0)
 
 
 def _along(values: Array) -> Array:
