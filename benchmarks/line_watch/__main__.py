@@ -38,9 +38,12 @@ def main(arguments: Sequence[str]) -> int:
     asked.add_argument("--half", choices=HALVES, default="unseen")
     asked.add_argument("--processes", type=int, default=1)
     asked.add_argument("--rooms", type=int, default=0, help="judge as many rooms in place of nights")
+    asked.add_argument("--without-retrace", action="store_true", help="judge the trace of the rooms alone")
     given = asked.parse_args(arguments)
     if given.rooms:
-        return judge_rooms(range(given.first, given.first + given.rooms), given.processes)
+        return judge_rooms(
+            range(given.first, given.first + given.rooms), given.processes, channels=1 if given.without_retrace else 2
+        )
     end_s, found = time.monotonic() + 60.0 * given.minutes, []
     KEPT.parent.mkdir(exist_ok=True)
     seeds = iter(range(given.first, given.first + given.nights))
@@ -53,12 +56,12 @@ def main(arguments: Sequence[str]) -> int:
     return report(found)
 
 
-def judge_rooms(seeds: Sequence[int], processes: int) -> int:
+def judge_rooms(seeds: Sequence[int], processes: int, channels: int) -> int:
     """Print the table of some rooms; return 1 where a target is missed."""
     found: list[JudgedScan] = []
     KEPT_ROOMS.parent.mkdir(exist_ok=True)
     with ProcessPoolExecutor(processes) as pool, KEPT_ROOMS.open("w", encoding="utf-8") as kept:
-        for outcomes in pool.map(judged_room, repeat("kept"), seeds):
+        for outcomes in pool.map(judged_room, repeat("kept"), seeds, repeat(channels)):
             found += outcomes
             kept.writelines(json.dumps(asdict(one)) + "\n" for one in outcomes)
     print(*table(found), sep="\n")

@@ -69,6 +69,10 @@ class Clock(Protocol):
         """Let the holds begin that begin with a publication."""
         ...
 
+    def awaits(self, what: Publication) -> bool:
+        """Return whether simulated time will wait for a receiver of a publication; see `ExperimentClock.late`."""
+        ...
+
 
 def _anchor_s() -> float:
     # wall-clock time at the zero of time.monotonic(): a system clock that is corrected later never makes a run jump
@@ -108,6 +112,9 @@ class NeverLate:
 
     def published(self, what: Publication) -> None:
         """Do nothing: no process is late."""
+
+    def awaits(self, what: Publication) -> bool:
+        return False
 
 
 @dataclass(frozen=True)
@@ -204,6 +211,10 @@ class ExperimentClock:
         """Let the holds begin that begin with a publication: call it when something was published."""
         if self._waiting is not None:
             self._waiting.published(what, self.speed)
+
+    def awaits(self, what: Publication) -> bool:
+        """Return whether a receiver of a publication has declared that it is late from then on."""
+        return self._waiting is not None and self._waiting.awaits(what)
 
     def holds(self) -> SharedTime | None:
         """Return the processes for which simulated time waits, or will wait; None if it waits for none."""

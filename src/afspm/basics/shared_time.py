@@ -221,8 +221,12 @@ class SharedSimulationTime:
 
     def published(self, what: Publication, speed: float) -> None:
         """Let the holds begin that begin with a publication."""
-        if any(one.from_ns == _NEVER_NS + what.value for one in self.read().holds):
+        if self.awaits(what):
             self._change(lambda shared: shared.with_published(what), speed)
+
+    def awaits(self, what: Publication) -> bool:
+        """Return whether a receiver has declared a hold that begins with a publication."""
+        return any(one.from_ns == _NEVER_NS + what.value for one in self.read().holds)
 
     def drop(self, hold: TimeHold, speed: float) -> bool:
         """Drop a hold of another process; return False if the file is in use, since its user may hang."""

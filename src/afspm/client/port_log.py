@@ -98,6 +98,9 @@ class RecordedClock:
     def published(self, what: Publication) -> None:
         self._clock.published(what)
 
+    def awaits(self, what: Publication) -> bool:
+        return self._clock.awaits(what)
+
     def taken(self) -> PlainList:
         """Return the readings since the last call, as a flat list: kind, value, kind, value …"""
         taken, self._readings = self._readings, []

@@ -34,6 +34,8 @@ LENDS_MICROSCOPE: Final = "lends_microscope"
 """Static method of a component: returns whether, with given settings, it acts as a microscope for other schedulers."""
 FILE_SUFFIX: Final = "file_suffix"
 """Class attribute of a component that writes a file into the run folder: `file` of its settings, and this suffix."""
+FASTEST_WITHOUT_WAIT: Final = 60.0
+"""Speed at which scans of minutes still have lines in half a second of real time."""
 _OF_EACH_RUN = ("experiment.toml", "journal.sqlite", "log.txt", "report.html", "run.json")
 ADDRESS: Final = "address"
 """Usual name of a translator's setting for the address of its controller."""
@@ -273,6 +275,7 @@ def check_envelopes(resolved: ResolvedExperiment) -> None:
     published.update(envelope for process in processes for envelope in process.declared.publishes)
     if any(map(_may_publish_lines, resolved.with_role(Role.TRANSLATOR))):
         published.add(SCAN_LINES.name)
+        _check_clock_of_lines(resolved)
     for name, process in resolved.processes.items():
         for i, prefix in enumerate(process.envelopes or ()):
             if _is_published(prefix, published, made):
@@ -291,6 +294,19 @@ def check_envelopes(resolved: ResolvedExperiment) -> None:
 def _may_publish_lines(translator: ResolvedProcess) -> bool:
     given = translator.part.settings.get("live_lines_s", getattr(translator.component, "live_real_s", None))
     return bool(translator.part.command or given)
+
+
+def _check_clock_of_lines(resolved: ResolvedExperiment) -> None:
+    # lines are published twice a second of real time, unless the clock waits for their receivers
+    clock = resolved.sections.clock
+    name = next((one for one, p in resolved.processes.items() if SCAN_LINES.name in (p.envelopes or ())), None)
+    if name is not None and clock.speed > FASTEST_WITHOUT_WAIT and not clock.waits:
+        resolved.document.warning(
+            f"lines of scans may come too late for [{name}], or not at all: the clock does not wait for it",
+            "clock",
+            "waits",
+            hint=f"leave waits out, or set speed = {FASTEST_WITHOUT_WAIT:g} or less",
+        )
 
 
 def _is_published(prefix: str, published: set[str], made: Collection[str]) -> bool:

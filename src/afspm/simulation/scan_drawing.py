@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from afspm.basics.clock import Clock
 from afspm.basics.errors import InvalidValue
 from afspm.basics.plain_data import Plain
+from afspm.basics.shared_time import Publication
 from afspm.simulation.activities import NoValues, ScanActivity, ScanValues, ValuesInAir
 from afspm.simulation.feedback import Loop
 from afspm.simulation.world import World
@@ -35,7 +36,8 @@ class ScanDrawing:
     Attributes:
         wake: called from the thread of the computation when a scan is ready.
         log: receives unexpected errors.
-        clock: waits at the end of a scan that is still being computed, until `release`; None: no clock waits.
+        clock: waits at the end of a scan that is still being computed, until `release`; from the start of the scan if
+            a component waits for its lines. None: no clock waits.
     """
 
     def __init__(self, world: World, units: Callable[[], Mapping[str, str]], seed: int, run: RunWork) -> None:
@@ -62,7 +64,9 @@ class ScanDrawing:
         self._newest = scan
         self._late.close()
         if self.clock is not None:
-            self._late.enter_context(self.clock.late(scan.end_s))
+            # a receiver of lines needs the first lines long before the end
+            since_s = None if self.clock.awaits(Publication.LINES) else scan.end_s
+            self._late.enter_context(self.clock.late(since_s))
         self._run(work)
 
     def release(self) -> None:

@@ -135,10 +135,11 @@ class Observer:
         return max(0.0, wait_s)
 
     def late_at_change(self) -> AbstractContextManager[None]:
-        """Return a context that holds simulated time at the driver's next known change."""
-        at_s = self._driver.next_change_s()
-        is_coming = at_s is not None and at_s > self._clock.now_s()
-        return self._clock.late(at_s) if is_coming else nullcontext()
+        """Return a context that holds simulated time at the driver's next change, or when awaited lines are due."""
+        now_s = self._clock.now_s()
+        due = (self._driver.next_change_s(), self._live.awaited_s)
+        at_s = min((one for one in due if one is not None and one > now_s), default=None)
+        return nullcontext() if at_s is None else self._clock.late(at_s)
 
     @property
     def reads_settings(self) -> bool:
@@ -349,7 +350,7 @@ class Observer:
             self._polling.began(object(), self._clock.monotonic_s())
             # of an earlier process: its lines come again, from the first
             if published.state is ScopeState.SCANNING and not self._state.kept.get("spoiled"):
-                self._live.begin(self._clock.now_ns())
+                self._live.begin(self._clock.now_ns(), self._expected_scan()[0])
 
     def publish(self, thing: setting_groups.Published | ScopeStatus) -> None:
         self._port.publish(*self._packet(thing))
@@ -396,12 +397,12 @@ class Observer:
         before, self._polled_for, now_s = self._polled_for, state, self._clock.monotonic_s()
         if over := self._overdue.state_changed(now_s, is_scanning=state is ScopeState.SCANNING):
             self._log.info("%s", over)
+        lasts_s, extent = self._expected_scan() if state is ScopeState.SCANNING else (None, ())
         if state is not ScopeState.SCANNING:
             self._live.end()
         elif before is not ScopeState.SCANNING:  # a pause and its end are published too, during the same scan
-            self._live.begin(self._clock.now_ns())
+            self._live.begin(self._clock.now_ns(), lasts_s)
         if state in MEASURING:
-            lasts_s, extent = self._expected_scan() if state is ScopeState.SCANNING else (None, ())
             self._polling.began((state, *extent), now_s, lasts_s)
         elif state in (ScopeState.FREE, ScopeState.UNDEFINED):
             self._polling.ended(now_s, as_expected=state is ScopeState.FREE and before in MEASURING)
@@ -427,34 +428,57 @@ class Observer:
         return None, extent
 
 
-def _live_lines_s(microscope: DriverBase) -> float | None:
-    # experiment seconds; None: never
-    if microscope.common.live_lines_s is not None:
-        return microscope.common.live_lines_s or None
-    real_s = microscope.live_real_s
-    return None if real_s is None else real_s / microscope.clock.real_s(1.0)
+_READINGS = 16
+"""Number of readings during a scan if simulated time waits for a receiver of lines. The interval by real time may be
+longer than a scan: 10 min of experiment time at a speed of 1,200."""
 
 
 class LiveLines:
     """A reader of new lines of the running scan. Times are in experiment seconds.
 
     Args:
-        microscope: its `live_lines_s` sets the interval between readings of lines.
+        microscope: its `live_lines_s` sets the interval between readings of lines; otherwise the interval is its
+            `live_real_s`, or shorter if simulated time waits for a receiver of lines.
     """
 
     def __init__(self, microscope: DriverBase) -> None:
-        self._microscope = microscope
-        self._every_s = _live_lines_s(microscope)
+        self._microscope, self._clock = microscope, microscope.clock
+        given_s, real_s = microscope.common.live_lines_s, microscope.live_real_s
+        self._is_given = given_s is not None
+        # None: never
+        self._usual_s = (given_s or None) if self._is_given or real_s is None else real_s / self._clock.real_s(1.0)
+        self._lasts_s: float | None = None
+        self._is_awaited = False
         self._began_ns = 0
         self._lines = 0
         self.due_s: float | None = None
         """Time of the next `look`; None until another scan begins."""
 
-    def begin(self, now_ns: int) -> None:
-        """Start reading the lines of a new scan."""
-        if self._every_s is not None:
+    @property
+    def awaited_s(self) -> float | None:
+        """Time of the next `look` if simulated time waits for a receiver of lines."""
+        return self.due_s if self._is_awaited else None
+
+    def begin(self, now_ns: int, lasts_s: float | None = None) -> None:
+        """Start reading the lines of a new scan.
+
+        Args:
+            lasts_s: expected duration of the scan in real seconds; None: unknown.
+        """
+        if self._usual_s is not None:
             self._began_ns, self._lines = now_ns, 0
-            self.due_s = now_ns / NS_PER_S + self._every_s
+            self._lasts_s = None if lasts_s is None else lasts_s / self._clock.real_s(1.0)
+            self._plan(now_ns / NS_PER_S)
+
+    def _plan(self, now_s: float) -> None:
+        assert self._usual_s is not None
+        # kept once true: the receiver withdraws its hold for a moment after each publication
+        self._is_awaited = self._is_awaited or self._clock.awaits(Publication.LINES)
+        every_s = self._usual_s
+        if self._is_awaited and self._lasts_s is not None and not self._is_given:
+            # the half: the last reading is before the end
+            every_s = min(every_s, self._lasts_s / (_READINGS + 0.5))
+        self.due_s = now_s + every_s
 
     def end(self) -> None:
         """Stop reading lines, at the end of the scan."""
@@ -462,9 +486,9 @@ class LiveLines:
 
     def look(self, now_s: float) -> list[tuple[str, bytes]]:
         """Return messages with the new lines; empty before `due_s` or without new lines."""
-        if self._every_s is None or self.due_s is None or now_s < self.due_s:
+        if self.due_s is None or now_s < self.due_s:
             return []
-        self.due_s = now_s + self._every_s
+        self._plan(now_s)
         new = self._microscope.lines(self._lines)
         self._lines += max((len(lines.values) for lines in new), default=0)
         return [wire.encode(replace(lines, began_ns=self._began_ns)) for lines in new if len(lines.values)]

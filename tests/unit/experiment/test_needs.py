@@ -127,3 +127,15 @@ def test_component_that_needs_lines_needs_a_microscope_that_publishes_them(write
     assert errors(write(watch, frame=SIMULATED)) == []
     error = only_error(write(watch, frame=SIMULATED + "live_lines_s = 0.0\n"))
     assert error.what == "[line_watch] subscribes to 'ScanLines', which no component publishes"
+
+
+def test_lines_that_a_fast_clock_does_not_wait_for_are_a_warning(write: Write) -> None:
+    watch = (
+        '[line_watch]\ncomponent = true\nclass = "LineWatch"\n'
+        '[tip_classifier]\ncomponent = true\nclass = "TipClassifier"\n' + SOLVED
+    )
+    fast = "[clock]\nspeed = 1200.0\n"
+    late = "lines of scans may come too late for [line_watch], or not at all: the clock does not wait for it"
+    assert late not in [one.what for one in write(watch, frame=SIMULATED + fast).check()]
+    found = write(watch, frame=SIMULATED + fast + "waits = false\n").check()
+    assert [one.hint for one in found if one.what == late] == ["leave waits out, or set speed = 60 or less"]

@@ -11,6 +11,7 @@ import pytest
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError, InvalidValue
+from afspm.basics.shared_time import Publication
 from afspm.model import ControlRequest, Region, ScanLines, ScopeState, ScopeStatus, names
 from afspm.simulation.simulator import Simulator
 from afspm.translator.observer import LiveLines
@@ -189,6 +190,21 @@ def test_a_simulated_microscope_publishes_lines_by_real_time(given: float | None
     live = LiveLines(driver)
     live.begin(0)
     assert live.due_s == every_s
+
+
+def test_lines_are_read_during_a_scan_if_a_fast_clock_waits_for_their_receiver(tmp_path: Path) -> None:
+    clock = ExperimentClock.starting_now(speed=1200.0).waiting_in(tmp_path / "time")
+    driver = Simulator()
+    driver.clock = clock
+    live = LiveLines(driver)
+    began_s = clock.now_s()
+    live.begin(clock.now_ns(), lasts_s=0.33)  # of 396 s
+    assert live.due_s == pytest.approx(began_s + 600.0, abs=1.0)
+    assert live.awaited_s is None
+    with clock.late(Publication.LINES):
+        live.begin(clock.now_ns(), lasts_s=0.33)
+        assert live.awaited_s is not None
+        assert live.awaited_s - clock.now_s() < 24.1  # 16 times in 396 s
 
 
 def test_result_of_a_scan_that_the_next_followed_at_once_is_published_during_that(make_bench: Any, scan: Any) -> None:

@@ -69,16 +69,16 @@ def _unscarred(image: Image, other: Image, theta: Array) -> Image:
         if not inside.size:
             continue
         least = SCAR_SD * spread_of(inside)
-        up, down = up > least, down > least
-        some = rows_with_scars(up) | rows_with_scars(down)
+        high, low = up > least, down > least
+        some = rows_with_scars(high) | rows_with_scars(low)
         if not some.any():
             continue
         own = levelled(image.values) if own is None else own
         both = _along(apart[some])
         alone = np.sign(both) * _along(standing_out(own[rows], thick)[2][some]) > OWN * np.abs(both)
-        up[some] &= alone
-        down[some] &= alone
-        scar[rows] |= scarred(up, down, thick)
+        high[some] &= alone
+        low[some] &= alone
+        scar[rows] |= scarred(high, low, thick)
     if own is None or not scar.any():
         return image
     return Image(mended_rows(image.values, own, scar), image.known, scar)
