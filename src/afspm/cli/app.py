@@ -16,6 +16,7 @@ from afspm.cli import (
     experiment_file,
     run,
     runs,
+    shadow,
     status,
     steer,
 )
@@ -89,7 +90,7 @@ app.command("export", rich_help_panel=AFTERWARDS)(runs.export)
 app.command("test-client", rich_help_panel=MICROSCOPES)(developing.check_client)
 app.command("test-translator", rich_help_panel=MICROSCOPES)(developing.check_translator)
 app.command("commission", rich_help_panel=MICROSCOPES)(commission.commission)
-app.command("shadow", rich_help_panel=MICROSCOPES)(run.shadow)
+app.add_typer(shadow.app, name="shadow", rich_help_panel=MICROSCOPES)
 app.command("trace", rich_help_panel=MICROSCOPES)(run.trace)
 app.command("emulate", rich_help_panel=MICROSCOPES)(developing.emulate)
 

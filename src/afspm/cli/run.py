@@ -239,33 +239,6 @@ def trace(
     raise typer.Exit(ended.outcome.exit_code)
 
 
-def shadow(
-    files: Files,
-    runs: Runs = RUNS,
-) -> None:
-    """Watch a person's work at the microscope, and write down what afspm would have done.
-
-    The controller is only read: the process that talks to it has no function that sets or starts anything. Components
-    see all scans, and no component gets control. Ctrl-C ends it; a killed shadow leaves the controller as it is. The
-    report and shadow.csv have what afspm would have done, beside what the person did.
-    """
-    import sys
-
-    from afspm.cli.experiment_file import require_no_errors
-    from afspm.experiment.shadow import shadow_overlay
-    from afspm.record.report import shadow as watched
-    from afspm.record.run import open_run
-    from afspm.supervisor import run as running
-
-    experiment = _with_overlay(files, shadow_overlay)
-    require_no_errors(experiment, (), ())
-    ended = running.run(experiment, running.RunOptions(runs=runs), terminal=sys.stdout)
-    with open_run(ended.folder) as found:
-        for line in watched.agreement_lines(watched.read(found)):
-            typer.echo("{}: {}, the person acted at {} of them ({} with 95 %)".format(*line))
-    raise typer.Exit(ended.outcome.exit_code)
-
-
 def _with_trace(files: list[Path]) -> Experiment:
     from afspm.experiment.tracing import trace_overlay
 
@@ -275,10 +248,10 @@ def _with_trace(files: list[Path]) -> Experiment:
             raise ConfigError("no translator here talks to a controller: nothing to trace", where=str(files[0]))
         return found
 
-    return _with_overlay(files, overlay)
+    return with_overlay(files, overlay)
 
 
-def _with_overlay(files: list[Path], overlay: Callable[[ResolvedExperiment, Path], Path]) -> Experiment:
+def with_overlay(files: list[Path], overlay: Callable[[ResolvedExperiment, Path], Path]) -> Experiment:
     import tempfile
 
     from afspm.experiment import load

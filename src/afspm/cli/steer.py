@@ -105,8 +105,16 @@ def note(
     scan: Annotated[
         int | None, typer.Option(metavar="N", help="The number of the scan that it belongs to.", show_default=False)
     ] = None,
+    row: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Mark this row of a shadow's table: TEXT begins with right or wrong.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
-    """Write a note into the record of a run, in your name: on a scan, or on this moment.
+    """Write a note into the record of a run, in your name: on a scan, on this moment, or on a row of a shadow's table.
 
     Needs no control. After the end of a run the note is appended to its record, and the report is written again.
     """
@@ -114,26 +122,36 @@ def note(
     from afspm.cli.joining import acting, person
     from afspm.client.connect import find_run
     from afspm.record.notes import append_note
-    from afspm.record.report import REPORT_FILE, write
+    from afspm.record.report import REPORT_FILE, shadow, write
     from afspm.record.run import open_run
     from afspm.record.run_lock import goes_on
 
     *where, text = words
     if len(where) > 1:
         raise typer.BadParameter("put the text into quotation marks")
+    if scan is not None and row is not None:
+        raise typer.BadParameter("a note is on a scan or on a row", param_hint="--row")
     folder = find_run(Path(where[0]) if where else RUNS)
-    row = None
-    if scan is not None:
-        with open_run(folder) as run:
-            row = run.numbered(scan)
+    measured = marked = None
+    with open_run(folder) as run:
+        if scan is not None:
+            measured = run.numbered(scan)
+        elif row is not None:
+            marked = shadow.read(run).row(row)
+            text = shadow.mark_text(marked, text)
+    time_ns = None if marked is None else marked.time_ns
     if goes_on(folder):
         with acting(folder) as scope:
-            scope.note(text, scan=row)
+            scope.note(text, scan=measured, time_ns=time_ns)
     else:
-        append_note(folder, person(), text, ExperimentClock.real().now_ns(), None if row is None else row.time_ns)
+        scan_ns = None if measured is None else measured.time_ns
+        append_note(folder, person(), text, ExperimentClock.real().now_ns(), scan_ns, time_ns)
         if (folder / REPORT_FILE).exists():
             write(folder)
-    typer.echo("noted" if row is None else f"noted on scan {row.number}")
+    if marked is not None:
+        typer.echo(f"marked row {marked.number}, {marked.would or marked.did}")
+    else:
+        typer.echo("noted" if measured is None else f"noted on scan {measured.number}")
 
 
 def _list(where: Path, *, as_json: bool) -> None:

@@ -47,6 +47,7 @@ class ProcessStart:
         leaves_last: whether it stays until the other components have ended, to record their last packets.
         acts: whether it follows a plan of its own, as a series does (True if unknown), or only reacts.
         hidden: environment variables that hold secrets of other processes.
+        solves: the problems that it declares to solve.
     """
 
     launch: Launch
@@ -58,6 +59,7 @@ class ProcessStart:
     leaves_last: bool = False
     acts: bool = False
     hidden: tuple[str, ...] = ()
+    solves: tuple[str, ...] = ()
 
 
 def starts(
@@ -203,10 +205,12 @@ def _start(
     )
     folders = resolved.document.folders
     command = runnable(command, folders[0])
-    beats = process.part.own.get("heartbeats") is not False
+    beats, solves = process.part.own.get("heartbeats") is not False, process.declared.solves
     hidden, is_last = _hidden_variables(resolved, process), process.declares(RECORDS)
     acts = role is Role.COMPONENT and process.acts
-    return ProcessStart(launch, role, command, folders[0], tuple(map(str, folders)), beats, is_last, acts, hidden)
+    return ProcessStart(
+        launch, role, command, folders[0], tuple(map(str, folders)), beats, is_last, acts, hidden, solves
+    )
 
 
 def _hidden_variables(resolved: ResolvedExperiment, process: ResolvedProcess) -> tuple[str, ...]:

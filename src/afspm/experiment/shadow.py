@@ -4,9 +4,50 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from afspm.basics import entry_points
 from afspm.basics.errors import ConfigError
+from afspm.experiment.findings import nearest
 from afspm.experiment.resolved_experiment import ResolvedExperiment
 from afspm.model import Role
+
+_DETECTORS = """
+[scheduler]
+component = true
+class = "DriftCompensatedScheduler"
+drift = { correct = false } # the person's frames stay as they were set
+
+[classifier]
+component = true
+class = "TipClassifier"
+"""
+_OF_LINES = """
+[lines]
+component = true
+class = "LineWatch"
+"""
+
+
+def shadow_file(maker: str, folder: Path) -> Path:
+    """Write an experiment into `folder`: all detectors that need no settings, on the microscope of a maker.
+
+    Args:
+        maker: the short name of a driver, in any case: "nanonis".
+
+    Raises:
+        ConfigError: there is no such driver.
+    """
+    from afspm.translator.driver_base import DriverBase
+
+    drivers = {name.lower(): name for name in entry_points.names(entry_points.DRIVERS)}
+    if maker.lower() not in drivers:
+        raise ConfigError(f"there is no driver {maker!r}", where="--on", hint=nearest(maker.lower(), drivers))
+    name = drivers[maker.lower()]
+    driver: type[DriverBase] = entry_points.load(entry_points.DRIVERS, name)
+    has_lines = driver.lines is not DriverBase.lines
+    lines = ["[microscope]", "component = true", f'class = "{name}"', *(['live_lines_s = "1 s"'] if has_lines else [])]
+    file = folder / f"{maker.lower()}_shadow.toml"
+    file.write_text("\n".join(lines) + "\n" + _DETECTORS + (_OF_LINES if has_lines else ""), encoding="utf-8")
+    return file
 
 
 def shadow_overlay(experiment: ResolvedExperiment, folder: Path) -> Path:

@@ -25,6 +25,7 @@ from afspm.record.run_json import (
     METADATA,
     PLANNED,
     REAL_S,
+    SOLVES,
     STATE_DIR,
     UNFINISHED,
     WAITS_GIVEN_UP,
@@ -225,6 +226,7 @@ def run_facts(name: str, starts: Sequence[ProcessStart], common: RunIdentity) ->
                 "role": start.role.value,
                 "publish": start.launch.sockets.publish,
                 "serve": start.launch.sockets.serve,
+                **({SOLVES: start.solves} if start.solves else {}),
             }
             for start in starts
         },

@@ -28,6 +28,8 @@ _ROUNDED: Final = 0.06  # rounding of the panel's digits
 REFNAMES: Final = ("PointsX", "PointsY", "RangeX", "RangeY", "OffsetX", "OffsetY", "Rotation")
 SUBSCAN: Final = ("SPMC-sls-xs", "SPMC-sls-xn", "SPMC-sls-ys", "SPMC-sls-yn")
 """First column, columns, first row and rows of a *SubScan*; zeros without it. Gxsm3 has no such names."""
+_READS: Final = 10
+"""Most readings of a frame that is empty."""
 _PLACE: Final = ("OffsetX", "OffsetY", "Rotation")
 _SIZE: Final = {names.SCAN_SIZE_X, names.SCAN_SIZE_Y}
 PIXELS: Final = {names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y}
@@ -68,7 +70,11 @@ class ScanFrame:
 
     def read(self) -> dict[str, Value]:
         """Return the frame and its pixels by generic parameter names, in SI."""
-        columns, rows, width, height, x, y, clockwise_deg = (number(self._ask, ref) for ref in REFNAMES)
+        # while GXSM opens a file, it returns a range of 0 for a moment (seen in Gxsm4 4.4.1)
+        for _ in range(_READS):
+            columns, rows, width, height, x, y, clockwise_deg = (number(self._ask, ref) for ref in REFNAMES)
+            if width and height:
+                break
         center_m, size_m = (x * self._unit_m, y * self._unit_m), (width * self._unit_m, height * self._unit_m)
         angle_rad = 0.0 - math.radians(math.remainder(clockwise_deg, 720.0))
         return frame_values(Region(center_m, size_m, angle_rad), (round(rows), round(columns)))

@@ -5,19 +5,31 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from html import escape
 from typing import Final
 
 from afspm.basics.clock import NS_PER_S
-from afspm.basics.errors import FileError
-from afspm.basics.formatting import duration_text
-from afspm.model import ActByHand, ControlEvent, ControlRequest, ControlResponse, JournalEntry, PanelAct, Problem
+from afspm.basics.errors import FileError, InvalidValue
+from afspm.basics.formatting import counted, duration_text, position_text, quantity
+from afspm.model import (
+    ActByHand,
+    ControlEvent,
+    ControlRequest,
+    ControlResponse,
+    Frame,
+    JournalEntry,
+    PanelAct,
+    Problem,
+    RegistrationOutcome,
+)
 from afspm.record.bad_scans import BAD, LINE_VERDICT_MESSAGE, VERDICT_MESSAGE, read_verdict
 from afspm.record.report.markup import PageTimes, table
 from afspm.record.run import Run
+from afspm.record.run_json import SOLVES
+from afspm.record.tables import NoteRow, ScanRow
 from afspm.wire.messages import SpatialROIWithScoreList, TipVerdict
 
 SOON_S: Final = 300.0
@@ -28,17 +40,38 @@ _ENDED_EARLY: Final = "a scan ended before its last line, and nothing but a pers
 _SIGMAS: Final = 1.959964
 _MESSAGES: Final = ("ActByHand", LINE_VERDICT_MESSAGE, VERDICT_MESSAGE)
 FILE: Final = "shadow.csv"
-_HEADS: Final = ("time_ns", "kind", "afspm", "person", "after_s")
+_HEADS: Final = ("number", "time_ns", "kind", "afspm", "person", "after_s", "left_s", "mark", "comment")
+RIGHT: Final = "right"
+WRONG: Final = "wrong"
+_MARKS: Final = (RIGHT, WRONG)
+_SAME_FRAME: Final = 1e-3
+"""Frames are equal if their edges differ by less than this part of their size."""
 
 
 class ShadowKind(StrEnum):
     """The kind of a row: a decision of afspm, or an act of the person without one."""
 
+    TAKEN = "scan"
     SCAN = "bad scan"
     LINES = "line alarm"
     PROBLEM = "problem"
+    REPAIR = "repair"
+    DRIFT = "drift"
+    CONTROL = "control"
     LIMIT = "limit"
     PERSON = "by hand"
+
+
+COUNTED: Final = (ShadowKind.SCAN, ShadowKind.LINES, ShadowKind.PROBLEM)
+"""Kinds of which the agreement is counted: a person answers them, if at all, by an act."""
+
+
+@dataclass(frozen=True)
+class ShadowMark:
+    """The opinion of a person on a row: right or wrong, and why."""
+
+    right: bool
+    comment: str = ""
 
 
 @dataclass(frozen=True)
@@ -50,6 +83,8 @@ class ShadowRow:
         would: what afspm would have done, in words; empty for an act that no decision preceded.
         did: the act of the person, with its evidence; empty: the person went on.
         after_s: experiment time from the decision to the act; None without both.
+        left_s: experiment time from a line alarm to the end of its scan; None for other rows.
+        number: the place in the table, from 1.
     """
 
     time_ns: int
@@ -57,6 +92,9 @@ class ShadowRow:
     would: str
     did: str = ""
     after_s: float | None = None
+    left_s: float | None = None
+    number: int = 0
+    mark: ShadowMark | None = None
 
 
 @dataclass(frozen=True)
@@ -73,23 +111,37 @@ class Agreement:
     """The number of decisions of a kind, and the number that the person answered.
 
     For `ShadowKind.PERSON`: the number of acts that can answer, and how many a decision preceded.
+
+    Attributes:
+        right, wrong: the number of rows that a person marked so.
     """
 
     kind: ShadowKind
     count: int
     agreed: int
+    right: int = 0
+    wrong: int = 0
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The 95 % interval of the share (Wilson's score); (0, 1) without a decision."""
-        n, z = self.count, _SIGMAS
-        if not n:
-            return 0.0, 1.0
-        share = self.agreed / n
-        middle = share + z * z / (2 * n)
-        half = z * math.sqrt(share * (1.0 - share) / n + z * z / (4 * n * n))
-        # rounding may leave the bounds of none and all a little beyond them
-        return max(0.0, (middle - half) / (1 + z * z / n)), min(1.0, (middle + half) / (1 + z * z / n))
+        """The 95 % interval of the share that the person answered."""
+        return interval(self.agreed, self.count)
+
+    @property
+    def interval_right(self) -> tuple[float, float]:
+        """The 95 % interval of the share that is right, of the marked rows."""
+        return interval(self.right, self.right + self.wrong)
+
+
+def interval(agreed: int, count: int) -> tuple[float, float]:
+    """Return the 95 % interval of a share (Wilson's score); (0, 1) without a count."""
+    if not count:
+        return 0.0, 1.0
+    share, z = agreed / count, _SIGMAS
+    middle = share + z * z / (2 * count)
+    half = z * math.sqrt(share * (1.0 - share) / count + z * z / (4 * count * count))
+    # rounding may leave the bounds of none and all a little beyond them
+    return max(0.0, (middle - half) / (1 + z * z / count)), min(1.0, (middle + half) / (1 + z * z / count))
 
 
 @dataclass(frozen=True)
@@ -98,6 +150,39 @@ class ShadowNight:
 
     rows: Sequence[ShadowRow] = ()
     agreement: Sequence[Agreement] = field(default_factory=tuple)
+
+    def row(self, number: int) -> ShadowRow:
+        """Return a row by its number. Raises InvalidValue if there is none."""
+        for one in self.rows:
+            if one.number == number:
+                return one
+        hint = f"1 to {len(self.rows)}" if self.rows else "the run is no shadow, or nothing has happened yet"
+        raise InvalidValue(f"the shadow's table has no row {number}", hint=hint)
+
+    def left_s(self, *, right: bool) -> float:
+        """Return the scan time left at all line alarms that a person marked right, or wrong."""
+        marked = (row for row in self.rows if row.mark is not None and row.mark.right is right)
+        return sum(row.left_s or 0.0 for row in marked)
+
+
+def mark_text(row: ShadowRow, opinion: str) -> str:
+    """Return the note that marks a row, to be written at the time of the row.
+
+    Args:
+        opinion: "right" or "wrong", and perhaps a comment after it.
+
+    Raises:
+        InvalidValue: the opinion begins with neither.
+    """
+    if _opinion(opinion) is None:
+        raise InvalidValue(f"{opinion!r} is neither right nor wrong", hint='write e.g. "wrong, it was the sample"')
+    return f"{row.kind}: {opinion}"
+
+
+def _opinion(text: str) -> ShadowMark | None:
+    word = next((one for one in _MARKS if text.lower().startswith(one)), "")
+    rest = text[len(word) :]
+    return ShadowMark(word == RIGHT, rest.strip(" ,;:.")) if word and not rest[:1].isalnum() else None
 
 
 def read(run: Run) -> ShadowNight:
@@ -108,55 +193,93 @@ def read(run: Run) -> ShadowNight:
         is_shadow = False
     if not is_shadow:
         return ShadowNight()
-    decisions: list[ShadowRow] = []
-    acts = [PersonAct(scan.time_ns, _ENDED_EARLY, answers=True) for scan in run.scans if scan.interrupted]
+    scans, names, solvers = run.scans, run.problem_names, _solvers(run)
+    decisions = [*_of_drift(run, scans)]
+    taken = [
+        ShadowRow(scan.time_ns, ShadowKind.TAKEN, _judged(scan), f"took scan {scan.number} to its last line")
+        for scan in scans
+        if not scan.interrupted
+    ]
+    acts = [PersonAct(scan.time_ns, _ENDED_EARLY, answers=True) for scan in scans if scan.interrupted]
     for packet, _, thing in run.messages(_MESSAGES):
         time_ns = packet.time_ns or 0
         if isinstance(thing, ActByHand):
             acts.append(PersonAct(thing.time_ns, str(thing), thing.act in ANSWERS))
         elif isinstance(thing, TipVerdict):
-            decisions.append(ShadowRow(time_ns, ShadowKind.LINES, _of_lines(thing)))
+            decisions.append(_of_lines(time_ns, thing, scans))
         elif isinstance(thing, SpatialROIWithScoreList):
             verdict = read_verdict(thing)
             if verdict is not None and verdict[1] == BAD:
-                decisions.append(ShadowRow(time_ns, ShadowKind.SCAN, "would have taken the tip for bad"))
-    names = run.problem_names
+                scan = run.scan_at(verdict[0])
+                which = "" if scan is None else f" of scan {scan.number}"
+                decisions.append(ShadowRow(time_ns, ShadowKind.SCAN, f"would have taken the tip{which} for bad"))
     for entry in filter(_is_flag, run.journal):
-        would = f"{entry.who} would have had {names.name(entry.problem or 0)} solved"
+        problem = names.name(entry.problem or 0)
+        would = f"{entry.who} would have had {problem} solved"
         decisions.append(ShadowRow(entry.time_ns, ShadowKind.PROBLEM, would))
+        for solver in solvers.get(problem, ()):
+            would = f"{solver} would have been given control to solve {problem}"
+            decisions.append(ShadowRow(entry.time_ns, ShadowKind.REPAIR, would))
     limits = [
         ShadowRow(entry.time_ns, ShadowKind.LIMIT, f"would have refused this: {entry.reason}", entry.what)
         for entry in run.journal
         if entry.event is ControlEvent.BY_HAND and entry.reason
     ]
-    return compare(decisions, sorted(acts, key=lambda act: act.time_ns), limits)
+    decisions += _asked(run.journal)
+    return compare(decisions, sorted(acts, key=lambda act: act.time_ns), [*limits, *taken], run.notes)
 
 
-def compare(decisions: Sequence[ShadowRow], acts: Sequence[PersonAct], limits: Sequence[ShadowRow] = ()) -> ShadowNight:
+def compare(
+    decisions: Sequence[ShadowRow],
+    acts: Sequence[PersonAct],
+    limits: Sequence[ShadowRow] = (),
+    notes: Sequence[NoteRow] = (),
+) -> ShadowNight:
     """Set each decision beside the first act that answers it, and list the acts beside them.
 
     Args:
         acts: in the order of time.
-        limits: rows that are their own answer, since the act is what the limits would have refused.
+        limits: rows that are their own answer, such as an act that the limits would have refused.
+        notes: those of `mark_text` at the time of a row are marks; of several the last written one counts.
     """
     answers = [act for act in acts if act.answers]
     rows, foreseen = [], set[int]()
     for one in decisions:
         soon = [act for act in answers if 0 <= act.time_ns - one.time_ns <= SOON_S * NS_PER_S]
-        foreseen |= {act.time_ns for act in soon}
+        if one.kind in COUNTED:
+            foreseen |= {act.time_ns for act in soon}
         if soon:
             after_s = (soon[0].time_ns - one.time_ns) / NS_PER_S
-            rows.append(ShadowRow(one.time_ns, one.kind, one.would, soon[0].text, after_s))
+            rows.append(replace(one, did=soon[0].text, after_s=after_s))
         else:
             rows.append(one)
-    agreement = []
-    for kind in (ShadowKind.SCAN, ShadowKind.LINES, ShadowKind.PROBLEM):
-        mine = [row for row in rows if row.kind is kind]
-        agreement.append(Agreement(kind, len(mine), sum(bool(row.did) for row in mine)))
-    known = sum(act.time_ns in foreseen for act in answers)
-    agreement.append(Agreement(ShadowKind.PERSON, len(answers), known))
     rows += [*limits, *(ShadowRow(act.time_ns, ShadowKind.PERSON, "", act.text) for act in acts)]
-    return ShadowNight(sorted(rows, key=lambda row: row.time_ns), agreement)
+    marks = _marks(notes)
+    numbered = [
+        replace(row, number=number, mark=marks.get((row.time_ns, row.kind)))
+        for number, row in enumerate(sorted(rows, key=lambda row: row.time_ns), 1)
+    ]
+    known = sum(act.time_ns in foreseen for act in answers)
+    return ShadowNight(numbered, [*_agreements(numbered), Agreement(ShadowKind.PERSON, len(answers), known)])
+
+
+def _agreements(rows: Sequence[ShadowRow]) -> Iterator[Agreement]:
+    for kind in ShadowKind:
+        mine = [row for row in rows if row.kind is kind]
+        marked = [row.mark.right for row in mine if row.mark is not None]
+        if kind in COUNTED or (marked and kind is not ShadowKind.PERSON):
+            acted = sum(bool(row.did) for row in mine)
+            yield Agreement(kind, len(mine), acted, sum(marked), len(marked) - sum(marked))
+
+
+def _marks(notes: Sequence[NoteRow]) -> dict[tuple[int, ShadowKind], ShadowMark]:
+    found = {}
+    for note in sorted(notes, key=lambda note: note.written_ns or 0):
+        kind, colon, opinion = note.text.partition(": ")
+        mark = _opinion(opinion) if colon else None
+        if mark is not None and kind in list(ShadowKind):
+            found[note.time_ns, ShadowKind(kind)] = mark
+    return found
 
 
 def html(night: ShadowNight, clock: PageTimes) -> str:
@@ -165,26 +288,59 @@ def html(night: ShadowNight, clock: PageTimes) -> str:
         return ""
     cells = [
         [
+            str(row.number),
             clock.both(row.time_ns),
             escape(row.kind),
             escape(row.would),
-            escape(row.did) or ("went on" if row.would else ""),
+            escape(row.did) or ("went on" if row.would and row.kind is not ShadowKind.CONTROL else ""),
             "" if row.after_s is None else escape(duration_text(row.after_s)),
+            "" if row.mark is None else f"{_word(row.mark)}<small>{escape(row.mark.comment)}</small>",
         ]
         for row in night.rows
     ]
     shares = [[escape(text) for text in line] for line in agreement_lines(night)]
-    return table(("decisions", "number", "the person acted", "95 % interval"), shares) + table(
-        ("time", "", "afspm", "the person", "after"), cells
+    heads = (
+        "decisions",
+        "number",
+        "the person acted",
+        "95 % interval",
+        "marked right",
+        "marked wrong",
+        "95 % interval",
+    )
+    return (
+        table(heads, shares)
+        + f'<p class="note">{escape(marks_in_words(night))}</p>'
+        + table(("", "time", "", "afspm", "the person", "after", "marked"), cells)
     )
 
 
-def agreement_lines(night: ShadowNight) -> list[tuple[str, str, str, str]]:
-    """Return kind, number, number agreed, and interval in words, of each kind."""
+def marks_in_words(night: ShadowNight) -> str:
+    """Return the number of marks, and the scan time that line alarms would have saved and lost."""
+    marked = sum(row.mark is not None for row in night.rows)
+    if not marked:
+        return 'No row is marked yet: afspm note RUN --row NUMBER "right", or "wrong".'
+    saved, lost = (duration_text(night.left_s(right=right)) for right in (True, False))
+    return f"{counted(marked, 'row')} marked; line alarms would have saved {saved} and lost {lost} of scans."
+
+
+def agreement_lines(night: ShadowNight) -> list[tuple[str, ...]]:
+    """Return a line of each kind: number, number answered with interval, and number marked right, wrong, interval."""
     return [
-        (one.kind.value, str(one.count), str(one.agreed), "{:.0%} to {:.0%}".format(*one.interval))
+        (
+            *(one.kind.value, str(one.count), str(one.agreed), _between(one.interval)),
+            *(str(one.right), str(one.wrong), _between(one.interval_right)),
+        )
         for one in night.agreement
     ]
+
+
+def _between(share: tuple[float, float]) -> str:
+    return "{:.0%} to {:.0%}".format(*share)
+
+
+def _word(mark: ShadowMark) -> str:
+    return RIGHT if mark.right else WRONG
 
 
 def csv_text(night: ShadowNight) -> str:
@@ -193,7 +349,9 @@ def csv_text(night: ShadowNight) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_HEADS)
     for row in night.rows:
-        writer.writerow((row.time_ns, row.kind.value, row.would, row.did, "" if row.after_s is None else row.after_s))
+        times = ("" if value is None else value for value in (row.after_s, row.left_s))
+        mark = ("", "") if row.mark is None else (_word(row.mark), row.mark.comment)
+        writer.writerow((row.number, row.time_ns, row.kind.value, row.would, row.did, *times, *mark))
     return text.getvalue()
 
 
@@ -202,6 +360,64 @@ def _is_flag(entry: JournalEntry) -> bool:
     return is_flag and entry.problem != Problem.DEVICE_MALFUNCTION
 
 
-def _of_lines(verdict: TipVerdict) -> str:
+def _judged(scan: ScanRow) -> str:
+    if scan.tip_score is None:
+        return "did not judge the tip"
+    return "would have taken the tip for bad" if scan.tip_score == BAD else "would have gone on"
+
+
+def _of_lines(time_ns: int, verdict: TipVerdict, scans: Sequence[ScanRow]) -> ShadowRow:
     would = "would have stopped the scan" if verdict.stops else "would have asked a person to look"
-    return f"{would} at row {verdict.row}, changed since row {verdict.since_row}: {verdict.reason}"
+    ends_ns = (scan.time_ns for scan in scans if (scan.began_ns or scan.time_ns) <= time_ns <= scan.time_ns)
+    left_s = next(((end_ns - time_ns) / NS_PER_S for end_ns in ends_ns), None)
+    left = "" if left_s is None else f", {duration_text(left_s)} before its end"
+    text = f"{would} at row {verdict.row}{left}, changed since row {verdict.since_row}: {verdict.reason}"
+    return ShadowRow(time_ns, ShadowKind.LINES, text, left_s=left_s)
+
+
+def _solvers(run: Run) -> Mapping[str, Sequence[str]]:
+    found: dict[str, list[str]] = {}
+    for name, process in (run.facts.get("processes") or {}).items():
+        for problem in process.get(SOLVES, ()):
+            found.setdefault(problem, []).append(name)
+    return found
+
+
+def _asked(journal: Sequence[JournalEntry]) -> Iterator[ShadowRow]:
+    # a component asks again and again while it waits: a row for each would hide the others
+    asked = [entry for entry in journal if entry.request == ControlRequest.REQUEST_CTRL]
+    for who in dict.fromkeys(entry.who for entry in asked):
+        times_ns = [entry.time_ns for entry in asked if entry.who == who]
+        would = f"{who} would have asked for control, and waits ({counted(len(times_ns), 'request')})"
+        yield ShadowRow(times_ns[0], ShadowKind.CONTROL, would)
+
+
+def _of_drift(run: Run, scans: Sequence[ScanRow]) -> Iterator[ShadowRow]:
+    # a frame that a person sets again is meant for the same place on the sample, which has moved meanwhile
+    points, first = run.drift, dict[int, tuple[float, float]]()
+    placed: list[ScanRow] = []
+    for scan in scans:
+        began_ns = scan.time_ns if scan.began_ns is None else scan.began_ns
+        point = next((one for one in points if began_ns <= one.time_ns <= scan.time_ns), None)
+        if point is None or scan.region is None or scan.region.frame is Frame.SAMPLE:
+            continue
+        moved_m, doubt = point.translation_m, quantity(point.sd_m, "m", 2)
+        before = next((one for one in placed if _same_frame(one, scan)), None)
+        if before is None:
+            placed.append(scan)
+            first[scan.number] = moved_m
+        how = "" if point.outcome is RegistrationOutcome.REGISTERED else f" ({point.outcome.label}: {point.reason})"
+        text = f"scan {scan.number}: the sample had moved by {position_text(moved_m)} ± {doubt}{how}"
+        if before is not None:
+            (x, y), (x_now, y_now), (x_then, y_then) = scan.region.center_m, moved_m, first[before.number]
+            center_m = (x + x_now - x_then, y + y_now - y_then)
+            text += f"; a run would have had the frame of scan {before.number} at {position_text(center_m)}"
+            text += f" instead of {position_text(scan.region.center_m)}"
+        yield ShadowRow(scan.time_ns, ShadowKind.DRIFT, text)
+
+
+def _same_frame(one: ScanRow, other: ScanRow) -> bool:
+    if one.region is None or other.region is None:
+        return False
+    pairs = zip(one.region.center_m + one.region.size_m, other.region.center_m + other.region.size_m, strict=True)
+    return all(abs(a - b) <= _SAME_FRAME * min(one.region.size_m) for a, b in pairs)

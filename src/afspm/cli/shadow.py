@@ -1,0 +1,71 @@
+"""`afspm shadow`: a run that only watches a person's work, and its folder for others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer.core import TyperGroup
+
+from afspm.cli.arguments import RUNS, OptionalFiles, Runs, opt
+
+_WATCH = "watch"
+
+
+class ShadowCommands(TyperGroup):
+    """The commands of `afspm shadow`; without the name of one it is `watch`."""
+
+    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
+        is_named = not args or args[0] in self.commands or args[0] in ctx.help_option_names
+        return super().parse_args(ctx, args if is_named else [_WATCH, *args])
+
+
+app = typer.Typer(
+    cls=ShadowCommands,
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Watch a person's work at the microscope, and write down what afspm would have done.",
+)
+
+
+@app.command(_WATCH)
+def watch(
+    files: OptionalFiles = None,
+    on: Annotated[
+        str,
+        opt(
+            "The microscope, e.g. nanonis: all detectors that need no settings. Files are then its overlays.",
+            "--on",
+            metavar="MAKER",
+        ),
+    ] = "",
+    runs: Runs = RUNS,
+) -> None:
+    """Watch a person's work; `watch` may be left out: `afspm shadow night.toml`, `afspm shadow --on nanonis`.
+
+    The controller is only read: the process that talks to it has no function that sets or starts anything. Components
+    see all scans, and no component gets control. Ctrl-C ends it; a killed shadow leaves the controller as it is. The
+    report and shadow.csv have what afspm would have done, beside what the person did.
+    """
+    import sys
+    import tempfile
+
+    from afspm.cli.experiment_file import require_no_errors
+    from afspm.cli.run import with_overlay
+    from afspm.experiment.shadow import shadow_file, shadow_overlay
+    from afspm.record.report import shadow as watched
+    from afspm.record.run import open_run
+    from afspm.supervisor import run as running
+
+    with tempfile.TemporaryDirectory() as folder:
+        named = [*([shadow_file(on, Path(folder))] if on else []), *(files or [])]
+        if not named:
+            raise typer.BadParameter("name an experiment file, or a microscope with --on", param_hint="FILE")
+        experiment = with_overlay(named, shadow_overlay)
+        require_no_errors(experiment, (), ())
+        ended = running.run(experiment, running.RunOptions(runs=runs), terminal=sys.stdout)
+    with open_run(ended.folder) as found:
+        for line in watched.agreement_lines(watched.read(found)):
+            typer.echo("{}: {}, the person acted at {} of them ({} with 95 %)".format(*line))
+    raise typer.Exit(ended.outcome.exit_code)
