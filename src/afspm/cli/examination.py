@@ -27,6 +27,8 @@ from afspm.model import CLOCK_REQUEST, ProcessCondition, ProcessStates, Request
 from afspm.model.events import SUPERVISOR
 from afspm.record.run_lock import goes_on
 from afspm.supervisor.reporter import computer_name
+from afspm.translator.trace import FILE as TRACE_FILE
+from afspm.translator.trace import load_of, newest_lines
 from afspm.transport import diagnosis, keys, probe
 from afspm.transport.diagnosis import Diagnosis, Handshake, Heard, Reach, Severity, Versions
 from afspm.transport.network import Network
@@ -67,6 +69,7 @@ def examine(experiment: Experiment | None, runs: Path, listen_s: float, commands
         found.found += _keys(experiment)
         _Connections(experiment, found).examine(listen_s)
         found.found += _devices(experiment)
+        found.found += _load(experiment)
     found.found += _disk(runs)
     found.found.append(diagnosis.of_memory(psutil.virtual_memory().available, _sizes(found.pids)))
     return found
@@ -126,6 +129,14 @@ def _devices(experiment: Experiment) -> Iterator[Diagnosis]:
         except Exception as error:  # of a class of another package, which may raise anything
             what = f"can't be tried: {type(error).__name__}: {error}"
             yield Diagnosis("device", Severity.ERROR, process.name, what, f"mend {class_.__qualname__}")
+
+
+def _load(experiment: Experiment) -> Iterator[Diagnosis]:
+    # only a run with a trace shows what it asks of the controller: `afspm shadow` and `afspm trace` keep one
+    with suppress(AfspmError, OSError):
+        folder = find_run(experiment.files[0])
+        if goes_on(folder) and (load := load_of(newest_lines(folder / TRACE_FILE))) is not None:
+            yield diagnosis.fine("load", "controller", f"{load}, over the last {load.over_s:.0f} s")
 
 
 def _disk(runs: Path) -> Iterator[Diagnosis]:

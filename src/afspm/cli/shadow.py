@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from typer.core import TyperGroup
 
-from afspm.cli.arguments import RUNS, OptionalFiles, Runs, opt
+from afspm.cli.arguments import RUNS, OptionalFiles, RecordedRun, Runs, opt
 
 _WATCH = "watch"
 
@@ -69,3 +69,36 @@ def watch(
         for line in watched.agreement_lines(watched.read(found)):
             typer.echo("{}: {}, the person acted at {} of them ({} with 95 %)".format(*line))
     raise typer.Exit(ended.outcome.exit_code)
+
+
+@app.command("pack")
+def pack(
+    recorded: RecordedRun = RUNS,
+    out: Annotated[Path, opt("The folder to make.", "--out", "-o", metavar="DIR")] = Path("shadow-pack"),
+    hide: Annotated[list[str] | None, opt("Replace this text, too. Repeatable.", "--hide", metavar="TEXT")] = None,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Don't ask.")] = False,
+) -> None:
+    """Make a folder of a shadow's run for others: without names, comments and places of files.
+
+    It has raw values, the wire trace, which `afspm emulate --replay` plays back, and the table. All that is replaced
+    and kept is listed first. Nothing is sent: look at the folder, and then give it to whom you like.
+    """
+    from afspm.cli import shadow_pack
+    from afspm.record.run import open_run
+
+    with open_run(recorded) as run:
+        found = shadow_pack.read(run, hide or ())
+        typer.echo("replaced by x, in all files:")
+        for one in found.private:
+            typer.echo(f"  {one.text!r}, {one.where}")
+        for one in found.too_short:
+            typer.echo(f"NOT replaced, too short or a word of the protocol: {one.text!r}, {one.where}")
+        typer.echo(f"left out: {shadow_pack.LEFT_OUT}")
+        typer.echo("kept:")
+        for line in shadow_pack.KEPT:
+            typer.echo(f"  {line}")
+        if not yes:
+            typer.confirm(f"Write {out}?", abort=True)
+        for line in shadow_pack.write(found, out):
+            typer.echo(f"left out: {line}")
+    typer.echo(f"packed into {out}")

@@ -11,9 +11,9 @@ import base64
 import json
 import threading
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import IO, Final
 
@@ -23,6 +23,7 @@ from afspm.basics.plain_data import Plain, from_json
 
 FILE: Final = "controller.trace.jsonl"
 FORMAT: Final = 1
+_NEWEST_BYTES: Final = 1 << 20
 TCP, ZEROMQ = "tcp", "zeromq"
 
 
@@ -77,20 +78,78 @@ class TracedFile:
 TraceLine = TraceHeader | TracedExchange | TracedFile
 
 
+@dataclass(frozen=True)
+class ControllerLoad:
+    """The load on a controller: connections, and questions in a real second."""
+
+    connections: int
+    questions_per_s: float
+    over_s: float
+
+    def __str__(self) -> str:
+        noun = "connection" if self.connections == 1 else "connections"
+        return f"{self.connections} {noun}, {self.questions_per_s:.3g} questions a second"
+
+
 def read_trace(file: Path) -> list[TraceLine]:
-    """Read a trace; an incomplete last line is left out.
+    """Read a trace; an incomplete last line is left out. Raises as `trace_lines`."""
+    return list(trace_lines(file))
+
+
+def trace_lines(file: Path) -> Iterator[TraceLine]:
+    """Yield the lines of a trace one by one: the trace of a night may be larger than memory.
 
     Raises:
         FileError: the file can't be read, is no trace, or is a trace of another version.
     """
+    first = True
     try:
-        lines = file.read_text(encoding="utf-8").split("\n")[:-1]
-        found = [_line(from_json(line)) for line in lines]
+        with file.open(encoding="utf-8", newline="\n") as lines:
+            for text in lines:
+                if not text.endswith("\n"):
+                    break  # of a killed process
+                line = _line(from_json(text))
+                if first and (not isinstance(line, TraceHeader) or line.trace != FORMAT):
+                    break
+                first = False
+                yield line
     except (OSError, ValueError, TypeError, KeyError, zlib.error) as error:
         raise FileError(f"can't be read as a trace: {error}", where=str(file)) from error
-    if not found or not isinstance(found[0], TraceHeader) or found[0].trace != FORMAT:
+    if first:
         raise FileError("is not a trace of this version of afspm", where=str(file), hint="afspm trace FILE records one")
-    return found
+
+
+def load_of(lines: Iterable[TraceLine]) -> ControllerLoad | None:
+    """Return the load on the controller in a part of a trace; None if the part is too short."""
+    connections, count, first_s, last_s = set[int](), 0, None, 0.0
+    for line in lines:
+        if isinstance(line, TracedExchange):
+            connections.add(line.connection)
+            first_s, last_s, count = line.at_s if first_s is None else first_s, line.at_s, count + 1
+    over_s = last_s - (first_s or 0.0)
+    return ControllerLoad(len(connections), (count - 1) / over_s, over_s) if over_s > 0.0 else None
+
+
+def newest_lines(file: Path) -> Iterator[TraceLine]:
+    """Yield the last lines of a trace, some thousand at most; an incomplete line is left out. Raises OSError."""
+    with file.open("rb") as stream:
+        stream.seek(max(0, file.stat().st_size - _NEWEST_BYTES))
+        parts = stream.read().split(b"\n")
+    for part in parts[1:-1]:
+        with suppress(ValueError, TypeError, KeyError, zlib.error):
+            yield _line(from_json(part.decode()))
+
+
+def written_line(line: TraceLine) -> str:
+    """Return a line as it is written, without the line feed."""
+    if isinstance(line, TracedFile):
+        facts: Plain = {"file": line.file, "at_s": line.at_s, "zlib": _packed(line.content)}
+    elif isinstance(line, TracedExchange):
+        facts = {**asdict(line), "asked": _shown(line.asked), "answered": _shown(line.answered)}
+        facts = {key: value for key, value in facts.items() if value or key not in ("lost", "command")}
+    else:
+        facts = asdict(line)
+    return json.dumps(facts, ensure_ascii=False)
 
 
 class Trace:
@@ -111,7 +170,7 @@ class Trace:
             self._file, self._clock, self._began_s = file.open("w", encoding="utf-8"), clock, clock.monotonic_s()
             self._began_at_s = ExperimentClock.real().now_s()
             self._lines = self._connections = 0
-            self._write(asdict(header))
+            self._write(header)
 
     def end(self) -> None:
         """Stop recording."""
@@ -139,10 +198,10 @@ class Trace:
         state = (path, path.stat().st_mtime_ns) if self.is_kept and path.is_file() else None
         if state is not None and state not in self._files:
             self._files.add(state)
-            content = base64.b64encode(zlib.compress(path.read_bytes())).decode()
+            content = path.read_bytes()
             with self._lock:
                 written_s = state[1] / NS_PER_S - self._began_at_s
-                self._write({"file": path.name, "at_s": round(min(written_s, self.now_s()), 6), "zlib": content})
+                self._write(TracedFile(path.name, content, round(min(written_s, self.now_s()), 6)))
 
     @property
     def lines(self) -> int:
@@ -154,13 +213,12 @@ class Trace:
 
     def exchange(self, one: TracedExchange) -> None:
         """Write a finished exchange."""
-        facts = {**asdict(one), "asked": _shown(one.asked), "answered": _shown(one.answered), "command": self._command}
         with self._lock:
-            self._write({key: value for key, value in facts.items() if value or key not in ("lost", "command")})
+            self._write(replace(one, command=self._command))
 
-    def _write(self, facts: Plain) -> None:
+    def _write(self, line: TraceLine) -> None:
         if self._file is not None:
-            self._file.write(json.dumps(facts, ensure_ascii=False) + "\n")
+            self._file.write(written_line(line) + "\n")
             self._file.flush()  # a killed process leaves all its exchanges
             self._lines += 1
 
@@ -233,6 +291,10 @@ class TracedAnswer:
 
 
 TRACE: Final = Trace()
+
+
+def _packed(content: bytes) -> str:
+    return base64.b64encode(zlib.compress(content)).decode()
 
 
 def _shown(content: bytes | None) -> object:

@@ -217,7 +217,9 @@ def _begin_trace(driver: DriverBase, context: ProcessContext) -> None:
     folder = Path(context.launch.run_dir or ".")
     file = next(one for i in itertools.count() if not (one := folder / (f"{i}-{FILE}" if i else FILE)).exists())
     began = datetime.fromtimestamp(context.clock.now_s(), UTC).isoformat(timespec="seconds")
-    TRACE.begin(file, TraceHeader(type(driver).__name__, version("afspm"), began), context.clock)
+    # a shadow's trace is played back as its driver's: the name finds the way in which the maker's clients begin
+    watched = getattr(driver, "watches", type(driver)).__name__
+    TRACE.begin(file, TraceHeader(watched, version("afspm"), began), context.clock)
 
 
 def _run_locked(driver: DriverBase, context: ProcessContext, make: Callable[..., Translator]) -> int:
