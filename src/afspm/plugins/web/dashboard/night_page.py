@@ -26,6 +26,7 @@ from afspm.model.events import PERSON
 from afspm.model.line_levelling import Levelling, levelled
 from afspm.plugins.drift.scan_pair import onto_first
 from afspm.plugins.web.archive import Archive, allowed_region
+from afspm.plugins.web.dashboard import shadow_marks
 from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.dashboard.actions import Action, ActionResult, Actions, Steering, not_signed_in
 from afspm.plugins.web.dashboard.content import Content, Contents
@@ -66,6 +67,10 @@ class NightPage(Page):
 
     def _add_more(self) -> None:
         with ui.element("div").classes("further more"):
+            if (watched := shadow_marks.read(self._night.folder)).agreement:
+                with section("What afspm would have done", "shadow"):
+                    steering = self._services.steering
+                    shadow_marks.ShadowMarks(self._night.folder, watched, steering, self._visitor)
             with section("Two scans", "two"):
                 ui.html(_asset("compare"), sanitize=False)
             if self._night.drifted():
