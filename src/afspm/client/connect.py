@@ -148,6 +148,8 @@ def find_run(where: Path) -> Path:
     Raises:
         FileError: there is no such run.
     """
+    if where.suffix == ".toml" and (where.parent / RUN_FILE).is_file():  # the expanded file of a run
+        return where.parent
     if where.suffix == ".toml":
         name = where.resolve().parent.name if where.stem == "experiment" else where.stem
         runs = (Path("runs"), where.resolve().parent / "runs")

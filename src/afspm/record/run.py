@@ -285,6 +285,14 @@ class Run:
         verdicts = (read_verdict(message) for message in found if isinstance(message, SpatialROIWithScoreList))
         return [verdict for verdict in verdicts if verdict is not None]
 
+    def judgements(self) -> Iterator[tuple[int, TipVerdict | SpatialROIWithScoreList]]:
+        """Yield (time of publication, message) of each verdict of a component, on a scan or on the lines of one."""
+        sql = "SELECT time_ns, message, payload FROM packets WHERE message IN (?, ?) ORDER BY time_ns, rowid"
+        for time_ns, message, payload in self._query(sql, (VERDICT_MESSAGE, LINE_VERDICT_MESSAGE)):
+            verdict = self._decoded(message, payload)
+            if isinstance(verdict, TipVerdict | SpatialROIWithScoreList):
+                yield time_ns, verdict
+
     def changed_rows(self) -> dict[int, int]:
         """Return the index of the first row after a tip change, by the end of the scan in ns.
 

@@ -473,3 +473,21 @@ def test_missing_target_of_the_tip_is_the_centre_of_the_frame(target: float | Ex
 def test_lost_link_is_no_missing_target_of_the_tip() -> None:
     with pytest.raises(ControllerLost, match="gone"):
         ScanFrame(Asking(Targetless(ControllerLost("gone"))), ANGSTROM_M).tip()
+
+
+class OpeningAFile(Targetless):
+    """GXSM while it opens a file: its range is 0 for a moment."""
+
+    def __init__(self) -> None:
+        super().__init__(0.0)
+        self.readings = 0
+
+    def call(self, method: str, *arguments: str | int | float) -> object:
+        self.readings += arguments == ("RangeX",)
+        value = super().call(method, *arguments)
+        return 0.0 if self.readings < 3 and arguments[0] in ("RangeX", "RangeY") else value
+
+
+def test_frame_is_read_again_while_gxsm_opens_a_file() -> None:
+    region = ScanFrame(Asking(OpeningAFile()), ANGSTROM_M).region()
+    assert region.size_m == pytest.approx((1000.0 * ANGSTROM_M,) * 2)

@@ -8,7 +8,7 @@ import pytest
 
 from afspm.basics.errors import ConfigError
 from afspm.experiment import Experiment, load
-from afspm.experiment.shadow import shadow_overlay
+from afspm.experiment.shadow import shadow_file, shadow_overlay
 
 FILE = """
 [scheduler]
@@ -65,3 +65,29 @@ def test_experiment_without_a_controller_is_refused(tmp_path: Path) -> None:
     file.write_text('[scheduler]\ncomponent = true\nclass = "Scheduler"\n', encoding="utf-8")
     with pytest.raises(ConfigError, match="no controller to watch"):
         shadow_overlay(load(file).resolved, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("maker", "settings", "has_lines"),
+    [
+        ("nanonis", "", True),
+        ("Asylum", "", False),
+        ("gxsm", "", True),
+        ("park", "", False),
+        ("nanosurf", "[microscope]\nrelease = 18\n", True),
+    ],
+)
+def test_maker_alone_gives_all_detectors(tmp_path: Path, maker: str, settings: str, has_lines: bool) -> None:
+    own = tmp_path / "own.toml"
+    own.write_text(settings, encoding="utf-8")
+    files = (shadow_file(maker, tmp_path), own)
+    experiment = load(*files, shadow_overlay(load(*files).resolved, tmp_path))
+    experiment.require_valid()
+    assert {"scheduler", "classifier"} <= experiment.resolved.processes.keys()
+    assert ("lines" in experiment.resolved.processes) is has_lines
+
+
+def test_unknown_maker_is_refused_with_the_nearest(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no driver 'nanoniss'") as caught:
+        shadow_file("nanoniss", tmp_path)
+    assert "nanonis" in caught.value.hint

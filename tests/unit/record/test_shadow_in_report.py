@@ -6,6 +6,9 @@ import csv
 
 import pytest
 
+from afspm.basics.errors import InvalidValue
+from afspm.model import Region
+from afspm.record.measurement_history import DriftPoint
 from afspm.record.report.markup import PageTimes
 from afspm.record.report.shadow import (
     SOON_S,
@@ -17,7 +20,10 @@ from afspm.record.report.shadow import (
     compare,
     csv_text,
     html,
+    mark_text,
+    of_drift,
 )
+from afspm.record.tables import NoteRow, ScanRow
 
 S = 1_000_000_000
 
@@ -60,7 +66,9 @@ def test_begun_scan_is_listed_and_answers_nothing() -> None:
 def test_limit_row_is_listed_and_not_counted() -> None:
     refused = ShadowRow(100 * S, ShadowKind.LIMIT, "would have refused this", "set at the microscope")
     night = compare([], [act(100.0)], [refused])
-    assert refused in night.rows
+    assert [(row.would, row.did) for row in night.rows if row.kind is ShadowKind.LIMIT] == [
+        (refused.would, refused.did)
+    ]
     assert ShadowKind.LIMIT not in {one.kind for one in night.agreement}
 
 
@@ -80,3 +88,56 @@ def test_table_and_page_have_all_rows_and_a_run_that_commands_has_none() -> None
     assert page.count("would have stopped the scan") == 2
     assert "went on" in page
     assert html(ShadowNight(), PageTimes(0, 1000 * S)) == ""
+
+
+def note(row: ShadowRow, opinion: str, written_s: int = 1) -> NoteRow:
+    return NoteRow(row.time_ns, "Ada", mark_text(row, opinion), None, written_s * S)
+
+
+def test_marks_of_a_person_are_figures_and_the_last_written_counts() -> None:
+    alarms = [
+        ShadowRow(at_s * S, ShadowKind.LINES, "would have stopped the scan", left_s=left_s)
+        for at_s, left_s in ((100, 60.0), (200, 30.0), (300, 5.0))
+    ]
+    notes = [
+        note(alarms[0], "right, there was a double tip"),
+        note(alarms[1], "right", written_s=1),
+        note(alarms[1], "wrong: it was a step", written_s=2),
+        NoteRow(300 * S, "Ada", "line alarm: rightly seen", None, S),  # a note, and no mark
+    ]
+    night = compare(alarms, [], notes=notes)
+    assert [row.mark and (row.mark.right, row.mark.comment) for row in night.rows] == [
+        (True, "there was a double tip"),
+        (False, "it was a step"),
+        None,
+    ]
+    (lines,) = [one for one in night.agreement if one.kind is ShadowKind.LINES]
+    assert (lines.right, lines.wrong) == (1, 1)
+    assert lines.interval_right == pytest.approx((0.0945, 0.9055), abs=5e-4)
+    assert (night.left_s(right=True), night.left_s(right=False)) == (60.0, 30.0)
+    assert "would have saved 1 min and lost 30 s" in html(night, PageTimes(0, 1000 * S))
+
+
+def test_mark_without_right_or_wrong_is_refused() -> None:
+    with pytest.raises(InvalidValue, match="neither right nor wrong"):
+        mark_text(decision(100.0), "the door slammed")
+
+
+def test_row_is_found_by_its_number() -> None:
+    night = compare([decision(200.0), decision(100.0)], [])
+    assert night.row(1).time_ns == 100 * S
+    with pytest.raises(InvalidValue, match="no row 3"):
+        night.row(3)
+
+
+def test_frame_that_is_set_again_is_told_where_a_run_would_have_had_it() -> None:
+    frames = [(0.0, 0.0), (1e-6, 0.0), (0.0, 0.0)]
+    drifts = [(0.0, 0.0), (3e-9, 1e-9), (10e-9, -5e-9)]
+    scans = [
+        ScanRow(n + 1, (n + 1) * S, n * S + 1, (), Region(center, (1e-7, 1e-7)), (8, 8), False, None, None, (), "", "")
+        for n, center in enumerate(frames)
+    ]
+    points = [DriftPoint((n + 1) * S, drift, (0.0, 0.0), sd_m=2e-10) for n, drift in enumerate(drifts)]
+    second, third = of_drift(points, scans)
+    assert second.would == "scan 2: the sample had moved by (3, 1) nm ± 200 pm"
+    assert third.would.endswith("a run would have had the frame of scan 1 at (10, -5) nm instead of (0, 0) nm")

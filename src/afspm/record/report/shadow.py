@@ -15,7 +15,6 @@ from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import FileError, InvalidValue
 from afspm.basics.formatting import counted, duration_text, position_text, quantity
 from afspm.model import (
-    ActByHand,
     ControlEvent,
     ControlRequest,
     ControlResponse,
@@ -25,12 +24,13 @@ from afspm.model import (
     Problem,
     RegistrationOutcome,
 )
-from afspm.record.bad_scans import BAD, LINE_VERDICT_MESSAGE, VERDICT_MESSAGE, read_verdict
+from afspm.record.bad_scans import BAD, read_verdict
+from afspm.record.measurement_history import DriftPoint
 from afspm.record.report.markup import PageTimes, table
 from afspm.record.run import Run
 from afspm.record.run_json import SOLVES
 from afspm.record.tables import NoteRow, ScanRow
-from afspm.wire.messages import SpatialROIWithScoreList, TipVerdict
+from afspm.wire.messages import TipVerdict
 
 SOON_S: Final = 300.0
 """Experiment time within which an act of the person answers a decision. Fixed before any night was seen."""
@@ -38,7 +38,6 @@ ANSWERS: Final = frozenset({PanelAct.WITHDRAW, PanelAct.FEEDBACK_OFF, PanelAct.V
 """Acts that answer a decision, beside a scan that ended early: the person did not simply go on."""
 _ENDED_EARLY: Final = "a scan ended before its last line, and nothing but a person or the controller could end it"
 _SIGMAS: Final = 1.959964
-_MESSAGES: Final = ("ActByHand", LINE_VERDICT_MESSAGE, VERDICT_MESSAGE)
 FILE: Final = "shadow.csv"
 _HEADS: Final = ("number", "time_ns", "kind", "afspm", "person", "after_s", "left_s", "mark", "comment")
 RIGHT: Final = "right"
@@ -194,25 +193,22 @@ def read(run: Run) -> ShadowNight:
     if not is_shadow:
         return ShadowNight()
     scans, names, solvers = run.scans, run.problem_names, _solvers(run)
-    decisions = [*_of_drift(run, scans)]
+    decisions = [*of_drift(run.drift, scans)]
     taken = [
         ShadowRow(scan.time_ns, ShadowKind.TAKEN, _judged(scan), f"took scan {scan.number} to its last line")
         for scan in scans
         if not scan.interrupted
     ]
     acts = [PersonAct(scan.time_ns, _ENDED_EARLY, answers=True) for scan in scans if scan.interrupted]
-    for packet, _, thing in run.messages(_MESSAGES):
-        time_ns = packet.time_ns or 0
-        if isinstance(thing, ActByHand):
-            acts.append(PersonAct(thing.time_ns, str(thing), thing.act in ANSWERS))
-        elif isinstance(thing, TipVerdict):
-            decisions.append(_of_lines(time_ns, thing, scans))
-        elif isinstance(thing, SpatialROIWithScoreList):
-            verdict = read_verdict(thing)
-            if verdict is not None and verdict[1] == BAD:
-                scan = run.scan_at(verdict[0])
-                which = "" if scan is None else f" of scan {scan.number}"
-                decisions.append(ShadowRow(time_ns, ShadowKind.SCAN, f"would have taken the tip{which} for bad"))
+    for _, _, act in run.messages(("ActByHand",)):
+        acts.append(PersonAct(act.time_ns, str(act), act.act in ANSWERS))
+    for time_ns, verdict in run.judgements():
+        if isinstance(verdict, TipVerdict):
+            decisions.append(_of_lines(time_ns, verdict, scans))
+        elif (judged := read_verdict(verdict)) is not None and judged[1] == BAD:
+            scan = run.scan_at(judged[0])
+            which = "" if scan is None else f" of scan {scan.number}"
+            decisions.append(ShadowRow(time_ns, ShadowKind.SCAN, f"would have taken the tip{which} for bad"))
     for entry in filter(_is_flag, run.journal):
         problem = names.name(entry.problem or 0)
         would = f"{entry.who} would have had {problem} solved"
@@ -248,7 +244,7 @@ def compare(
         soon = [act for act in answers if 0 <= act.time_ns - one.time_ns <= SOON_S * NS_PER_S]
         if one.kind in COUNTED:
             foreseen |= {act.time_ns for act in soon}
-        if soon:
+        if soon and one.kind is not ShadowKind.CONTROL:  # a component that waits all night is no decision
             after_s = (soon[0].time_ns - one.time_ns) / NS_PER_S
             rows.append(replace(one, did=soon[0].text, after_s=after_s))
         else:
@@ -392,28 +388,39 @@ def _asked(journal: Sequence[JournalEntry]) -> Iterator[ShadowRow]:
         yield ShadowRow(times_ns[0], ShadowKind.CONTROL, would)
 
 
-def _of_drift(run: Run, scans: Sequence[ScanRow]) -> Iterator[ShadowRow]:
+def of_drift(points: Sequence[DriftPoint], scans: Sequence[ScanRow]) -> Iterator[ShadowRow]:
+    """Yield a row of each scan after the first: the drift so far, and where a run would have had a repeated frame."""
     # a frame that a person sets again is meant for the same place on the sample, which has moved meanwhile
-    points, first = run.drift, dict[int, tuple[float, float]]()
+    first = dict[int, tuple[float, float]]()
     placed: list[ScanRow] = []
     for scan in scans:
         began_ns = scan.time_ns if scan.began_ns is None else scan.began_ns
         point = next((one for one in points if began_ns <= one.time_ns <= scan.time_ns), None)
         if point is None or scan.region is None or scan.region.frame is Frame.SAMPLE:
             continue
-        moved_m, doubt = point.translation_m, quantity(point.sd_m, "m", 2)
+        if not placed and point.translation_m == (0.0, 0.0):  # the first scan, from which the drift is counted
+            placed, first[scan.number] = [scan], point.translation_m
+            continue
+        moved_m, doubt = point.translation_m, quantity(point.sd_m, "m", 3)
         before = next((one for one in placed if _same_frame(one, scan)), None)
         if before is None:
             placed.append(scan)
             first[scan.number] = moved_m
         how = "" if point.outcome is RegistrationOutcome.REGISTERED else f" ({point.outcome.label}: {point.reason})"
-        text = f"scan {scan.number}: the sample had moved by {position_text(moved_m)} ± {doubt}{how}"
+        text = f"scan {scan.number}: the sample had moved by {_place(moved_m)} ± {doubt}{how}"
         if before is not None:
             (x, y), (x_now, y_now), (x_then, y_then) = scan.region.center_m, moved_m, first[before.number]
-            center_m = (x + x_now - x_then, y + y_now - y_then)
-            text += f"; a run would have had the frame of scan {before.number} at {position_text(center_m)}"
-            text += f" instead of {position_text(scan.region.center_m)}"
+            way_m = (x_now - x_then, y_now - y_then)
+            if math.hypot(*way_m) > (point.sd_m or 0.0):  # a run would not follow what may be nothing
+                text += f"; a run would have had the frame of scan {before.number} at"
+                text += f" {_place((x + way_m[0], y + way_m[1]))} instead of {_place(scan.region.center_m)}"
         yield ShadowRow(scan.time_ns, ShadowKind.DRIFT, text)
+
+
+def _place(xy_m: tuple[float, float]) -> str:
+    # rounded to a nanometre's tenth: the doubt of a place is larger, as a rule
+    x, y = (round(value, 10) + 0.0 for value in xy_m)  # no minus before a zero
+    return position_text((x, y))
 
 
 def _same_frame(one: ScanRow, other: ScanRow) -> bool:
