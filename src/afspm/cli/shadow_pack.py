@@ -1,7 +1,7 @@
 """A shadow's run as a folder for others: raw values, wire trace and table, without names, comments and places of files.
 
-**Theory of operation.** What is private is found first, and shown to the person: the facts of [metadata], the user and
-the computer, folders and names of the controller's files, and the entries of their headers that a person writes. Each
+**Theory of operation.** Private texts are found first, and shown to the person: the facts of [metadata], the user and the
+computer, folders and names of the controller's files, and the entries of their headers that a person writes. Each
 of these texts is then replaced in everything that goes into the folder, by letters x of the same length, so that
 lengths in messages and offsets in files stay as they are, and the trace can be played back. At last every file of the
 folder is searched once more. Journal, log, notes, experiment file and saved state are not packed at all.
@@ -100,7 +100,7 @@ class ShadowPack:
 
 
 def read(run: Run, hidden: Iterable[str] = ()) -> ShadowPack:
-    """Read a shadow's run, and find what is private in it.
+    """Read a shadow's run, and find the private texts in it.
 
     Args:
         hidden: more texts to replace.

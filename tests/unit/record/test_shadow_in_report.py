@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import csv
+from pathlib import Path
 
+import numpy as np
 import pytest
+from tests.unit.record.record_lab import REGION, Night
 
 from afspm.basics.errors import InvalidValue
-from afspm.model import Region
+from afspm.basics.formatting import duration_text
+from afspm.components.tip_verdict import OF_LINES, LineVerdict, line_verdict_message, verdict_message
+from afspm.model import Region, Scan
+from afspm.record.bad_scans import BAD, VERDICT_MESSAGE
 from afspm.record.measurement_history import DriftPoint
 from afspm.record.report.markup import PageTimes
 from afspm.record.report.shadow import (
@@ -22,7 +28,10 @@ from afspm.record.report.shadow import (
     html,
     mark_text,
     of_drift,
+    read,
 )
+from afspm.record.run import open_run
+from afspm.record.store import RecordStore
 from afspm.record.tables import NoteRow, ScanRow
 
 S = 1_000_000_000
@@ -115,7 +124,9 @@ def test_marks_of_a_person_are_figures_and_the_last_written_counts() -> None:
     assert (lines.right, lines.wrong) == (1, 1)
     assert lines.interval_right == pytest.approx((0.0945, 0.9055), abs=5e-4)
     assert (night.left_s(right=True), night.left_s(right=False)) == (60.0, 30.0)
-    assert "would have saved 1 min and lost 30 s" in html(night, PageTimes(0, 1000 * S))
+    assert f"would have saved {duration_text(60.0)} and lost {duration_text(30.0)}" in html(
+        night, PageTimes(0, 1000 * S)
+    )
 
 
 def test_mark_without_right_or_wrong_is_refused() -> None:
@@ -130,7 +141,7 @@ def test_row_is_found_by_its_number() -> None:
         night.row(3)
 
 
-def test_frame_that_is_set_again_is_told_where_a_run_would_have_had_it() -> None:
+def test_frame_that_is_set_again_has_the_place_where_a_run_would_have_had_it() -> None:
     frames = [(0.0, 0.0), (1e-6, 0.0), (0.0, 0.0)]
     drifts = [(0.0, 0.0), (3e-9, 1e-9), (10e-9, -5e-9)]
     scans = [
@@ -141,3 +152,17 @@ def test_frame_that_is_set_again_is_told_where_a_run_would_have_had_it() -> None
     second, third = of_drift(points, scans)
     assert second.would == "scan 2: the sample had moved by (3, 1) nm ± 200 pm"
     assert third.would.endswith("a run would have had the frame of scan 1 at (10, -5) nm instead of (0, 0) nm")
+
+
+def test_verdicts_that_components_publish_are_rows(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    (tmp_path / "experiment.toml").write_text("[control]\nshadow = true\n", encoding="utf-8")
+    store.take(night.whole_scan(1))
+    (scan,) = open_run(tmp_path).scans
+    assert scan.began_ns is not None
+    bad = verdict_message(Scan(REGION, "Height", "m", np.zeros((6, 8)), scan.time_ns), BAD)
+    lines = line_verdict_message(LineVerdict(REGION, (6, 8), "Height", scan.began_ns, 4, 2, True, 0.9, True))
+    for verdict, envelope in ((bad, f"{VERDICT_MESSAGE}_judge"), (lines, f"{OF_LINES}_watch")):
+        packet, _ = night.packet(verdict, envelope)
+        store.take([(packet, "tcp://127.0.0.1:1")])  # from their own address, not from the scheduler
+    kinds = {row.kind for row in read(open_run(tmp_path)).rows if row.would}
+    assert {ShadowKind.SCAN, ShadowKind.LINES} <= kinds

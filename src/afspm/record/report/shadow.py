@@ -62,7 +62,7 @@ class ShadowKind(StrEnum):
 
 
 COUNTED: Final = (ShadowKind.SCAN, ShadowKind.LINES, ShadowKind.PROBLEM)
-"""Kinds of which the agreement is counted: a person answers them, if at all, by an act."""
+"""Kinds with a counted agreement: a person answers them, if at all, by an act."""
 
 
 @dataclass(frozen=True)
