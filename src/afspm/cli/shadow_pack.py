@@ -1,7 +1,7 @@
 """A shadow's run as a folder for others: raw values, wire trace and table, without names, comments and places of files.
 
-**Theory of operation.** Private texts are found first, and shown to the person: the facts of [metadata], the user and the
-computer, folders and names of the controller's files, and the entries of their headers that a person writes. Each
+**Theory of operation.** Private texts are found first, and shown to the person: the facts of [metadata], the user and
+the computer, folders and names of the controller's files, and the entries of their headers that a person writes. Each
 of these texts is then replaced in everything that goes into the folder, by letters x of the same length, so that
 lengths in messages and offsets in files stay as they are, and the trace can be played back. At last every file of the
 folder is searched once more. Journal, log, notes, experiment file and saved state are not packed at all.
@@ -48,14 +48,16 @@ _WRITTEN_BY_PEOPLE: Final = re.compile(
 )
 """Names of entries in a file's header whose texts are private."""
 _FOLDER: Final = re.compile(
-    rb"(?:(?<=\0\0\0[\x20-\xff])|(?<![A-Za-z0-9+/=]))"
-    rb"(?:(?:[A-Za-z]:(?:\\\\?|/)|/)(?:[^\\/\0-\x1f\"<>|*?:]{2,100}(?:\\\\?|/)+)+|[A-Z]:(?:[\w -]{2,100}:)+)",
-    re.DOTALL,
+    rb"(?<![A-Za-z0-9+/=])"
+    rb"(?:(?:[A-Za-z]:(?:\\\\?|/)|/)(?:[^\\/\0-\x1f\"<>|*?:]{2,100}(?:\\\\?|/)+)+|[A-Z]:(?:[\w -]{2,100}:)+)"
 )
-"""A folder in an answer: of Windows, of other systems, or of Igor; backslashes may be doubled, as in JSON.
-
-A letter before it is a part of base64, or the last byte of the length of a text.
-"""
+"""A folder in a text: of Windows, of other systems, or of Igor; backslashes may be doubled, as in JSON."""
+_WHOLE_FOLDER: Final = re.compile(_FOLDER.pattern + rb"[^\\/.:\0-\x1f]{1,100}")
+_TEXT_IN_BINARY: Final = re.compile(rb"(?=(\0\0[\0-\x0f][\0-\xff])[\x20-\x7e])", re.DOTALL)
+"""The length of a text in a binary message, and its place."""
+_PRINTABLE: Final = re.compile(rb"[\t\n\r\x20-\x7e\x80-\xff]*")
+_LONG: Final = 6
+"""Shorter texts may be found in binary values by chance: there they are replaced within a printable text only."""
 _COUNTER: Final = re.compile(r"(.*?)\d{2,}.*")
 _LETTERS: Final = re.compile(rb"\\u[0-9a-fA-F]{4}|\\.|[A-Za-z0-9\x80-\xff]", re.DOTALL)
 _SHORTEST: Final = 3
@@ -159,8 +161,31 @@ def _private(run: Run, traces: Iterable[Path]) -> Iterator[PrivateText]:
 
 @lru_cache(maxsize=4096)
 def _folders(content: bytes) -> tuple[str, ...]:
-    found = (one.decode("utf-8", "replace").replace("\\\\", "\\") for one in _FOLDER.findall(content))
-    return tuple(dict.fromkeys(one.rstrip("\\/:") for one in found))
+    texts = list(_texts(content))
+    found = [text for text in texts if _WHOLE_FOLDER.fullmatch(text)] + [
+        one for text in texts for one in _FOLDER.findall(text)
+    ]
+    folders = (one.decode("utf-8", "replace").replace("\\\\", "\\").rstrip("\\/:") for one in found)
+    return tuple(dict.fromkeys(folders))
+
+
+def _is_text(content: bytes) -> bool:
+    try:
+        content.decode()
+    except UnicodeDecodeError:
+        return False
+    return _PRINTABLE.fullmatch(content) is not None
+
+
+def _texts(content: bytes) -> Iterator[bytes]:
+    if _is_text(content):
+        yield content
+        return
+    for place in _TEXT_IN_BINARY.finditer(content):
+        length, begin = int.from_bytes(place[1], "big"), place.end(1)
+        text = content[begin : begin + length]
+        if len(text) == length and _is_text(text):
+            yield text
 
 
 def _of_path(where: str, name: str) -> Iterator[PrivateText]:
@@ -195,24 +220,29 @@ class Mask:
     """A replacement of private texts by letters of the same length."""
 
     def __init__(self, private: Iterable[PrivateText]) -> None:
-        plain, escaped, wide = list[bytes](), list[bytes](), list[bytes]()
+        plain, escaped, in_binary = list[bytes](), list[bytes](), list[bytes]()
         for one in private:
             end = rb"" if one.is_start else rb"(?![A-Za-z0-9])"
             start = rb"(?<![A-Za-z0-9])" if one.text[:1].isalnum() else rb""
-            forms = {one.text.encode(), one.text.encode("cp1252", "replace")}
-            plain += [start + re.escape(form) + end for form in forms]
+            for form in {one.text.encode(), one.text.encode("cp1252", "replace")}:
+                plain.append(start + re.escape(form) + end)
+                length = re.escape(len(form).to_bytes(4, "big"))
+                within = rb"" if len(form) >= _LONG else rb"(?:(?<=[\t\n\r\x20-\x7e]{4})|(?<=" + length + rb"))"
+                in_binary.append(within + plain[-1])
             once = json.dumps(one.text)[1:-1]
-            for form in {once, json.dumps(once)[1:-1], json.dumps(one.text, ensure_ascii=False)[1:-1]} - {one.text}:
-                escaped.append(start + re.escape(form.encode()) + end)
-            wide.append(re.escape(one.text.encode("utf-16-le")))
-        # the longest first: a folder before the name of its user
-        self._escaped, self._plain = _any_of(escaped), _any_of([*plain, *wide])
+            for text in {once, json.dumps(once)[1:-1], json.dumps(one.text, ensure_ascii=False)[1:-1]} - {one.text}:
+                escaped.append(start + re.escape(text.encode()) + end)
+            wide = re.escape(one.text.encode("utf-16-le"))
+            in_binary += [wide] if len(one.text) >= _SHORTEST else []
+        self._escaped, self._plain, self._in_binary = _any_of(escaped), _any_of(plain), _any_of(in_binary)
 
     def of(self, content: bytes) -> bytes:
         """Return the content with each private text replaced."""
-        if self._escaped is not None:
+        is_text = _is_text(content)
+        if is_text and self._escaped is not None:
             content = self._escaped.sub(lambda found: _LETTERS.sub(_letter, found[0]), content)
-        return content if self._plain is None else self._plain.sub(lambda found: _x(found[0]), content)
+        pattern = self._plain if is_text else self._in_binary
+        return content if pattern is None else pattern.sub(lambda found: _x(found[0]), content)
 
     def text(self, text: str) -> str:
         return self.of(text.encode()).decode("utf-8", "replace")
