@@ -5,6 +5,7 @@ The limits are enforced by `scheduler.safety.limits`.
 [limits]
 region = { x = ["-5 um", "5 um"], y = ["-5 um", "5 um"] }
 most_pixels = 4_000_000
+forbid = ["abs(tip-bias-voltage) > 1 V and zctrl-setpoint > 100 pA"]
 
 [limits.tip-bias-voltage]
 min = "-3 V"
@@ -30,6 +31,7 @@ import contextlib
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Final
 
 import pydantic
@@ -43,13 +45,18 @@ from afspm.experiment.sections import Section, parse
 from afspm.experiment.toml_lines import Table
 from afspm.experiment.validation_messages import name_of, report
 from afspm.model import Parameter, Region, component_of, instrument_of, names
-from afspm.scheduler.safety.limits import ExperimentLimits, Limit, RoleLimits
+from afspm.scheduler.safety import rule_language
+from afspm.scheduler.safety.forbidden_states import STATES
+from afspm.scheduler.safety.limits import ExperimentLimits, ForbiddenState, Limit, RoleLimits
+from afspm.scheduler.safety.rule_language import RuleComparison, RuleError, RuleTree
 
 Quantity = str | float
 _QUANTITIES: Final = ("min", "max", "step", "rate")
 _OF_ACTION: Final = ("only", "every")
 _OF_PARAMETER: Final = (*_QUANTITIES, *_OF_ACTION)
 Pair = tuple[Length, Length]
+_FORBID: Final = ("limits", "forbid")
+_EXAMPLE: Final = "abs(tip-bias-voltage) > 1 V and zctrl-setpoint > 100 pA"
 
 
 class RegionSection(Section):
@@ -78,7 +85,12 @@ class RoleSection(Section):
     per_hour: dict[str, WholeNumber] | None = None
 
 
-_OWN: Final = (*LimitsSection.model_fields, "actions", "roles")
+_OWN: Final = (*LimitsSection.model_fields, "actions", "roles", "forbid")
+_TYPES: Final = {
+    **dict.fromkeys((names.FEEDBACK_ON, names.ENGAGED), "bool"),
+    **dict.fromkeys((names.SPEC_KIND, names.SCAN_DIRECTION, names.CONTROLLER), "text"),
+}
+"""The types of the parameters of afspm that are no numbers."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +103,7 @@ class LimitsReader:
         sets: parameters that an action sets, by the action's name.
         certain: whether `parameters` has all parameters, or only the base parameters and afspm's extensions.
         instruments: parameters of each other instrument, whose units are known only when the instrument runs.
+        types: "bool" or "text" for parameters that are no numbers.
     """
 
     document: Document
@@ -100,6 +113,7 @@ class LimitsReader:
     sets: Mapping[str, tuple[Parameter, ...]]
     certain: bool
     instruments: Mapping[str, Collection[str]] = field(default_factory=dict)
+    types: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def _known_actions(self) -> frozenset[str]:
@@ -122,6 +136,7 @@ class LimitsReader:
             most_pixels=whole.most_pixels,
             sets={name: one for name, one in self.sets.items() if one},
             roles=self._roles(table.get("roles", {})),
+            forbid=self._forbid(table.get("forbid", [])),
         )
         self._check_sizes(limits)
         return limits
@@ -187,6 +202,82 @@ class LimitsReader:
             self.document.error(f"[limits.actions] there is no action {name!r}", *path, hint=hint)
         given = self._table(table, path, _OF_ACTION)
         return None if given is None else self._limit(given, path, None)
+
+    def _forbid(self, given: object) -> dict[str, ForbiddenState]:
+        if isinstance(given, Mapping):
+            rules = [(name, name, rule) for name, rule in given.items()]
+        elif isinstance(given, list):
+            rules = [(i, str(rule), rule) for i, rule in enumerate(given)]
+        else:
+            self.document.error("[limits] forbid is neither a list of rules nor a table of named rules", *_FORBID)
+            return {}
+        found = {name: self._rule(key, rule) for key, name, rule in rules}
+        return {name: one for name, one in found.items() if one is not None}
+
+    def _rule(self, key: str | int, rule: object) -> ForbiddenState | None:
+        path = (*_FORBID, key)
+        if not isinstance(rule, str):
+            self.document.error(f"[limits] forbid: {rule!r} is not a text", *path, hint=f'e.g. "{_EXAMPLE}"')
+            return None
+        try:
+            units = self._units_of(rule_language.parse(rule))
+        except RuleError as error:
+            at = f"column {self._column(rule, path, error.at)}"
+            self.document.error(f"[limits] forbid, {at}: {error.what}", *path, hint=error.hint)
+            return None
+        return ForbiddenState(rule, units, str(self.document.place(*path)))
+
+    def _column(self, rule: str, path: tuple[str | int, ...], at: int) -> int:
+        # in the line of the file, from 1; of a rule with escapes or over several lines, in the rule
+        place = self.document.place(*path)
+        with contextlib.suppress(OSError, IndexError, UnicodeDecodeError):
+            line = Path(place.file).read_text(encoding="utf-8-sig").splitlines()[place.line - 1]
+            return max(0, line.find(rule)) + at + 1
+        return at + 1
+
+    def _units_of(self, tree: RuleTree) -> dict[str, str]:
+        units = dict[str, str]()
+        for atom in rule_language.atoms(tree):
+            if isinstance(atom, RuleComparison):
+                self._compare(atom, units)
+            elif atom.name not in STATES and (kind := self._type_of(atom.name, atom.at)) != "bool":
+                if kind == "text":
+                    raise RuleError(f"{atom.name} is a text, which no rule can judge", atom.at)
+                hint = f"as in {atom.name} > 0; a name alone is a switch or a state: {', '.join(STATES)}"
+                raise RuleError(f"{atom.name} is a number, and is compared with nothing", atom.at, hint)
+        return units
+
+    def _compare(self, atom: RuleComparison, units: dict[str, str]) -> None:
+        terms = (atom.left, atom.right)
+        for term in terms:
+            kind = "bool" if term.name in STATES else self._type_of(term.name, term.at) if term.name else ""
+            if kind == "text":
+                raise RuleError(f"{term.name} is a text, which no rule can judge", term.at)
+            if kind:
+                hint = f"write {term.name} or not {term.name} alone"
+                raise RuleError(f"{term.name} is on or off, and can't be compared", term.at, hint)
+        known = {term.name: self.parameters.get(term.name) for term in terms if term.name}
+        given = [term.unit for term in terms if not term.name] + [one for one in known.values() if one is not None]
+        given += [units[name] for name in known if name in units]
+        if not given:
+            what = f"the units of {' and '.join(known)} are known only in the run"
+            raise RuleError(what, atom.left.at, "compare each with a number and its unit")
+        for term in terms:
+            unit = (known[term.name] if known[term.name] is not None else given[0]) if term.name else term.unit
+            if unit != given[0]:
+                here, there = (one or "no unit" for one in (unit, given[0]))
+                number = next((one for one in terms if not one.name), term)
+                raise RuleError(f"{atom.left} and {atom.right} have different units: {here} and {there}", number.at)
+            if term.name and units.setdefault(term.name, unit or "") != unit:
+                raise RuleError(f"{term.name} is compared in {units[term.name]} and in {unit}", term.at)
+
+    def _type_of(self, name: str, at: int) -> str:
+        # empty for a number
+        known = self._known_parameters
+        if name in known or (not self.certain and name.startswith("x-")):
+            return self.types.get(name, _TYPES.get(name, ""))
+        hint = nearest(name, [*known, *STATES])
+        raise RuleError(f"there is no parameter, instrument's parameter or state {name!r}", at, hint)
 
     def _roles(self, table: object) -> dict[str, RoleLimits]:
         if not isinstance(table, Mapping):

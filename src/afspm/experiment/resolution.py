@@ -130,6 +130,9 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
         actions=None if has is None else has.actions,
         sets={} if has is None else has.sets,
         certain=has is not None,
+        types={}
+        if has is None
+        else {name: has.table[name].type for name in has.table if not has.table[name].is_number},
     )
     if resolved.declaring("needs_approval") or resolved.sections.control.agents:
         resolved.named_problems.setdefault(STOPPED_BY_AGENT, HIGHEST_PROBLEM)

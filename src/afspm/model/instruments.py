@@ -101,6 +101,22 @@ class InstrumentOrder:
     rate_unit: str = ""
 
 
+@dataclass(frozen=True)
+class GivenOrder:
+    """An order whose target the instrument may still be moving to; kept over a restart.
+
+    Attributes:
+        is_done: whether the instrument has reported its success.
+    """
+
+    order: InstrumentOrder
+    is_done: bool = False
+
+    @property
+    def parameter(self) -> str:
+        return self.order.parameter.name
+
+
 @dataclass(frozen=True, slots=True)
 class InstrumentOrders:
     """The scheduler's answer to a report.

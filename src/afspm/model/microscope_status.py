@@ -51,6 +51,8 @@ class MicroscopeStatus:
         feedback_before: the feedback before a request of unknown outcome.
         in_doubt: whether a request of unknown outcome may have changed the feedback.
         logged: the danger that was logged last.
+        expected: the states that a started action may have led to, and that were not published yet.
+        expected_until_s: the real time after which the published state alone counts.
     """
 
     dangerous: Collection[str] = ()
@@ -62,6 +64,8 @@ class MicroscopeStatus:
     feedback_before: bool | None = None
     in_doubt: bool = False
     logged: str | None = None
+    expected: tuple[ScopeState, ...] = ()
+    expected_until_s: float = 0.0
 
     @property
     def is_free(self) -> bool:
@@ -75,13 +79,24 @@ class MicroscopeStatus:
 
     def with_state(self, state: ScopeState, now_s: float) -> MicroscopeStatus:
         """Return the status after a state that the translator published."""
-        changed = replace(self, state=state, states_seen=self.states_seen + 1)
+        expected = () if state in self.expected else self.expected
+        changed = replace(self, state=state, states_seen=self.states_seen + 1, expected=expected)
         if state is ScopeState.UNDEFINED:
             return replace(changed, lost_since_s=now_s) if self.lost_since_s is None else changed
         # the answer to a withdrawal comes at its beginning: it may fail later
         is_broken_off = state is ScopeState.INTERRUPTED and self.risk.state is ScopeState.COARSE_MOTOR
         away = self.risk.tip_away and not is_broken_off
         return replace(changed, lost_since_s=None)._with_risk(replace(self.risk, state=state, tip_away=away))
+
+    def expecting(self, *states: ScopeState, until_s: float) -> MicroscopeStatus:
+        """Return the status after an action that leads to a state: packets of older states may come before its own."""
+        return self if self.state in states else replace(self, expected=states, expected_until_s=until_s)
+
+    def possible_states(self, now_s: float) -> tuple[ScopeState, ...]:
+        """Return the states in which the microscope may be; empty if unknown."""
+        if self.state is ScopeState.UNDEFINED:
+            return ()
+        return (self.state, *(self.expected if now_s < self.expected_until_s else ()))
 
     def with_feedback(self, feedback: Feedback) -> MicroscopeStatus:
         """Return the status with a published feedback; unchanged if `feedback.on` is unknown."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from afspm.basics.frozen import replace
 from afspm.model.idempotency_cache import SentAction
+from afspm.model.instruments import GivenOrder
 from afspm.model.microscope_status import TipRisk
 from afspm.scheduler.control.arbitration import ArbitrationState
 from afspm.scheduler.control.panel_state import PanelState
@@ -48,6 +49,7 @@ class SavedState:
         frame: the result of `CoordinateFrame.saved`; as plain data if the state was read from a file.
         instrument_units: the first unit of each parameter of an instrument.
         instrument_orders: the number of the newest order or token.
+        given_orders: the orders that may still be carried out, or whose value is on its way.
     """
 
     control: ArbitrationState = field(default_factory=ArbitrationState)
@@ -66,6 +68,7 @@ class SavedState:
     frame: object = None
     instrument_units: Mapping[str, str] = field(default_factory=dict)
     instrument_orders: int = 0
+    given_orders: tuple[GivenOrder, ...] = ()
     grants: GrantBook = field(default_factory=GrantBook)
     panel: PanelState = field(default_factory=PanelState)
 

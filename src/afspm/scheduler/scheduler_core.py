@@ -64,6 +64,7 @@ from afspm.scheduler.publishing.event_log import SCHEDULER, SentStart, start_ent
 from afspm.scheduler.requests import answers, approvals, instrument_requests, request_pipeline
 from afspm.scheduler.requests.forwarder import AskForFrame
 from afspm.scheduler.safety import safety_commands
+from afspm.scheduler.safety.forbidden_states import STARTED, PresentState
 from afspm.scheduler.safety.limit_checker import is_get
 from afspm.scheduler.saved_state import SavedState
 from afspm.scheduler.settings import SchedulerSettings
@@ -147,6 +148,9 @@ class SchedulerCore:
         draft.lease = draft.lease.held_by(draft.control.holder, now_ns)
         if self._restored is not None:
             draft.lease = draft.lease.asked(self._restored.lease_s, now_s)
+            # a start sent before the kill may be known to the translator alone
+            until_s = now_s + self._env.settings.control.request_timeout_s
+            draft.microscope = draft.microscope.expecting(*STARTED.values(), until_s=until_s)
             self._env.cache.remember(self._restored.recent)
             starts = self._restored.starts
             draft.event_log = draft.event_log.restored(starts, self._entries_since(starts), now_s, now_ns)
@@ -321,6 +325,8 @@ def _on_ask_microscope(draft: StateDraft, output: AskMicroscope) -> None:
         return
     # the values, and not who may set them: no component asks
     refusal = draft.limits.check(SCHEDULER, output.request, draft.now_ns, used=())
+    # a command in flight may change what is known, so no value counts as known for the forbidden states
+    refusal = refusal or draft.limits.check_forbidden(output.request, PresentState())
     if refusal is not None:
         draft.raised.append(FrameAnswered(output.purpose, refusal))
         return

@@ -112,6 +112,7 @@ class SchedulerState:
             self.idempotency.sent_actions,
             self.event_log.starts,
             self.instruments.units,
+            self.instruments.given,
         )
 
     def due_s(self) -> float | None:
@@ -234,6 +235,7 @@ def saved_state(state: SchedulerState, env: Environment) -> SavedState:
         frame=state.frame.saved(),
         instrument_units=state.instruments.units,
         instrument_orders=state.instruments.number,
+        given_orders=state.instruments.given,
         grants=state.grants.book,
         panel=state.panel,
     )
@@ -263,7 +265,12 @@ def restored_state(
         limits=replace(state.limits, state=saved.limits),
         watchdog=state.watchdog.restored(saved.tip),
         microscope=replace(state.microscope, risk=saved.tip_risk),
-        instruments=replace(state.instruments, units=saved.instrument_units, number=saved.instrument_orders),
+        instruments=replace(
+            state.instruments,
+            units=saved.instrument_units,
+            number=saved.instrument_orders,
+            given=saved.given_orders,
+        ),
         grants=replace(state.grants, book=saved.grants),
         panel=saved.panel,
     )

@@ -74,6 +74,10 @@ class ParameterSpec:
         """The unit of values on the wire that carry no unit: lengths in m, angles in deg."""
         return "deg" if self.si_unit == "rad" else self.si_unit
 
+    @property
+    def is_number(self) -> bool:
+        return self.type not in ("bool", "text")
+
     def parse(self, text: str, unit: str | None = None) -> Value:
         """Return a peer's value, converted and checked.
 

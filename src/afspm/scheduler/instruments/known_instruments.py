@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 from afspm.basics.frozen import replace
-from afspm.model import InstrumentOrder, InstrumentReading, InstrumentReadings, OrderOutcome, instrument_of
+from afspm.model import (
+    ControlResponse,
+    InstrumentOrder,
+    InstrumentReading,
+    InstrumentReadings,
+    OrderOutcome,
+    Parameter,
+    instrument_of,
+)
+from afspm.model.instruments import GivenOrder
 from afspm.scheduler.instruments.conditions import OLDEST_S, ConditionState, InstrumentSettings
 from afspm.scheduler.requests.forwarder import ForwardedRequest
 
@@ -34,10 +43,14 @@ class OpenOrder:
     Attributes:
         job: the request of the client.
         order: the order given to the instrument; None: the request still waits for a report.
+        read: the values of the microscope that forbidden states need, by name; None where it reports no value.
+        read_s: the real time at which these were asked for; None: not yet.
     """
 
     job: ForwardedRequest
     order: InstrumentOrder | None = None
+    read: Mapping[str, Parameter | None] = field(default_factory=dict)
+    read_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -65,6 +78,7 @@ class Instruments:
         units: the first unit of each parameter, kept over a restart: a reading in another unit is rejected.
         number: the number of the newest order or token.
         states: the states of the conditions, by name.
+        given: the orders that may still be carried out, or whose value is on its way.
     """
 
     settings: InstrumentSettings = field(default_factory=InstrumentSettings)
@@ -72,6 +86,7 @@ class Instruments:
     units: Mapping[str, str] = field(default_factory=dict)
     number: int = 0
     states: Mapping[str, ConditionState] = field(default_factory=dict)
+    given: tuple[GivenOrder, ...] = ()
 
     # --- readings ---
 
@@ -89,6 +104,21 @@ class Instruments:
         why = known.reading.reason or f"its last reading is older than {OLDEST_S:g} s"
         return replace(known.reading, value=None, reason=why)
 
+    def candidates(self, parameter: str, now_s: float) -> tuple[Parameter, ...] | str:
+        """Return the values between which a parameter may be: reading, target, and a target that is being set.
+
+        Returns:
+            The reason, if they are unknown.
+        """
+        reading = self.reading(parameter, now_s)
+        if reading.value is None:
+            return reading.reason or "it has no value"
+        unit = reading.unit or "1"  # a parameter without a unit would be taken in the unit of the rule
+        numbers = (reading.value,) if reading.target is None else (reading.value, reading.target)
+        found = [Parameter(parameter, repr(number), unit) for number in numbers]
+        orders = [one.order.parameter for one in self.given if one.parameter == parameter]
+        return tuple(dict.fromkeys((*found, *orders)))
+
     def reported(self, report: InstrumentReadings, now_s: float, now_ns: int) -> Instruments:
         """Store a report; the caller settles the outcomes in it."""
         before = self._of(report.instrument)
@@ -105,7 +135,9 @@ class Instruments:
             age_s = reading.age_s if reading.age_s is not None and reading.age_s >= 0.0 else float("inf")
             readings[reading.name] = KnownReading(reading, made_s - age_s)
         changed = self._with(report.instrument, replace(before, readings=readings))
-        return replace(changed, units=units).evaluated(now_s, now_ns)
+        arrived = {reading.name for reading in report.readings if reading.value is not None and not reading.busy}
+        given = tuple(one for one in self.given if not (one.is_done and one.parameter in arrived))
+        return replace(changed, units=units, given=given).evaluated(now_s, now_ns)
 
     def to_publish(self, report: InstrumentReadings, now_s: float) -> Instruments | None:
         """Return the instruments after publishing a report; None if its publication is not due."""
@@ -170,7 +202,48 @@ class Instruments:
     def handed_out(self, instrument: str, order: OpenOrder) -> Instruments:
         """Store that the instrument was given its first order."""
         known = self._of(instrument)
-        return self._with(instrument, replace(known, open=(order, *known.open[1:])))
+        changed = self._with(instrument, replace(known, open=(order, *known.open[1:])))
+        return (
+            changed
+            if order.order is None
+            else replace(changed, given=(*self.given, GivenOrder(order.order))[-_MOST_PARAMETERS:])
+        )
+
+    def reported_outcome(self, outcome: OrderOutcome) -> Instruments:
+        """Store the outcome of an order: a success replaces earlier targets, a refusal leaves them."""
+        found = next((one for one in self.given if one.order.number == outcome.number), None)
+        if found is None or outcome.response == ControlResponse.NO_RESPONSE:
+            return self
+        if outcome.response != ControlResponse.SUCCESS:
+            return replace(self, given=tuple(one for one in self.given if one is not found))
+        newer = (one for one in self.given if one.parameter != found.parameter or one.order.number > outcome.number)
+        return replace(self, given=(replace(found, is_done=True), *newer))
+
+    def asked_to_read(self, instrument: str, now_s: float) -> Instruments:
+        """Store that the values for the first order of an instrument are being read."""
+        first, *rest = self._of(instrument).open
+        known = replace(self._of(instrument), open=(replace(first, read={}, read_s=now_s), *rest))
+        return self._with(instrument, known)
+
+    def was_read(self, number: int, name: str, value: Parameter | None) -> Instruments:
+        """Store a value of the microscope that was read for an order."""
+        changed = self
+        for owner, known in self.known.items():
+            for one in known.open:
+                if one.job.number == number and one.read_s is not None:
+                    filled = replace(one, read={**one.read, name: value})
+                    orders = tuple(filled if other is one else other for other in known.open)
+                    changed = changed._with(owner, replace(known, open=orders))
+        return changed
+
+    def without_reads(self, names: Collection[str]) -> Instruments:
+        """Forget the values read for waiting orders that are judged with one of these names."""
+        changed = self
+        for owner, known in self.known.items():
+            if any(one.read_s is not None and one.order is None and one.read.keys() & names for one in known.open):
+                orders = tuple(one if one.order else replace(one, read={}, read_s=None) for one in known.open)
+                changed = changed._with(owner, replace(known, open=orders))
+        return changed
 
     def settled(self, instrument: str, number: int) -> Instruments:
         """Remove the order with this number."""

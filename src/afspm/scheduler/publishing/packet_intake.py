@@ -100,6 +100,7 @@ def _update_state(draft: StateDraft, published: object) -> None:
 
 
 def _take_act(draft: StateDraft, act: ActByHand) -> None:
+    draft.limits = draft.limits.seen(Parameter(one.parameter, one.after, one.unit or None) for one in act.changes)
     for one in act.changes:
         changed = Parameter(one.parameter, one.after, one.unit or None)
         draft.panel = draft.panel.with_change(one.parameter, draft.limits.outside(changed))

@@ -28,6 +28,14 @@ class ReadForTurn:
 
 
 @dataclass(frozen=True, slots=True)
+class ReadForOrder:
+    """The purpose of reading `name` before the order `number` is given to an instrument."""
+
+    number: int
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
 class MoveForTurn:
     """The purpose of moving the microscope before the action `number`."""
 
@@ -48,7 +56,7 @@ class AskForFrame:
     purpose: object
 
 
-OwnPurpose = ReadForTurn | MoveForTurn | ReadAhead | AskForFrame
+OwnPurpose = ReadForTurn | ReadForOrder | MoveForTurn | ReadAhead | AskForFrame
 
 
 class ForwardedRequest(NamedTuple):

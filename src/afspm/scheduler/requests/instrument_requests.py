@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 from afspm.model import (
     RELAY_REQUEST,
+    ControlRequest,
     ControlResponse,
     InstrumentOrder,
     InstrumentOrders,
@@ -20,6 +21,7 @@ from afspm.model import (
     OrderOutcome,
     Parameter,
     RelayedMessage,
+    Request,
     Response,
     ResponseDetail,
     component_of,
@@ -31,11 +33,14 @@ from afspm.model.problems import CONDITIONS
 from afspm.scheduler.control import control_change
 from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlInput
 from afspm.scheduler.events import RequestIn
+from afspm.scheduler.instruments.conditions import OLDEST_S
 from afspm.scheduler.instruments.known_instruments import OpenOrder
 from afspm.scheduler.publishing import own_packets as publishing
 from afspm.scheduler.requests import answers, approvals
-from afspm.scheduler.requests.forwarder import ForwardedRequest
+from afspm.scheduler.requests.forwarder import ForwardedRequest, ReadForOrder
+from afspm.scheduler.safety.forbidden_states import judging, to_read
 from afspm.scheduler.safety.limit_checker import is_get
+from afspm.scheduler.safety.present_state import present_state
 from afspm.scheduler.state import SchedulerState, StateDraft
 from afspm.wire.messages import INSTRUMENT_READINGS
 
@@ -57,6 +62,7 @@ def ask(draft: StateDraft, event: RequestIn, job: ForwardedRequest) -> None:
     job = job._replace(deadline_s=draft.now_s + draft.env.settings.control.request_timeout_s)
     draft.idempotency = draft.idempotency.noted(event.name, event.request, RequestStatus.PENDING)
     draft.instruments = draft.instruments.asked(job)
+    _has_read(draft, instrument_of(event.request.subject.name))
 
 
 def _answer_get(draft: StateDraft, event: RequestIn) -> None:
@@ -106,6 +112,7 @@ def take_report(draft: StateDraft, event: RequestIn, report: InstrumentReadings,
     name = report.instrument
     draft.instruments = draft.instruments.reported(report, draft.now_s, draft.now_ns)
     for outcome in report.outcomes:
+        draft.instruments = draft.instruments.reported_outcome(outcome)
         if (found := draft.instruments.found(name, outcome)) is not None:
             _settle(draft, name, found, outcome)
     for reading in report.readings:
@@ -133,7 +140,9 @@ def _next_order(draft: StateDraft, instrument: str, may_send: MaySend) -> Instru
     while (first := draft.instruments.first(instrument)) is not None:
         if first.order is not None:
             return first.order
-        refusal = may_send(draft, first.job) or _limit_refusal(draft, first.job) or approvals.refusal(draft, first.job)
+        if not _has_read(draft, instrument):
+            return None
+        refusal = may_send(draft, first.job) or _limit_refusal(draft, first) or approvals.refusal(draft, first.job)
         if refusal is None:
             return _hand_out(draft, instrument, first)
         draft.log("WARNING", f"refused {first.job.client}: {refusal.reason}")
@@ -142,8 +151,33 @@ def _next_order(draft: StateDraft, instrument: str, may_send: MaySend) -> Instru
     return None
 
 
-def _limit_refusal(draft: StateDraft, job: ForwardedRequest) -> Response | None:
-    request = job.request
+def _has_read(draft: StateDraft, instrument: str) -> bool:
+    # Whether the values of the microscope that forbidden states need are there for the first order. They are read in
+    # the line of the commands; a command that may change them makes them void (`present_state.sending`).
+    first = draft.instruments.first(instrument)
+    if first is None or first.order is not None:
+        return True
+    needed = to_read(judging(draft.limits.limits, first.job.request))
+    if not needed or not draft.forwarder.up:
+        return True
+    if first.read_s is not None and draft.now_s - first.read_s <= OLDEST_S:
+        return first.read.keys() >= set(needed)
+    draft.instruments = draft.instruments.asked_to_read(instrument, draft.now_s)
+    for name in needed:
+        request = Request(int(ControlRequest.PARAM), Parameter(name))
+        draft.forwarder, _ = draft.forwarder.ask_own(request, draft.now_s, ReadForOrder(first.job.number, name))
+    return False
+
+
+def take_read_value(draft: StateDraft, purpose: ReadForOrder, response: Response) -> None:
+    """Store a value of the microscope, or that it could not be read, for an order that waits for it."""
+    answered = draft.env.codec.decode_parameter(response.payload) if response.ok and response.payload else None
+    answered = answered if answered is not None and answered.name == purpose.name else None
+    draft.instruments = draft.instruments.was_read(purpose.number, purpose.name, answered)
+
+
+def _limit_refusal(draft: StateDraft, waiting: OpenOrder) -> Response | None:
+    job, request = waiting.job, waiting.job.request
     base, _, part = request.subject.name.rpartition(".")
     if part in PARTS and draft.instruments.owns(base):
         why = f"{request.subject.name} can only be read: set {base}"
@@ -152,7 +186,9 @@ def _limit_refusal(draft: StateDraft, job: ForwardedRequest) -> Response | None:
     if reading.value is None:
         why = f"{request.subject.name} can't be set while its value is not known: {reading.reason}"
         return Response(int(ControlResponse.PARAM_ERROR), b"", why, request.id)
-    return draft.limits.check(job.client, request, draft.now_ns, is_repeated=job.is_repeated)
+    refusal = draft.limits.check(job.client, request, draft.now_ns, is_repeated=job.is_repeated)
+    read = waiting.read if draft.forwarder.up else {}
+    return refusal or draft.limits.check_forbidden(request, present_state(draft, read))
 
 
 def _hand_out(draft: StateDraft, instrument: str, waiting: OpenOrder) -> InstrumentOrder:

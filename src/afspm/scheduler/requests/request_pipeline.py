@@ -61,11 +61,13 @@ from afspm.scheduler.requests.forwarder import (
     MoveForTurn,
     OwnPurpose,
     ReadAhead,
+    ReadForOrder,
     ReadForTurn,
     SettledRequest,
 )
 from afspm.scheduler.requests.pending_requests import PrePositioner, Turn
-from afspm.scheduler.safety import safety_commands
+from afspm.scheduler.safety import present_state, safety_commands
+from afspm.scheduler.safety.forbidden_states import STARTED
 from afspm.scheduler.safety.limit_checker import is_get
 from afspm.scheduler.state import StateDraft
 
@@ -334,7 +336,7 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
         return
     _apply_read_values(draft, turn)
     mapped = _mapped(draft, job)
-    if isinstance(mapped, Response) or not _is_within_limits(draft, job, mapped):
+    if isinstance(mapped, Response) or not _is_within_limits(draft, job, mapped, turn):
         return
     if (refusal := approvals.refusal(draft, job)) is not None:
         _refuse(draft, job, refusal)
@@ -359,6 +361,7 @@ def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None
     draft.event_log = draft.event_log.sending(name, request, sent_ns)
     if job.command:
         draft.limits = draft.limits.sending(name, job.outgoing, draft.now_ns, _names_meant(job))
+        present_state.sending(draft, job.outgoing)
         approvals.sending(draft, job)
         draft.pending = replace(draft.pending, turn=None)
         _restart_lease(draft, name)
@@ -440,7 +443,7 @@ def _mapped(draft: StateDraft, job: ForwardedRequest) -> MappedRequest | Respons
     return outgoing  # None: it is sent as it is
 
 
-def _is_within_limits(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None) -> bool:
+def _is_within_limits(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None, turn: Turn) -> bool:
     check, now_ns = draft.limits.check, draft.now_ns
     if mapped is None:
         refusal = check(job.client, job.request, now_ns, is_repeated=job.is_repeated)
@@ -448,6 +451,9 @@ def _is_within_limits(draft: StateDraft, job: ForwardedRequest, mapped: MappedRe
         refusal = check(job.client, mapped.request, now_ns, mapped.names, is_repeated=job.is_repeated)
         if refusal is not None:
             refusal = replace(refusal, reason=f"{refusal.reason}; {mapped.places_text}")
+    if refusal is None and draft.limits.limits.forbid:
+        request = job.request if mapped is None else mapped.request
+        refusal = draft.limits.check_forbidden(request, present_state.present_state(draft, turn.values))
     if refusal is not None:
         _refuse(draft, job, refusal)
     return refusal is None
@@ -513,9 +519,10 @@ def _starts_move(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
     draft.frame, move = draft.frame.move_before(str(job.request.subject), draft.now_ns)
     if move is None:
         return False
-    if not _is_within_limits(draft, job, move):
+    if not _is_within_limits(draft, job, move, turn):
         return True
     draft.limits = draft.limits.sending(job.client, move.request, draft.now_ns, ())
+    present_state.sending(draft, move.request)
     draft.forwarder, own = draft.forwarder.ask_own(move.request, draft.now_s, MoveForTurn(job.number), move)
     assert own is not None  # the line is free
     own = own._replace(deadline_s=job.deadline_s)
@@ -588,6 +595,8 @@ def _serve_purpose(draft: StateDraft, purpose: OwnPurpose, response: Response) -
     match purpose:
         case ReadForTurn():
             _take_read_value(draft, purpose.number, purpose.name, response)
+        case ReadForOrder():
+            instrument_requests.take_read_value(draft, purpose, response)
         case MoveForTurn():
             _take_move_result(draft, purpose.number, response)
         case AskForFrame():
@@ -646,6 +655,9 @@ def _apply_success(draft: StateDraft, job: ForwardedRequest, response: Response)
 def _action_started(draft: StateDraft, job: ForwardedRequest, *, is_certain: bool) -> None:
     action = str(job.request.subject)
     draft.watchdog = draft.watchdog.started(action, job.states_seen, draft.microscope)
+    if (state := STARTED.get(action)) is not None:
+        until_s = draft.now_s + draft.env.settings.control.request_timeout_s
+        draft.microscope = draft.microscope.expecting(state, until_s=until_s)
     is_away = is_certain and action == draft.watchdog.settings.retract
     draft.microscope = draft.microscope.after_action(action, is_away=is_away)
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple
@@ -46,8 +46,10 @@ from afspm.model.positions import (
     changes_by,
     moved,
 )
+from afspm.scheduler.safety import forbidden_states
+from afspm.scheduler.safety.forbidden_states import PresentState
 from afspm.scheduler.safety.limit_state import LastUse, LimitState, Usage
-from afspm.scheduler.safety.limits import ExperimentLimits, Limit
+from afspm.scheduler.safety.limits import ExperimentLimits, ForbiddenState, Limit
 from afspm.scheduler.safety.parameter_values import ParameterValue, ParameterValueError, numbers, values_of
 
 _REACH = 1e-9  # relative: a value on the border, to the precision of the arithmetic, is inside
@@ -131,16 +133,23 @@ class LimitChecker:
                 return _action_error(request, breach)
         return None
 
+    def check_forbidden(self, request: Request, present: PresentState) -> Response | None:
+        """Return the refusal of a request that leads into a forbidden state; None: it may be sent."""
+        why = forbidden_states.refusal(self.limits, request, present)
+        code = ControlResponse.ACTION_ERROR if request.kind == ControlRequest.ACTION else ControlResponse.PARAM_ERROR
+        return Response(int(code), b"", why, request.id) if why else None
+
     def outside(self, changed: Parameter) -> str:
-        """Return why a value that a person has set lies outside its range; empty: it does not."""
+        """Return why a value that a person has set lies outside its range or in a forbidden state; empty: neither."""
         limit, value = self.limits.parameters.get(changed.name), self._number(changed)
-        if limit is None or value is None:
-            return ""
-        try:
-            self._check_range(changed.name, value, limit, _TOLD_REACH)
-        except _Breach as breach:
-            return breach.reason
-        return ""
+        if limit is not None and value is not None:
+            try:
+                self._check_range(changed.name, value, limit, _TOLD_REACH)
+            except _Breach as breach:
+                return breach.reason
+        seen = PresentState({name: (one,) for name, one in {**self.state.last_seen, changed.name: changed}.items()})
+        rules = (rule for rule in self.limits.forbid.values() if changed.name in rule.names)
+        return next(filter(None, (forbidden_states.now_forbidden(rule, seen) for rule in rules)), "")
 
     def depends_on(self, request: Request, *, is_mapped: bool = False) -> list[str]:
         """Return the parameters to read before a request is checked.
@@ -164,11 +173,31 @@ class LimitChecker:
                     needed += sorted(place)
         if len(SHAPE_CHANGES.keys() & given) == 1:
             needed += sorted(SHAPE_CHANGES)
+        needed += forbidden_states.to_read(self._judging(request, is_mapped=is_mapped))
+        for place, _ in _PLACES:
+            if place.intersection(needed):  # a place of values read at different times would be a wrong one
+                needed += sorted(place)
         return list(dict.fromkeys(needed))
 
+    def _judging(self, request: Request, *, is_mapped: bool) -> list[ForbiddenState]:
+        rules = forbidden_states.judging(self.limits, request)
+        if is_mapped:
+            given = set(self.names_set_by(request))
+            moved_ones = frozenset[str]().union(*(place for place, _ in _PLACES if place & given))
+            rules += [one for one in self.limits.forbid.values() if one not in rules and one.names & moved_ones]
+        return rules
+
     def to_be_known(self) -> list[str]:
-        """Return the parameters with a limited rate, to read once before a request sets them."""
-        return list(self.limits.rated)
+        """Return the parameters to read when a translator connects: those with a limited rate, and in rules."""
+        return list(dict.fromkeys((*self.limits.rated, *forbidden_states.to_read(self.limits.forbid.values()))))
+
+    def seen(self, values: Iterable[Parameter]) -> LimitChecker:
+        """Store the last known values of quantities in forbidden states."""
+        wanted = frozenset[str]().union(*(rule.names for rule in self.limits.forbid.values()))
+        new = {one.name: one for one in values if one.name in wanted}
+        if not new:
+            return self
+        return replace(self, state=replace(self.state, last_seen={**self.state.last_seen, **new}))
 
     def was_read(self, values: Mapping[str, Parameter | None], now_ns: int) -> LimitChecker:
         """Store values that were read for a check.
@@ -183,7 +212,8 @@ class LimitChecker:
                 usage = usage.forget(name)
             elif name in self.limits.bounded or name in _OF_TREATMENTS:
                 usage = usage.learn(name, value, now_ns, was_read=True)
-        return replace(self, state=LimitState(usage, self.state.position.was_read(numbers_read)))
+        read = self.seen(one for one in values.values() if one is not None)
+        return read._with_state(usage, self.state.position.was_read(numbers_read))
 
     def unknown(self, request: Request) -> LimitChecker:
         """Forget the values that a request of unknown outcome may have changed."""
@@ -191,7 +221,7 @@ class LimitChecker:
         usage = self.state.usage
         for name in given:
             usage = usage.forget(name)
-        return replace(self, state=LimitState(usage, self.state.position.without(given)))
+        return self._with_state(usage, self.state.position.without(given))
 
     def forget(self, name: str) -> LimitChecker:
         """Forget the value of a parameter that could not be read."""
@@ -259,7 +289,8 @@ class LimitChecker:
         for name, value in numbers(self._valid_values(subject)):
             if name in self.limits.rated:
                 usage = usage.learn(name, value, now_ns)
-        return self._with_state(usage, self.state.position.learn(subject))
+        seen = self.seen(forbidden_states.values_in(subject).values()) if self.limits.forbid else self
+        return seen._with_state(usage, self.state.position.learn(subject))
 
     def in_force(self, subject: object, now_ns: int, *, was_read: bool = False) -> LimitChecker:
         """Store values that were set or read: a ScanParameters, Feedback, Parameter …"""
@@ -271,12 +302,13 @@ class LimitChecker:
         for name, value in values:
             if name in self.limits.bounded:
                 usage = usage.learn(name, value, now_ns, was_read=was_read)
-        return self._with_state(usage, position.learn(subject))
+        seen = self.seen(forbidden_states.values_in(subject).values()) if self.limits.forbid else self
+        return seen._with_state(usage, position.learn(subject))
 
     def _with_state(self, usage: Usage, position: KnownPosition) -> LimitChecker:
         if usage is self.state.usage and position is self.state.position:
             return self
-        return replace(self, state=LimitState(usage, position))
+        return replace(self, state=replace(self.state, usage=usage, position=position))
 
     def _with_usage(self, usage: Usage) -> LimitChecker:
         return self if usage is self.state.usage else replace(self, state=replace(self.state, usage=usage))

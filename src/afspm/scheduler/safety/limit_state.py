@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from afspm.basics.frozen import replace
+from afspm.model import Parameter
 from afspm.model.positions import KnownPosition
 
 T = TypeVar("T")
@@ -110,10 +111,16 @@ class Usage:
 
 @dataclass(frozen=True)
 class LimitState:
-    """The state that requests are checked against, beside the limits themselves."""
+    """The state that requests are checked against, beside the limits themselves.
+
+    Attributes:
+        last_seen: the last known values of quantities in forbidden states. Requests are not checked against them, since
+            they may be old: they tell that a person has set a forbidden state.
+    """
 
     usage: Usage = field(default_factory=Usage)
     position: KnownPosition = field(default_factory=KnownPosition)
+    last_seen: Mapping[str, Parameter] = field(default_factory=dict)
 
 
 def _without(uses: Mapping[str, T], name: str) -> dict[str, T]:

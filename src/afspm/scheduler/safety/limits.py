@@ -9,6 +9,8 @@ from typing import ClassVar
 
 from afspm.basics.units import PositiveDuration
 from afspm.model import Parameter, Region
+from afspm.scheduler.safety import rule_language
+from afspm.scheduler.safety.rule_language import RuleTree
 
 _KEYS = {"low": "min", "high": "max", "rate_per_s": "rate", "interval_s": "every"}
 
@@ -56,6 +58,30 @@ class Limit:
 
 
 @dataclass(frozen=True)
+class ForbiddenState:
+    """A rule that joins quantities: no request may lead into a state in which the rule holds.
+
+    Attributes:
+        rule: the rule in the language of `rule_language`.
+        units: the SI unit of each quantity in the rule, by name; switches and states have none.
+        source: the place in the experiment file.
+    """
+
+    rule: str
+    units: Mapping[str, str] = field(default_factory=dict)
+    source: str = "[limits] forbid"
+
+    @cached_property
+    def tree(self) -> RuleTree:
+        return rule_language.parse(self.rule)
+
+    @cached_property
+    def names(self) -> frozenset[str]:
+        """The quantities, switches and states in the rule."""
+        return frozenset(name for atom in rule_language.atoms(self.tree) for name in atom.names)
+
+
+@dataclass(frozen=True)
 class RoleLimits:
     """Further limits of a component, of a person, or of an agent that acts through a component.
 
@@ -87,6 +113,7 @@ class ExperimentLimits:
         most_pixels: the largest number of pixels of a scan.
         sets: for each action by name, the parameters that the microscope sets as that action.
         roles: further limits by name of a component, or of a person or agent: "agent", "agent:claude".
+        forbid: the forbidden states, by name.
     """
 
     parameters: Mapping[str, Limit] = field(default_factory=dict)
@@ -96,6 +123,7 @@ class ExperimentLimits:
     most_pixels: int = 8192 * 8192
     sets: Mapping[str, tuple[Parameter, ...]] = field(default_factory=dict)
     roles: Mapping[str, RoleLimits] = field(default_factory=dict)
+    forbid: Mapping[str, ForbiddenState] = field(default_factory=dict)
 
     @cached_property
     def fixed(self) -> ExperimentLimits:
