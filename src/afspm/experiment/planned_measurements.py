@@ -17,6 +17,7 @@ from afspm.model import ControlRequest, Parameter, ProbePosition, Region, Reques
 from afspm.model.geometry import XY
 from afspm.model.planned_work import PlannedWork, path_length_m
 from afspm.model.sweep_plan import SweepPlan
+from afspm.scheduler.safety.forbidden_states import PlanRehearsal
 from afspm.scheduler.safety.limit_checker import LimitChecker
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit, RoleLimits
 
@@ -150,6 +151,8 @@ def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) 
     The limits of the component's role count, too.
     """
     found = _refusals_by(name, planned, limits)
+    if limits.forbid:
+        found += _forbidden(planned, limits)
     if (role := limits.roles.get(name)) is not None:
         known = {one.reason for one in found}
         found += [one for one in _refusals_by_role(name, planned, role) if one.reason not in known]
@@ -166,6 +169,30 @@ def _refusals_by_role(name: str, planned: PlannedMeasurements, role: RoleLimits)
             if one.name not in role.limits.parameters:
                 reason = f"{one.name} is not among the parameters of {name} ({role.source})"
                 yield Refusal(reason, (setting, one.name))
+
+
+def _forbidden(planned: PlannedMeasurements, limits: ExperimentLimits) -> list[Refusal]:
+    # judged by what the plan itself sets: other values are unknown before the run
+    rehearsal, found = PlanRehearsal(limits), dict[str, Refusal]()
+    for where, request in _requests(planned):
+        if why := rehearsal.refusal(request):
+            found.setdefault(where[-1] if where else str(request.subject), Refusal(why, where))
+    return list(found.values())
+
+
+def _requests(planned: PlannedMeasurements) -> Iterator[tuple[tuple[str, ...], Request]]:
+    # in the order of a run, each with the setting that it is made of
+    scans = [Request(ControlRequest.SET_SCAN_PARAMS, ScanParameters(one, planned.shape)) for one in planned.regions]
+    scans += [Request(ControlRequest.SET_PROBE_POS, ProbePosition(one)) for one in planned.positions]
+    scans += [Request(ControlRequest.ACTION, one) for one in planned.needs_actions]
+    settings = {setting: given for setting, given in planned.parameters.items() if setting != "initial"}
+    if planned.sweep is not None:
+        sweep = planned.sweep
+        settings["parameters"] = tuple(one for place in sweep.places() for one in sweep.settings(place))
+    for setting, given in (settings or {"": ()}).items():
+        for one in given:
+            yield (setting, one.name), Request(ControlRequest.PARAM, one)
+        yield from (((), request) for request in scans)
 
 
 def _refusals_by(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[Refusal]:

@@ -25,6 +25,7 @@ from afspm.model.line_levelling import Levelling, levelled
 from afspm.plugins.agent.plan import MoveStep, Plan, ScanStep, SetStep, SpectrumStep, plan_of
 from afspm.record.drawing.raster import indices, png, value_range
 from afspm.record.run_json import EXPERIMENT_FILE
+from afspm.scheduler.safety.forbidden_states import PlanRehearsal
 from afspm.scheduler.safety.grants import not_of_role
 from afspm.scheduler.safety.limit_checker import LimitChecker
 from afspm.scheduler.safety.limits import ExperimentLimits
@@ -56,10 +57,13 @@ def refusals(plan: Plan, who: str, limits: ExperimentLimits, frame: Frame) -> li
     checkers = [LimitChecker(limits.fixed)]
     if role is not None:
         checkers.append(LimitChecker(role.limits.fixed))
+    rehearsal = PlanRehearsal(limits)
     for number, planned in enumerate(plan.requests(frame), 1):
         request = Request(planned.kind, planned.subject)
         refused = [one for checker in checkers if (one := checker.check(who, request, 0)) is not None]
         found += [f"request {number} ({planned.text}): {one.reason}" for one in refused]
+        if why := rehearsal.refusal(request):
+            found.append(f"request {number} ({planned.text}): {why}")
         if role is not None and (why := not_of_role(role, who, request)):
             found.append(f"request {number} ({planned.text}): {why}")
     return found

@@ -64,7 +64,7 @@ class PublishedScheduler:
         limits: Mapping[str, object] | None = None,
         cache: Mapping[str, object] | None = None,
     ) -> None:
-        if any((limits or {}).get(kind) for kind in ("parameters", "actions", "sets")):
+        if any((limits or {}).get(kind) for kind in ("parameters", "actions", "sets", "forbid")):
             raise ConfigError(
                 "a scheduler of the published implementation enforces no limits",
                 where="limits",

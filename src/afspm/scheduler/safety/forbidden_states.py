@@ -117,6 +117,22 @@ def refusal(limits: ExperimentLimits, request: Request, present: PresentState, *
     return ""
 
 
+class PlanRehearsal:
+    """Requests of a plan, one after the other, judged by the values that the plan itself has set so far."""
+
+    def __init__(self, limits: ExperimentLimits) -> None:
+        self._limits = limits
+        self._known: dict[str, tuple[Parameter, ...]] = {}
+
+    def refusal(self, request: Request) -> str:
+        """Return why a request would certainly be refused; empty otherwise. A refused request changes nothing."""
+        why = refusal(self._limits, request, PresentState(self._known), certain=True)
+        if not why:
+            changed = changed_by(self._limits, request).items()  # a scan ends by itself
+            self._known.update({name: (value,) for name, value in changed if name not in STATES})
+        return why
+
+
 def now_forbidden(rule: ForbiddenState, present: PresentState) -> str:
     """Return the sentence that a state is forbidden; empty if it may be allowed."""
     known = {name: _value(rule, one) for name, (one, *_) in present.values.items() if name in rule.names}
