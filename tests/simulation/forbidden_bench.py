@@ -77,6 +77,62 @@ _VALUES = (-2.0, -1.0, 0.0, 1.0, 2.0)
 _SIGNS = ("<", "<=", ">", ">=")
 
 
+def _above(name: str, number: float = 1.0) -> Rule:
+    return (name, False, ">", number)
+
+
+_BOTH = ("and", (_above(TEMPERATURE), _above(BIAS)))
+_HANDED: tuple[Step, ...] = (("serve", 9), ("order", 2.0), ("serve", 9), ("report", False, False))
+_BIAS_SET: tuple[Step, ...] = (("set", "series", BIAS, 2.0), ("serve", 9))
+_CARRIED_OUT: Step = ("report", True, True)
+SCENARIOS: dict[str, tuple[list[Rule], tuple[Step, ...]]] = {
+    "set": ([_above(BIAS)], (("serve", 9), *_BIAS_SET)),
+    "set below zero": ([(BIAS, True, ">", 1.0)], (("serve", 9), ("set", "person", BIAS, -2.0), ("serve", 9))),
+    "either": ([("or", (_above(SPEED, 9.0), _above(BIAS)))], (("serve", 9), *_BIAS_SET)),
+    "part of a frame": ([_above(SIZE, 2.0)], (("serve", 9), ("size", 3.0), ("serve", 30))),
+    "action that sets": ([_above(BIAS)], (("serve", 9), ("action", HIGH), ("serve", 9))),
+    "stop in a forbidden state": (
+        [(BIAS, False, ">=", 1.0)], (("serve", 9), ("action", names.STOP_SCAN), ("serve", 9))
+    ),
+    "one of two values moves away": (
+        [("or", (("and", (_above(SETPOINT), (BIAS, False, ">=", 1.0))), ("and", ((FEEDBACK,), _above(BIAS, 5.0)))))],
+        (("serve", 9), ("feedback", 2.0, False), ("serve", 30)),
+    ),
+    "lost answer": (
+        [("and", (_above(BIAS), _above(SETPOINT)))],
+        (("serve", 9), ("set", "series", BIAS, 2.0), ("serve", 2), ("lose", True), ("set", "person", SETPOINT, 2.0),
+         ("serve", 9)),
+    ),
+    "scan before its state": (
+        [("and", ((SCANNING,), _above(BIAS)))], (("serve", 9), ("action", names.START_SCAN), ("serve", 30), *_BIAS_SET)
+    ),
+    "lost answer without a read": (
+        [("and", (_above(BIAS), _above(SETPOINT)))],
+        (("serve", 9), ("set", "series", BIAS, 0.0), ("serve", 9), ("set", "series", SETPOINT, 0.0), ("serve", 9),
+         ("set", "series", BIAS, 2.0), ("lose", True), ("set", "person", SETPOINT, 2.0), ("serve", 9)),
+    ),
+    "unknown instrument": (
+        [("and", ((TEMPERATURE, False, ">=", 1.0), _above(BIAS)))], (("kill", False), ("serve", 9), *_BIAS_SET)
+    ),
+    "command after an order": ([_BOTH], (*_HANDED, *_BIAS_SET, _CARRIED_OUT)),
+    "command after an order and a kill": (
+        [_BOTH],
+        (*_HANDED, ("kill", False), ("report", False, False), ("report", False, False), *_BIAS_SET, _CARRIED_OUT),
+    ),
+    "order beside a command": (
+        [_BOTH],
+        (("serve", 9), ("set", "series", BIAS, 2.0), ("serve", 1), ("order", 2.0), ("report", False, False),
+         ("serve", 9), ("report", False, False), _CARRIED_OUT),
+    ),
+    "order after a command": (
+        [_BOTH],
+        (("serve", 9), ("order", 2.0), ("serve", 9), *_BIAS_SET, ("report", False, False), _CARRIED_OUT),
+    ),
+    "command before a dialled target is reached": ([_BOTH], (("serve", 9), ("dial", 2.0), *_BIAS_SET)),
+}  # fmt: skip
+"""Rules and steps in which a decision without care begins a forbidden state, or refuses a stop."""
+
+
 def case(seed: int, length: int = 60) -> tuple[list[Rule], list[Step]]:
     """Return one or two random rules, and random steps."""
     chance = Random(seed)
@@ -119,6 +175,7 @@ def _step(chance: Random) -> Step:
         (1, ("end",)),
         (1, ("continue",)),
         (0.5, ("panel", pick([BIAS, SETPOINT]), value)),
+        (0.5, ("dial", value)),
         (0.5, ("kill", pick(both))),
         (0.5, ("wait", pick([0.5, 4.5, 6.0]))),
     ]
@@ -398,15 +455,25 @@ class ForbiddenBench:
             self._become(ScopeState.FREE)
 
     def _do_panel(self, name: str, value: float) -> None:
-        # only while nothing is decided on values read before: no program can know what a person does next
-        state = self._core.state
-        if self._flight is not None or state.pending.turn is not None or state.instruments.given:
-            return
-        if any(known.open for known in state.instruments.known.values()):
+        if not self._is_quiet:
             return
         before, self.truth[name] = self.truth[name], value
         change = ChangedValue(name, repr(before), repr(value), _UNITS[name])
-        self._publish("ActByHand", ActByHand(self._now_ns, PanelAct.VALUES, (change,)))
+        self._publish("ActByHand", ActByHand(self._now_ns, PanelAct.VALUES, "seen", (change,)))
+
+    @property
+    def _is_quiet(self) -> bool:
+        # whether nothing is decided on values known before: no program can know what a person does next
+        state = self._core.state
+        is_deciding = self._flight is not None or state.pending.turn is not None or bool(state.instruments.given)
+        return not is_deciding and not any(known.open for known in state.instruments.known.values())
+
+    def _do_dial(self, value: float) -> None:
+        if not self._is_quiet:
+            return
+        self.cryo.target = value
+        for _ in range(2):
+            self._do_report(False, False)
 
     def _do_kill(self, is_executed: bool) -> None:
         if self._flight is not None and is_executed:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.simulation.forbidden_bench import ForbiddenBench, case
+from tests.simulation.forbidden_bench import SCENARIOS, ForbiddenBench, case
 
 TOTAL = Counter[str]()
 
@@ -19,6 +20,12 @@ def test_no_request_begins_a_forbidden_state(seed: int) -> None:
     bench = ForbiddenBench(rules)
     bench.run(steps)
     TOTAL.update(bench.counts)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_careless_order_of_events_begins_no_forbidden_state(name: str) -> None:
+    rules, steps = SCENARIOS[name]
+    ForbiddenBench(rules).run(steps)
 
 
 def test_random_cases_execute_and_refuse() -> None:

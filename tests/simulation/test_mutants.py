@@ -35,6 +35,8 @@ from afspm.scheduler.shell import SchedulerShell
 from afspm.scheduler.state import StateDraft
 from afspm.transport.port import CaughtUp, PacketReceived
 from tests.simulation.drift_night import DriftNight
+from tests.simulation.forbidden_bench import SCENARIOS, ForbiddenBench
+from tests.simulation.forbidden_mutants import MUTANTS as FORBIDDEN_MUTANTS
 from tests.simulation.invariants import InvariantViolated
 from tests.simulation.microscope import GARBLED
 from tests.simulation.night import FINDERS, PANEL_NIGHTS, Night, bad_night
@@ -430,6 +432,11 @@ def _nights() -> None:
         Night(night).run()
 
 
+def _scenarios() -> None:
+    for rules, steps in SCENARIOS.values():
+        ForbiddenBench(rules).run(steps)
+
+
 def _panel_nights() -> None:
     for night in PANEL_NIGHTS:
         Night(night).run()
@@ -454,6 +461,13 @@ def test_a_scheduler_that_disturbs_a_person_is_found(mutant: Callable[[Patch], N
     mutant(monkeypatch)
     with pytest.raises(InvariantViolated):
         _panel_nights()
+
+
+@pytest.mark.parametrize("mutant", FORBIDDEN_MUTANTS, ids=lambda mutant: mutant.__name__)
+def test_a_broken_decision_about_forbidden_states_is_found(mutant: Callable[[Patch], None], monkeypatch: Patch) -> None:
+    mutant(monkeypatch)
+    with pytest.raises(InvariantViolated):
+        _scenarios()
 
 
 def test_limits_decided_at_arrival_are_found_in_sample_coordinates(monkeypatch: Patch) -> None:

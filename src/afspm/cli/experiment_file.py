@@ -60,6 +60,8 @@ def check(
     if expanded:
         typer.echo(experiment.expanded(), nl=False)
     if experiment.is_readable:
+        for line in experiment.resolved.default_limits.lines():
+            console.print(line, markup=False, soft_wrap=True)
         console.print(_summary(experiment, findings), markup=False, soft_wrap=True)
         if not any(finding.is_error for finding in findings):
             for line in estimate_lines(experiment.planned_work(), experiment.clock().speed, datetime.now(UTC)):
@@ -179,13 +181,18 @@ def notify(
     require_no_errors(experiment)
     section = experiment.resolved.sections.notify
     targets = implied_parts.targets(section, experiment.folder)
-    if not targets.ways:
-        typer.echo("afspm: the file has no [notify] with a `command` or a `webhook`", err=True)
+    if not targets.ways and not section.ping:
+        typer.echo("afspm: the file has no [notify] with a `command`, a `webhook` or a `ping`", err=True)
         raise typer.Exit(1)
     if not test:
-        typer.echo(f"{' and '.join(targets.ways)}, on {', '.join(section.on)}; --test sends a message")
+        if targets.ways:
+            typer.echo(f"{' and '.join(targets.ways)}, on {', '.join(section.on)}; --test sends a message")
+        if section.ping:
+            typer.echo(f"a ping every {duration_text(section.every)}; --test sends one")
         return
     arrived = [_arrives(targets, _message(experiment), way) for way in targets.ways]
+    if section.ping:
+        arrived.append(_pings(section.ping))
     if not all(arrived):
         raise typer.Exit(1)
 
@@ -196,6 +203,19 @@ def _message(experiment: Experiment) -> Notification:
 
     now_ns = ExperimentClock.real().now_ns()
     return Notification(TEST, experiment.name, "", now_ns, "a test message of afspm: calls from this experiment arrive")
+
+
+def _pings(where: str) -> bool:
+    from afspm.basics.errors import ConfigError
+    from afspm.components.notifications import NotDelivered, address, ping
+
+    try:
+        ping(address(where, key="ping"))
+    except (ConfigError, NotDelivered) as error:
+        typer.echo(f"the ping failed: {error}", err=True)
+        return False
+    typer.echo("the ping was answered")
+    return True
 
 
 def _arrives(targets: Targets, message: Notification, way: Way) -> bool:

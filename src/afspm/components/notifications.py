@@ -18,9 +18,12 @@ UNSOLVED: Final = "unsolved-problem"
 GIVEN_UP: Final = "given-up"
 CRITICAL: Final = "critical"
 BY_HAND: Final = "by-hand"
+SOLVED: Final = "solved"
 TEST: Final = "test"
 """Occasion of a test message."""
-OCCASIONS: Final = (END, UNSOLVED, GIVEN_UP, CRITICAL, BY_HAND)
+USUAL: Final = (END, UNSOLVED, GIVEN_UP, CRITICAL, BY_HAND)
+"""The occasions without the key `on`."""
+OCCASIONS: Final = (*USUAL, SOLVED)
 
 TIMEOUT_S = 10.0  # of one attempt
 FIRST_DELAY_S, LONGEST_DELAY_S = 2.0, 300.0
@@ -97,15 +100,18 @@ class Targets:
             _post(address(self.webhook), notice)
 
 
-def address(webhook: str, environment: Mapping[str, str] = os.environ) -> str:
-    """Return the address of a webhook, looked up in the environment for "$NAME".
+def address(webhook: str, environment: Mapping[str, str] = os.environ, *, key: str = "webhook") -> str:
+    """Return the address of a webhook or a ping, looked up in the environment for "$NAME".
+
+    Args:
+        key: the key in [notify] that holds the address.
 
     Raises:
         ConfigError: the environment variable is not set, or holds no address; the error contains no secret.
     """
     from urllib.parse import urlsplit
 
-    where = "[notify] webhook"
+    where = f"[notify] {key}"
     if webhook.startswith("$"):
         name = webhook[1:]
         where = f"{where} = {webhook!r}"
@@ -145,7 +151,21 @@ def _run(command: Sequence[str], notice: Notification, folder: str) -> None:
         raise NotDelivered(f"{program} ended with {done.returncode}{f': {output[-1][:200]}' if output else ''}")
 
 
+def ping(url: str) -> None:
+    """Send a bare GET request: it holds the address and the name afspm, and nothing of the experiment.
+
+    Raises:
+        NotDelivered: no success within `TIMEOUT_S`; the error contains no secret.
+    """
+    _request(url, None, {"User-Agent": "afspm"})
+
+
 def _post(url: str, notice: Notification) -> None:
+    headers = {"Content-Type": "application/json; charset=utf-8", "User-Agent": "afspm"}
+    _request(url, notice.body(), headers)
+
+
+def _request(url: str, body: bytes | None, headers: dict[str, str]) -> None:
     from http.client import HTTPException
     from urllib.error import HTTPError, URLError
     from urllib.parse import urlsplit
@@ -158,9 +178,8 @@ def _post(url: str, notice: Notification) -> None:
             return None
 
     host = urlsplit(url).hostname
-    headers = {"Content-Type": "application/json; charset=utf-8", "User-Agent": "afspm"}
     try:
-        request = Request(url, notice.body(), headers, method="POST")
+        request = Request(url, body, headers, method="GET" if body is None else "POST")
         with build_opener(NoRedirect).open(request, timeout=TIMEOUT_S) as answer:
             answer.read(1000)
     except HTTPError as error:

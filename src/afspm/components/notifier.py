@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 from afspm.basics.errors import ConfigError
 from afspm.basics.formatting import duration_text
 from afspm.basics.plain_data import Plain
-from afspm.basics.units import Duration
+from afspm.basics.units import Duration, PositiveDuration
 from afspm.client.component import Component
 from afspm.components import notifications
 from afspm.components.notifications import (
@@ -19,7 +19,9 @@ from afspm.components.notifications import (
     MOST_TRIES,
     MOST_WAITING,
     OCCASIONS,
+    SOLVED,
     UNSOLVED,
+    USUAL,
     NotDelivered,
     Notification,
     Targets,
@@ -34,7 +36,7 @@ LAST_TRIES = 2  # the end of the experiment does not wait for more
 
 
 class Notifier(Component):
-    """Notifications by command or webhook: a problem stays unsolved, a process is given up or CRITICAL, a run waits.
+    """Notifications by command or webhook, of problems, failures and a run that waits; and pings while the run goes on.
 
     [notify] of the experiment file adds this component to an experiment. The component only subscribes, and delays no
     other process. A failed delivery is retried at growing intervals, for about 25 minutes; retries continue after a
@@ -45,9 +47,12 @@ class Notifier(Component):
         program: a command with arguments, run in the experiment file's folder; the JSON is on its standard input.
         webhook: address for a POST of the JSON; "$NAME" is taken from the environment.
         on: occasions: "unsolved-problem", "given-up", "critical", "by-hand" (the run waits for a person at the panel);
-            by default all. ("end" is left to `afspm run`.)
+            by default these. "solved": a problem that counted as unsolved is solved. ("end" is left to `afspm run`.)
         unsolved_after: experiment time after which a flagged problem counts as unsolved.
         folder: working directory of the command; [notify] sets it to the experiment file's folder.
+        ping: address for a bare GET request at regular times, so that silence is noticed elsewhere; "$NAME" is taken
+            from the environment.
+        every: real time between two pings.
     """
 
     listens: ClassVar = ("ControlState", "JournalEntries", "ProcessStates", "LogLines")
@@ -62,12 +67,16 @@ class Notifier(Component):
         on: list[str] | None = None,
         unsolved_after: Duration = 900.0,
         folder: str = "",
+        ping: str = "",
+        every: PositiveDuration = 300.0,
     ) -> None:
         self.targets = Targets(tuple(program or ()), webhook, folder)
-        self.on = tuple(OCCASIONS if on is None else on)
+        self.on = tuple(USUAL if on is None else on)
         self.unsolved_after = unsolved_after
-        if not self.targets.ways:
-            raise ConfigError("there is no recipient", where="[notify]", hint="it needs a `command` or a `webhook`")
+        self.ping, self.every = ping, every
+        if not self.targets.ways and not ping:
+            hint = "it needs a `command`, a `webhook` or a `ping`"
+            raise ConfigError("there is no recipient", where="[notify]", hint=hint)
         if unknown := [one for one in self.on if one not in OCCASIONS]:
             raise ConfigError(f"[notify] on: {unknown[0]!r} never happens", hint=f"known: {', '.join(OCCASIONS)}")
 
@@ -76,6 +85,13 @@ class Notifier(Component):
         self.memory.setdefault("told", [])
         self.memory.setdefault("waiting", [])
         self._due_s: dict[str, float] = {}
+        self._ping_due_s, self._is_silent = self.clock.monotonic_s(), False
+        try:
+            if self.ping:
+                notifications.address(self.ping, key="ping")
+        except ConfigError as error:  # notifications go on without pings
+            self.log.error("no pings are sent: %s", error)
+            self.ping = ""
         try:
             if self.targets.webhook:
                 notifications.address(self.targets.webhook)  # a wrong address fails at the start, not in the night
@@ -88,6 +104,11 @@ class Notifier(Component):
     def on_control(self, control_state: ControlState) -> None:
         since_ns = self.packet.time_ns if self.packet and self.packet.time_ns is not None else self.clock.now_ns()
         before: dict[str, int] = self.memory["flagged"]
+        for number in before.keys() - {str(number) for number in control_state.problems}:
+            lasted_ns = since_ns - before[number]
+            if lasted_ns >= self.unsolved_after * 1e9:
+                text = f"{self.scope.problems.name(int(number))} is solved, after {duration_text(lasted_ns * 1e-9)}"
+                self._queue_once(SOLVED, f"{number} {before[number]}", text)
         now = {str(number): before.get(str(number), since_ns) for number in control_state.problems}
         if now != before:
             self.memory["flagged"] = now
@@ -120,6 +141,22 @@ class Notifier(Component):
                 text = f"{name} has been flagged for {since}, and is not solved"
                 self._queue_once(UNSOLVED, f"{number} {since_ns}", text)
         self._deliver_what_is_due()
+        if self.ping and self.clock.monotonic_s() >= self._ping_due_s:
+            self._send_ping()
+
+    def _send_ping(self) -> None:
+        # not kept over a restart, and not repeated: the next one follows soon enough
+        try:
+            notifications.ping(notifications.address(self.ping, key="ping"))
+        except (NotDelivered, ConfigError) as error:
+            if not self._is_silent:
+                self.log.warning("a ping failed; later failures are not logged: %s", error)
+            self._is_silent = True
+        else:
+            if self._is_silent:
+                self.log.info("pings arrive again")
+            self._is_silent = False
+        self._ping_due_s = self.clock.monotonic_s() + self.every
 
     def on_end(self) -> None:
         for waiting in self.memory["waiting"][-LAST_TRIES:]:

@@ -35,13 +35,14 @@ def notifier(resolved: ResolvedExperiment) -> ExperimentPart | None:
     """Return the notifier of [notify]; None if nothing is sent during the experiment, or the file has a notifier."""
     section = resolved.sections.notify
     occasions = (set(OCCASIONS) - {END}) & set(section.on)
-    is_wanted = (section.command or section.webhook) and occasions
+    is_wanted = section.ping or ((section.command or section.webhook) and occasions)
     if not is_wanted or resolved.declaring(NOTIFIES) or not resolved.with_role(Role.SCHEDULER):
         return None
     wanted = targets(section, resolved.document.folders[0])
     settings: Settings = {"program": list(wanted.command)} if wanted.command else {}
     settings |= {"webhook": wanted.webhook} if wanted.webhook else {}
     settings |= {"on": list(section.on), "unsolved_after": section.unsolved_after, "folder": wanted.folder}
+    settings |= {"ping": section.ping, "every": section.every} if section.ping else {}
     return _implied(resolved, NOTIFIER, settings, "notify")
 
 
@@ -58,18 +59,22 @@ def targets(section: NotifySection, folder: Path) -> Targets:
 def check_notify(resolved: ResolvedExperiment) -> None:
     """Check that [notify] has a target, its program exists, and its webhook is a valid address."""
     section = resolved.sections.notify
-    if "notify" in resolved.parts.sections and not (section.command or section.webhook):
-        resolved.document.error("[notify] has no recipient", "notify", hint="give a `command` or a `webhook`")
+    if "notify" in resolved.parts.sections and not (section.command or section.webhook or section.ping):
+        resolved.document.error("[notify] has no recipient", "notify", hint="give a `command`, a `webhook` or a `ping`")
+    if section.every <= 0.0:
+        resolved.document.error("[notify] every is not above zero", "notify", "every", hint='as in "5 min"')
     if section.command and not is_program(section.command[0], resolved.document.folders[0]):
         what = f"[notify] there is no program {section.command[0]!r}"
         resolved.document.error(what, "notify", "command", hint=NO_PROGRAM)
-    if section.webhook:
+    for key, given in (("webhook", section.webhook), ("ping", section.ping)):
+        if not given:
+            continue
         try:
-            address(section.webhook)
+            address(given, key=key)
         except ConfigError as error:
             # the scheduler may start on another computer, where the environment has this variable
-            report = resolved.document.warning if section.webhook.startswith("$") else resolved.document.error
-            report(f"[notify] webhook: {error.what}", "notify", "webhook", hint=error.hint)
+            report = resolved.document.warning if given.startswith("$") else resolved.document.error
+            report(f"[notify] {key}: {error.what}", "notify", key, hint=error.hint)
 
 
 def runnable(command: tuple[str, ...], folder: Path) -> tuple[str, ...]:

@@ -74,6 +74,7 @@ class LimitsSection(Section):
 
     region: RegionSection | None = None
     most_pixels: Count = ExperimentLimits.most_pixels
+    loosen: tuple[str, ...] = ()
 
 
 class RoleSection(Section):
@@ -262,14 +263,14 @@ class LimitsReader:
         if not given:
             what = f"the units of {' and '.join(known)} are known only in the run"
             raise RuleError(what, atom.left.at, "compare each with a number and its unit")
-        for term in terms:
-            unit = (known[term.name] if known[term.name] is not None else given[0]) if term.name else term.unit
-            if unit != given[0]:
-                here, there = (one or "no unit" for one in (unit, given[0]))
-                number = next((one for one in terms if not one.name), term)
-                raise RuleError(f"{atom.left} and {atom.right} have different units: {here} and {there}", number.at)
-            if term.name and units.setdefault(term.name, unit or "") != unit:
-                raise RuleError(f"{term.name} is compared in {units[term.name]} and in {unit}", term.at)
+        left, right = (known.get(term.name, term.unit) if term.name else term.unit for term in terms)
+        left, right = (given[0] if unit is None else unit for unit in (left, right))
+        if left != right:
+            what = f"{atom.left} and {atom.right} have different units: {left or 'no unit'} and {right or 'no unit'}"
+            raise RuleError(what, atom.left.at if atom.right.name else atom.right.at)
+        for name in known:
+            if units.setdefault(name, left) != left:
+                raise RuleError(f"{name} is compared in {units[name]} and in {left}", atom.left.at)
 
     def _type_of(self, name: str, at: int) -> str:
         # empty for a number

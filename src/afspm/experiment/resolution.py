@@ -12,6 +12,7 @@ from afspm.experiment import (
     capabilities,
     class_loader,
     conditions_section,
+    default_limits,
     implied_parts,
     limits_section,
     planned_measurements,
@@ -136,7 +137,12 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
     )
     if resolved.declaring("needs_approval") or resolved.sections.control.agents:
         resolved.named_problems.setdefault(STOPPED_BY_AGENT, HIGHEST_PROBLEM)
-    resolved.limits = reader.read(parts.sections.get("limits", {}))
+    limits_table = parts.sections.get("limits", {})
+    resolved.limits = reader.read(limits_table)
+    for translator in translators:
+        if (file := getattr(translator.component, "limits_file", None)) is not None:
+            resolved.default_limits = default_limits.read(file, reader, limits_table)
+    resolved.limits = default_limits.merged(resolved.limits, resolved.default_limits, limits_table, document)
     resolved.conditions = conditions_section.ConditionsReader(
         document, resolved.instruments, reader.actions, resolved.problems
     ).read(parts.sections.get("conditions", {}))

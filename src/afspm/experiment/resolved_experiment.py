@@ -10,6 +10,7 @@ from afspm.client.component import Component
 from afspm.experiment import capabilities
 from afspm.experiment.capabilities import MicroscopeCapabilities
 from afspm.experiment.class_loader import ComponentDeclaration
+from afspm.experiment.default_limits import DefaultLimits
 from afspm.experiment.document import Document
 from afspm.experiment.parts import EMULATED, SIMULATED, ExperimentPart, ExperimentParts
 from afspm.experiment.planned_measurements import PlannedMeasurements
@@ -87,6 +88,7 @@ class ResolvedExperiment:
     Attributes:
         processes: processes by name, in the order of the file.
         listening: sockets that components bind by settings of their own, beside the wiring.
+        limits: of the file, within the default limits of the driver.
         plans: plan of each component whose settings define a plan.
     """
 
@@ -99,6 +101,7 @@ class ResolvedExperiment:
     net: Wiring = field(default_factory=Wiring)
     listening: list[BoundSocket] = field(default_factory=list)
     limits: ExperimentLimits = field(default_factory=ExperimentLimits)
+    default_limits: DefaultLimits = field(default_factory=DefaultLimits)
     conditions: InstrumentSettings = field(default_factory=InstrumentSettings)
     caching: CacheSettings = field(default_factory=CacheSettings)
     plans: dict[str, PlannedMeasurements] = field(default_factory=dict)

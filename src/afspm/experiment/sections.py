@@ -14,7 +14,7 @@ import pydantic
 from pydantic import Field, StrictBool
 
 from afspm.basics.plain_data import file_key
-from afspm.basics.units import Duration, PositiveDuration
+from afspm.basics.units import Duration, Period, PositiveDuration
 from afspm.experiment.document import Document
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.validation_messages import report
@@ -121,11 +121,14 @@ class NotifySection(Section):
 
     command: tuple[str, ...] = ()
     webhook: str = ""
-    on: tuple[Literal["end", "unsolved-problem", "given-up", "critical", "by-hand"], ...] = (
+    on: tuple[Literal["end", "unsolved-problem", "given-up", "critical", "by-hand", "solved"], ...] = (
         "end", "unsolved-problem", "given-up", "critical", "by-hand",
     )  # fmt: skip
     unsolved_after: PositiveDuration = 900.0
     """Experiment time for which a problem may be flagged before it counts as unsolved."""
+    ping: str = ""
+    every: Period = 300.0
+    """Real time between two pings."""
 
 
 class ExperimentSections(Section):

@@ -196,6 +196,8 @@ class DriverBase(ABC):
     """
 
     parameters_file: ClassVar[Path]
+    limits_file: ClassVar[Path | None] = None
+    """A file with default limits for this model of microscope, in the form of [limits]; None: there are none."""
     channel_roles: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({})
     """The maker's names of channels by role, as in `Scan.channel`; under "other" those without a role."""
     translated: ClassVar[Collection[str]] = ()

@@ -36,6 +36,7 @@ class Hook(ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), _Handler)
         self.codes = [200]
         self.got: list[dict[str, object]] = []
+        self.pings: list[tuple[str, dict[str, str], bytes]] = []
         threading.Thread(target=self.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
 
     @property
@@ -58,7 +59,13 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def do_GET(self) -> None:
-        self.send_response(200)
+        code = self.server.codes.pop(0) if len(self.server.codes) > 1 else self.server.codes[0]
+        self.server.pings.append(
+            (self.path, dict(self.headers), self.rfile.read(int(self.headers.get("Content-Length", 0))))
+        )
+        self.send_response(code)
+        if 300 <= code < 400:
+            self.send_header("Location", self.path)
         self.send_header("Content-Length", "0")
         self.end_headers()
 
@@ -358,3 +365,48 @@ def test_without_notify_there_is_nothing_to_test(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["notify", str(file), "--test"])
     assert done.exit_code == 1
     assert "no [notify]" in done.output
+
+
+def test_ping_is_a_bare_request_at_regular_times(tmp_path: Path, hook: Hook) -> None:
+    night = Night(tmp_path, ping=hook.url, every=300.0)
+    night.control(1)
+    night.passes(3000)
+    assert len(hook.pings) == 10
+    path, headers, body = hook.pings[0]
+    assert (path, body) == (f"/hooks/{SECRET}", b"")
+    assert headers.keys() <= {"Host", "User-Agent", "Accept-Encoding", "Connection"}
+    assert headers["User-Agent"] == "afspm"
+    assert hook.got == []
+
+
+def test_failed_pings_are_logged_once_without_the_address(
+    tmp_path: Path, hook: Hook, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "afspm.notifier")
+    hook.codes = [500, 302, 500, 200, 200]
+    night = Night(tmp_path, ping=hook.url, every=60.0, webhook=hook.url, on=["given-up"])
+    night.passes(300)
+    assert [record.levelname for record in caplog.records] == ["WARNING", "INFO"]
+    assert SECRET not in caplog.text
+    night.given_up("series")  # messages go on meanwhile
+    night.passes(60)
+    assert [one["what"] for one in hook.got] == ["given-up"]
+
+
+def test_wrong_address_of_a_ping_leaves_the_messages(tmp_path: Path, hook: Hook) -> None:
+    night = Night(tmp_path, ping="$NO_SUCH_VARIABLE_HERE", webhook=hook.url)
+    night.given_up("series")
+    night.passes(60)
+    assert [one["what"] for one in hook.got] == ["given-up"]
+    assert hook.pings == []
+
+
+def test_solved_problem_is_notified_if_it_counted_as_unsolved(tmp_path: Path, hook: Hook) -> None:
+    night = Night(tmp_path, webhook=hook.url, unsolved_after=600.0, on=["unsolved-problem", "solved"])
+    for lasts_s in (300, 700):
+        night.control(1)
+        night.passes(lasts_s)
+        night.control()
+        night.passes(60)
+    assert [one["what"] for one in hook.got] == ["unsolved-problem", "solved"]
+    assert "is solved, after 1" in str(hook.got[1]["text"])

@@ -12,6 +12,7 @@ from afspm.plugins.web.dashboard.access import PASSWORD
 
 from .conftest import Write, errors, only_error
 
+PING = '[notify]\nping = "https://check.example.org/1"\n'
 HOOK = '[notify]\nwebhook = "https://chat.example.org/hooks/1"\n'
 
 
@@ -27,6 +28,12 @@ def test_notifier_is_part_of_an_experiment_with_notify(write: Write) -> None:
     experiment = write(HOOK + 'unsolved_after = "10 min"\n')
     assert notifier(experiment)["unsolved_after"] == 600.0
     assert "notifier" in experiment.component_names
+
+
+def test_ping_needs_no_other_recipient(write: Write) -> None:
+    settings = notifier(write(PING + 'every = "1 min"\n'))
+    assert (settings["ping"], settings["every"]) == ("https://check.example.org/1", 60.0)
+    assert "webhook" not in settings
 
 
 def test_experiment_without_notify_has_no_notifier(write: Write) -> None:
@@ -52,6 +59,9 @@ def test_python_is_the_running_interpreter(write: Write) -> None:
         ('[notify]\nwebhook = "chat.example.org"\n', "it is not an address"),
         (HOOK + 'on = ["dawn"]\n', "'dawn'"),
         (HOOK + "unsolved_after = 0\n", "above 0"),
+        ('[notify]\nping = "check.example.org"\n', "it is not an address"),
+        (PING + "every = 5\n", "has no unit"),
+        (PING + 'every = "0 s"\n', "not above zero"),
         (HOOK + 'weebhook = "x"\n', "weebhook is not a setting"),
     ],
 )
