@@ -208,7 +208,7 @@ def is_true(rule: Rule, truth: dict[str, Any]) -> bool:
             return bool(truth[name])
     name, is_absolute, sign, number = rule
     value = abs(truth[name]) if is_absolute else truth[name]
-    return {"<": value < number, "<=": value <= number, ">": value > number, ">=": value >= number}[sign]
+    return bool({"<": value < number, "<=": value <= number, ">": value > number, ">=": value >= number}[sign])
 
 
 def _names_of(rule: Rule) -> Iterator[str]:

@@ -14,7 +14,7 @@ from afspm.basics.requirements import require
 from afspm.experiment.findings import Finding, Level, nearest
 from afspm.experiment.implied_parts import RECORDS, runnable
 from afspm.experiment.toml_lines import Settings
-from afspm.experiment.toml_writer import SECRET
+from afspm.experiment.toml_writer import SECRETS
 from afspm.experiment.wiring_classes import ProcessSockets
 from afspm.model import Frame, Role
 from afspm.model.microscope_status import FEEDBACK_OFF
@@ -215,14 +215,15 @@ def _start(
 
 def _hidden_variables(resolved: ResolvedExperiment, process: ResolvedProcess) -> tuple[str, ...]:
     # environment variables with secrets of other processes
-    every = {DASHBOARD_PASSWORD, *_variable_name(resolved.sections.notify.webhook)}
+    notify = resolved.sections.notify
+    every = {DASHBOARD_PASSWORD, *_variable_name(notify.webhook), *_variable_name(notify.ping)}
     every.update(*map(_secrets, resolved.processes.values()))
     return tuple(sorted(every - _secrets(process)))
 
 
 def _secrets(process: ResolvedProcess) -> set[str]:
     return {
-        *_variable_name(process.settings.get(SECRET)),
+        *(name for key in SECRETS for name in _variable_name(process.settings.get(key))),
         *([DASHBOARD_PASSWORD] if process.declares("operates") else []),
     }
 

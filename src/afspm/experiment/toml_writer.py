@@ -12,8 +12,8 @@ from typing import Any
 from afspm.experiment.parts import ExperimentParts
 from afspm.experiment.toml_lines import Settings, Table
 
-SECRET = "webhook"
-"""Name of settings and keys whose value is a secret, unless it is the "$NAME" of an environment variable."""
+SECRETS = ("webhook", "ping")
+"""Names of settings and keys whose value is a secret, unless it is the "$NAME" of an environment variable."""
 _NAMED_INSTEAD = "$AFSPM_WEBHOOK"
 
 
@@ -38,8 +38,8 @@ def _secrets_in(value: object) -> list[str]:
         return list(dict.fromkeys(secret for one in value for secret in _secrets_in(one)))
     if not isinstance(value, Mapping):
         return []
-    own = value.get(SECRET)
-    here = [own] if isinstance(own, str) and own and not own.startswith("$") else []
+    own = [value.get(key) for key in SECRETS]
+    here = [one for one in own if isinstance(one, str) and one and not one.startswith("$")]
     return list(dict.fromkeys([*here, *_secrets_in(list(value.values()))]))
 
 

@@ -94,6 +94,7 @@ def test_expanded_file_with_a_notifier_round_trips(write: Write, more: str) -> N
 
 @pytest.mark.parametrize("text", [
     HOOK,
+    '[notify]\nping = "https://chat.example.org/hooks/1"\n',
     'hook = "https://chat.example.org/hooks/1"\n[notify]\nwebhook = "hook"\n',
     '[caller]\ncomponent = true\nclass = "Notifier"\nwebhook = "https://chat.example.org/hooks/1"\n',
 ])  # fmt: skip
