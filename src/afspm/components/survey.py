@@ -22,7 +22,7 @@ from afspm.components.scan_plan import ScanPlan
 from afspm.components.surveying.record import Outcome, SurveyRecord, Visit
 from afspm.components.surveying.targets import Target, find_particles, lowest_beside, nearest
 from afspm.model import (
-    HEIGHT,
+    TOPOGRAPHY,
     ChannelName,
     Region,
     RegistrationOutcome,
@@ -98,7 +98,7 @@ class Survey(Component):
         angle: Angle = 0.0,
         pixels: Pixels | None = None,
         zoom_pixels: Pixels = (128, 128),
-        channel: ChannelName = HEIGHT,
+        channel: ChannelName = TOPOGRAPHY,
         min_height: Length | None = None,
         separation: Length | None = None,
         targets: str | None = None,

@@ -15,10 +15,14 @@ HEIGHT: Final = "height"
 HEIGHT_RETRACE: Final = HEIGHT + RETRACE
 CURRENT: Final = "current"
 FREQUENCY_SHIFT: Final = "frequency shift"
+INTENSITY: Final = "intensity"
+"""Role of the signal of a detector, where a beam scans instead of a tip."""
 TOPOGRAPHY: Final = "topography"
-"""Role of the channel that shows the surface: the height, or at constant height what `AT_CONSTANT_HEIGHT` names."""
+"""Role of the channel that shows the sample: the height, or at constant height what `AT_CONSTANT_HEIGHT` names, or the
+intensity of a microscope without a tip."""
 QUANTITIES: Final = (
     HEIGHT, CURRENT, "amplitude", "phase", "deflection", FREQUENCY_SHIFT, "excitation", "friction", "potential",
+    INTENSITY,
 )  # fmt: skip
 """The measured quantities, each with a role for the trace, and one with `RETRACE` for the retrace."""
 ROLES_APART: Final = "; "
@@ -78,7 +82,7 @@ class ChannelRoles:
     def with_topography(self, *, feedback_on: bool | None) -> ChannelRoles:
         """Return the roles with the topography: at constant height, the height shows nothing."""
         wanted = AT_CONSTANT_HEIGHT if feedback_on is False else ()
-        role = next((one for one in (*wanted, HEIGHT) if one in self.names), None)
+        role = next((one for one in (*wanted, HEIGHT, INTENSITY) if one in self.names), None)
         return self if role is None else replace(self, names={**self.names, TOPOGRAPHY: self.names[role]})
 
     def of(self, channel: str) -> tuple[str, ...]:
@@ -96,7 +100,9 @@ class ChannelRoles:
 
     def refuses(self, channel: str) -> str:
         """Return why the microscope cannot have a channel, by its role or name; empty for one that it may have."""
-        known = {*self.names, *self.all_names()} | ({TOPOGRAPHY} if HEIGHT in self.names else set())
+        known = {*self.names, *self.all_names()}
+        if not known.isdisjoint((HEIGHT, INTENSITY)):
+            known.add(TOPOGRAPHY)
         if not channel or channel in known:
             return ""
         kind = "role" if channel in ROLES else "channel"

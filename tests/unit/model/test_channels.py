@@ -47,6 +47,14 @@ def test_current_shows_the_surface_at_constant_height() -> None:
     assert shifted.with_topography(feedback_on=False).names[TOPOGRAPHY] == ("df Forward",)
 
 
+def test_topography_is_the_intensity_where_there_is_no_height() -> None:
+    beam = ChannelRoles.declared({"intensity": ("HAADF",), "other": ("MAADF",)})
+    assert beam.with_topography(feedback_on=None).names[TOPOGRAPHY] == ("HAADF",)
+    assert beam.refuses(TOPOGRAPHY) == ""
+    both = ChannelRoles({**ROLES.names, "intensity": ("Camera",)})
+    assert both.with_topography(feedback_on=True).names[TOPOGRAPHY] == ROLES.names["height"]
+
+
 def test_file_names_other_channels() -> None:
     changed = ROLES.changed({"height": "ZS-Topo", "other": ["Lock-in X"]})
     assert changed.names["height"] == ("ZS-Topo",)

@@ -18,7 +18,7 @@ from afspm.basics.errors import AfspmError, FileError
 from afspm.basics.formatting import counted
 from afspm.client.component import Component
 from afspm.components.line_file import LineFile, csv_line
-from afspm.model import HEIGHT, ChannelName, RegistrationOutcome, of_role
+from afspm.model import TOPOGRAPHY, ChannelName, RegistrationOutcome, of_role
 from afspm.plugins.drift.record import COLUMNS as RECORD
 from afspm.record.drift_mapping import drift_at
 
@@ -306,7 +306,7 @@ class DriftPictures(DriftTable):
         from afspm.storage.formats import read
 
         content = read(tabled.file)
-        channel = self.channel or self.memory.get("channel", HEIGHT)
+        channel = self.channel or self.memory.get("channel", TOPOGRAPHY)
         scan = of_role(map(self.scope.channels.shown, content.scans), channel)
         if scan is None:
             there = ", ".join(one.channel for one in content.scans)
