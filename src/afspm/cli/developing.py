@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 _ASK = """This moves the probe, takes scans and spectra, changes gains and bias by a few percent, and switches the
 feedback off and on, all within the present frame, and then restores all settings. It never approaches, pulses or
 crashes. Is the tip so far from the sample that it can't reach it, even at the full extension of the feedback?"""
+_ASK_WITHOUT_TIP = """This takes scans and changes settings by a few percent, all within the present frame, and then
+restores all settings. Shall it begin?"""
 
 
 def check_translator(
@@ -67,15 +69,19 @@ def check_translator(
         raise typer.BadParameter("give an experiment file", param_hint="FILE")
     console = Console(file=sys.stdout, highlight=False)
     options = CheckOptions(files, names_in(without), runs, speed, names_in(only), si(frame, "m") if frame else None)
-    if not yes and not _is_simulated(options):
-        typer.confirm(_ASK, abort=True)
+    if not yes and (question := _question(options)):
+        typer.confirm(question, abort=True)
     _check(options, console, report)
 
 
-def _is_simulated(options: CheckOptions) -> bool:
-    from afspm.testing.translators.session import is_simulated, prepare
+def _question(options: CheckOptions) -> str:
+    # empty: a simulated microscope can't be damaged
+    from afspm.testing.translators.session import has_tip, is_simulated, prepare
 
-    return is_simulated(prepare(options), options)
+    experiment = prepare(options)
+    if is_simulated(experiment, options):
+        return ""
+    return _ASK if has_tip(experiment) else _ASK_WITHOUT_TIP
 
 
 def _check(options: CheckOptions, console: Console, copy: Path | None) -> None:

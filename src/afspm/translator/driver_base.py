@@ -219,6 +219,9 @@ class DriverBase(ABC):
     shadow: ClassVar[str] = ""
     """The class that only reads this controller, "package.module.Class" (see `shadow`); empty: there is none."""
 
+    has_tip: ClassVar[bool] = True
+    """False for a microscope that scans by a beam: before a check or a commissioning, nothing is asked about a tip."""
+
     start_engages: ClassVar[bool] = False
     """True if the start of a scan brings a withdrawn tip to the sample."""
 

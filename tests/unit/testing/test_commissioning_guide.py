@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from afspm.testing.commissioning.guide import UNSEEN, Guide
-from afspm.testing.conformance import Failed, Skipped
+from afspm.testing.commissioning.steps import all_steps
+from afspm.testing.conformance import Failed, Skipped, Unsupported
+from afspm.testing.translators.support import Support
 
 
 @dataclass
@@ -36,9 +39,9 @@ class Person:
         return next((answer for words, answer in self.answers.items() if words in question), default)
 
 
-def guide(person: Person, *, has_panel: bool) -> Guide:
-    kit: Any = None  # no question needs it
-    return Guide(kit, person, Path(), has_panel=has_panel)
+def guide(person: Person, *, has_panel: bool, has_tip: bool = True) -> Guide:
+    kit: Any = SimpleNamespace(support=Support({}, {}))
+    return Guide(kit, person, Path(), has_panel=has_panel, has_tip=has_tip)
 
 
 PANEL_QUESTIONS: dict[str, Callable[[Guide], object]] = {
@@ -79,3 +82,15 @@ def test_unseen_outcome_is_skipped_with_a_panel_and_passes_without() -> None:
     with pytest.raises(Skipped, match="not seen at the panel"):
         guide(Person(), has_panel=True).unseen()
     assert "set and read back" in guide(Person(), has_panel=False).unseen()
+
+
+def test_person_is_not_asked_about_the_tip_of_a_microscope_without_one() -> None:
+    about_tip = [step for step in all_steps() if step.about_tip]
+    person = Person()
+    for step in about_tip:
+        with pytest.raises(Unsupported, match="no tip"):
+            guide(person, has_panel=True, has_tip=False).perform(step)
+    assert len(about_tip) == 2
+    assert not person.asked + person.shown
+    assert guide(person, has_panel=True).perform(about_tip[0]) == "confirmed"
+    assert len(person.asked) == 1

@@ -41,6 +41,7 @@ class Guide:
     Attributes:
         folder: the run folder, for pictures.
         has_panel: True for a real controller. Without a panel, each question about it is shown and skipped.
+        has_tip: False for a microscope without a tip, where the steps about it are left out.
         program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
         in_contact: True if the person has approached the tip, which is withdrawn after the steps at the sample.
     """
@@ -49,6 +50,7 @@ class Guide:
     prompts: Prompts
     folder: Path
     has_panel: bool = True
+    has_tip: bool = True
     program_s: float = 0.0
     in_contact: bool = False
 
@@ -64,6 +66,8 @@ class Guide:
         """
         if missing := self.kit.support.missing(step.needs):
             raise Unsupported(", ".join(missing))
+        if step.about_tip and not self.has_tip:
+            raise Unsupported("this microscope has no tip")
         self.prompts.show(f"\n{step.title}\n{step.explained}")
         if step.needs_panel and not self.has_panel:
             raise Skipped(f"{NO_PANEL} or cable")

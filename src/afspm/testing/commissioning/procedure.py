@@ -92,7 +92,9 @@ def _in_session(
 
     try:
         with restored(session, checks) as kit:
-            guide = Guide(kit, prompts, session.folder, has_panel=has_panel, program_s=session.program_s)
+            guide = Guide(
+                kit, prompts, session.folder, has_panel=has_panel, has_tip=session.has_tip, program_s=session.program_s
+            )
             walk = _Walk(guide, result.progress, write)
             try:
                 walk.through()

@@ -124,6 +124,7 @@ def _compare_values(guide: Guide) -> int:
     "Withdraw the tip with the coarse motor, so far that the scanner can't reach the sample, and begin again.",
     after=("controller",),
     moves=False,
+    about_tip=True,
     remembered=False,
 )
 def _withdrawn(guide: Guide) -> str:
@@ -320,6 +321,7 @@ def _connection(guide: Guide) -> str:
     "Leave the tip withdrawn. All before this is reported.",
     after=("withdrawn", "scan", "stop"),
     moves=False,
+    about_tip=True,
     remembered=False,
 )
 def _contact(guide: Guide) -> str:
@@ -348,7 +350,7 @@ def _contact(guide: Guide) -> str:
 def _axes(guide: Guide) -> str:
     guide.kit.forget()  # those measurements were taken with the tip withdrawn
     picture.picture(guide.kit)
-    taken = guide.kit.scan("wide").scans
+    taken = guide.kit.scan("wide" if guide.kit.can_pass("scan/not-square") else "plain").scans
     scan = next((one for one in taken if one.unit == "m"), taken[0])
     file = guide.folder / "commissioning.png"
     levels = raster.indices(scan.values[::-1], raster.value_range(scan.values))

@@ -90,6 +90,7 @@ class CheckSession:
         excused: checks that this controller can't pass, with the reason.
         complaints: the logged warnings and errors; the list grows.
         program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
+        has_tip: False for a microscope without a tip.
     """
 
     client: CheckClient
@@ -102,6 +103,7 @@ class CheckSession:
     complaints: Sequence[str]
     maker: str = ""
     program_s: float = 0.0
+    has_tip: bool = True
 
 
 def prepare(options: CheckOptions) -> Experiment:
@@ -151,7 +153,19 @@ def opened(options: CheckOptions) -> Iterator[CheckSession]:
         if translator.component is not None and issubclass(translator.component, Driver):
             driver = translator.component
             excused, maker, program_s = driver.excused(support.controller), driver.maker, driver.program_s
-        yield CheckSession(client, support, named, simulated, folder, options, excused, complaints, maker, program_s)
+        yield CheckSession(
+            client,
+            support,
+            named,
+            simulated,
+            folder,
+            options,
+            excused,
+            complaints,
+            maker,
+            program_s,
+            has_tip(experiment),
+        )
 
 
 @contextmanager
@@ -260,6 +274,12 @@ def _link(port: Port, own: Launch, log: logging.Logger) -> ExperimentLink:
 def is_simulated(experiment: Experiment, options: CheckOptions) -> bool:
     """Return whether the microscope is known to be simulated."""
     return experiment.simulated(without=_left_out(experiment, options))
+
+
+def has_tip(experiment: Experiment) -> bool:
+    """Return whether the microscope may have a tip: only a driver can declare that it has none."""
+    (translator,) = experiment.resolved.with_role(Role.TRANSLATOR)
+    return bool(getattr(translator.component, "has_tip", True))
 
 
 def _run_identity(experiment: Experiment, options: CheckOptions) -> RunIdentity:

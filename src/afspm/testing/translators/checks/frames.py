@@ -105,20 +105,20 @@ def require_published_once(observed: list[Observation], kind: type, named: str) 
 @check("frame/set", "a frame that is set: SS_MOVING, ScanParameters2d as set, once, SS_FREE", needs=_SIZES)
 def set_whole(kit: CheckMeasurements) -> None:
     ask_for(kit, kit.frames.plain.request(kit.support))
-    observed = ask_for(kit, kit.frames.wide.request(kit.support))
+    observed = ask_for(kit, kit.frames.other.request(kit.support))
     require_published_once(observed, ScanParameters, "ScanParameters2d")
-    require_in_force(kit, kit.frames.wide)
+    require_in_force(kit, kit.frames.other)
 
 
 @check("frame/position-only", "only the fields that are present are set: the corner", needs=(names.SCAN_TOP_LEFT_X,))
 def position_only(kit: CheckMeasurements) -> None:
-    ask_for(kit, kit.frames.wide.request(kit.support))
-    left, low = kit.frames.wide.region.top_left_m
-    moved_m = 0.05 * kit.frames.wide.region.size_m[0]
+    ask_for(kit, kit.frames.other.request(kit.support))
+    left, low = kit.frames.other.region.top_left_m
+    moved_m = 0.05 * kit.frames.other.region.size_m[0]
     ask_for(kit, ScanParameters(RegionChange(left_m=left - moved_m, low_m=low + moved_m)))
-    center = kit.frames.wide.region.center_m
-    wanted = kit.frames.wide.region.moved_to((center[0] - moved_m, center[1] + moved_m))
-    require_in_force(kit, FrameSetting(wanted, kit.frames.wide.shape))
+    center = kit.frames.other.region.center_m
+    wanted = kit.frames.other.region.moved_to((center[0] - moved_m, center[1] + moved_m))
+    require_in_force(kit, FrameSetting(wanted, kit.frames.other.shape))
 
 
 @check("frame/shape-only", "only the fields that are present are set: the pixels", needs=(names.SCAN_RESOLUTION_X,))

@@ -142,8 +142,9 @@ _SHAPE = (96, 96)
     needs=(names.START_SCAN,),
 )
 def picture(kit: CheckMeasurements) -> None:
-    has_angle = kit.support.has(names.SCAN_ANGLE)
-    details = [kit.scan(name) for name in ("plain", "wide", *(["turned"] if has_angle else []))]
+    wide = ["wide"] if kit.can_pass("scan/not-square") else []
+    turned = ["turned"] if kit.support.has(names.SCAN_ANGLE) else []
+    details = [kit.scan(name) for name in ("plain", *wide, *turned)]
     larger = kit.take_scan(FrameSetting(kit.frames.whole, _SHAPE))
     found = [likenesses(*_pictures(channel, larger, details)) for channel in _common(larger, details)]
     if not found:
