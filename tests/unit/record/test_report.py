@@ -669,7 +669,7 @@ def test_planned_work_stands_beside_the_measured_work(run: Path) -> None:
     Page(text)
     head = "<td>series &lt;b&gt;</td><td>planned</td><td>4</td><td>0</td><td>128 µm</td><td>30 min</td>"
     measured = "<td></td><td>measured</td><td>3</td><td>0</td><td>96 µm</td><td>22 min</td>"
-    assert "<th>tip path</th><th>duration</th>" in text
+    assert "<th>path</th><th>duration</th>" in text
     assert f"<tr>{head}</tr><tr>{measured}</tr>" in re.sub(r"\s*\n\s*", "", text)
     assert "tuner" not in text, "it has no estimate to compare"
 

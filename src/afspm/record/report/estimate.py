@@ -17,7 +17,7 @@ def html(story: RunStory) -> str:
         planned = "planned at most" if one.planned.at_most else "planned"
         rows.append([escape(one.name), planned, *_cells(one.planned)])
         rows.append(["", "measured", *_cells(one.measured)])
-    return table(["component", "", "scans", "spectra", "tip path", "duration"], rows)
+    return table(["component", "", "scans", "spectra", "path", "duration"], rows)
 
 
 def _cells(work: PlannedWork) -> list[str]:

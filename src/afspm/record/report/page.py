@@ -203,7 +203,7 @@ def _problems(story: RunStory, clock: PageTimes) -> str:
         for span in story.overview.routine_spans
     )
     return (
-        table(["problem", "flagged", "by", "in control meanwhile", "done to the tip", "for", "cleared"], rows)
+        table(["problem", "flagged", "by", "in control meanwhile", "treatments", "for", "cleared"], rows)
         or "<p>None.</p>"
     ) + routine
 
