@@ -7,7 +7,7 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 DEV := .venv/.dev
 
-.PHONY: demo demo-drift dev test test-times test-all test-slow test-power-cut test-apart test-lowest mutants test-samples test-matrix coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
+.PHONY: demo demo-drift dev test test-times test-all test-slow test-power-cut test-apart test-lowest mutants test-samples test-matrix test-nion coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
 .PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift bench-guests soak chaos simulate replay-nights power-cut docs release-check test-plug-ins changelog clean
 .DEFAULT_GOAL := demo
 
@@ -94,12 +94,21 @@ LOWEST ?= tests/unit tests/plugins
 test-lowest:
 	@$(PYTHON) tools/lowest_versions.py -n $(TESTS_AT_A_TIME) --dist worksteal -m "not slow" $(LOWEST)
 
-## each component on the simulator and on five emulated controllers, and the table of docs/reference/instruments.md
+## each component on the simulator, on five emulated controllers and on Nion's simulated microscope, and the table of docs/reference/instruments.md
 test-matrix: $(COLLECTED)
 	@rm -rf build/matrix
+	@$(PYTHON) tools/bootstrap.py afspm-nion
 	@AFSPM_MATRIX=$(CURDIR)/build/matrix $(PYTEST) -n 3 --dist worksteal tests/system/matrix -k job_is_done
+	@AFSPM_MATRIX=$(CURDIR)/build/matrix $(NION)/.venv/bin/pytest -n 3 tests/system/matrix -k "job_is_done and nion"
 	@$(BIN)/python tools/matrix.py build/matrix
 	@$(BIN)/python tools/docs.py
+
+## the driver of Nion's microscope, in an environment of its own: its tests, and its column of the matrix
+NION := packages/afspm-nion
+test-nion:
+	@$(PYTHON) tools/bootstrap.py afspm-nion
+	@PYTHONDONTWRITEBYTECODE= $(NION)/.venv/bin/pytest -n 2 --dist worksteal $(NION)/tests
+	@AFSPM_CASES=all PYTHONDONTWRITEBYTECODE= $(NION)/.venv/bin/pytest -n 2 --dist worksteal tests/system/matrix -k nion
 
 ## every sample in experiments/, shortened, to its end
 test-samples: $(TEST)

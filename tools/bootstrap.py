@@ -2,7 +2,8 @@
 
 Run by the Makefile: `python3 tools/bootstrap.py demo` (what a plain install holds), `test` (and what the tests need),
 `all` (and the tools of `make check`), `browser` (what drives one), `gateway` (its judge), `coverage` or `release` (what
-judges the distributions). Each adds to what is there.
+judges the distributions). Each adds to what is there. The name of a package of `packages/` makes an environment of its
+own in the package's folder, with what its tests need.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 VENV = ROOT / ".venv"
+PACKAGES = ROOT / "packages"
 TOOLS = ROOT / "build" / "tools"
 UV_VERSION = "uv>=0.5,<1"
 NOT_TESTED = {"all", "formats", "notebook"}
@@ -26,6 +28,10 @@ NOT_TESTED = {"all", "formats", "notebook"}
 def main(wanted: str) -> None:
     if sys.version_info < (3, 11):  # noqa: UP036  (it is run by whatever python3 there is)
         sys.exit(f"afspm needs Python 3.11 or later, this is {sys.version.split()[0]}")
+    if (PACKAGES / wanted).is_dir():
+        _sync(f"--package={wanted}", "--group=test", venv=PACKAGES / wanted / ".venv")
+        _compile(PACKAGES / wanted / ".venv")
+        return
     is_new = not VENV.exists()
     _sync("--group=pip")
     if is_new or wanted == "demo":
@@ -44,9 +50,9 @@ def extras() -> list[str]:
     return sorted(project["optional-dependencies"].keys() - NOT_TESTED)
 
 
-def _sync(*options: str) -> None:
+def _sync(*options: str, venv: Path = VENV) -> None:
     uv = find_uv()
-    environment = {**os.environ, "UV_PROJECT_ENVIRONMENT": str(VENV), "UV_PYTHON_DOWNLOADS": "never"}
+    environment = {**os.environ, "UV_PROJECT_ENVIRONMENT": str(venv), "UV_PYTHON_DOWNLOADS": "never"}
     environment.pop("VIRTUAL_ENV", None)
     command = [uv, "sync", "--frozen", "--inexact", "--python", sys.executable, "--quiet", "--no-default-groups"]
     if subprocess.run([*command, *options], cwd=ROOT, env=environment).returncode != 0:
@@ -75,10 +81,10 @@ def _has_browser() -> bool:
     return bool(os.environ.get("AFSPM_CHROMIUM")) or any(map(shutil.which, names))
 
 
-def _compile() -> None:
+def _compile(venv: Path = VENV) -> None:
     """Compile what an experiment imports now, as pip would and uv does not: it starts many processes, and where Python
     may not keep what it compiled (PYTHONDONTWRITEBYTECODE), each would spend most of its start on compiling again."""
-    python = VENV / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+    python = venv / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
     packages = "import sysconfig; print(sysconfig.get_path('purelib'))"
     folder = subprocess.run([str(python), "-c", packages], capture_output=True, text=True, check=True).stdout.strip()
     # the tests of packages are not imported; what can't be compiled is a template for another Python
@@ -114,7 +120,10 @@ def _make_venv() -> None:
 def _wanted(arguments: list[str]) -> str:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "wanted", nargs="?", default="all", choices=("demo", "test", "all", "gateway", "coverage", "release")
+        "wanted",
+        nargs="?",
+        default="all",
+        choices=("demo", "test", "all", "gateway", "coverage", "release", *(one.name for one in PACKAGES.iterdir())),
     )
     return str(parser.parse_args(arguments).wanted)
 
