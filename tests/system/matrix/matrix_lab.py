@@ -16,15 +16,24 @@ from makers import MAKERS
 from tests.system.experiment.experiment_lab import AfspmRun
 
 import afspm
+from afspm.basics import entry_points
 from afspm.experiment import load
 
 HERE = Path(__file__).parent
 RECORD = HERE / "matrix.toml"
 JOBS = HERE / "jobs"
 EXPERIMENTS = HERE.parents[2] / "experiments"
-SECOND_FILES = {"simulator": EXPERIMENTS / "every_microscope" / "simulator.toml"} | {
-    name: maker.emulated for name, maker in MAKERS.items()
-}
+OUTSIDE = {"nion": "Nion"}
+"""Instruments of other distributions, by the names of their drivers: their cells run where the driver is installed."""
+SECOND_FILES = (
+    {"simulator": EXPERIMENTS / "every_microscope" / "simulator.toml"}
+    | {name: maker.emulated for name, maker in MAKERS.items()}
+    | {
+        name: folder / "simulated.toml"
+        for name, driver in OUTSIDE.items()
+        if (folder := entry_points.folder(entry_points.DRIVERS, driver)) is not None
+    }
+)
 DONE = "done"
 Proof = Callable[[AfspmRun], bool]
 
@@ -68,7 +77,6 @@ PROOFS: Mapping[str, Mapping[str, Proof]] = {
     "series": {
         "Scheduler": scans(4),
         "ScanSeries": scans(4),
-        "TipClassifier": said("tip_classifier", "good|bad|unclear"),
         "NightPicture": file("night.png"),
         "Metadata": file("metadata.csv"),
         "LogCollector": file("log*.txt"),
@@ -76,6 +84,7 @@ PROOFS: Mapping[str, Mapping[str, Proof]] = {
         "Dashboard": said("dashboard", "http"),
         "Gateway": said("gateway", "http"),
     },
+    "judge": {"TipClassifier": said("tip_classifier", "good|bad|unclear")},
     "list": {"ScanList": scans(2)},
     "grid": {"RegionGrid": scans(2)},
     "sweep": {"Sweep": scans(2)},
