@@ -6,7 +6,7 @@ import math
 import sys
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from afspm import wire
@@ -50,6 +50,7 @@ from afspm.model.events import PERSON
 from afspm.model.grants import with_proposal
 from afspm.model.names import START_SCAN
 from afspm.model.problems import CONDITIONS
+from afspm.record.allowed_bands import AllowedBands, ReadingCurve
 from afspm.record.measurement_history import (
     SOON_NS,
     DriftPoint,
@@ -62,43 +63,7 @@ from afspm.record.running_scan import RunningScan
 from afspm.record.timeline import Span, Timeline, Timelines
 
 if TYPE_CHECKING:
-    from afspm.record.allowed_bands import AllowedBands
     from afspm.wire.messages import DriftMapping, DriftRescan, SpatialPointWithScoreList
-
-MOST_POINTS = 4000
-
-
-@dataclass(slots=True)
-class ReadingCurve:
-    """Values over time; NaN where the value was unknown.
-
-    Attributes:
-        step_ns: the least time between two points; a nearer point replaces the last. The step grows with the run.
-    """
-
-    unit: str = ""
-    times_ns: list[int] = field(default_factory=list)
-    values: list[float] = field(default_factory=list)
-    step_ns: int = 0
-
-    def add(self, time_ns: int, value: float) -> None:
-        """Add a value; thin a long curve to every second point, but keep its gaps."""
-        is_near = len(self.times_ns) > 1 and time_ns - self.times_ns[-2] < self.step_ns
-        if is_near and (value != value) == (self.values[-1] != self.values[-1]):
-            self.times_ns[-1], self.values[-1] = time_ns, value
-            return
-        self.times_ns.append(time_ns)
-        self.values.append(value)
-        if len(self.times_ns) > MOST_POINTS:
-            kept = [k for k in range(len(self.values)) if k % 2 == 0 or self._begins_or_ends_gap(k)]
-            self.times_ns = [self.times_ns[k] for k in kept]
-            self.values = [self.values[k] for k in kept]
-            self.step_ns = 2 * max(self.step_ns, (self.times_ns[-1] - self.times_ns[0]) // MOST_POINTS)
-
-    def _begins_or_ends_gap(self, k: int) -> bool:
-        # a gap whose only point is dropped would be drawn as a line through it
-        return k > 0 and math.isnan(self.values[k]) != math.isnan(self.values[k - 1])
-
 
 __all__ = [
     "ROUTINE",

@@ -6,9 +6,9 @@ import math
 from pathlib import Path
 
 from afspm.model import ProblemNames
-from afspm.record.allowed_bands import allowed_bands, instrument_curves
+from afspm.record.allowed_bands import MOST_POINTS, ReadingCurve, allowed_bands, instrument_curves
 from afspm.record.drawing.timeline import DrawnBand
-from afspm.record.overview import MOST_POINTS, Overview, ReadingCurve
+from afspm.record.overview import Overview
 from afspm.record.run_json import EXPERIMENT_FILE
 
 
@@ -29,7 +29,7 @@ def test_bands_of_the_experiment_file_are_in_the_units_of_the_curves(tmp_path: P
     overview = Overview(ProblemNames())
     for name, unit in (("cryo.temperature", "K"), ("magnet.field", "T"), ("gas.pressure", "Pa")):
         overview.instruments[name] = ReadingCurve(unit, [0], [1.0])
-    bands = {one.name: one.bands for one in instrument_curves(overview, allowed_bands(tmp_path))}
+    bands = {one.name: one.bands for one in instrument_curves(overview.instruments, allowed_bands(tmp_path))}
     assert bands == {
         "cryo.temperature": [DrawnBand("cold", 4.15, 4.25)],
         "gas.pressure": [],

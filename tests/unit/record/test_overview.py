@@ -20,7 +20,8 @@ from afspm.model import (
     ScopeState,
 )
 from afspm.model.events import NO_LONGER_TRUE
-from afspm.record.overview import MOST_LINES, MOST_POINTS, Overview
+from afspm.record.allowed_bands import MOST_POINTS
+from afspm.record.overview import MOST_LINES, Overview
 
 S = 1_000_000_000
 REGION = model.Region((0.0, 0.0), (1e-6, 1e-6))

@@ -62,7 +62,7 @@ def html(
 
 def _timeline(story: RunStory) -> str:
     local = PageTimes(story.start_ns, story.end_ns).is_local
-    curves = instrument_curves(story.overview, story.bands)
+    curves = instrument_curves(story.overview.instruments, story.bands)
     rows = timeline_rows(story)
     return timeline.timeline_html(rows, story.start_ns, story.end_ns, UTC, local_too=local, curves=curves)
 

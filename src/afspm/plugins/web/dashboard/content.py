@@ -182,7 +182,7 @@ class Contents:
                 None,
                 now_ns,
                 pictures=self._strip(overview),
-                curves=instrument_curves(overview, self._bands),
+                curves=instrument_curves(overview.instruments, self._bands),
             )
             for unfolded in (False, True)
         )
