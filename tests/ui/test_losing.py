@@ -76,7 +76,7 @@ def test_microscope_without_an_answer_does_not_stop_the_page(night: Night, opene
 
 def test_a_page_that_joined_a_run_shows_a_lost_scheduler(opened: Opened, tmp_path: Path) -> None:
     file = tmp_path / "experiment.toml"
-    file.write_text(EXPERIMENT.partition("[dashboard]")[0].format(speed=60.0, lines=2.0), encoding="utf-8")
+    file.write_text(EXPERIMENT.partition("[dashboard]")[0].format(speed=60.0, lines=2.0, every="4 h"), encoding="utf-8")
     with ExitStack() as started:
 
         def start(*words: object) -> subprocess.Popen[str]:

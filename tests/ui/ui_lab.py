@@ -41,7 +41,7 @@ class = "ScanSeries"
 size = ["1 um", "0.6 um"]
 center = ["0.3 um", "-0.2 um"]
 pixels = [40, 64]
-every = "4 h"
+every = "{every}"
 scans = 20
 
 [control]
@@ -69,10 +69,17 @@ class Night(AfspmProcess):
     """`afspm run` of an experiment with a dashboard, as a process of its own."""
 
     def __init__(
-        self, folder: Path, *, speed: float = 60.0, lines: float = 2.0, more: str = "", options: tuple[str, ...] = ()
+        self,
+        folder: Path,
+        *,
+        speed: float = 60.0,
+        lines: float = 2.0,
+        more: str = "",
+        options: tuple[str, ...] = (),
+        every: str = "4 h",
     ) -> None:
         file = folder / "experiment.toml"
-        file.write_text(EXPERIMENT.format(speed=speed, lines=lines) + more, encoding="utf-8")
+        file.write_text(EXPERIMENT.format(speed=speed, lines=lines, every=every) + more, encoding="utf-8")
         super().__init__("run", str(file), "--runs", str(folder / "runs"), *options, folder=folder)
         try:
             self.url = self.wait_for_url("dashboard")
