@@ -169,7 +169,9 @@ class RequestHandler:
             self._state.save()
         # it starts together with this process: `Connection` logs a controller that does not come
         is_starting = response.detail is ResponseDetail.NOT_SENT and not self._connection.ever_stood
-        self._reply(response, logging.DEBUG if is_starting else logging.INFO)
+        # the scheduler asks each microscope for a retract: "no" is an answer, and no refusal of anything
+        is_question = request.kind == ControlRequest.ACTION_SUPPORT
+        self._reply(response, logging.DEBUG if is_starting or is_question else logging.INFO)
 
 
 def _run_of(frames: Sequence[bytes]) -> str:
