@@ -123,7 +123,16 @@ def _wanted(arguments: list[str]) -> str:
         "wanted",
         nargs="?",
         default="all",
-        choices=("demo", "test", "all", "gateway", "coverage", "release", *(one.name for one in PACKAGES.iterdir())),
+        choices=(
+            "demo",
+            "test",
+            "all",
+            "browser",
+            "gateway",
+            "coverage",
+            "release",
+            *(one.name for one in PACKAGES.iterdir()),
+        ),
     )
     return str(parser.parse_args(arguments).wanted)
 
