@@ -145,7 +145,7 @@ COUNTED = 1 << 16
 
 def scarred(up: Mask, down: Mask, thick: int) -> Mask:
     """Return the mask of scars `thick` rows thick, from the pixels that stand out up or down."""
-    there = np.zeros(up.shape, dtype=bool)
+    there: Mask = np.zeros_like(up)
     for which in (up, down):
         some = rows_with_scars(which)
         there[some] |= _mostly(which[some])
@@ -157,8 +157,7 @@ def scarred(up: Mask, down: Mask, thick: int) -> Mask:
 
 def rows_with_scars(which: Mask) -> Mask:
     """Return the rows with enough of these pixels for a scar; most rows of most scans have too few."""
-    enough: Mask = np.count_nonzero(which, axis=1) > SCAR_PX / 2
-    return enough
+    return np.asarray(which.sum(axis=1) > SCAR_PX / 2)
 
 
 def mended_rows(values: Array, level: Array, scar: Mask) -> Array:
