@@ -104,14 +104,14 @@ def take_spectrum(bench: Any, meanwhile: dict[str, Any], afterwards: dict[str, A
     bench.microscope.state = ScopeState.FREE
 
 
-def test_a_value_changed_in_a_spectrum_is_told_once_the_controller_has_put_back_its_own(bench: Any) -> None:
+def test_a_value_changed_in_a_spectrum_is_published_once_the_controller_has_put_back_its_own(bench: Any) -> None:
     take_spectrum(bench, {"Setpoint": 2.0, "Loop": False}, {"Loop": True})
     for _ in range(4):
         bench.look(2.0)
     assert acts(bench) == [PanelAct.VALUES]
 
 
-def test_a_feedback_switched_off_in_a_spectrum_is_told_although_another_request_follows(bench: Any) -> None:
+def test_a_feedback_switched_off_in_a_spectrum_is_seen_although_another_request_follows(bench: Any) -> None:
     take_spectrum(bench, {"Loop": False}, {})
     bench.look(2.0)
     assert acts(bench) == []
