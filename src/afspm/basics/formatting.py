@@ -156,7 +156,7 @@ def quantity(value: float | None, unit: str, digits: int = 4) -> str:
     if value is None or not math.isfinite(value):
         return "–"
     factor, shown = scale(value, unit)
-    rounded = float(f"{value * factor:.{digits}g}")  # and then 20000, not 2e+04
+    rounded = float(f"{value * factor:.{digits}g}") + 0.0  # 20000, not 2e+04; 0, not -0
     return f"{rounded:.{max(digits, _PLAIN_DIGITS)}g} {shown}".strip()
 
 

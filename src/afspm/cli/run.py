@@ -28,7 +28,9 @@ _QUESTIONS: Final = {
     "technique": "Technique (STM, STS or AFM)",
 }
 _SIMULATOR, _PAPERS_METHOD = "simulator", "paper"
-_TIP_REPAIR_NIGHT = "A simulated night of eight hours: the tip changes three times, and is repaired. Two minutes."
+_TIP_REPAIR_NIGHT = (
+    "A simulated night, planned for eight hours: the tip changes three times, and is repaired. Two minutes."
+)
 _DRIFT_NIGHT = "A simulated night of eighteen hours on a sample that drifts by micrometres. Three to five minutes."
 
 

@@ -104,8 +104,9 @@ class Replayer:
         return max(0.0, self._clock.real_s((next_ns - self._clock.now_ns()) / NS_PER_S))
 
     def _publish_due(self) -> None:
+        uncached = tuple(one.name for one in wire.declared() if not one.history)  # by a scheduler either
         for packet in islice(self._recorded.due(self._clock.now_ns()), MOST_AT_ONCE):
-            keep = not packet.envelope.startswith("ScanLines")  # a scheduler does not cache them either
+            keep = not packet.envelope.startswith(uncached)
             stamped = self._published.stamp(packet.envelope, bytes(packet.payload), packet.time_ns, keep=keep)
             self._publisher.publish(stamped)
             self.count += 1

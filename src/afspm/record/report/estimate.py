@@ -17,7 +17,16 @@ def html(story: RunStory) -> str:
         planned = "planned at most" if one.planned.at_most else "planned"
         rows.append([escape(one.name), planned, *_cells(one.planned)])
         rows.append(["", "measured", *_cells(one.measured)])
-    return table(["component", "", "scans", "spectra", "path", "duration"], rows)
+    if not rows:
+        return ""
+    # the plan leaves computing out, which a fast clock multiplies by its speed
+    computing = "" if story.real_s is None else ", and with the real time of computing times the speed of the clock"
+    note = (
+        "Both durations are in experiment time. The measured one goes from the first scan or spectrum to the end of "
+        f"the last, with pauses and repairs{computing}."
+    )
+    made = table(["component", "", "scans", "spectra", "path", "duration"], rows)
+    return f'{made}<p class="note">{note}</p>'
 
 
 def _cells(work: PlannedWork) -> list[str]:

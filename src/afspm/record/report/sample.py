@@ -125,8 +125,8 @@ class _View:
         y = Axis("", "m", self.low, self.low + self.height, largest_m)
         _, unit = scale(largest_m, "m")
         ticks = [f'<s class="x" style="left:{100 * at:.2f}%">{label}</s>' for at, label in x.ticks()[:-1]]
-        ticks += [f'<s class="y" style="top:{100 - 100 * at:.2f}%">{label}</s>' for at, label in y.ticks()]
-        ticks.append(f'<s class="x" style="left:97%">{unit}</s>')
+        ticks += [f'<s class="y" style="top:{100 - 100 * at:.2f}%">{label}</s>' for at, label in y.ticks()[:-1]]
+        ticks.append(f'<s class="x" style="left:97%">{unit}</s><s class="y" style="top:3%">{unit}</s>')
         bar = scale_bar((self.width, self.height))
         ratio = self.width / self.height
         look = f"aspect-ratio:{ratio:.5g};max-width:{min(560.0, 480.0 * ratio):.0f}px"
