@@ -451,8 +451,10 @@ class ForbiddenBench:
         self._ask("series", ControlRequest.REQUEST_CTRL, 0)
 
     def _do_end(self) -> None:
-        if self.truth[SCANNING]:
+        # a state that begins by itself counts from its packet on, and no earlier
+        if self.truth[SCANNING] and self._is_quiet:
             self._become(ScopeState.FREE)
+            self._publish_all()
 
     def _do_panel(self, name: str, value: float) -> None:
         if not self._is_quiet:
