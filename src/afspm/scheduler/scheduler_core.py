@@ -325,7 +325,7 @@ def _on_ask_microscope(draft: StateDraft, output: AskMicroscope) -> None:
         return
     # the values, and not who may set them: no component asks
     refusal = draft.limits.check(SCHEDULER, output.request, draft.now_ns, used=())
-    # a command in flight may change what is known, so no value counts as known for the forbidden states
+    # a command in flight may change the known values, so none counts for the forbidden states
     refusal = refusal or draft.limits.check_forbidden(output.request, PresentState())
     if refusal is not None:
         draft.raised.append(FrameAnswered(output.purpose, refusal))

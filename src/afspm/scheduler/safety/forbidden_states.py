@@ -3,7 +3,7 @@
 A rule refuses a request after which the rule would hold, or could hold because a value that decides it is unknown.
 Three requests are never refused: one that ends the forbidden state, one that moves away from it, and a stop or retract
 (`NEVER_REFUSED`). A request moves away if it makes no comparison of the rule truer, and at least one less true. A rule
-has only `and` and `or`, so such a request can't begin a forbidden state, whatever the unknown values are. A request
+has only `and` and `or`, so such a request can't begin a forbidden state, for any unknown values. A request
 that changes no value of a rule is not judged by it, unless it is an action: nothing begins in a forbidden state.
 
 The caller collects the values before the request (`PresentState`). One value may have several candidates: an instrument
