@@ -55,6 +55,13 @@ def test_model_learns_that_its_arguments_are_no_json() -> None:
     assert "no JSON" in model.asked[1][-1]["content"]
 
 
+def test_report_that_the_bench_could_not_read_goes_back_to_the_model() -> None:
+    unknown = completion((REPORT, '{"status": "cannot", "reason": "no tool"}'))
+    model = ScriptedModel(unknown, completion((REPORT, '{"status": "cannot"}')))
+    assert model.run() is not None
+    assert model.asked[1][-1]["content"] == "a report has no field 'reason'"
+
+
 def test_model_that_never_reports_makes_no_report() -> None:
     model = ScriptedModel({"choices": [{"message": {"role": "assistant", "content": "hello"}}]})
     assert model.run() is None

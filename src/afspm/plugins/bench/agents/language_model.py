@@ -15,6 +15,9 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from afspm.basics.errors import InvalidValue
+from afspm.plugins.bench.evidence import Report
+
 MOST_TURNS: Final = 60
 """Answers of the model in one trial; a model that has not reported by then fails the trial."""
 REPORT: Final = "report"
@@ -27,12 +30,16 @@ _TO_REPORT: Final = {
             "type": "object",
             "properties": {
                 "status": {"type": "string", "enum": ["done", "cannot", "ask"]},
-                "answer": {"description": "as the task describes it"},
-                "cites": {"type": "array", "description": "times of the measurements that the answer rests on"},
+                "answer": {"type": "object", "description": "as the task describes it"},
+                "cites": {
+                    "type": "array",
+                    "items": {"type": "string"},
+                    "description": "ids of the measurements that the answer rests on",
+                },
                 "asks": {"type": "array", "items": {"type": "string"}, "description": "names of the missing facts"},
-                "reason": {"type": "string"},
             },
             "required": ["status"],
+            "additionalProperties": False,
         },
     },
 }
@@ -64,11 +71,21 @@ async def converse(prompt: str, tools: Sequence[Message], ask: Ask, call: Call) 
             except ValueError as error:
                 answer = f"the arguments are no JSON: {error}"
             else:
-                if name == REPORT and isinstance(given, dict):
+                if name != REPORT:
+                    answer = await call(name, given)
+                elif not (answer := _fault_of(given)):
                     return {**given, "usage": usage}
-                answer = await call(name, given)
             messages.append({"role": "tool", "tool_call_id": one["id"], "content": answer})
     return None
+
+
+def _fault_of(report: object) -> str:
+    # the model may report again: the bench judges the work, not the format of one call
+    try:
+        Report.from_plain(report)
+    except InvalidValue as error:
+        return str(error)
+    return ""
 
 
 async def main() -> None:
