@@ -28,6 +28,7 @@ speed = 20.0
 
 [microscope]
 trace = true
+reply_timeout_s = "60 s"  # or a busy computer loses contact, which is a malfunction
 
 [scheduler]
 component = true
