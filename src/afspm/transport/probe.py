@@ -24,7 +24,12 @@ def versions_here() -> Versions:
 
 
 def reach(address: str, within_s: float = WITHIN_S) -> Reach:
-    """Return the outcome of an attempt to connect to a `tcp://` address; `within_s` limits connection and greeting."""
+    """Return the outcome of an attempt to connect to a `tcp://` address; `within_s` limits connection and greeting.
+
+    An address of another kind is on this computer, and only a handshake shows who is there.
+    """
+    if not address.startswith("tcp://"):
+        return Reach.OPEN
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     try:
         with socket.create_connection((host.strip("[]"), int(port)), timeout=within_s) as peer:
