@@ -189,6 +189,7 @@ check: $(DEV)
 	@$(BIN)/lint-imports
 	@$(BIN)/zizmor --quiet --no-progress --offline --strict-collection --persona pedantic .github
 	@$(BIN)/python tools/quality.py
+	@$(BIN)/python tools/doors.py
 
 ## speed, beside bare pyzmq and beside the last landed run: a table, and build/bench.json. LAND=1 lands this run's ratios
 bench: $(TEST)

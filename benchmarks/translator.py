@@ -12,8 +12,8 @@ import numpy as np
 import zmq
 
 from afspm import wire
+from afspm.driver import Driver, Value, action
 from afspm.model import ControlRequest, Parameter, Region, Request, Scan, ScopeState, ScopeStatus, Spectrum, names
-from afspm.translator import Driver, Value, action
 from benchmarks.effort import effort
 from benchmarks.processes import roles
 from benchmarks.rows import Row, measurement

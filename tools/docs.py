@@ -16,6 +16,7 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
+import doors
 import python_api
 import quality
 import state_diagram
@@ -351,6 +352,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "components": component_pages,
     "simulator": simulator_page,
     "python-api": python_api.python_api,
+    "plug-in-interface": doors.plug_in_interface,
     "control": lambda: section(ControlSettings),
     "roles": lambda: section(RoleTable),
     "limit": lambda: section(Limit),

@@ -15,11 +15,11 @@ from typing import Any
 
 GROUPS = {
     "Join, open, read": ["afspm.connect", "afspm.open_run", "afspm.find_runs", "afspm.read"],
-    "Write a component": ["afspm.Component", "afspm.storage.memory.Memory"],
+    "Write a component": ["afspm.Component", "afspm.Memory"],
     "Use the microscope": [
         "afspm.Scope",
-        "afspm.client.events.Events",
-        "afspm.client.events.PublishedEvent",
+        "afspm.Events",
+        "afspm.PublishedEvent",
         "afspm.client.sweeping.SweepPoint",
     ],
     "Requests and measurements": [
@@ -27,10 +27,10 @@ GROUPS = {
         "afspm.Scan",
         "afspm.ScanSet",
         "afspm.Spectrum",
-        "afspm.storage.formats.FileContent",
+        "afspm.driver.FileContent",
     ],
     "After the night": [
-        "afspm.record.run.Run",
+        "afspm.Run",
         "afspm.record.tables.Table",
         *(f"afspm.record.measured_tables.{name}" for name in ("KeyedTable", "SpectrumTable")),
         *(f"afspm.record.tables.{name}" for name in ("ScanRow", "SpectrumRow", "NoteRow")),

@@ -3,7 +3,7 @@
 import numpy as np
 
 from afspm import Component, Region, wire
-from afspm.basics.units import Length
+from afspm.basics import Length
 from afspm.model import ChannelName
 
 MESSAGE = "SpatialPointWithScoreList"

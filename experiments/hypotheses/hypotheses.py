@@ -7,7 +7,7 @@ from decision_picture import draw
 from spots import difference, judged
 
 from afspm import Component
-from afspm.basics.units import Length
+from afspm.basics import Length
 from afspm.plugins.adaptive.quantities import gap_ev
 
 

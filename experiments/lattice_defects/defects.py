@@ -7,7 +7,7 @@ from scipy import ndimage
 from sites_picture import COLOURS, draw
 
 from afspm import Component, Region
-from afspm.basics.units import Length
+from afspm.basics import Length
 
 
 def lattice_sites(heights):

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from afspm.basics.formatting import scale
+from afspm.basics import scale
 
 COLOURS = {"vacancy": "tab:blue", "atom": "tab:green", "adatom": "tab:red"}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from afspm.client.component import Component
+from afspm import Component
 from afspm.model import Scan
 
 

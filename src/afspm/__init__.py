@@ -5,23 +5,50 @@ What one writes components and scripts with is here, loaded when it is first use
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+from afspm.basics.lazy import lazily
 
 if TYPE_CHECKING:
     from afspm.client.component import Component
     from afspm.client.connect import connect
+    from afspm.client.events import Events, PublishedEvent
     from afspm.client.scope import Scope
     from afspm.model import ControlMode, Problem, Region, Scan, ScanSet, ScopeState, Spectrum
     from afspm.record.catalogue import find_runs
-    from afspm.record.run import open_run
+    from afspm.record.run import Run, open_run
     from afspm.storage.formats import read
+    from afspm.storage.memory import Memory
+
+if TYPE_CHECKING:  # components judge tips, pair channels, plan work, keep files and states
+    from afspm.basics.shared_time import Publication
+    from afspm.components import tip_verdict
+    from afspm.components.channel_pairs import ChannelPairing, HeightPair, MissingChannels
+    from afspm.components.line_file import LineFile, csv_line
+    from afspm.components.tip_judge import Opinion, TipJudge
+    from afspm.model.line_levelling import Array, Levelling, flattened, levelled
+    from afspm.model.planned_work import PlannedWork
+    from afspm.model.snapshot import from_plain, restored, snapshot, to_plain
+    from afspm.record.notes import append_note
+    from afspm.storage.atomic import OutageLog, replace_file, write_atomic
+    from afspm.storage.formats import suffixes
+
+if TYPE_CHECKING:  # a page's person and an agent measure and set as a script does
+    from afspm.client.connect import GUEST, find_run, guest_of
+    from afspm.client.cycle import Cycle, CycleOutcome
+    from afspm.client.measurement import BEGUN_WITHIN_S
+    from afspm.client.parameter_text import Value, from_parameter, to_parameter, value_in
+    from afspm.client.targets import FITS, ScanTarget, SpectrumTarget, Target, is_set, target_from, xy_of
 
 __all__ = [
     "Component",
     "ControlMode",
+    "Events",
+    "Memory",
     "Problem",
+    "PublishedEvent",
     "Region",
+    "Run",
     "Scan",
     "ScanSet",
     "Scope",
@@ -32,27 +59,64 @@ __all__ = [
     "open_run",
     "read",
 ]
+USERS_NAMES = tuple(__all__)
+"""What `dir` lists, and the page of the Python API; the others are for plug-ins."""
+__all__ += [
+    "BEGUN_WITHIN_S",
+    "FITS",
+    "GUEST",
+    "Array",
+    "ChannelPairing",
+    "Cycle",
+    "CycleOutcome",
+    "HeightPair",
+    "Levelling",
+    "LineFile",
+    "MissingChannels",
+    "Opinion",
+    "OutageLog",
+    "PlannedWork",
+    "Publication",
+    "ScanTarget",
+    "SpectrumTarget",
+    "Target",
+    "TipJudge",
+    "Value",
+    "append_note",
+    "csv_line",
+    "find_run",
+    "flattened",
+    "from_parameter",
+    "from_plain",
+    "guest_of",
+    "is_set",
+    "levelled",
+    "replace_file",
+    "restored",
+    "snapshot",
+    "suffixes",
+    "target_from",
+    "tip_verdict",
+    "to_parameter",
+    "to_plain",
+    "value_in",
+    "write_atomic",
+    "xy_of",
+]
 
-_HOMES = {
-    "Component": "afspm.client.component",
-    "Scope": "afspm.client.scope",
-    "connect": "afspm.client.connect",
-    "find_runs": "afspm.record.catalogue",
-    "open_run": "afspm.record.run",
-    "read": "afspm.storage.formats",
-}
+_own = lazily(__name__)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        from afspm.basics import entry_points
+    if name in __all__:
+        return _own(name)
+    from afspm.basics import entry_points
 
-        # a function that a package adds; never under a name of Python's own
-        if not name.startswith("_") and (found := entry_points.load(entry_points.FUNCTIONS, name)) is not None:
-            return found
-        raise AttributeError(f"module 'afspm' has no attribute {name!r}")
-    return getattr(import_module(_HOMES.get(name, "afspm.model")), name)
+    # a function that a package adds; never under a name of Python's own
+    if not name.startswith("_") and (found := entry_points.load(entry_points.FUNCTIONS, name)) is not None:
+        return found
+    raise AttributeError(f"module 'afspm' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted([name for name in globals() if name not in __all__] + list(USERS_NAMES))

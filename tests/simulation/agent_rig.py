@@ -25,7 +25,6 @@ from afspm.basics.errors import WireError
 from afspm.model import (
     CLOCK_REQUEST,
     GRANT_REQUEST,
-    HIGHEST_PROBLEM,
     LEASE_REQUEST,
     STOPPED_BY_AGENT,
     ControlMode,
@@ -49,6 +48,7 @@ from afspm.model import (
     component_of,
     names,
 )
+from afspm.model.problems import HIGHEST_PROBLEM
 from afspm.model.snapshot import restored, snapshot
 from afspm.plugins.agent.preflight import Preflight
 from afspm.plugins.agent.tools import AgentTools

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from afspm.basics import entry_points
-from afspm.translator import Driver
+from afspm.driver import Driver
 
 VENDORS = Path(__file__).parents[1] / "plugins"
 

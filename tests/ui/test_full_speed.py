@@ -15,7 +15,8 @@ from benchmarks.dashboard import latency_ms, open_page
 from benchmarks.stage import REGION, Stage, picture
 from deadlines import DEADLINE_S
 
-from afspm.model import LogLine, LogLines, ScanLines, ScopeState, ScopeStatus
+from afspm.model import LogLine, ScanLines, ScopeState, ScopeStatus
+from afspm.model.events import LogLines
 
 MB = 1 << 20
 AT_ONCE = 60

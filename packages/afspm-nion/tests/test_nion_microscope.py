@@ -13,7 +13,7 @@ from nion.device_kit.ScanDevice import ScanFrameParameters
 
 import afspm
 import afspm_nion
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
 from afspm.model import Region, RegistrationOutcome
 from afspm_nion import Nion
 from afspm_nion.microscope import frame_parameters

@@ -16,6 +16,7 @@ _ADDRESS = re.compile(r"(tcp://(\[[0-9A-Fa-f:.%]+\]|[^:/\s]+):(\d+|\*)|ipc://\S+
 
 
 def is_address(text: str) -> bool:
+    """Return whether a text is an address of this computer's or another's socket."""
     match = _ADDRESS.fullmatch(text)
     return match is not None and _has_port(match)
 

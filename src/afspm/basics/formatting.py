@@ -161,14 +161,17 @@ def quantity(value: float | None, unit: str, digits: int = 4) -> str:
 
 
 def typeset_position(xy_m: tuple[float, float]) -> str:
+    """Return a position (x, y) in m as text for pages."""
     return typeset(position_text(xy_m))
 
 
 def typeset_area(size_m: Sequence[float]) -> str:
+    """Return a size (width, height) in m as text for pages."""
     return typeset(area_text(size_m))
 
 
 def typeset_length(length_m: float) -> str:
+    """Return a length in m as text for pages."""
     return typeset(lengths_text([length_m]))
 
 

@@ -13,7 +13,6 @@ from afspm.model import (
     RELAY_REQUEST,
     ControlRequest,
     ControlResponse,
-    MeasurementSettings,
     Parameter,
     RelayedMessage,
     Request,
@@ -22,6 +21,7 @@ from afspm.model import (
     ScopeState,
     request_name,
 )
+from afspm.model.events import MeasurementSettings
 from afspm.model.microscope_status import feedback_of
 from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
 from afspm.wire.messages import FEEDBACK

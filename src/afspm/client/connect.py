@@ -15,7 +15,8 @@ from afspm.basics.launch import Launch, Sockets
 from afspm.basics.plain_data import Plain, from_json
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
-from afspm.model import Frame, ProblemNames, is_process_name
+from afspm.model import Frame, ProblemNames
+from afspm.model.events import is_process_name
 from afspm.record.run_json import RUN_FILE, STATE_DIR, latest_run, read_run_json, run_json_or_empty
 from afspm.record.run_lock import cut_off_message
 from afspm.transport.process.context import new_session

@@ -17,14 +17,12 @@ from afspm.client.interrupts import Interrupts
 from afspm.model import (
     CLOCK_REQUEST,
     HAS_ENDED,
-    OTHER_RUN_RESPONSE,
     RELAY_REQUEST,
     ActByHand,
     ChannelRoles,
     ControlMode,
     ControlState,
     Feedback,
-    FeedbackUnits,
     Packet,
     ProbePosition,
     RelayedMessage,
@@ -39,7 +37,9 @@ from afspm.model import (
     TipStatus,
     request_name,
 )
+from afspm.model.requests import OTHER_RUN_RESPONSE
 from afspm.model.sessions import run_of
+from afspm.model.state import FeedbackUnits
 from afspm.transport.port import (
     CaughtUp,
     ControlConnected,

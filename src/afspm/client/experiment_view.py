@@ -15,13 +15,13 @@ from afspm.model import (
     ControlMode,
     ControlState,
     Feedback,
-    FeedbackUnits,
     ProbePosition,
     ProblemNames,
     ScanParameters,
     ScopeState,
     TipStatus,
 )
+from afspm.model.state import FeedbackUnits
 
 
 class ExperimentView:

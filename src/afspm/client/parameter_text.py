@@ -8,7 +8,7 @@ from afspm import wire
 from afspm.basics.errors import InvalidValue, UnitError
 from afspm.basics.units import convert, parse_quantity, require_unit
 from afspm.model import Parameter, Response
-from afspm.model.names import BASE_PARAMETERS
+from afspm.model.parameter_names import BASE_PARAMETERS
 
 Value = float | str | bool
 

@@ -34,8 +34,6 @@ from afspm.model import (
     Feedback,
     Frame,
     Grant,
-    HasTime,
-    InstrumentOrders,
     InstrumentReadings,
     Note,
     Parameter,
@@ -47,6 +45,8 @@ from afspm.model import (
     ScanSet,
     Spectrum,
 )
+from afspm.model.events import HasTime
+from afspm.model.instruments import InstrumentOrders
 from afspm.model.sessions import KEYED
 from afspm.model.sweep_plan import SweepOrder, SweepPlan, SweptValues
 from afspm.transport.process.parent import StopRequested

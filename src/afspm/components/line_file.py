@@ -81,6 +81,7 @@ class LineFile:
 
 
 def csv_line(row: Iterable[str]) -> str:
+    """Return a row as a line of CSV, with its line end."""
     line = io.StringIO()
     csv.writer(line, lineterminator="").writerow(row)
     return line.getvalue().replace("\n", " ")

@@ -9,7 +9,8 @@ from typing import ClassVar, Literal
 from afspm.basics.clock import iso_utc
 from afspm.client.component import Component
 from afspm.components.line_file import LineFile
-from afspm.model import LogLine, LogLines
+from afspm.model import LogLine
+from afspm.model.events import LogLines
 
 _WRITTEN_NS = "written_ns"
 

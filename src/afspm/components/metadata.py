@@ -20,7 +20,6 @@ from afspm.model import (
     ControlResponse,
     ControlState,
     Feedback,
-    FeedbackUnits,
     JournalEntries,
     JournalEntry,
     Note,
@@ -30,6 +29,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
+from afspm.model.state import FeedbackUnits
 
 COLUMNS = (
     "time", "measurement", "filename", "channel", "center_x", "center_y", "width", "height", "length_units",

@@ -26,8 +26,8 @@ from afspm.components.notifications import (
     Notification,
     Targets,
 )
-from afspm.model import ControlMode, ControlState, JournalEntries, LogLines, ProcessCondition, ProcessStates
-from afspm.model.events import LOGGED_AS
+from afspm.model import ControlMode, ControlState, JournalEntries, ProcessCondition, ProcessStates
+from afspm.model.events import LOGGED_AS, LogLines
 from afspm.record.run_json import experiment_name
 
 MOST_TOLD = 1000

@@ -30,7 +30,7 @@ from afspm.components.scan_plan import (
     rounds_within,
 )
 from afspm.model import Region, ScanSet, ScopeState, ScopeStatus, names
-from afspm.model.names import BASE_PARAMETERS
+from afspm.model.parameter_names import BASE_PARAMETERS
 from afspm.model.planned_work import PlannedWork, planned_rounds
 
 Pixels = tuple[int, int]

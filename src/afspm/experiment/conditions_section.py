@@ -21,8 +21,9 @@ from afspm.basics.units import parse_quantity, si
 from afspm.experiment.document import Document
 from afspm.experiment.findings import nearest
 from afspm.experiment.toml_lines import Table
-from afspm.model import ProblemNames, instrument_of
-from afspm.model.names import BASE_ACTIONS
+from afspm.model import ProblemNames
+from afspm.model.instruments import instrument_of
+from afspm.model.parameter_names import BASE_ACTIONS
 from afspm.scheduler.instruments.conditions import AllowedBand, InstrumentSettings, MeasuringCondition
 
 _WHILE, _PROBLEM = "while", "problem"

@@ -44,7 +44,8 @@ from afspm.experiment.findings import nearest
 from afspm.experiment.sections import Section, parse
 from afspm.experiment.toml_lines import Table
 from afspm.experiment.validation_messages import name_of, report
-from afspm.model import Parameter, Region, component_of, instrument_of, names
+from afspm.model import Parameter, Region, component_of, names
+from afspm.model.instruments import instrument_of
 from afspm.scheduler.safety import rule_language
 from afspm.scheduler.safety.forbidden_states import STATES
 from afspm.scheduler.safety.limits import ExperimentLimits, ForbiddenState, Limit, RoleLimits

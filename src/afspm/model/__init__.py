@@ -16,72 +16,80 @@ a name (`sessions`), which scheduler a translator obeys (`fencing`), and that a 
 
 from __future__ import annotations
 
-from afspm.model.channels import HEIGHT, HEIGHT_RETRACE, TOPOGRAPHY, ChannelName, ChannelRoles, both_ways, of_role
-from afspm.model.events import (
-    ControlEvent,
-    HasTime,
-    JournalEntries,
-    JournalEntry,
-    LogLine,
-    LogLines,
-    MeasurementSettings,
-    Note,
-    ProcessCondition,
-    ProcessState,
-    ProcessStates,
-    Progress,
-    RelayedMessage,
-    Role,
-    component_of,
-    is_process_name,
-)
-from afspm.model.geometry import Frame, Region, RegionChange
-from afspm.model.grants import Approval, Approvals, Grant, GrantedCount, GrantedRange, GrantedStep, Proposal
-from afspm.model.instruments import (
-    InstrumentOrder,
-    InstrumentOrders,
-    InstrumentReading,
-    InstrumentReadings,
-    OrderOutcome,
-    instrument_of,
-    is_of_instrument,
-)
-from afspm.model.packet import LoggedPacket, Packet, PacketHeader
-from afspm.model.panel import ActByHand, ChangedValue, MeasurementConditions, PanelAct, TipStatus
-from afspm.model.problems import HIGHEST_PROBLEM, STOPPED_BY_AGENT, Problem, ProblemNames
-from afspm.model.registration_outcome import RegistrationOutcome, registration_summary
-from afspm.model.requests import (
-    CLOCK_REQUEST,
-    GRANT_REQUEST,
-    HAS_ENDED,
-    LEASE_AT_ONCE_S,
-    LEASE_REQUEST,
-    LONGEST_LEASE_S,
-    OTHER_RUN_RESPONSE,
-    RELAY_REQUEST,
-    RESTART_REQUEST,
-    WAIT_FOR_CONTROL,
-    ControlRequest,
-    ControlResponse,
-    Parameter,
-    Request,
-    RescanKind,
-    Response,
-    ResponseDetail,
-    request_name,
-)
-from afspm.model.scan import Scan, ScanLines, ScanParameters, ScanSet, ShapeChange
-from afspm.model.spectrum import Spectrum
-from afspm.model.state import (
-    ControlMode,
-    ControlState,
-    Feedback,
-    FeedbackUnits,
-    PositionChange,
-    ProbePosition,
-    ScopeState,
-    ScopeStatus,
-)
+from typing import TYPE_CHECKING
+
+from afspm.basics.lazy import lazily
+
+if TYPE_CHECKING:
+    from afspm.model import parameter_names as names
+    from afspm.model.channels import (
+        HEIGHT,
+        HEIGHT_RETRACE,
+        RETRACE,
+        TOPOGRAPHY,
+        ChannelName,
+        ChannelRoles,
+        both_ways,
+        of_role,
+    )
+    from afspm.model.events import (
+        LONGEST_NOTE,
+        PERSON,
+        ControlEvent,
+        JournalEntries,
+        JournalEntry,
+        LogLine,
+        Note,
+        ProcessCondition,
+        ProcessState,
+        ProcessStates,
+        Progress,
+        RelayedMessage,
+        Role,
+        component_of,
+    )
+    from afspm.model.geometry import XY, Frame, Region, RegionChange
+    from afspm.model.grants import Approval, Approvals, Grant, GrantedCount, GrantedRange, GrantedStep, Proposal
+    from afspm.model.instruments import (
+        InstrumentOrder,
+        InstrumentReading,
+        InstrumentReadings,
+        OrderOutcome,
+        is_of_instrument,
+    )
+    from afspm.model.packet import LoggedPacket, Packet, PacketHeader
+    from afspm.model.panel import ActByHand, ChangedValue, MeasurementConditions, PanelAct, TipStatus
+    from afspm.model.problems import STOPPED_BY_AGENT, Problem, ProblemNames
+    from afspm.model.registration_outcome import RegistrationOutcome, registration_summary
+    from afspm.model.requests import (
+        CLOCK_REQUEST,
+        GRANT_REQUEST,
+        HAS_ENDED,
+        LEASE_AT_ONCE_S,
+        LEASE_REQUEST,
+        RELAY_REQUEST,
+        RESTART_REQUEST,
+        WAIT_FOR_CONTROL,
+        ControlRequest,
+        ControlResponse,
+        Parameter,
+        Request,
+        RescanKind,
+        Response,
+        ResponseDetail,
+        request_name,
+    )
+    from afspm.model.scan import Scan, ScanLines, ScanParameters, ScanSet
+    from afspm.model.spectrum import Spectrum
+    from afspm.model.state import (
+        ControlMode,
+        ControlState,
+        Feedback,
+        PositionChange,
+        ProbePosition,
+        ScopeState,
+        ScopeStatus,
+    )
 
 __all__ = [
     "CLOCK_REQUEST",
@@ -89,16 +97,17 @@ __all__ = [
     "HAS_ENDED",
     "HEIGHT",
     "HEIGHT_RETRACE",
-    "HIGHEST_PROBLEM",
     "LEASE_AT_ONCE_S",
     "LEASE_REQUEST",
-    "LONGEST_LEASE_S",
-    "OTHER_RUN_RESPONSE",
+    "LONGEST_NOTE",
+    "PERSON",
     "RELAY_REQUEST",
     "RESTART_REQUEST",
+    "RETRACE",
     "STOPPED_BY_AGENT",
     "TOPOGRAPHY",
     "WAIT_FOR_CONTROL",
+    "XY",
     "ActByHand",
     "Approval",
     "Approvals",
@@ -111,24 +120,19 @@ __all__ = [
     "ControlResponse",
     "ControlState",
     "Feedback",
-    "FeedbackUnits",
     "Frame",
     "Grant",
     "GrantedCount",
     "GrantedRange",
     "GrantedStep",
-    "HasTime",
     "InstrumentOrder",
-    "InstrumentOrders",
     "InstrumentReading",
     "InstrumentReadings",
     "JournalEntries",
     "JournalEntry",
     "LogLine",
-    "LogLines",
     "LoggedPacket",
     "MeasurementConditions",
-    "MeasurementSettings",
     "Note",
     "OrderOutcome",
     "Packet",
@@ -159,15 +163,16 @@ __all__ = [
     "ScanSet",
     "ScopeState",
     "ScopeStatus",
-    "ShapeChange",
     "Spectrum",
     "TipStatus",
     "both_ways",
     "component_of",
-    "instrument_of",
     "is_of_instrument",
-    "is_process_name",
+    "names",
     "of_role",
     "registration_summary",
     "request_name",
 ]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazily(__name__)

@@ -8,8 +8,9 @@ from dataclasses import asdict, dataclass, replace
 
 from afspm.basics.errors import InvalidValue
 from afspm.basics.plain_data import Plain
-from afspm.model import PositionChange, ProbePosition, Region, RegionChange, ScanParameters, ShapeChange, names
+from afspm.model import PositionChange, ProbePosition, Region, RegionChange, ScanParameters, names
 from afspm.model.geometry import XY
+from afspm.model.scan import ShapeChange
 
 SHAPE_CHANGES: dict[str, Callable[[int], ShapeChange]] = {
     names.SCAN_RESOLUTION_X: lambda value: ShapeChange(columns=value),

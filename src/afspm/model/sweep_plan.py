@@ -11,7 +11,7 @@ from typing import Final, Literal, get_args
 from afspm.basics.errors import InvalidValue, UnitError
 from afspm.basics.units import convert, parse_quantity, require_unit, si_unit
 from afspm.model.instruments import is_of_instrument
-from afspm.model.names import BASE_PARAMETERS
+from afspm.model.parameter_names import BASE_PARAMETERS
 from afspm.model.requests import Parameter
 
 SweptValue = float | str | bool

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.units import si
-from afspm.model.names import START_SCAN, START_SPEC
+from afspm.model.parameter_names import START_SCAN, START_SPEC
 from afspm.record.drawing.timeline import DrawnBand, TimelineCurve
 from afspm.record.run_json import EXPERIMENT_FILE
 

@@ -21,7 +21,7 @@ from afspm.basics.errors import FileError, InvalidValue
 from afspm.basics.formatting import counted
 from afspm.basics.plain_data import Plain
 from afspm.model import ControlRequest, ControlResponse, JournalEntry
-from afspm.model.names import BASE_ACTIONS
+from afspm.model.parameter_names import BASE_ACTIONS
 from afspm.model.planned_work import path_length_m
 from afspm.record.bad_scans import BAD
 from afspm.record.journal import not_a_table

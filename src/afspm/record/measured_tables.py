@@ -12,16 +12,8 @@ from afspm import wire
 from afspm.basics.errors import NoSuchItem, UnitError, WireError
 from afspm.basics.plain_data import from_json
 from afspm.basics.units import convert, si_unit
-from afspm.model import (
-    Frame,
-    MeasurementSettings,
-    Parameter,
-    Region,
-    RegistrationOutcome,
-    Spectrum,
-    component_of,
-    names,
-)
+from afspm.model import Frame, Parameter, Region, RegistrationOutcome, Spectrum, component_of, names
+from afspm.model.events import MeasurementSettings
 from afspm.record.bad_scans import last_scores
 from afspm.record.tables import ScanRow, SpectrumRow, SweptSetting, Table
 

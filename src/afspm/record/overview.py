@@ -25,7 +25,6 @@ from afspm.model import (
     JournalEntries,
     JournalEntry,
     LogLine,
-    LogLines,
     MeasurementConditions,
     Note,
     ProbePosition,
@@ -46,9 +45,9 @@ from afspm.model import (
     TipStatus,
     registration_summary,
 )
-from afspm.model.events import PERSON
+from afspm.model.events import PERSON, LogLines
 from afspm.model.grants import with_proposal
-from afspm.model.names import START_SCAN
+from afspm.model.parameter_names import START_SCAN
 from afspm.model.problems import CONDITIONS
 from afspm.record.allowed_bands import AllowedBands, ReadingCurve
 from afspm.record.measurement_history import (

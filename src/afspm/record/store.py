@@ -23,7 +23,6 @@ from afspm.model import (
     Frame,
     JournalEntries,
     JournalEntry,
-    LogLines,
     Note,
     Packet,
     ProblemNames,
@@ -34,6 +33,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
+from afspm.model.events import LogLines
 from afspm.record import journal, provenance
 from afspm.record.journal import SCHEDULER
 from afspm.record.measured_files import MeasuredFiles, insert_packet

@@ -27,6 +27,114 @@ A coordinate frame may translate between the coordinates of components and the c
 
 from __future__ import annotations
 
-from afspm.scheduler.scheduler import Scheduler
+from typing import TYPE_CHECKING
 
-__all__ = ["Scheduler"]
+from afspm.basics.lazy import lazily
+
+if TYPE_CHECKING:  # a coordinate frame is asked about every event, and answers in its own outputs
+    from afspm.model.drift_removal import undistorted
+    from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, scan_values
+    from afspm.scheduler.control.arbitration import ArbitrationState
+    from afspm.scheduler.coordinate_frame import (
+        TIP_FRAME,
+        AskMicroscope,
+        CoordinateFrame,
+        FrameOutput,
+        HoldControl,
+        MappedRequest,
+        Reconsider,
+        SaveNow,
+    )
+    from afspm.scheduler.events import (
+        Announced,
+        Codec,
+        ControlChanged,
+        Delegate,
+        FrameAnswered,
+        FrameReported,
+        Input,
+        Log,
+        PacketIn,
+        ProblemSeen,
+        RequestIn,
+        Started,
+        Tick,
+        TranslatorCaughtUp,
+        TranslatorUp,
+    )
+    from afspm.scheduler.safety.parameter_values import number_of
+    from afspm.scheduler.scheduler import Coordinates, Scheduler
+    from afspm.scheduler.wire_codec import WireCodec
+
+if TYPE_CHECKING:  # an agent's plan is checked against the limits before a person sees it
+    from afspm.model.grants import with_proposal
+    from afspm.model.microscope_status import feedback_of
+    from afspm.model.problems import STOPPER
+    from afspm.scheduler.safety.forbidden_states import PlanRehearsal
+    from afspm.scheduler.safety.grants import not_of_role
+    from afspm.scheduler.safety.limit_checker import LimitChecker
+    from afspm.scheduler.safety.limits import ExperimentLimits
+
+if TYPE_CHECKING:  # a replay gives a scheduler its recorded steps
+    from afspm.scheduler.control.descriptions import request_text
+    from afspm.scheduler.saved_state import KIND as STATE_KIND
+    from afspm.scheduler.saved_state import VERSION as STATE_VERSION
+    from afspm.scheduler.saved_state import SavedState
+    from afspm.scheduler.scheduler_core import SchedulerCore
+    from afspm.scheduler.step_log import Restored, StateSums, Step, facts_of, read_cached, read_event
+
+__all__ = [
+    "PROBE_CHANGES",
+    "REGION_CHANGES",
+    "STATE_KIND",
+    "STATE_VERSION",
+    "STOPPER",
+    "TIP_FRAME",
+    "Announced",
+    "ArbitrationState",
+    "AskMicroscope",
+    "Codec",
+    "ControlChanged",
+    "CoordinateFrame",
+    "Coordinates",
+    "Delegate",
+    "ExperimentLimits",
+    "FrameAnswered",
+    "FrameOutput",
+    "FrameReported",
+    "HoldControl",
+    "Input",
+    "LimitChecker",
+    "Log",
+    "MappedRequest",
+    "PacketIn",
+    "PlanRehearsal",
+    "ProblemSeen",
+    "Reconsider",
+    "RequestIn",
+    "Restored",
+    "SaveNow",
+    "SavedState",
+    "Scheduler",
+    "SchedulerCore",
+    "Started",
+    "StateSums",
+    "Step",
+    "Tick",
+    "TranslatorCaughtUp",
+    "TranslatorUp",
+    "WireCodec",
+    "facts_of",
+    "feedback_of",
+    "not_of_role",
+    "number_of",
+    "read_cached",
+    "read_event",
+    "request_text",
+    "scan_values",
+    "undistorted",
+    "with_proposal",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazily(__name__)

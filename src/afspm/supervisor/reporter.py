@@ -24,19 +24,18 @@ from afspm.basics.launch import Launch, Sockets
 from afspm.experiment import Experiment, ProcessStart, Role
 from afspm.model import (
     CLOCK_REQUEST,
-    OTHER_RUN_RESPONSE,
     RELAY_REQUEST,
     ControlRequest,
     ControlResponse,
     LogLine,
-    LogLines,
     ProcessState,
     ProcessStates,
     RelayedMessage,
     Request,
     Response,
 )
-from afspm.model.events import LONGEST_ANNOUNCEMENT, SUPERVISOR
+from afspm.model.events import LONGEST_ANNOUNCEMENT, SUPERVISOR, LogLines
+from afspm.model.requests import OTHER_RUN_RESPONSE
 from afspm.supervisor.supervision.supervisor_events import (
     AskUse,
     EndExperiment,

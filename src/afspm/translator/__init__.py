@@ -14,11 +14,3 @@
 A driver (`driver`) reads and sets the parameters of its table (`parameters`), starts and stops measurements, and
 returns their results. A driver may fail at any time with `ControllerLost`; the translator reconnects.
 """
-
-from __future__ import annotations
-
-from afspm.translator.driver import Driver
-from afspm.translator.driver_base import ControllerLost, action
-from afspm.translator.parameters import ParameterSpec, ParameterTable, Value
-
-__all__ = ["ControllerLost", "Driver", "ParameterSpec", "ParameterTable", "Value", "action"]

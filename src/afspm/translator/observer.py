@@ -17,7 +17,6 @@ from afspm.model import (
     ActByHand,
     ChannelRoles,
     ControlRequest,
-    FeedbackUnits,
     MeasurementConditions,
     PanelAct,
     Request,
@@ -27,6 +26,7 @@ from afspm.model import (
     names,
 )
 from afspm.model.microscope_status import feedback_of
+from afspm.model.state import FeedbackUnits
 from afspm.storage.disk import is_full
 from afspm.translator import setting_groups
 from afspm.translator.driver_base import LOST, MEASURING, DriverBase

@@ -32,10 +32,14 @@ forgets the peer."""
 
 
 class PeerConnected(NamedTuple):
+    """A peer has connected."""
+
     connection: int
 
 
 class PeerDisconnected(NamedTuple):
+    """A peer has gone."""
+
     connection: int
 
 

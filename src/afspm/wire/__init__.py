@@ -32,7 +32,7 @@ from afspm.wire.frames import (
     encode_time,
     id_of,
 )
-from afspm.wire.mapping import decode_instrument_orders, decode_orders, encode_orders
+from afspm.wire.mapping import decode_instrument_orders, decode_orders, encode_orders, timestamp
 from afspm.wire.messages import (
     MessageDeclaration,
     MessageKind,
@@ -91,4 +91,5 @@ __all__ = [
     "place_in",
     "register",
     "relocated",
+    "timestamp",
 ]

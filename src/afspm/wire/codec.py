@@ -12,6 +12,7 @@ from afspm import model
 from afspm.basics.errors import AfspmError, InvalidValue, UnitError, WireError
 from afspm.basics.plain_data import Plain
 from afspm.basics.units import convert as convert_unit
+from afspm.model.scan import ShapeChange
 from afspm.wire import unit_conversion
 from afspm.wire.generated import analysis_pb2, lines_pb2, scan_pb2, spectroscopy_pb2
 from afspm.wire.mapping import MAPPINGS, MessageMapping, time_ns, timestamp
@@ -228,7 +229,7 @@ def _published_parameters(payload: Buffer) -> model.ScanParameters:
         whole = unit_conversion.whole_region(parameters.region)
         parameters = model.ScanParameters(whole or parameters.region, parameters.shape, parameters.unit)
     # a request may change one axis alone, but parameters in force have both
-    if isinstance(parameters.shape, model.ShapeChange):
+    if isinstance(parameters.shape, ShapeChange):
         raise WireError("scan parameters in force with pixels along one axis only")
     return parameters
 

@@ -15,7 +15,6 @@ from afspm.model import (
     CLOCK_REQUEST,
     GRANT_REQUEST,
     LEASE_REQUEST,
-    LONGEST_LEASE_S,
     RELAY_REQUEST,
     RESTART_REQUEST,
     ControlRequest,
@@ -27,6 +26,7 @@ from afspm.model import (
     ResponseDetail,
     request_name,
 )
+from afspm.model.requests import LONGEST_LEASE_S
 from afspm.wire import unit_conversion
 from afspm.wire.codec import encode
 from afspm.wire.generated import control_pb2, scan_pb2, spectroscopy_pb2

@@ -16,6 +16,9 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from afspm import model
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import InvalidValue
+from afspm.model.events import LogLines, MeasurementSettings
+from afspm.model.instruments import InstrumentOrders
+from afspm.model.state import FeedbackUnits
 from afspm.wire.generated import (
     channels_pb2,
     control_pb2,
@@ -240,7 +243,7 @@ _NOTE = MessageMapping(
     written_ns=_time("written"),
 )
 _SETTINGS = MessageMapping(
-    model.MeasurementSettings,
+    MeasurementSettings,
     journal_pb2.MeasurementSettings,
     *("who",),
     time_ns=_time(),
@@ -271,9 +274,7 @@ _ORDER = MessageMapping(
 RELAYED = MessageMapping(
     model.RelayedMessage, journal_pb2.Told, "payload", message=FieldMapping("message", from_wire=_needed("a message"))
 )
-INSTRUMENT_ORDERS = MessageMapping(
-    model.InstrumentOrders, journal_pb2.Orders, "token", orders=_each("instrument", _ORDER)
-)
+INSTRUMENT_ORDERS = MessageMapping(InstrumentOrders, journal_pb2.Orders, "token", orders=_each("instrument", _ORDER))
 _COUNT = MessageMapping(model.GrantedCount, grants_pb2.GrantedCount, "action", "count")
 _RANGE = MessageMapping(model.GrantedRange, grants_pb2.GrantedRange, "parameter", "low", "high")
 GRANT = MessageMapping(
@@ -332,7 +333,7 @@ CHANNEL_ROLES = MessageMapping(
     others=FieldMapping("others", from_wire=tuple),
 )
 FEEDBACK_UNITS = MessageMapping(
-    model.FeedbackUnits,
+    FeedbackUnits,
     feedback_pb2.ZCtrlUnits,
     proportional_gain=FieldMapping("proportional_gain", sparse=True),
     integral_gain=FieldMapping("integral_gain", sparse=True),
@@ -368,7 +369,7 @@ MAPPINGS: tuple[MessageMapping[Any], ...] = (
         time_ns=_time(),
         processes=_each("processes", _PROCESS_STATE),
     ),
-    MessageMapping(model.LogLines, journal_pb2.LogLines, lines=_each("lines", _LOG_LINE)),
+    MessageMapping(LogLines, journal_pb2.LogLines, lines=_each("lines", _LOG_LINE)),
     MessageMapping(model.Progress, journal_pb2.Progress, "name", "done", "of", time_ns=_time(), left_s="remaining"),
     _NOTE,
     _SETTINGS,
@@ -389,7 +390,7 @@ def encode_orders(restart: Iterable[str]) -> bytes:
     return journal_pb2.Orders(restart=restart).SerializeToString()
 
 
-def decode_instrument_orders(payload: Buffer) -> model.InstrumentOrders:
+def decode_instrument_orders(payload: Buffer) -> InstrumentOrders:
     """Return the orders in the answer to an instrument's report.
 
     Raises:

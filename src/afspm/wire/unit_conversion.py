@@ -12,6 +12,7 @@ from afspm import model
 from afspm.basics.errors import InvalidValue
 from afspm.basics.formatting import lengths_text
 from afspm.basics.units import convert
+from afspm.model.scan import ShapeChange
 from afspm.wire.generated import control_pb2, scan_pb2, spectroscopy_pb2
 
 LENGTH_UNIT = "m"
@@ -81,7 +82,7 @@ def scan_parameters_to_wire(parameters: model.ScanParameters) -> scan_pb2.ScanPa
         message.spatial.CopyFrom(spatial_to_wire(parameters.region))
     if parameters.shape is not None:
         shape = parameters.shape
-        change = shape if isinstance(shape, model.ShapeChange) else model.ShapeChange(*shape)
+        change = shape if isinstance(shape, ShapeChange) else ShapeChange(*shape)
         if change.rows is not None:
             message.data.shape.y = change.rows
         if change.columns is not None:
@@ -101,11 +102,11 @@ def scan_parameters_from_wire(message: scan_pb2.ScanParameters2d) -> model.ScanP
     _finite(change)
     # a request without an angle keeps the present angle, so it is only a change of the region
     region = whole_region(change) if change is not None and change.angle_rad is not None else None
-    shape: tuple[int, int] | model.ShapeChange | None = None
+    shape: tuple[int, int] | ShapeChange | None = None
     if message.data.HasField("shape"):
         rows = message.data.shape.y if message.data.shape.HasField("y") else None
         columns = message.data.shape.x if message.data.shape.HasField("x") else None
-        shape = model.ShapeChange(rows, columns) if rows is None or columns is None else (rows, columns)
+        shape = ShapeChange(rows, columns) if rows is None or columns is None else (rows, columns)
     return model.ScanParameters(region or change, shape, message.data.units or None)
 
 

@@ -14,7 +14,6 @@ from afspm.model import (
     JournalEntries,
     JournalEntry,
     LogLine,
-    LogLines,
     Packet,
     ProblemNames,
     ProcessCondition,
@@ -26,6 +25,7 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
+from afspm.model.events import LogLines
 from afspm.plugins.web.archive import Archive
 from afspm.plugins.web.dashboard.content import trouble
 from afspm.plugins.web.watch import Watch

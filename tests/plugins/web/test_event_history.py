@@ -12,7 +12,6 @@ from afspm.model import (
     ControlMode,
     ControlState,
     LogLine,
-    LogLines,
     ProblemNames,
     ProcessCondition,
     ProcessState,
@@ -22,6 +21,7 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
+from afspm.model.events import LogLines
 from afspm.plugins.web.gateway.events import MOST_BYTES, MOST_EVENTS, EventHistory, fill
 from afspm.plugins.web.gateway.models import event_kinds
 from afspm.record.journal import JOURNAL_FILE

@@ -13,7 +13,6 @@ from afspm.model import (
     ControlMode,
     ControlState,
     LogLine,
-    LogLines,
     Note,
     Packet,
     ProcessCondition,
@@ -23,6 +22,7 @@ from afspm.model import (
     Scan,
     Spectrum,
 )
+from afspm.model.events import LogLines
 from afspm.plugins.web.dashboard.content import Contents
 from afspm.plugins.web.dashboard.night import Night, NightWatch
 from afspm.record.journal import SCHEDULER

@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 from afspm.basics import entry_points
+from afspm.driver import Driver
 from afspm.model import Scan, ScopeState, ScopeStatus, Spectrum, names
 from afspm.plugins.nanonis.emulator import NanonisEmulator
-from afspm.translator import Driver
 
 LATE_S = 120.0
 """Experiment seconds."""

@@ -22,7 +22,6 @@ from afspm.model import (
     ControlRequest,
     ControlResponse,
     LogLine,
-    LogLines,
     Note,
     ProcessCondition,
     ProcessState,
@@ -34,6 +33,7 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
+from afspm.model.events import LogLines
 from afspm.supervisor import run_identity
 from afspm.supervisor.reporter import Reporter, ReportFailed
 from afspm.transport.network import Network

@@ -18,6 +18,7 @@ from afspm.basics.clock import utc_time
 from afspm.basics.formatting import day_and_time
 from afspm.cli.status_text import RunDescription, StatusText, bar
 from afspm.model import ControlMode, ControlState, ProcessCondition, ScopeState
+from afspm.model.events import LogLines
 from afspm.model.planned_work import PlannedWork
 from afspm.record.overview import Overview
 from afspm.wire import messages
@@ -59,7 +60,7 @@ def night() -> Overview:
             ),
         ))),
         (123, "ControlState", ControlState(ControlMode.AUTOMATED, "series", (1,))),
-        (124, "LogLines", model.LogLines((model.LogLine(START + 124 * S, "judge", "ERROR", "lost the tip [/x]"),))),
+        (124, "LogLines", LogLines((model.LogLine(START + 124 * S, "judge", "ERROR", "lost the tip [/x]"),))),
     ):  # fmt: skip
         overview.take(message, thing, START + after_s * S)
     return overview

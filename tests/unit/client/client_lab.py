@@ -22,7 +22,6 @@ from afspm.model import (
     ControlResponse,
     ControlState,
     Feedback,
-    FeedbackUnits,
     Packet,
     Parameter,
     ProbePosition,
@@ -37,6 +36,7 @@ from afspm.model import (
     ScopeStatus,
     Spectrum,
 )
+from afspm.model.state import FeedbackUnits
 from afspm.scheduler.control import arbitration as a
 from afspm.simulation.simulator import Simulator
 from afspm.transport.port import (

@@ -14,7 +14,8 @@ from afspm import wire
 from afspm.basics.errors import InvalidValue, Refused
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
-from afspm.model import ControlRequest, ControlResponse, MeasurementSettings, Parameter, Problem, Request, Response
+from afspm.model import ControlRequest, ControlResponse, Parameter, Problem, Request, Response
+from afspm.model.events import MeasurementSettings
 from afspm.model.sweep_plan import SweptValues
 from afspm.scheduler.control.arbitration import ArbitrationEvent
 

@@ -22,7 +22,8 @@ from afspm.components.feedback_metrics import (
     relative_error,
 )
 from afspm.components.feedback_signal import FeedbackSignal
-from afspm.model import Feedback, FeedbackUnits, Region, Scan
+from afspm.model import Feedback, Region, Scan
+from afspm.model.state import FeedbackUnits
 from afspm.simulation import World
 
 PICTURE = Path(__file__).parents[3] / "experiments" / "picture" / "sample.png"

@@ -7,7 +7,8 @@ from pathlib import Path
 from tests.unit.client.client_lab import Lab, run
 
 from afspm.components.log_collector import LogCollector, formatted
-from afspm.model import LogLine, LogLines
+from afspm.model import LogLine
+from afspm.model.events import LogLines
 
 
 def test_line_has_time_level_process_and_text() -> None:

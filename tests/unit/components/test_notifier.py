@@ -21,6 +21,7 @@ from afspm.components import notifications, notifier
 from afspm.components.notifications import NotDelivered, Notification, Targets
 from afspm.components.notifier import Notifier
 from afspm.model import ControlMode, ControlState, ProblemNames, ProcessCondition
+from afspm.model.events import LogLines
 from afspm.storage.memory import Memory
 
 SECRET = "T0PSECRET"
@@ -110,7 +111,7 @@ class Night:
 
     def says(self, *lines: tuple[str, str, str]) -> None:
         told = (model.LogLine(1, name, level, text) for name, level, text in lines)
-        self.notifier.on_log_lines(model.LogLines(tuple(told)))
+        self.notifier.on_log_lines(LogLines(tuple(told)))
 
     def passes(self, seconds: int) -> None:
         """Let time pass, with a tick every ten seconds."""

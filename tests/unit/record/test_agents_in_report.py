@@ -11,7 +11,6 @@ import pytest
 
 from afspm import wire
 from afspm.model import (
-    HIGHEST_PROBLEM,
     STOPPED_BY_AGENT,
     Approval,
     Approvals,
@@ -31,6 +30,7 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
+from afspm.model.problems import HIGHEST_PROBLEM
 from afspm.record.report import agents, write
 from afspm.record.run import open_run
 from afspm.record.store import RecordSettings, RecordStore

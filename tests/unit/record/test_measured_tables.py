@@ -12,15 +12,8 @@ from tests.unit.record.record_lab import Given, Night
 
 import afspm
 from afspm.basics.errors import ConfigError, InvalidValue
-from afspm.model import (
-    ControlResponse,
-    JournalEntries,
-    JournalEntry,
-    MeasurementSettings,
-    Parameter,
-    ScopeState,
-    names,
-)
+from afspm.model import ControlResponse, JournalEntries, JournalEntry, Parameter, ScopeState, names
+from afspm.model.events import MeasurementSettings
 from afspm.record.export import export
 from afspm.record.store import RecordStore
 

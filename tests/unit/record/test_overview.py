@@ -19,7 +19,7 @@ from afspm.model import (
     RescanKind,
     ScopeState,
 )
-from afspm.model.events import NO_LONGER_TRUE
+from afspm.model.events import NO_LONGER_TRUE, LogLines
 from afspm.record.allowed_bands import MOST_POINTS
 from afspm.record.overview import MOST_LINES, Overview
 
@@ -72,7 +72,7 @@ NIGHT: list[tuple[str, object, int]] = [
     ("ControlState", control("corrector", TIP), 26),
     ("ProcessStates", model.ProcessStates(30 * S, "lab", (process(ProcessCondition.BUSY, 29),)), 30),
     ("JournalEntries", entry(31, "sets scan-speed to 1 m/s", 9, "series", "at most 1e-5 m/s"), 31),
-    ("LogLines", model.LogLines((model.LogLine(32 * S, "series", "WARNING", "the tip is blunt"),)), 32),
+    ("LogLines", LogLines((model.LogLine(32 * S, "series", "WARNING", "the tip is blunt"),)), 32),
     ("ControlState", control("corrector"), 35),
     ("ControlState", control(None, mode=ControlMode.MANUAL), 40),
 ]
@@ -163,7 +163,7 @@ def test_log_is_bounded() -> None:
     night = Overview()
     for k in range(3):
         batch = tuple(model.LogLine(i, "series", "INFO", f"{k} {i}") for i in range(MOST_LINES))
-        night.take("LogLines", model.LogLines(batch), k + 1)
+        night.take("LogLines", LogLines(batch), k + 1)
     assert len(night.log) == MOST_LINES
     assert night.log[-1].text == f"2 {MOST_LINES - 1}"
 
@@ -375,7 +375,7 @@ def test_readings_of_instruments_become_bounded_curves() -> None:
 
 
 def logged(time_s: int, name: str, level: str, text: str) -> tuple[str, object, int]:
-    return "LogLines", model.LogLines((model.LogLine(time_s * S, name, level, text),)), time_s
+    return "LogLines", LogLines((model.LogLine(time_s * S, name, level, text),)), time_s
 
 
 def test_alarm_is_open_until_a_line_of_its_process_ends_it() -> None:

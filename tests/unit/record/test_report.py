@@ -20,6 +20,7 @@ from afspm import model, wire
 from afspm.basics.errors import FileError
 from afspm.components.tip_verdict import OF_LINES, LineVerdict, line_verdict_message
 from afspm.model import ControlMode, ControlState, ProcessCondition, RegistrationOutcome, ScopeState, names
+from afspm.model.events import LogLines
 from afspm.model.problems import CONDITIONS
 from afspm.record.bad_scans import BAD, VERDICT_MESSAGE
 from afspm.record.report import REPORT_FILE, page, pictures, sample, story, write
@@ -313,7 +314,7 @@ def test_critical_messages_are_listed_with_their_end(tmp_path: Path) -> None:
     )
     for at_s, line in enumerate(lines):
         time_ns = START + at_s * 60 * S
-        name, payload = wire.encode(model.LogLines((model.LogLine(time_ns, *line),)))
+        name, payload = wire.encode(LogLines((model.LogLine(time_ns, *line),)))
         store.take([(model.Packet(name, payload, time_ns), "")])
     store.finish()
     store.close()
@@ -337,7 +338,7 @@ def test_duration_excludes_figures_drawn_after_the_end(run: Path) -> None:
     ended = model.JournalEntry(
         START + 3601 * S, "control", "series", "ended", event=model.ControlEvent.EXPERIMENT_ENDED
     )
-    drawn = model.LogLines((model.LogLine(START + 9000 * S, "night_picture", "INFO", "the night is drawn"),))
+    drawn = LogLines((model.LogLine(START + 9000 * S, "night_picture", "INFO", "the night is drawn"),))
     for at_s, thing in ((3602, model.JournalEntries((ended,))), (9000, drawn)):
         name, payload = wire.encode(thing)
         store.take([(model.Packet(name, payload, START + at_s * S), "")])

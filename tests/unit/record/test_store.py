@@ -26,7 +26,6 @@ from afspm.model import (
     JournalEntries,
     JournalEntry,
     LogLine,
-    LogLines,
     Packet,
     ProblemNames,
     ProcessCondition,
@@ -35,6 +34,7 @@ from afspm.model import (
     Scan,
     ScopeState,
 )
+from afspm.model.events import LogLines
 from afspm.record import report
 from afspm.record.run_json import EXPERIMENT_FILE
 from afspm.record.store import _PROCESS, RecordSettings, RecordStore

@@ -28,7 +28,7 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
-from afspm.model.names import BASE_PARAMETERS
+from afspm.model.parameter_names import BASE_PARAMETERS
 from afspm.model.snapshot import restored, snapshot
 from afspm.scheduler.events import (
     Connected,

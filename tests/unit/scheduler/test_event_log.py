@@ -24,8 +24,8 @@ from afspm.model import (
     Request,
     Response,
     ScanParameters,
-    ShapeChange,
 )
+from afspm.model.scan import ShapeChange
 from afspm.scheduler.control.descriptions import request_text
 from afspm.scheduler.events import Effect, Forward, Kill, Publish, SaveState, Tick, Unreadable
 from afspm.scheduler.publishing import event_log

@@ -12,7 +12,6 @@ from tests.unit.scheduler.logic_lab import Lab, killed, published, replies
 from afspm.basics.errors import InvalidValue
 from afspm.model import (
     GRANT_REQUEST,
-    HIGHEST_PROBLEM,
     LEASE_REQUEST,
     RELAY_REQUEST,
     RESTART_REQUEST,
@@ -44,6 +43,7 @@ from afspm.model import (
     ScopeState,
     names,
 )
+from afspm.model.problems import HIGHEST_PROBLEM
 from afspm.scheduler.control.arbitration import RoleTable
 from afspm.scheduler.events import Forward, Tick
 from afspm.scheduler.instruments.conditions import InstrumentSettings

@@ -11,7 +11,6 @@ from afspm.model import (
     RELAY_REQUEST,
     ControlRequest,
     ControlResponse,
-    InstrumentOrders,
     InstrumentReading,
     InstrumentReadings,
     OrderOutcome,
@@ -21,7 +20,8 @@ from afspm.model import (
     Request,
     Response,
 )
-from afspm.model.names import START_SCAN
+from afspm.model.instruments import InstrumentOrders
+from afspm.model.parameter_names import START_SCAN
 from afspm.scheduler.events import (
     Connected,
     Forward,

@@ -20,8 +20,8 @@ from afspm.model import (
     RegionChange,
     Request,
     ScanParameters,
-    ShapeChange,
 )
+from afspm.model.scan import ShapeChange
 from afspm.model.snapshot import from_plain, to_plain
 from afspm.scheduler.safety.limit_checker import LimitChecker
 from afspm.scheduler.safety.limit_state import LimitState

@@ -15,8 +15,6 @@ from afspm.model import (
     ControlRequest,
     ControlResponse,
     LogLine,
-    LogLines,
-    MeasurementSettings,
     Note,
     Parameter,
     ProcessCondition,
@@ -29,7 +27,7 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
-from afspm.model.events import LONGEST_ANNOUNCEMENT
+from afspm.model.events import LONGEST_ANNOUNCEMENT, LogLines, MeasurementSettings
 from afspm.scheduler.control.arbitration import RoleTable, Rules
 from afspm.scheduler.control.supervisor_registry import SILENT_S
 from afspm.scheduler.events import Log, SaveState

@@ -8,8 +8,8 @@ import pytest
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.launch import Launch
-from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlRequest, ControlResponse, LogLines, Response
-from afspm.model.events import LONGEST_ANNOUNCEMENT
+from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlRequest, ControlResponse, Response
+from afspm.model.events import LONGEST_ANNOUNCEMENT, LogLines
 from afspm.supervisor import reporter as reporting
 from afspm.supervisor.reporter import Reporter
 from afspm.supervisor.supervision.supervisor_events import EndRefused, UseReported

@@ -15,12 +15,12 @@ from fake_clock import FakeClock
 from afspm import wire
 from afspm.basics.errors import FileError, Refused
 from afspm.basics.exit_codes import ExitCode
+from afspm.driver import Driver, Value, action
 from afspm.model import (
     ActByHand,
     ChannelRoles,
     ControlRequest,
     ControlResponse,
-    FeedbackUnits,
     MeasurementConditions,
     Region,
     Request,
@@ -32,8 +32,8 @@ from afspm.model import (
     TipStatus,
     names,
 )
+from afspm.model.state import FeedbackUnits
 from afspm.storage.memory import Memory
-from afspm.translator import Driver, Value, action
 from afspm.translator.translator import Translator, TranslatorRun
 from afspm.transport.port import RequestReceived, Served
 

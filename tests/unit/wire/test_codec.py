@@ -30,9 +30,9 @@ from afspm.model import (
     Scan,
     ScanLines,
     ScanParameters,
-    ShapeChange,
     Spectrum,
 )
+from afspm.model.scan import ShapeChange
 from afspm.wire.frames import decode_time, encode_subject, encode_time
 from afspm.wire.generated import journal_pb2
 

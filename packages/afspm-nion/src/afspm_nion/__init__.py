@@ -16,13 +16,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import afspm
-from afspm.basics.errors import ConfigError, Refused
-from afspm.basics.units import Speed
+from afspm import write_atomic
+from afspm.basics import ConfigError, Refused, Speed
+from afspm.driver import FRAME, Driver, FileFacts, SettingsGroup, Value, action, encode_scan, frame, frame_values
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
-from afspm.storage.atomic import write_atomic
-from afspm.translator import Driver, Value, action
-from afspm.translator.own_files import FileFacts, encode_scan
-from afspm.translator.setting_groups import FRAME, SettingsGroup, frame, frame_values
 
 if TYPE_CHECKING:
     from afspm_nion.microscope import SimulatedMicroscope

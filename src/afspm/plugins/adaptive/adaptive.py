@@ -8,12 +8,9 @@ import logging
 from pathlib import Path
 from typing import ClassVar, Final
 
-from afspm.basics.errors import ConfigError
-from afspm.basics.formatting import counted, quantity
-from afspm.basics.units import Angle, Length
-from afspm.client.component import Component
+from afspm import Component, OutageLog, PlannedWork, write_atomic
+from afspm.basics import Angle, ConfigError, Length, counted, quantity
 from afspm.model import Region, names
-from afspm.model.planned_work import PlannedWork
 from afspm.plugins.adaptive.mapping import (
     MOST_SPECTRA,
     MapProgress,
@@ -23,7 +20,6 @@ from afspm.plugins.adaptive.mapping import (
     rows,
 )
 from afspm.plugins.adaptive.quantities import evaluation
-from afspm.storage.atomic import OutageLog, write_atomic
 
 MOST_LINES: Final = 20
 """Approximate largest number of log lines about the progress of a map."""

@@ -12,12 +12,10 @@ from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from afspm.basics.formatting import counted, scale
+from afspm.basics import counted, scale
 from afspm.model import Region
 from afspm.plugins.adaptive.mapping import MapProgress
-from afspm.record.drawing.palette import CATEGORICAL, PROBLEM
-from afspm.record.drawing.raster import Contrast, value_range
-from afspm.record.plotting import draw_scale_bar, gold
+from afspm.record import CATEGORICAL, PROBLEM, Contrast, draw_scale_bar, gold, value_range
 
 Floats = NDArray[np.float64]
 _LONGER: Final = 120  # pixels along the longer side

@@ -8,16 +8,21 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from afspm.basics.clock import NS_PER_S
-from afspm.basics.errors import ConfigError, InvalidValue, MeasurementFailed, Refused
-from afspm.basics.formatting import position_text
-from afspm.basics.plain_data import Plain
-from afspm.basics.units import si_or_text
-from afspm.client.scope import Scope
+from afspm import Scope
+from afspm.basics import (
+    NS_PER_S,
+    ConfigError,
+    InvalidValue,
+    MeasurementFailed,
+    Plain,
+    Refused,
+    position_text,
+    si_or_text,
+)
 from afspm.model import Region, Spectrum
 from afspm.plugins.adaptive.quantities import Evaluation, evaluation
 from afspm.plugins.adaptive.refinement import ID, AdaptiveMap, LatticeMap, NestedGrid, Optimizer
-from afspm.transport.process.loading import find_object
+from afspm.processes import find_object
 
 MOST_SPECTRA: Final = 1500
 """Largest number of spectra in a map. For this number the Gaussian process takes about a second; the time grows with

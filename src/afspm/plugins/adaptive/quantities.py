@@ -10,9 +10,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import ConfigError, InvalidValue
+from afspm.basics import ConfigError, InvalidValue
 from afspm.model import Spectrum
-from afspm.transport.process.loading import find_object
+from afspm.processes import find_object
 
 Floats = NDArray[np.float64]
 _EDGE: Final = (0.2, 0.65)

@@ -20,7 +20,7 @@ from typing import Any, Final, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import InvalidValue
+from afspm.basics import InvalidValue
 from afspm.model import Region
 from afspm.plugins.adaptive.gaussian_process import GaussianProcess, Parameters, fitted
 from afspm.plugins.adaptive.tours import Cell, MeasurementCost, learnt_cost, short_tour, snake, way_m

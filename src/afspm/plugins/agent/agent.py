@@ -5,7 +5,7 @@ from __future__ import annotations
 from afspm.model import Frame
 from afspm.plugins.web.gateway.gateway import MOST_REQUESTS, Gateway
 from afspm.plugins.web.watch import Bell
-from afspm.record.run_json import experiment_name
+from afspm.record import experiment_name
 
 
 class Agent(Gateway):

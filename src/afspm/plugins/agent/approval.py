@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from afspm.basics.errors import InvalidValue
-from afspm.basics.formatting import duration_text, escaped, quantity
-from afspm.basics.plain_data import Plain, from_json
-from afspm.basics.units import parse_quantity, si
+from afspm.basics import InvalidValue, Plain, duration_text, escaped, from_json, parse_quantity, quantity, si
 from afspm.model import Frame, Grant, GrantedCount, GrantedRange, Proposal, is_of_instrument, names
 from afspm.plugins.agent.plan import Plan, ScanStep, plan_of
 

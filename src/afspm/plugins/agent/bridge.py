@@ -11,7 +11,7 @@ from mcp.client.streamable_http import streamable_http_client
 from mcp.server.lowlevel import Server
 from mcp.server.stdio import stdio_server
 
-from afspm.basics.formatting import escaped
+from afspm.basics import escaped
 from afspm.plugins.agent.serving import PATH
 from afspm.plugins.web.gateway.problems import RefusalCode
 

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from afspm.cli.arguments import MEANWHILE, RUNS, Where
-from afspm.cli.joining import acting, looking
+from afspm.processes import MEANWHILE, RUNS, Where, acting, looking
 
 if TYPE_CHECKING:
     from afspm.model import Grant, Proposal
@@ -38,7 +37,7 @@ def approve(
     the approval, and the limits of the experiment. An approval ends with MANUAL, with `--revoke`, or after its time: an
     hour for a plan.
     """
-    from afspm.basics.errors import InvalidValue
+    from afspm.basics import InvalidValue
     from afspm.model import Grant
     from afspm.plugins.agent.approval import of_table
 
@@ -81,14 +80,14 @@ def agent(url: Annotated[str, typer.Argument(help="Of the agent server, as its l
 
 def grant_lines(grant: Grant) -> list[str]:
     """Return a grant as lines of text for people, with units."""
-    from afspm.basics.formatting import area_text, duration_text, position_text, quantity
-    from afspm.model.names import BASE_PARAMETERS
+    from afspm.basics import area_text, duration_text, position_text, quantity
+    from afspm.model import names
 
     region = grant.region
     where = "no place" if region is None else f"{area_text(region.size_m)} at {position_text(region.center_m)}"
     lines = [f"{grant.agent}, for {duration_text(grant.lasts_s)}", f"  place: {where}"]
     for one in grant.ranges:
-        unit = BASE_PARAMETERS.get(one.parameter) or ""
+        unit = names.BASE_PARAMETERS.get(one.parameter) or ""
         lines.append(f"  {one.parameter}: {quantity(one.low, unit)} to {quantity(one.high, unit)}")
     lines += [f"  {each.action}: {each.count} times" for each in grant.counts]
     return [*lines, "  nothing else"]
@@ -97,9 +96,8 @@ def grant_lines(grant: Grant) -> list[str]:
 def _approve(where: Path, proposal: Proposal, *, yes: bool) -> None:
     import asyncio
 
-    from afspm.basics.errors import AfspmError
-    from afspm.basics.formatting import escaped
-    from afspm.client.connect import find_run
+    from afspm import find_run
+    from afspm.basics import AfspmError, escaped
     from afspm.model import Frame, names
     from afspm.plugins.agent.approval import of_plan, summary
     from afspm.plugins.agent.simulated_run import repeated
@@ -128,7 +126,7 @@ def _proposals(where: Path) -> list[Proposal]:
 
 
 def _state(proposal: Proposal) -> str:
-    from afspm.basics.errors import AfspmError
+    from afspm.basics import AfspmError
     from afspm.plugins.agent.plan import plan_of
 
     try:
@@ -139,7 +137,7 @@ def _state(proposal: Proposal) -> str:
 
 
 def _title(proposal: Proposal) -> str:
-    from afspm.basics.formatting import escaped
+    from afspm.basics import escaped
     from afspm.plugins.agent.plan import title_of
 
     return f'"{escaped(title_of(proposal.plan))}"'

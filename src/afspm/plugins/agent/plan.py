@@ -8,15 +8,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from afspm.basics.errors import AfspmError, InvalidValue
-from afspm.basics.formatting import area_text, position_text
-from afspm.basics.plain_data import from_json
-from afspm.basics.units import convert, parse_quantity, si
-from afspm.client.parameter_text import to_parameter
-from afspm.client.targets import ScanTarget, SpectrumTarget
-from afspm.model import ControlRequest, Frame, GrantedStep, Parameter, ProbePosition, Region, names
-from afspm.model.geometry import XY
-from afspm.wire.frames import encode_subject
+from afspm import ScanTarget, SpectrumTarget, to_parameter
+from afspm.basics import AfspmError, InvalidValue, area_text, convert, from_json, parse_quantity, position_text, si
+from afspm.model import XY, ControlRequest, Frame, GrantedStep, Parameter, ProbePosition, Region, names
+from afspm.wire import encode_subject
 
 MOST_STEPS = 200
 MOST_PIXELS = 4096

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import AfspmError
-from afspm.basics.plain_data import Plain
+from afspm.basics import AfspmError, Plain
 from afspm.plugins.agent.plan import Plan
 from afspm.plugins.agent.simulated_run import simulate
 from afspm.plugins.agent.twin import LONGEST_S
@@ -14,7 +13,7 @@ from afspm.plugins.agent.workplace import Workplace
 from afspm.plugins.web.gateway import views
 from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest
 from afspm.plugins.web.gateway.services import READER
-from afspm.record.overview import ScanSummary
+from afspm.record import ScanSummary
 
 MOST_AT_ONCE = 1
 

@@ -16,13 +16,12 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import AfspmError
-from afspm.basics.plain_data import Plain
+from afspm.basics import AfspmError, Plain
 from afspm.model import Frame, ProblemNames
 from afspm.plugins.agent.plan import Plan
 from afspm.plugins.agent.twin import LONGEST_S
 from afspm.plugins.web.archive import Archive
-from afspm.record.overview import ScanSummary
+from afspm.record import ScanSummary
 
 Values = Callable[[ScanSummary], NDArray[np.float64] | None]
 """Returns the values of a scan; None if they are no longer known."""

@@ -17,12 +17,9 @@ from mcp import types
 from mcp.server.lowlevel import Server
 from numpy.typing import NDArray
 
-from afspm.basics.clock import iso_utc
-from afspm.basics.errors import AfspmError
-from afspm.basics.formatting import escaped
-from afspm.basics.plain_data import Plain
+from afspm import Levelling, levelled
+from afspm.basics import AfspmError, Plain, escaped, iso_utc
 from afspm.model import ControlMode, ControlResponse, ControlState, Proposal, names
-from afspm.model.line_levelling import Levelling, levelled
 from afspm.plugins.agent import arguments
 from afspm.plugins.agent.approval import preflight_of
 from afspm.plugins.agent.plan import Plan, PlannedRequest, plan_of, read_plan, read_step
@@ -34,9 +31,7 @@ from afspm.plugins.web.gateway.guard import PERSON
 from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest, of_error
 from afspm.plugins.web.gateway.services import READER
 from afspm.plugins.web.person_commands import PersonCommands
-from afspm.record.drawing.raster import indices, png, value_range
-from afspm.record.overview import ScanSummary
-from afspm.record.run_json import EXPERIMENT_FILE
+from afspm.record import EXPERIMENT_FILE, ScanSummary, indices, png, value_range
 
 INSTRUCTIONS = """A scanning probe microscope. You may look, propose plans, and stop. You measure only what a person
 has approved: one plan (propose, preflight, then wait for the approval, then run), or a grant (measure, within it).

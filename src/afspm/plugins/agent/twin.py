@@ -17,21 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from afspm.basics.errors import AfspmError
-from afspm.basics.plain_data import Plain
-from afspm.experiment.experiment import load_expanded
+from afspm import Levelling, levelled
+from afspm.basics import AfspmError, Plain
+from afspm.emulation import ScanActivity, SimulatedInstrument
 from afspm.model import Frame, Request, component_of, names
-from afspm.model.line_levelling import Levelling, levelled
 from afspm.plugins.agent.plan import MoveStep, Plan, ScanStep, SetStep, SpectrumStep, plan_of
-from afspm.record.drawing.raster import indices, png, value_range
-from afspm.record.run_json import EXPERIMENT_FILE
-from afspm.scheduler.safety.forbidden_states import PlanRehearsal
-from afspm.scheduler.safety.grants import not_of_role
-from afspm.scheduler.safety.limit_checker import LimitChecker
-from afspm.scheduler.safety.limits import ExperimentLimits
-from afspm.scheduler.safety.parameter_values import number_of
-from afspm.simulation.activities import ScanActivity
-from afspm.simulation.instrument import SimulatedInstrument
+from afspm.processes import load_expanded
+from afspm.record import EXPERIMENT_FILE, indices, png, value_range
+from afspm.scheduler import ExperimentLimits, LimitChecker, PlanRehearsal, not_of_role, number_of
 
 LONGEST_S = 60.0
 """Real seconds after which the process is killed."""

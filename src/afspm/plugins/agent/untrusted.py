@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from afspm.basics.formatting import escaped
+from afspm.basics import escaped
 
 MOST = 50
 

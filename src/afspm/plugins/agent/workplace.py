@@ -11,9 +11,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from afspm import wire
-from afspm.basics.plain_data import Plain
-from afspm.client.targets import Target
+from afspm import Memory, Target, wire
+from afspm.basics import Plain
 from afspm.model import (
     LEASE_AT_ONCE_S,
     RELAY_REQUEST,
@@ -27,9 +26,6 @@ from afspm.model import (
     Request,
     Response,
 )
-from afspm.model.grants import with_proposal
-from afspm.model.microscope_status import feedback_of
-from afspm.model.problems import STOPPER
 from afspm.plugins.agent.plan import MoveStep, Plan, ScanStep, SetStep, SpectrumStep, Step, plan_of
 from afspm.plugins.web.archive import Archive
 from afspm.plugins.web.gateway.measurements import Measurement, Measurements
@@ -37,8 +33,8 @@ from afspm.plugins.web.gateway.models import MeasurementState
 from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest, of_error, refused
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.watch import Bell, Watch
-from afspm.storage.memory import Memory
-from afspm.transport.process.parent import StopRequested
+from afspm.processes import StopRequested
+from afspm.scheduler import STOPPER, feedback_of, with_proposal
 
 LEASE_S = 30.0
 """Real seconds after which an agent whose process is gone loses control."""

@@ -20,8 +20,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from afspm.basics.errors import ConfigError, Refused
-from afspm.basics.units import Duration, PollPeriod
+from afspm.basics import ConfigError, Duration, PollPeriod, Refused
+from afspm.driver import FEEDBACK_ON, FRAME, POSITION, SCAN, Driver, KeptSettings, Value, action, connected, frame
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.asylum.activity import FORCE, AsylumActivity
 from afspm.plugins.asylum.link import Link
@@ -29,11 +29,6 @@ from afspm.plugins.asylum.result_files import AsylumFiles
 from afspm.plugins.asylum.session import Session
 from afspm.plugins.asylum.settings import NAMES, FeedbackSwitch, FrameSettings, TipPlace
 from afspm.plugins.asylum.xop import XopError
-from afspm.translator.driver import Driver
-from afspm.translator.driver_base import action, connected
-from afspm.translator.parameters import FEEDBACK_ON, Value
-from afspm.translator.result_files import SCAN
-from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
 
 _AT_FIRST: Final[dict[str, Value]] = {
     names.SCAN_DIRECTION: names.UP,

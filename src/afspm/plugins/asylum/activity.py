@@ -8,15 +8,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar, Final
 
-from afspm.basics.clock import Clock
-from afspm.basics.errors import Refused
+from afspm.basics import Clock, Refused
+from afspm.driver import SCAN, Activity, Kept, TipWay, as_list, as_region
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.plugins.asylum.result_files import AsylumFiles, Target, free_suffix, local
 from afspm.plugins.asylum.session import Session
 from afspm.plugins.asylum.xop import MISSING, XopError
-from afspm.translator.activity import Activity, TipWay
-from afspm.translator.result_files import SCAN, as_list, as_region
-from afspm.translator.state import Kept
 
 FORCE: Final = "force"
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 
+from afspm.driver import ZmqConnection
 from afspm.plugins.asylum import xop
-from afspm.translator.zmq_connection import ZmqConnection
 
 _HINTS = (
     '"tcp://host:port", as given to zeromq_server_bind',

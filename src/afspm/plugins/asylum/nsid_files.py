@@ -12,12 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import FileError
-from afspm.basics.units import convert
+from afspm.basics import FileError, convert
+from afspm.driver import FileContent, OtherFormat, hdf5_reading
 from afspm.model import Region, Scan
 from afspm.plugins.asylum import scan_files as asylum
-from afspm.storage.formats import hdf5_reading
-from afspm.storage.formats.content import FileContent, OtherFormat
 
 if TYPE_CHECKING:
     import h5py

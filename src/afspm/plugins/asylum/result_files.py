@@ -11,12 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
 from typing import Final
 
-from afspm.basics.errors import ConfigError
-from afspm.basics.formatting import area_text, position_text
-from afspm.basics.plain_data import PlainMapping
+from afspm.basics import ConfigError, PlainMapping, area_text, position_text
+from afspm.driver import Entry, FilePrecision, FolderFiles, as_region, modified_ns
 from afspm.model import Region, Scan, Spectrum
-from afspm.translator.folder_files import FolderFiles
-from afspm.translator.result_files import Entry, FilePrecision, as_region, modified_ns
 
 _NUMBERED: Final = re.compile(r".*\d{4}\.ibw", re.IGNORECASE)
 

@@ -15,12 +15,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.clock import NS_PER_S
-from afspm.basics.errors import FileError
-from afspm.basics.plain_data import PlainMapping
+from afspm.basics import NS_PER_S, FileError, PlainMapping
+from afspm.driver import FileContent, clock_ns, igor
 from afspm.model import Region, Scan, Spectrum
-from afspm.storage.formats import igor
-from afspm.storage.formats.content import FileContent, clock_ns
 
 Note = PlainMapping
 

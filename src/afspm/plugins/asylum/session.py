@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from afspm.basics.errors import Refused
+from afspm.basics import Refused
+from afspm.driver import Value
 from afspm.model import ControlResponse, ScopeState
 from afspm.plugins.asylum import xop
 from afspm.plugins.asylum.link import Link, number, text
-from afspm.translator.parameters import Value
 
 SCAN_STATUS, MAP_STATUS = "ScanStatus", "FMapStatus"
 

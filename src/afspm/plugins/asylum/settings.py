@@ -11,12 +11,11 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from afspm.basics.errors import InvalidValue, Refused
+from afspm.basics import InvalidValue, Refused
+from afspm.driver import FEEDBACK_ON, FRAME, POSITION, SettingsGroup, Value, frame, frame_values
 from afspm.model import ControlResponse, Region, names
 from afspm.plugins.asylum.scan_files import clockwise, counter_clockwise
 from afspm.plugins.asylum.session import Session
-from afspm.translator.parameters import FEEDBACK_ON, Value
-from afspm.translator.setting_groups import FRAME, POSITION, SettingsGroup, frame, frame_values
 
 GLOBALS: Final = (
     "XOffset", "YOffset", "FastScanSize", "SlowScanSize", "ScanAngle", "ScanPoints", "ScanLines", "ScanRate",

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import ClassVar, Final
 
-from afspm.basics.errors import Refused
+from afspm.basics import Refused
+from afspm.driver import POSITION, ShadowDriver, require_question
 from afspm.plugins.asylum import Asylum, xop
 from afspm.plugins.asylum.link import Link
-from afspm.translator.setting_groups import POSITION
-from afspm.translator.shadow import ShadowDriver, require_question
 
 QUESTIONS: Final = frozenset({
     *("GV", "GS", "ARGetStatus", "GetBaseName", "AfspmLook", "AfspmController", "AfspmFeedbackOn"),

@@ -12,9 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from afspm.basics.errors import AfspmError, InvalidValue
-from afspm.basics.plain_data import PlainMapping
-from afspm.translator.driver_base import ControllerLost
+from afspm.basics import AfspmError, InvalidValue, PlainMapping
+from afspm.driver import ControllerLost
 
 LONGEST_REQUEST: Final = 1024
 """Length of the longest request, in bytes. At a longer request the XOP drops the connection without a reply."""

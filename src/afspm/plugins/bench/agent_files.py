@@ -11,8 +11,7 @@ from importlib.machinery import all_suffixes
 from pathlib import Path
 from typing import Final
 
-from afspm.basics.errors import ConfigError, FileError
-from afspm.basics.interpreter import python_command, python_environment
+from afspm.basics import ConfigError, FileError, python_command, python_environment
 
 LINES_FILE: Final = "trials.jsonl"
 """The file with a line for each trial: the mark of the output folder of any bench."""

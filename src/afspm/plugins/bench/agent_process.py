@@ -13,16 +13,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Final, TextIO
 
-from afspm.basics.clock import ExperimentClock
-from afspm.basics.errors import ConfigError, ExperimentEnded, NoResponse
-from afspm.basics.launch import Launch
-from afspm.basics.plain_data import Plain
-from afspm.client.experiment_link import ExperimentLink
-from afspm.client.scope import Scope
+from afspm import Scope
+from afspm.basics import ConfigError, ExperimentClock, ExperimentEnded, Launch, NoResponse, Plain
 from afspm.model import Frame, ProblemNames
 from afspm.plugins.bench.session import BenchAgent, TrialSession
-from afspm.transport.process.context import new_session
-from afspm.transport.zmq_port import open_port
+from afspm.processes import ExperimentLink, new_session, open_port
 
 JOINED_WITHIN_S = 30.0
 

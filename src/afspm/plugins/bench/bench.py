@@ -16,8 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
-from afspm.basics.errors import ConfigError, FileError
-from afspm.basics.interpreter import python_command
+from afspm.basics import ConfigError, FileError, python_command
 from afspm.plugins.bench import sealing
 from afspm.plugins.bench.agent_files import LINES_FILE, AgentFiles
 from afspm.plugins.bench.agents import SEES_TRUTH, SHIPPED

@@ -28,8 +28,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Final
 
-from afspm.basics.errors import FileError
-from afspm.basics.plain_data import PlainMapping
+from afspm.basics import FileError, PlainMapping
 
 REPORT_CALL: Final = "report"
 """Name that the line with the report has in place of a tool."""

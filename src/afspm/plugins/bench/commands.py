@@ -8,12 +8,11 @@ from typing import Annotated
 
 import typer
 
-from afspm.cli.arguments import PLUGINS, HelpWhenBare
+from afspm.processes import HelpWhenBare
 
 app = typer.Typer(
     cls=HelpWhenBare,
     rich_markup_mode="markdown",
-    rich_help_panel=PLUGINS,
     help="AFMBench-Sim: try agents and algorithms on simulated tasks with known truth.",
 )
 Output = Annotated[
@@ -88,7 +87,7 @@ def run(
     A trial counts only if the task is solved, nothing was harmed and the report is honest. Record and truth decide.
     Exit code 1: a trial could not be run.
     """
-    from afspm.basics.errors import ConfigError
+    from afspm.basics import ConfigError
     from afspm.plugins.bench import bench
     from afspm.plugins.bench.page import write_page
 

@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
-from afspm.basics.errors import AfspmError
+from afspm.basics import AfspmError
 from afspm.model import Region
 from afspm.plugins.bench.session import TrialSession
 

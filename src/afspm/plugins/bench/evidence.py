@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import afspm
-from afspm.basics.errors import AfspmError, InvalidValue
-from afspm.basics.plain_data import Plain, PlainMapping
+from afspm import Run
+from afspm.basics import AfspmError, InvalidValue, Plain, PlainMapping
+from afspm.emulation import World
 from afspm.model import ControlMode, ControlRequest, ControlResponse, JournalEntry, Region, Scan, Spectrum
-from afspm.record.run import Run
-from afspm.record.tables import ScanRow, SpectrumRow
-from afspm.simulation import World
+from afspm.record import ScanRow, SpectrumRow
 
 STATUSES: Final = ("done", "cannot", "ask")
 _LIMITED: Final = frozenset(

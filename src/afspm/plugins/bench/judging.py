@@ -9,9 +9,9 @@ import math
 from collections import Counter
 from dataclasses import dataclass, field
 
+from afspm.emulation import LEDGER_EVENT
 from afspm.plugins.bench.evidence import Evidence
 from afspm.plugins.bench.tasks import BenchTask
-from afspm.simulation.ledger import LEDGER_EVENT
 
 MEASUREMENT_EVENTS = {"scans": "scan starts", "spectra": "spectrum starts", "pulses": "pulse", "crashes": "crash"}
 

@@ -9,12 +9,12 @@ from html import escape
 from pathlib import Path
 from typing import Final
 
+from afspm import replace_file
 from afspm.plugins.bench.agents import HOME
 from afspm.plugins.bench.bench import Line
 from afspm.plugins.bench.tasks import FAMILIES
-from afspm.record.report import markup
-from afspm.record.report.markup import document, section
-from afspm.storage.atomic import replace_file
+from afspm.record import document, section
+from afspm.record import table as html_table
 
 PAGE_FILE: Final = "bench.html"
 ORACLE, SCRIPT = "oracle", "script"
@@ -192,4 +192,4 @@ def _about(lines: Sequence[Line]) -> str:
 
 def _html(rows: Sequence[Sequence[str]]) -> str:
     heads, *cells = rows
-    return markup.table(heads, [[escape(cell) for cell in row] for row in cells])
+    return html_table(heads, [[escape(cell) for cell in row] for row in cells])

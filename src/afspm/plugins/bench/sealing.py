@@ -23,7 +23,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-from afspm.basics.errors import AfspmError
+from afspm.basics import AfspmError
 
 _CREATE, _ADD, _RESTRICT = 444, 445, 446  # system calls, the same on all architectures
 _VERSION_FLAG: Final = 1

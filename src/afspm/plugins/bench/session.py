@@ -9,12 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from afspm.basics.clock import ExperimentClock
-from afspm.basics.plain_data import PlainMapping
-from afspm.client.scope import Scope
+from afspm import Scope, write_atomic
+from afspm.basics import ExperimentClock, PlainMapping
+from afspm.emulation import World
 from afspm.plugins.bench.evidence import Report
-from afspm.simulation import World
-from afspm.storage.atomic import write_atomic
 
 REPORT_FILE = "report.json"
 

@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from afspm.basics.errors import NoSuchItem
-from afspm.basics.formatting import quantity
-from afspm.basics.plain_data import PlainMapping
+from afspm.basics import NoSuchItem, PlainMapping, quantity
 from afspm.model import Grant, GrantedCount, GrantedRange, names
 
 if TYPE_CHECKING:

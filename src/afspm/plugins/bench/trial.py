@@ -20,13 +20,8 @@ from typing import IO, Final
 from urllib.parse import urlsplit
 
 import afspm
-from afspm.basics.clock import ExperimentClock
-from afspm.basics.errors import AfspmError, NoResponse
-from afspm.basics.interpreter import python_command, python_environment
-from afspm.basics.plain_data import PlainMapping
-from afspm.client.connect import guest_of
-from afspm.client.scope import Scope
-from afspm.experiment.toml_writer import dumps
+from afspm import Scope, guest_of
+from afspm.basics import AfspmError, ExperimentClock, NoResponse, PlainMapping, python_command, python_environment
 from afspm.model import ControlMode, ScopeState, names
 from afspm.plugins.bench.agent_files import AgentFiles
 from afspm.plugins.bench.cassette import REPORT_CALL, ToolCall, recording
@@ -35,8 +30,9 @@ from afspm.plugins.bench.judging import TrialVerdict, judge
 from afspm.plugins.bench.sealing import Seal
 from afspm.plugins.bench.session import REPORT_FILE
 from afspm.plugins.bench.tasks import BenchTask
-from afspm.record.run_json import latest_run
-from afspm.supervisor.ports import FreePorts
+from afspm.processes import FreePorts
+from afspm.processes import toml_text as dumps
+from afspm.record import latest_run
 
 AGENT: Final = "agent"
 MCP: Final = "mcp"

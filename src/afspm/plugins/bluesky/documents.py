@@ -12,11 +12,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from uuid import NAMESPACE_URL, uuid5
 
-from afspm.basics.clock import NS_PER_S
-from afspm.record.journal import measured_file
-from afspm.record.nexus_writer import field_names
-from afspm.record.run import Run
-from afspm.record.tables import ScanRow, SpectrumRow
+from afspm import Run
+from afspm.basics import NS_PER_S
+from afspm.record import ScanRow, SpectrumRow, field_names, measured_file
 
 Document = tuple[str, dict[str, object]]
 """A document: its name and content."""

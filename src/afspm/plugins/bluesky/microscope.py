@@ -23,13 +23,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.clock import NS_PER_S
-from afspm.basics.requirements import imports_of_extra
-from afspm.client.connect import connect
-from afspm.client.parameter_text import Value
-from afspm.client.scope import Scope
+from afspm import Scope, Value, connect
+from afspm.basics import NS_PER_S, imports_of_extra
 from afspm.model import Region, names
-from afspm.record.nexus_writer import field_names
+from afspm.record import field_names
 
 with imports_of_extra("bluesky", __name__):
     from bluesky.protocols import Reading, Triggerable

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from afspm.cli.arguments import AFTERWARDS, HelpWhenBare, NoProgress
+from afspm.processes import AFTERWARDS, HelpWhenBare, NoProgress
 
 _FILES = "files"
 
@@ -63,8 +63,8 @@ def files(
     the current folder.
     """
     _one_thread_a_process()
-    from afspm.experiment.class_loader import importing_from
     from afspm.plugins.drift import file_commands as drift_files
+    from afspm.processes import importing_from
 
     # only for a class of one's own: the current folder may be a download, with a module named like a library's
     folders = [Path.cwd()] if "." in estimator + tracker else []
@@ -92,8 +92,8 @@ def study(
 ) -> None:
     """Simulate many nights over a grid of settings, rank the settings, and check whether the defaults hold."""
     _one_thread_a_process()
-    from afspm.experiment.class_loader import importing_from
     from afspm.plugins.drift import study_commands as drift_study
+    from afspm.processes import importing_from
 
     with importing_from([Path.cwd()]):
         drift_study.run(settings or [], nights, seed, cluster, jobs, quiet=quiet)

@@ -13,14 +13,11 @@ from typing import TYPE_CHECKING, ClassVar, Literal, overload
 
 import numpy as np
 
-from afspm.basics.clock import iso_utc
-from afspm.basics.errors import AfspmError, FileError
-from afspm.basics.formatting import counted
-from afspm.client.component import Component
-from afspm.components.line_file import LineFile, csv_line
+from afspm import Component, LineFile, csv_line
+from afspm.basics import AfspmError, FileError, counted, iso_utc
 from afspm.model import TOPOGRAPHY, ChannelName, RegistrationOutcome, of_role
 from afspm.plugins.drift.record import COLUMNS as RECORD
-from afspm.record.drift_mapping import drift_at
+from afspm.record import drift_at
 
 if TYPE_CHECKING:
     from afspm.plugins.drift.figures.album import RunPart
@@ -302,8 +299,8 @@ class DriftPictures(DriftTable):
 
     def _scan(self, tabled: TabledScan) -> DriftScan:
         # as the microscope saved it, in tip coordinates
+        from afspm import read
         from afspm.plugins.drift.study.scan_series import drift_scan
-        from afspm.storage.formats import read
 
         content = read(tabled.file)
         channel = self.channel or self.memory.get("channel", TOPOGRAPHY)

@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import wire
+from afspm import Run, wire
 from afspm.plugins.drift.record import DriftRecord
-from afspm.record.drift_mapping import drift_at, drift_knowledge
-from afspm.record.report.pictures import OFFSET, OWN_OFFSET, is_ours
-from afspm.record.run import Run
+from afspm.record import OFFSET, OWN_OFFSET, drift_at, drift_knowledge, is_ours
 
 if TYPE_CHECKING:
     from afspm.wire.messages import DriftMapping

@@ -16,10 +16,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from afspm.basics.clock import NS_PER_S
-from afspm.basics.errors import AfspmError, FileError, InvalidValue
-from afspm.basics.formatting import counted, day_and_time
-from afspm.basics.progress_line import ProgressLine
+from afspm import read, suffixes
+from afspm.basics import NS_PER_S, AfspmError, FileError, InvalidValue, ProgressLine, counted, day_and_time
+from afspm.driver import FileContent
 from afspm.model import RegistrationOutcome
 from afspm.plugins.drift.estimators import estimator
 from afspm.plugins.drift.offline import Stack, against_first, corrected, followed
@@ -29,9 +28,8 @@ from afspm.plugins.drift.simulated_truth import true_drift
 from afspm.plugins.drift.study.scan_series import Series, series
 from afspm.plugins.drift.study.workers import on_cores, processes
 from afspm.plugins.drift.trackers import tracker
-from afspm.record.journal import JOURNAL_FILE
-from afspm.record.measured_files import SUFFIX as RECORDED
-from afspm.storage.formats import FileContent, read, suffixes
+from afspm.record import JOURNAL_FILE
+from afspm.record import MEASURED_SUFFIX as RECORDED
 
 Array = NDArray[np.float64]
 

@@ -6,10 +6,16 @@ import difflib
 import inspect
 from collections.abc import Iterable
 
-from afspm.basics import entry_points, named_imports
-from afspm.basics.errors import AfspmError, ConfigError
-from afspm.basics.plain_data import PlainMapping
-from afspm.basics.requirements import require
+from afspm.basics import (
+    AfspmError,
+    ConfigError,
+    PlainMapping,
+    import_named,
+    load_plugin,
+    plugin_names,
+    require,
+    require_trusted,
+)
 
 
 def named(what: str, spec: str | PlainMapping, default: str, *arguments: object) -> tuple[object, str]:
@@ -44,21 +50,21 @@ def named(what: str, spec: str | PlainMapping, default: str, *arguments: object)
 def _imported(what: str, name: str) -> type[object]:
     module_name, _, class_name = name.rpartition(".")
     try:
-        module = named_imports.import_named(module_name)
+        module = import_named(module_name)
     except ImportError as error:
         hint = "is it installed, or on the path?"
         raise ConfigError(f"the {what} {name} can't be imported: {error}", hint=hint) from error
     found = getattr(module, class_name, None)
     if not isinstance(found, type):
         raise ConfigError(f"the module {module_name} has no class {class_name}", hint=_near(class_name, vars(module)))
-    named_imports.require_trusted(found, name)
+    require_trusted(found, name)
     return found
 
 
 def _declared(what: str, name: str) -> type[object]:
-    found = entry_points.load(f"afspm.{what}s", name)
+    found = load_plugin(f"afspm.{what}s", name)
     if not isinstance(found, type):
-        known = entry_points.names(f"afspm.{what}s")
+        known = plugin_names(f"afspm.{what}s")
         hint = _near(name.casefold(), known) or f"known: {', '.join(known)}; name one of your own as module.Name"
         raise ConfigError(f"there is no {what} {name!r}", hint=hint)
     return found

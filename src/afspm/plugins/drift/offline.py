@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import FileError, InvalidValue
+from afspm.basics import FileError, InvalidValue
 from afspm.model import Frame, Region, RegistrationOutcome
 from afspm.plugins.drift.record import DriftRecord
 from afspm.plugins.drift.registration import DriftScan, Registration

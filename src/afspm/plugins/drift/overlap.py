@@ -8,9 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from afspm.basics.errors import InvalidValue
-from afspm.model import Frame, Region
-from afspm.model.geometry import XY
+from afspm.basics import InvalidValue
+from afspm.model import XY, Frame, Region
 
 Array = NDArray[np.float64]
 

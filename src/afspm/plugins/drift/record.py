@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import FileError
+from afspm.basics import FileError
 from afspm.model import RegistrationOutcome, registration_summary
 from afspm.plugins.drift.registration import DriftScan
 from afspm.plugins.drift.tracking import Update
-from afspm.record.drift_mapping import drift_at
+from afspm.record import drift_at
 
 Array = NDArray[np.float64]
 

@@ -13,17 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import InvalidValue
-from afspm.model import Frame, Region, Scan, ScanSet
-from afspm.model.geometry import XY
+from afspm import Run
+from afspm.basics import InvalidValue
+from afspm.model import XY, Frame, Region, Scan, ScanSet
 from afspm.plugins.drift.estimators.correlation import Correlation
 from afspm.plugins.drift.estimators.images import Unusable, prepare
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
 from afspm.plugins.drift.registration import DriftScan, Registration
-from afspm.record.drawing.raster import reduced
-from afspm.record.report.pictures import topography
-from afspm.record.run import Run
-from afspm.record.tables import ScanRow
+from afspm.record import ScanRow, reduced, topography
 
 Array = NDArray[np.float64]
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, ClassVar
 
-from afspm import wire
-from afspm.basics.errors import ConfigError, ControlLost, Refused
-from afspm.client.component import Component
-from afspm.client.events import Events
+from afspm import Component, Events, wire
+from afspm.basics import ConfigError, ControlLost, Refused
 from afspm.model import Problem, Region, RescanKind, ScanParameters, names
 
 if TYPE_CHECKING:

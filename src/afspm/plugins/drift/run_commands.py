@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from afspm.basics.formatting import area_text, position_text, quantity
-from afspm.cli.arguments import AFTERWARDS, opt
+from afspm.basics import area_text, position_text, quantity
+from afspm.processes import AFTERWARDS, opt
 
 if TYPE_CHECKING:
+    from afspm import Run
     from afspm.model import Region
     from afspm.plugins.drift.remount import Remount
-    from afspm.record.run import Run
 
 compare_app = typer.Typer(rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
 find_app = typer.Typer(rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
@@ -36,11 +36,12 @@ def compare(
     Regions are the same if their scans have the same key, or without keys the same place. Prints a table and writes a
     page with pictures, which alternate and subtract scans of equal size.
     """
-    from afspm.cli.joining import plain_console, plain_table
+    from afspm import open_run
     from afspm.plugins.drift.scan_pair import onto_first
-    from afspm.record.comparison import compare as compared
-    from afspm.record.comparison_page import rows_that_differ, write
-    from afspm.record.run import open_run
+    from afspm.processes import plain_console, plain_table
+    from afspm.record import compare as compared
+    from afspm.record import rows_that_differ
+    from afspm.record import write_comparison as write
 
     with ExitStack() as stack:
         found = compared([stack.enter_context(open_run(folder)) for folder in runs], onto_first)
@@ -68,8 +69,8 @@ def find(
     Registers the overview of today with the earlier one, at any angle. Prints offset and angle with standard
     deviations, and the keyed regions of the earlier night in coordinates of today. Exit code 1: not found.
     """
+    from afspm import open_run
     from afspm.plugins.drift import remount
-    from afspm.record.run import open_run
 
     with open_run(run) as today, open_run(earlier) as night:
         now_row, now = remount.overview_of(today, scan)
@@ -102,7 +103,7 @@ def _percent(share: float) -> str:
 
 
 def _echo_regions(found: Remount, night: Run) -> None:
-    from afspm.cli.joining import plain_console, plain_table
+    from afspm.processes import plain_console, plain_table
 
     keyed = {row.key: row.region for row in night.scans if row.key and row.region is not None}
     if not keyed:

@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import InvalidValue
-from afspm.model.drift_removal import undistorted
+from afspm.basics import InvalidValue
 from afspm.plugins.drift.registration import DriftScan, Estimator, Prior, Registration
+from afspm.scheduler import undistorted
 
 Array = NDArray[np.float64]
 

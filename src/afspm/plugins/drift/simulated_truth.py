@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import AfspmError, FileError
-from afspm.basics.plain_data import Plain, from_json
+from afspm.basics import AfspmError, FileError, Plain, from_json
+from afspm.emulation import World
 from afspm.plugins.drift.registration import DriftScan
-from afspm.simulation import World
 
 Array = NDArray[np.float64]
 

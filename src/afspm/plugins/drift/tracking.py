@@ -9,8 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import InvalidValue
-from afspm.basics.plain_data import Plain, PlainMapping
+from afspm.basics import InvalidValue, Plain, PlainMapping
 from afspm.model import RegistrationOutcome
 from afspm.plugins.drift.mapping import Mapping
 from afspm.plugins.drift.registration import DriftScan, Registration

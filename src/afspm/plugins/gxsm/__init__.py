@@ -23,8 +23,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from afspm.basics.errors import ConfigError, Refused
-from afspm.basics.units import Duration
+from afspm.basics import ConfigError, Duration, Refused
+from afspm.driver import (
+    FEEDBACK_ON,
+    FRAME,
+    POSITION,
+    ControllerLost,
+    Driver,
+    Introduction,
+    KeptSettings,
+    Value,
+    action,
+    connected,
+    frame,
+)
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.gxsm import bridge
 from afspm.plugins.gxsm.activity import SHOWS_S, ConnectedGxsm, GxsmActivity, Saving
@@ -53,10 +65,6 @@ from afspm.plugins.gxsm.settings import (
     send,
     user_unit_m,
 )
-from afspm.translator.driver import Driver
-from afspm.translator.driver_base import ControllerLost, Introduction, action, connected
-from afspm.translator.parameters import FEEDBACK_ON, Value
-from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
 
 _AT_FIRST: Final[dict[str, Value]] = {names.SPEC_KIND: "IV", names.PULSE_VOLTAGE: 4.0, names.PULSE_DURATION: 0.1}
 _SAVERS: Final = ("afspm", "gxsm")

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Final
 
-from afspm.basics.clock import Clock
-from afspm.basics.errors import Refused
+from afspm.basics import Clock, Refused
+from afspm.driver import SCAN, Activity, ControllerLost, Kept, TipWay, as_list
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.plugins.gxsm.errors import GxsmError
 from afspm.plugins.gxsm.hardware import ABORT, AUTOSAVE, STATUS, Doing, Hardware, decoded, execute
@@ -17,10 +17,6 @@ from afspm.plugins.gxsm.link import Asking
 from afspm.plugins.gxsm.result_files import OLD_COLUMNS, GxsmFiles, endings
 from afspm.plugins.gxsm.scan_memory import Rows, has_new_row, has_old_columns, is_unfinished, looked_at, only
 from afspm.plugins.gxsm.settings import ScanFrame, subscan
-from afspm.translator.activity import Activity, TipWay
-from afspm.translator.driver_base import ControllerLost
-from afspm.translator.result_files import SCAN, as_list
-from afspm.translator.state import Kept
 
 SETTLES_S: Final = 0.3
 """Duration of GXSM's own work after the end of a scan; a file saved earlier has no end time."""

@@ -15,10 +15,9 @@ from typing import Final
 
 import numpy as np
 
+from afspm.driver import ControllerLost, Receiver, TcpConnection
 from afspm.plugins.gxsm.bridge import NONCE, SECRET, WELCOME, proof
 from afspm.plugins.gxsm.errors import BadReply, GxsmError
-from afspm.translator.driver_base import ControllerLost
-from afspm.translator.tcp import Receiver, TcpConnection
 
 _LONGEST: Final = 1 << 29
 _TYPES: Final = {f"<{kind}" for kind in ("f8", "f4", "i8", "i4", "u8", "u4", "i2", "u2")} | {"|u1", "|i1"}

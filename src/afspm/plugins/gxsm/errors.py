@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from afspm.basics.errors import AfspmError
-from afspm.translator.driver_base import ControllerLost
+from afspm.basics import AfspmError
+from afspm.driver import ControllerLost
 
 
 class GxsmError(AfspmError):

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
+from afspm.driver import ControllerLost, host_and_port
 from afspm.plugins.gxsm.errors import BadReply, GxsmError
-from afspm.translator.driver_base import ControllerLost
-from afspm.translator.tcp import host_and_port
 
 BLOCK = "gxsm4_py_shm_data_block"
 PROCESS = "gxsm4"

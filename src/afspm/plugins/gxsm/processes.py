@@ -9,7 +9,7 @@ from typing import Final
 
 import psutil
 
-from afspm.translator.driver_base import ControllerLost
+from afspm.driver import ControllerLost
 
 _SIGUSR1_BIT: Final = 1 << 9  # signal 10, counted from 1
 

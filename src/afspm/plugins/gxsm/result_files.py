@@ -8,15 +8,12 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
-from afspm.basics.clock import NS_PER_S
-from afspm.basics.errors import AfspmError
-from afspm.model import Region
-from afspm.plugins.gxsm.scan_memory import Rows, has_old_columns, in_files, is_unfinished
-from afspm.storage.formats.content import FileContent
-from afspm.translator.result_files import (
+from afspm.basics import NS_PER_S, AfspmError
+from afspm.driver import (
     SCAN,
     Content,
     Entry,
+    FileContent,
     FilePrecision,
     ResultFiles,
     as_region,
@@ -24,6 +21,8 @@ from afspm.translator.result_files import (
     modified_ns,
     read_result,
 )
+from afspm.model import Region
+from afspm.plugins.gxsm.scan_memory import Rows, has_old_columns, in_files, is_unfinished
 
 _NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+\.nc)$")
 _PRECISION: Final = FilePrecision(part=1e-5, angle_rad=1e-6)

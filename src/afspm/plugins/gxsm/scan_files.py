@@ -16,12 +16,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.clock import NS_PER_S
-from afspm.basics.errors import FileError
-from afspm.basics.units import convert
+from afspm.basics import NS_PER_S, FileError, convert
+from afspm.driver import FileContent, OtherFormat, hdf5_reading, netcdf
 from afspm.model import Region, Scan
-from afspm.storage.formats import hdf5_reading, netcdf
-from afspm.storage.formats.content import FileContent, OtherFormat
 
 CONTROLLER = "GXSM"
 # GXSM's table of units (`XsmUnitsTable`) has a name, a symbol and a factor for each: a window shows the stored number

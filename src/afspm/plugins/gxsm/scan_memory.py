@@ -13,10 +13,10 @@ from typing import TypedDict
 
 import numpy as np
 
+from afspm.driver import FileContent
 from afspm.model import Region, ScanLines
 from afspm.plugins.gxsm.link import Asking
 from afspm.plugins.gxsm.settings import ANGSTROM_M
-from afspm.storage.formats.content import FileContent
 
 _CONSTANT = "="
 _FIRST_LAYER, _NO_TIME = 0, -1

@@ -11,16 +11,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
-from afspm.basics import units
-from afspm.basics.errors import AfspmError, Refused
-from afspm.basics.formatting import position_text
+from afspm.basics import AfspmError, Refused, convert, position_text
+from afspm.driver import FEEDBACK_ON, FRAME, POSITION, Kept, SettingsGroup, Value, frame, frame_values
 from afspm.model import ControlResponse, Region, names
 from afspm.plugins.gxsm.errors import BadReply, GxsmError
 from afspm.plugins.gxsm.hardware import Doing
 from afspm.plugins.gxsm.link import Asking
-from afspm.translator.parameters import FEEDBACK_ON, Value
-from afspm.translator.setting_groups import FRAME, POSITION, SettingsGroup, frame, frame_values
-from afspm.translator.state import Kept
 
 ANGSTROM_M: Final = 1e-10
 _UNITS: Final = {"AA": "Å", "Ang": "Å", "\u00c5": "Å", "\u212b": "Å", "\u03bcm": "um", "\u00b5m": "um"}
@@ -49,7 +45,7 @@ def user_unit_m(ask: Asking) -> float:
         hint = "start GXSM with LC_NUMERIC=C"
         raise AfspmError(f"GXSM shows {shown!r}, with a decimal comma: it would read 12.5 as 12", hint=hint)
     try:
-        read, unit_m = float(digits), units.convert(1.0, _UNITS.get(unit.strip(), unit.strip()), "m")
+        read, unit_m = float(digits), convert(1.0, _UNITS.get(unit.strip(), unit.strip()), "m")
     except (ValueError, AfspmError) as error:
         raise BadReply(f"GXSM shows {shown!r} for RangeX: {error}") from error
     if not math.isclose(read, number, rel_tol=0.01, abs_tol=_ROUNDED):

@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+from afspm.driver import ShadowDriver, require_question
 from afspm.plugins.gxsm import Gxsm
 from afspm.plugins.gxsm.link import Link
-from afspm.translator.shadow import ShadowDriver, require_question
 
 QUESTIONS: Final = frozenset({
     *("get", "gets", "list_refnames", "list_actions", "rtquery", "y_current", "chfname"),

@@ -19,12 +19,11 @@ from pathlib import Path
 from threading import Event
 from typing import Final
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
+from afspm.driver import TCP, TRACE, ControllerLost
 from afspm.plugins.gxsm import bridge_client, pickles
 from afspm.plugins.gxsm.errors import BadReply, GxsmError
 from afspm.plugins.gxsm.processes import GxsmProcess, NoProcess, find
-from afspm.translator.driver_base import ControllerLost
-from afspm.translator.trace import TCP, TRACE
 
 _FOLDER: Final = Path("/dev/shm")
 _BYTES: Final = 16_777_344

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from afspm.basics.errors import FileError
-from afspm.basics.units import convert
+from afspm.basics import FileError, convert
+from afspm.driver import FileContent, local_ns, name_and_unit, text_of
 from afspm.model import Spectrum
 from afspm.plugins.gxsm.scan_files import CONTROLLER
-from afspm.storage.formats.content import FileContent, local_ns, name_and_unit, text_of
 
 _MISLABELLED = {"LockIn-Mag": "V", "McBSP Ampl": "V", "McBSP Exec": "V", "In 0": "nA"}
 """Unit of the values of signals that GXSM labels with another unit, in which it shows their scans (mV, pA).

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from afspm.basics.plain_data import PlainMapping
-from afspm.basics.units import Length
-from afspm.simulation.simulator import Simulator
+from afspm.basics import Length, PlainMapping
+from afspm.emulation import Simulator
 
 __all__ = ["ImageMicroscope"]
 

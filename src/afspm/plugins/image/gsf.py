@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from afspm.basics.errors import FileError
+from afspm.basics import FileError
+from afspm.driver import FileContent
 from afspm.model import Region, Scan
-from afspm.storage.formats.content import FileContent
 
 _MAGIC = b"Gwyddion Simple Field 1.0\n"
 

@@ -26,9 +26,9 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.plain_data import Plain
+from afspm import from_plain, to_plain
+from afspm.basics import Plain
 from afspm.model import Region
-from afspm.model.snapshot import from_plain, to_plain
 from afspm.plugins.line_watch.registration import (
     CLIP_SIGMAS,
     Array,

@@ -9,14 +9,17 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from afspm.basics.clock import NS_PER_S
-from afspm.basics.errors import UnitError
-from afspm.basics.shared_time import Publication
-from afspm.basics.units import convert
-from afspm.client.component import Component
-from afspm.client.events import Events, PublishedEvent
-from afspm.components import tip_verdict
-from afspm.components.channel_pairs import ChannelPairing, HeightPair, MissingChannels
+from afspm import (
+    ChannelPairing,
+    Component,
+    Events,
+    HeightPair,
+    MissingChannels,
+    Publication,
+    PublishedEvent,
+    tip_verdict,
+)
+from afspm.basics import NS_PER_S, UnitError, convert
 from afspm.model import (
     HEIGHT,
     HEIGHT_RETRACE,

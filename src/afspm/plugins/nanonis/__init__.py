@@ -21,18 +21,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from afspm.basics.errors import ConfigError, FileError, Refused
-from afspm.basics.units import Duration
+from afspm.basics import ConfigError, Duration, FileError, Refused
+from afspm.driver import FRAME, SCAN, Driver, Entry, KeptSettings, Value, action, as_region, connected, frame
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.nanonis import fetched, geometry, parameter_groups, protocol, z_controller
 from afspm.plugins.nanonis.activity import SAFE_TIP, WITHDRAWING, NanonisActivity
 from afspm.plugins.nanonis.result_files import NanonisFiles
 from afspm.plugins.nanonis.session import MODULES, Session
-from afspm.translator.driver import Driver
-from afspm.translator.driver_base import action, connected
-from afspm.translator.parameters import Value
-from afspm.translator.result_files import SCAN, Entry, as_region
-from afspm.translator.setting_groups import FRAME, KeptSettings, frame
 
 _AT_FIRST: Final[dict[str, Value]] = {
     names.SCAN_DIRECTION: names.UP,

@@ -7,19 +7,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import ClassVar, Final
 
-from afspm.basics.clock import Clock
-from afspm.basics.errors import Refused
+from afspm.basics import Clock, Refused
+from afspm.driver import SCAN, Activity, ControllerLost, Kept, as_list, frame
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.plugins.nanonis.geometry import Probe, ScanFrame
 from afspm.plugins.nanonis.parameter_groups import TipState
 from afspm.plugins.nanonis.protocol import NanonisError
 from afspm.plugins.nanonis.result_files import NanonisFiles
 from afspm.plugins.nanonis.session import APPROACH, MODULES, CurveEnded, ListenerEvent, ScanEnded, Session
-from afspm.translator.activity import Activity
-from afspm.translator.driver_base import ControllerLost
-from afspm.translator.result_files import SCAN, as_list
-from afspm.translator.setting_groups import frame
-from afspm.translator.state import Kept
 
 _SHOWS_S: Final = 10.0
 """Longest real time until a poll shows a started scan: the tip may first have to move to the first line."""

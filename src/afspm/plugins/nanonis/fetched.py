@@ -10,12 +10,12 @@ from typing import Final
 
 import numpy as np
 
-from afspm.basics.errors import ConfigError, FileError
+from afspm import write_atomic
+from afspm.basics import ConfigError, FileError
+from afspm.driver import FileFacts, encode_scan, encode_spectrum
 from afspm.model import Region, Scan, ScanLines, Spectrum
 from afspm.plugins.nanonis.parameter_groups import Ask
 from afspm.plugins.nanonis.session import CurveEnded
-from afspm.storage.atomic import write_atomic
-from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 
 ROWS: Final = ("top-first", "recorded")
 BACKWARD: Final = ("mirrored", "as-seen")

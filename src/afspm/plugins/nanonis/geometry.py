@@ -10,12 +10,11 @@ import math
 from collections.abc import Callable, Mapping
 from typing import ClassVar, Final
 
-from afspm.basics.formatting import lengths_text
+from afspm.basics import lengths_text
+from afspm.driver import FRAME, POSITION, Value, frame, frame_values, refuse_value
 from afspm.model import Region, names
 from afspm.plugins.nanonis.parameter_groups import Ask, Group, MoveSpeed, keep_speed
 from afspm.plugins.nanonis.protocol import BadReply, NanonisError
-from afspm.translator.parameters import Value, refuse_value
-from afspm.translator.setting_groups import FRAME, POSITION, frame, frame_values
 
 _PIXELS_AT_ONCE: Final = 16
 _DIGITS: Final = 1e-6  # relative precision of float32, with a margin

@@ -18,11 +18,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import FileError
-from afspm.model import Region, Scan, Spectrum
-from afspm.model.geometry import XY
+from afspm.basics import FileError
+from afspm.driver import FileContent, local_ns, name_and_unit, text_of
+from afspm.model import XY, Region, Scan, Spectrum
 from afspm.plugins.nanonis.scan_files import CONTROLLER
-from afspm.storage.formats.content import FileContent, local_ns, name_and_unit, text_of
 
 _END: Final = b":HEADER_END:\r\n"
 _LAYOUT: Final = "%d.%m.%Y %H:%M:%S"

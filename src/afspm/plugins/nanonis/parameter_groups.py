@@ -10,10 +10,9 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Final
 
+from afspm.driver import FEEDBACK_ON, SettingsGroup, Value, refuse_value
 from afspm.model import names
 from afspm.plugins.nanonis.protocol import BadReply, NanonisError
-from afspm.translator.parameters import FEEDBACK_ON, Value, refuse_value
-from afspm.translator.setting_groups import SettingsGroup
 
 Ask = Callable[..., tuple[Any, ...]]
 

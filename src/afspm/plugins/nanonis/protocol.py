@@ -16,9 +16,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from afspm.basics.errors import AfspmError, InvalidValue
-from afspm.storage.formats.content import text_of
-from afspm.translator.driver_base import ControllerLost
+from afspm.basics import AfspmError, InvalidValue
+from afspm.driver import ControllerLost, text_of
 
 HEADER_BYTES: Final = 40
 NEWEST: Final = 1 << 31

@@ -9,11 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from afspm.basics.errors import AfspmError, FileError
-from afspm.model import Spectrum
-from afspm.plugins.nanonis import fetched
-from afspm.translator.driver_base import LOST
-from afspm.translator.result_files import (
+from afspm.basics import AfspmError, FileError
+from afspm.driver import (
+    LOST,
     NEW_FRAME,
     SCAN,
     Content,
@@ -25,6 +23,8 @@ from afspm.translator.result_files import (
     newest,
     read_result,
 )
+from afspm.model import Spectrum
+from afspm.plugins.nanonis import fetched
 
 _PRECISION: Final = FilePrecision(part=2e-6, angle_rad=1e-3, positions=True)
 """Scan files have seven digits of a length, and four digits of an angle in degrees: errors of up to 0.05 degrees."""

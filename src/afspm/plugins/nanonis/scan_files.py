@@ -13,10 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from afspm.basics.clock import NS_PER_S
-from afspm.basics.errors import FileError
+from afspm.basics import NS_PER_S, FileError
+from afspm.driver import FileContent, local_ns, text_of
 from afspm.model import Region, Scan
-from afspm.storage.formats.content import FileContent, local_ns, text_of
 
 CONTROLLER = "Nanonis"
 _END = re.compile(rb"^:SCANIT_END:\s*\x1a\x04", re.MULTILINE)

@@ -10,12 +10,10 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from afspm.basics.errors import AfspmError
+from afspm.basics import AfspmError
+from afspm.driver import ControllerLost, Driver, Receiver, TcpConnection
 from afspm.plugins.nanonis import protocol
 from afspm.plugins.nanonis.protocol import BadReply, NanonisError
-from afspm.translator.driver import Driver
-from afspm.translator.driver_base import ControllerLost
-from afspm.translator.tcp import Receiver, TcpConnection
 
 MODULES: Final = {"IV": "BiasSpectr", "force": "ZSpectr"}
 APPROACH: Final = "AutoApproach"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Final
 
+from afspm.driver import ShadowDriver, require_question
 from afspm.plugins.nanonis import Nanonis
 from afspm.plugins.nanonis.activity import SAFE_TIP, NanonisActivity
 from afspm.plugins.nanonis.protocol import NanonisError
 from afspm.plugins.nanonis.session import APPROACH, Link, Session
-from afspm.translator.shadow import ShadowDriver, require_question
 
 QUESTIONS: Final = frozenset({
     *("Util.VersionGet", "Util.SessionPathGet", "Signals.NamesGet", "Bias.Get"),

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from afspm.basics.errors import FileError
+from afspm.basics import FileError
+from afspm.driver import FileContent, OtherFormat, local_ns, name_and_unit, text_of
 from afspm.model import Spectrum
 from afspm.plugins.nanonis.scan_files import CONTROLLER
-from afspm.storage.formats.content import FileContent, OtherFormat, local_ns, name_and_unit, text_of
 
 _TABLE = "[DATA]"
 _LAYOUT = "%d.%m.%Y %H:%M:%S"

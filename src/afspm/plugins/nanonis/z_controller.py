@@ -12,8 +12,7 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Final, cast
 
-from afspm.basics.errors import UnitError
-from afspm.basics.units import convert
+from afspm.basics import UnitError, convert
 from afspm.plugins.nanonis.protocol import NanonisError
 
 _ADDED: Final = {"log", "abs", "neg"}

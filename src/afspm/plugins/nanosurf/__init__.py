@@ -16,19 +16,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from afspm.basics.errors import ConfigError, Refused
-from afspm.basics.plain_data import PlainMapping
-from afspm.basics.units import Duration, PollPeriod
+from afspm.basics import ConfigError, Duration, PlainMapping, PollPeriod, Refused
+from afspm.driver import FRAME, POSITION, Driver, KeptSettings, Value, action, connected, frame
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.nanosurf import commands
 from afspm.plugins.nanosurf.activity import FORCE, NanosurfFiles, ScanTime, StudioActivity
 from afspm.plugins.nanosurf.link import Link, StudioError
 from afspm.plugins.nanosurf.session import Session, new_lines
 from afspm.plugins.nanosurf.settings import DIRECTION, SPEED_PATH, UNITS, FrameSettings, Slopes, TipPlace, direction
-from afspm.translator.driver import Driver
-from afspm.translator.driver_base import action, connected
-from afspm.translator.parameters import Value
-from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
 
 _AT_FIRST: Final[dict[str, Value]] = {names.SCAN_DIRECTION: names.UP, names.SPEC_KIND: FORCE}
 _STORAGE: Final = "data.storage"

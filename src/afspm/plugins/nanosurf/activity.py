@@ -9,19 +9,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Final
 
-from afspm.basics.clock import Clock
-from afspm.basics.errors import AfspmError, Refused
+from afspm.basics import AfspmError, Clock, Refused
+from afspm.driver import (
+    ANSWERS_S,
+    SCAN,
+    Activity,
+    ControllerLost,
+    Entry,
+    FilePrecision,
+    FolderFiles,
+    Kept,
+    LongCall,
+    as_list,
+)
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum
 from afspm.plugins.nanosurf import commands
 from afspm.plugins.nanosurf.link import StudioError
 from afspm.plugins.nanosurf.session import Session
 from afspm.plugins.nanosurf.settings import TipPlace
-from afspm.translator.activity import Activity
-from afspm.translator.driver_base import ControllerLost
-from afspm.translator.folder_files import FolderFiles
-from afspm.translator.long_call import ANSWERS_S, LongCall
-from afspm.translator.result_files import SCAN, Entry, FilePrecision, as_list
-from afspm.translator.state import Kept
 
 FORCE: Final = "force"
 _LEAST: Final = 0.45

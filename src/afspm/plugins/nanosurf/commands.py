@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
 
 FIRST_RELEASE: Final = 13
 """The oldest release for which a public script is known; older ones may have other commands."""

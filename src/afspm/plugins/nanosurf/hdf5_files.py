@@ -17,11 +17,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import FileError
-from afspm.basics.plain_data import PlainMapping
+from afspm.basics import FileError, PlainMapping
+from afspm.driver import FileContent, hdf5_reading
 from afspm.model import Region, Scan, Spectrum
-from afspm.storage.formats import hdf5_reading
-from afspm.storage.formats.content import FileContent
 
 if TYPE_CHECKING:
     import h5py

@@ -6,10 +6,9 @@ import struct
 from collections.abc import Callable
 from typing import Any, Final
 
-from afspm.basics.errors import AfspmError
+from afspm.basics import AfspmError
+from afspm.driver import ControllerLost, Receiver, TcpConnection, host_and_port
 from afspm.plugins.nanosurf.lua_values import BadLua, parse
-from afspm.translator.driver_base import ControllerLost
-from afspm.translator.tcp import Receiver, TcpConnection, host_and_port
 
 # Length of a script or reply in bytes, least significant byte first.
 _LENGTH: Final = struct.Struct("<I")

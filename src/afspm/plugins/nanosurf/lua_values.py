@@ -6,7 +6,7 @@ import math
 import re
 from typing import Any, Final
 
-from afspm.basics.errors import AfspmError
+from afspm.basics import AfspmError
 
 _TOKEN: Final = re.compile(
     r"""\s*(?:(?P<text>"(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*')

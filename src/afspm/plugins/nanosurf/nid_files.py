@@ -19,10 +19,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import FileError
-from afspm.basics.units import si
+from afspm.basics import FileError, si
+from afspm.driver import FileContent, local_ns, text_of
 from afspm.model import Region, Scan, Spectrum
-from afspm.storage.formats.content import FileContent, local_ns, text_of
 
 _DATA: Final = b"#!"
 _CHANNEL: Final = re.compile(r"Gr(\d{1,6})-Ch(\d{1,6})")

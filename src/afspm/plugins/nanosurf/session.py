@@ -9,15 +9,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from afspm.basics.errors import ConfigError, Refused
+from afspm.basics import ConfigError, Refused
+from afspm.driver import ControllerLost, LongCall, Value
 from afspm.model import ControlResponse, Region, ScanLines
 from afspm.plugins.nanosurf import commands
 from afspm.plugins.nanosurf.commands import WORKFLOW
 from afspm.plugins.nanosurf.link import Link, StudioError
 from afspm.plugins.nanosurf.lua_values import written
-from afspm.translator.driver_base import ControllerLost
-from afspm.translator.long_call import LongCall
-from afspm.translator.parameters import Value
 
 ENUMS: Final = frozenset({"imaging.scan_mode", "imaging.slow_axis_scan_direction", "data.storage.nhf_auto_store_mode"})
 """Paths of choices, whose value is a number."""

@@ -10,12 +10,11 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from afspm.basics.errors import InvalidValue
+from afspm.basics import InvalidValue
+from afspm.driver import FRAME, POSITION, SettingsGroup, Value, check_speed, frame, frame_values
 from afspm.model import Region, names
 from afspm.plugins.nanosurf import commands
 from afspm.plugins.nanosurf.session import Session
-from afspm.translator.parameters import Value
-from afspm.translator.setting_groups import FRAME, POSITION, SettingsGroup, check_speed, frame, frame_values
 
 DIRECTION: Final = "imaging.slow_axis_scan_direction"
 _UPWARD, _DOWNWARD = 1, 0

@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from typing import Any, ClassVar, Final
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
+from afspm.driver import ShadowDriver, refusal
 from afspm.plugins.nanosurf import SAVES, Nanosurf, commands
 from afspm.plugins.nanosurf.link import Link, shown
 from afspm.plugins.nanosurf.session import VERSIONS, Session
-from afspm.translator.shadow import ShadowDriver, refusal
 
 _TEXT: Final = r'"(?:[^"\\\n]|\\.)*"'
 _LIST: Final = rf"(?:{_TEXT}(?:, {_TEXT})*)?"

@@ -17,21 +17,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from afspm.basics.errors import ConfigError, Refused
-from afspm.basics.formatting import lengths_text
-from afspm.basics.plain_data import PlainMapping
-from afspm.basics.units import Duration, Length, PollPeriod
+from afspm.basics import ConfigError, Duration, Length, PlainMapping, PollPeriod, Refused, lengths_text
+from afspm.driver import FRAME, POSITION, Driver, KeptSettings, LongCall, Value, action, connected, frame
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.park.activity import STOP, STOP_CURVE, SmartScanActivity
 from afspm.plugins.park.link import Link, SmartScanError
 from afspm.plugins.park.result_files import SETTLE_S, ParkFiles
 from afspm.plugins.park.session import FALSE, TRUE, Session
 from afspm.plugins.park.settings import MICROMETRE, FrameSettings, Gains, TipPlace
-from afspm.translator.driver import Driver
-from afspm.translator.driver_base import action, connected
-from afspm.translator.long_call import LongCall
-from afspm.translator.parameters import Value
-from afspm.translator.setting_groups import FRAME, POSITION, KeptSettings, frame
 
 _SCANNING: Final = TRUE | {"scanning", "running"}
 _IDLE: Final = FALSE | {"idle", "ready", "done", "stopped"}

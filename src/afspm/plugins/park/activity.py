@@ -10,17 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Final
 
-from afspm.basics.clock import Clock
-from afspm.basics.errors import AfspmError, Refused
+from afspm.basics import AfspmError, Clock, Refused
+from afspm.driver import ANSWERS_S, SCAN, XY, Activity, Kept, LongCall, as_list
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.plugins.park.link import SmartScanError
 from afspm.plugins.park.result_files import ParkFiles
 from afspm.plugins.park.session import Session
 from afspm.plugins.park.settings import MOVE, way_to
-from afspm.translator.activity import Activity
-from afspm.translator.long_call import ANSWERS_S, LongCall
-from afspm.translator.result_files import SCAN, XY, as_list
-from afspm.translator.state import Kept
 
 START, STOP, STOP_CURVE = "scan.triggerImageScan()", "scan.stop()", "spect.stop()"
 CURVES: Final = {"force": "fd", "IV": "iv"}

@@ -7,10 +7,8 @@ import math
 from collections.abc import Callable
 from typing import Any, Final
 
-from afspm.basics.errors import AfspmError
-from afspm.basics.plain_data import Plain, from_json
-from afspm.translator.driver_base import ControllerLost
-from afspm.translator.zmq_connection import ZmqConnection
+from afspm.basics import AfspmError, Plain, from_json
+from afspm.driver import ControllerLost, ZmqConnection
 
 RUN_SCRIPT, SCRIPT_RUNS, IS_CONNECTED, SCAN_STATUS, GEOMETRY = (
     "js_cmd",

@@ -7,10 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from afspm.basics.plain_data import Plain
+from afspm.basics import Plain
+from afspm.driver import Entry, FilePrecision, FolderFiles, modified_ns
 from afspm.plugins.park.scan_files import is_foreign
-from afspm.translator.folder_files import FolderFiles
-from afspm.translator.result_files import Entry, FilePrecision, modified_ns
 
 SETTLE_S: Final = 1.0
 """Real time without a new file before a scan counts as complete: the number of its files is unknown."""

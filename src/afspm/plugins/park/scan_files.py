@@ -17,9 +17,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import FileError
-from afspm.model import Region, Scan, Spectrum
-from afspm.model.geometry import XY
+from afspm.basics import FileError
+from afspm.driver import FileContent, OtherFormat, local_ns
+from afspm.model import XY, Region, Scan, Spectrum
 from afspm.plugins.park.file_header import (
     CURVE_KINDS,
     CURVES,
@@ -44,7 +44,6 @@ from afspm.plugins.park.file_header import (
     in_si,
     text,
 )
-from afspm.storage.formats.content import FileContent, OtherFormat, local_ns
 
 _DATE: Final = "%Y:%m:%d %H:%M:%S"
 Tags = dict[int, Any]

@@ -7,7 +7,8 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Final
 
-from afspm.basics.errors import Refused
+from afspm.basics import Refused
+from afspm.driver import ANSWERS_S, ControllerLost, LongCall, Value
 from afspm.model import ControlResponse
 from afspm.plugins.park.link import (
     GEOMETRY,
@@ -18,9 +19,6 @@ from afspm.plugins.park.link import (
     SmartScanError,
     numbers,
 )
-from afspm.translator.driver_base import ControllerLost
-from afspm.translator.long_call import ANSWERS_S, LongCall
-from afspm.translator.parameters import Value
 
 TRUE, FALSE = frozenset({"true", "1"}), frozenset({"false", "0"})
 _GEOMETRY: Final = ("pixelHeight", "pixelWidth", "width", "height", "offsetX", "offsetY", "rotation")

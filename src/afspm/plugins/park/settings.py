@@ -10,21 +10,21 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from afspm.basics.errors import InvalidValue
-from afspm.model import ControlResponse, Region, names
-from afspm.plugins.park.session import Session
-from afspm.translator.long_call import LongCall
-from afspm.translator.parameters import Value
-from afspm.translator.result_files import XY
-from afspm.translator.setting_groups import (
+from afspm.basics import InvalidValue
+from afspm.driver import (
     FRAME,
     POSITION,
+    XY,
     KeptSettings,
+    LongCall,
     SettingsGroup,
+    Value,
     check_speed,
     frame,
     frame_values,
 )
+from afspm.model import ControlResponse, Region, names
+from afspm.plugins.park.session import Session
 
 MICROMETRE: Final = 1e-6
 MOVE: Final = "move"

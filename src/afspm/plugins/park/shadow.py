@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from typing import Any, ClassVar, Final
 
+from afspm.driver import ShadowDriver, refusal, require_question
 from afspm.plugins.park import Park
 from afspm.plugins.park.link import GEOMETRY, IS_CONNECTED, SCAN_STATUS, SCRIPT_RUNS, Link, shown
-from afspm.translator.shadow import ShadowDriver, refusal, require_question
 
 QUESTIONS: Final = frozenset({IS_CONNECTED, SCAN_STATUS, SCRIPT_RUNS, GEOMETRY})
 """Methods of SmartRemote that return a value and change nothing."""

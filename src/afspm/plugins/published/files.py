@@ -6,8 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from afspm.basics import units
-from afspm.basics.errors import AfspmError, InvalidValue
+from afspm.basics import AfspmError, InvalidValue, si
 from afspm.experiment.document import Document
 from afspm.experiment.parts import ExperimentParts
 from afspm.experiment.toml_lines import Settings, Table
@@ -169,7 +168,7 @@ def envelope(table: Table) -> object:
 
 def length_m(value: str | float) -> float:
     """Return a length in the cache settings in m: a text with its unit, or a number in nm."""
-    return units.si(value, "m") if isinstance(value, str) else float(value) * 1e-9
+    return si(value, "m") if isinstance(value, str) else float(value) * 1e-9
 
 
 def renamed_channels(components: Mapping[str, Table]) -> dict[str, str]:
@@ -300,13 +299,13 @@ def _width(value: Any, table: Table) -> Settings:
 def _speed(value: Any, table: Table) -> Settings:
     # the published setting is the time of a scan over the width of the picture, each line forth and back
     size, unit = table.get("physical_size"), str(table.get("physical_units", "nm"))
-    width_m = units.si(f"{size[0]} {unit}", "m") if isinstance(size, list) else _WIDTH_M
+    width_m = si(f"{size[0]} {unit}", "m") if isinstance(size, list) else _WIDTH_M
     return {"initial.scan-speed": f"{2 * _LINES * width_m / float(value) * 1e6:.6g} um/s"}
 
 
 def _velocity(value: Any, table: Table) -> Settings:
     unit = f"{table.get('spatial_units', 'nm')}/{table.get('temporal_units', 's')}"
-    x, y = (units.si(f"{part} {unit}", "m/s") for part in value)
+    x, y = (si(f"{part} {unit}", "m/s") for part in value)
     return {"drift.velocity_m_per_s": [x, y, 0.0]}
 
 

@@ -12,27 +12,36 @@ from typing import TYPE_CHECKING, ClassVar, Final
 import zmq
 
 from afspm import wire
-from afspm.basics.errors import ConfigError, WireError
-from afspm.basics.exit_codes import ExitCode
-from afspm.basics.launch import Launch
-from afspm.model import ControlRequest, ControlResponse, Packet, Response, ScopeState
-from afspm.model.events import PERSON
+from afspm.basics import ConfigError, ExitCode, Launch, WireError
+from afspm.model import PERSON, ControlRequest, ControlResponse, Packet, Response, ScopeState
 from afspm.plugins.published import version_1
 from afspm.plugins.published.version_1 import Pacing
-from afspm.transport.control_client import ControlClient
-from afspm.transport.frames import receive_frames, send_frames, send_packet
-from afspm.transport.late_joiners import PublishedHistory
-from afspm.transport.network import ACCEPTED, DISCONNECTED, Monitor, Network
-from afspm.transport.port import ControlConnected, Incoming, Killed, PacketReceived, ParentGone, ReplyReceived
-from afspm.transport.rate_limited_log import RateLimitedLog
-from afspm.transport.subscriber import Subscriber
-from afspm.transport.zmq_port import BasePort
+from afspm.processes import (
+    ACCEPTED,
+    DISCONNECTED,
+    BasePort,
+    ControlClient,
+    ControlConnected,
+    Incoming,
+    Killed,
+    Monitor,
+    Network,
+    PacketReceived,
+    ParentGone,
+    PublishedHistory,
+    RateLimitedLog,
+    ReplyReceived,
+    Subscriber,
+    receive_frames,
+    send_frames,
+    send_packet,
+)
 from afspm.wire.messages import CONTROL_STATE, SCOPE_STATE
 
 if TYPE_CHECKING:
-    from afspm.basics.clock import Clock
+    from afspm.basics import Clock
     from afspm.experiment.toml_lines import Settings
-    from afspm.transport.process.context import ProcessContext
+    from afspm.processes import ProcessContext
 
 SETTLED_S: Final = 0.05
 """Real time from a subscription to its replay. A peer subscribes several times in a row, and drops packets older than

@@ -11,20 +11,31 @@ from typing import TYPE_CHECKING, ClassVar, Final
 import zmq
 
 from afspm import wire
-from afspm.basics.errors import ConfigError, WireError
-from afspm.basics.exit_codes import ExitCode
+from afspm.basics import ConfigError, ExitCode, WireError
 from afspm.model import ControlRequest, ControlResponse, Request, Response, ResponseDetail, Role, component_of
 from afspm.plugins.published import version_1
-from afspm.transport.frames import receive_frames, send_frames
-from afspm.transport.network import CONNECTED, DISCONNECTED, MAX_PACKET_BYTES, Monitor, Network
-from afspm.transport.port import Incoming, ParentGone
-from afspm.transport.rate_limited_log import RateLimitedLog
-from afspm.transport.router import PeerAsked, PeerConnected, PeerDisconnected, Router, RouterEvent
-from afspm.transport.zmq_port import BasePort
+from afspm.processes import (
+    CONNECTED,
+    DISCONNECTED,
+    MAX_PACKET_BYTES,
+    BasePort,
+    Incoming,
+    Monitor,
+    Network,
+    ParentGone,
+    PeerAsked,
+    PeerConnected,
+    PeerDisconnected,
+    RateLimitedLog,
+    Router,
+    RouterEvent,
+    receive_frames,
+    send_frames,
+)
 from afspm.wire.messages import CONTROL_STATE
 
 if TYPE_CHECKING:
-    from afspm.transport.process.context import ProcessContext
+    from afspm.processes import ProcessContext
 
 CACHE_WITHIN_S: Final = 2.0
 """Real time within which a scheduler of version 1 sends its cache; no message marks the end of the cache."""

@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, Final
 
-from afspm.basics import units
-from afspm.basics.addresses import is_address
-from afspm.basics.errors import UnitError
+from afspm.basics import UnitError, is_address, si
 from afspm.experiment.findings import SourceLocation
 from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.toml_lines import Settings, Table
-from afspm.experiment.toml_writer import dumps
 from afspm.experiment.toml_writer import value as toml
 from afspm.experiment.wiring_classes import WIRE_KEYS, WiringClass, wire_of
 from afspm.model import Role
 from afspm.plugins.published.files import INSTEAD, last
-from afspm.transport.network import is_local
+from afspm.processes import is_local
+from afspm.processes import toml_text as dumps
 
 if TYPE_CHECKING:
     from afspm.experiment.resolved_experiment import ResolvedExperiment
@@ -179,5 +177,5 @@ def _series(table: Table) -> Settings | None:
 
 def _middle(origin: float, length: float, unit: str) -> str:
     # published regions have an origin, afspm's a centre
-    units.si(f"{length} {unit}", "m")
+    si(f"{length} {unit}", "m")
     return f"{origin + length / 2:g} {unit}"

@@ -14,11 +14,8 @@ from typing import TYPE_CHECKING, ClassVar, Final
 
 import zmq
 
-from afspm import wire
-from afspm.basics.errors import ConfigError, WireError
-from afspm.basics.exit_codes import ExitCode
-from afspm.basics.interpreter import python_command
-from afspm.basics.launch import Launch, Sockets
+from afspm import Memory, wire
+from afspm.basics import ConfigError, ExitCode, Launch, Sockets, WireError, python_command
 from afspm.model import (
     ChannelRoles,
     ControlRequest,
@@ -29,28 +26,38 @@ from afspm.model import (
     ResponseDetail,
     Role,
     ScopeState,
+    names,
 )
 from afspm.model.fencing import Epoch, SchedulerFence
-from afspm.model.names import STOP_SCAN, STOP_SPEC
 from afspm.model.sessions import run_of
 from afspm.plugins.published import version_1
-from afspm.storage.memory import Memory
-from afspm.supervisor.ports import FreePorts
+from afspm.processes import (
+    CONNECTED,
+    DISCONNECTED,
+    MAX_PACKET_BYTES,
+    FreePorts,
+    Monitor,
+    Network,
+    ParentGone,
+    Poller,
+    RequestReceived,
+    Served,
+    SubscriberJoined,
+    WakeUp,
+    ZmqServerPort,
+    receive_frames,
+    send_frames,
+)
 from afspm.supervisor.process import GUARD
 from afspm.translator.requests import RequestOutcomes
-from afspm.transport.frames import receive_frames, send_frames
-from afspm.transport.network import CONNECTED, DISCONNECTED, MAX_PACKET_BYTES, Monitor, Network
-from afspm.transport.polling import Poller, WakeUp
-from afspm.transport.port import ParentGone, RequestReceived, Served, SubscriberJoined
-from afspm.transport.zmq_server import ZmqServerPort
 from afspm.wire.messages import SCOPE_STATE, SPECTRUM
 
 if TYPE_CHECKING:
-    from afspm.transport.process.context import ProcessContext
+    from afspm.processes import ProcessContext
 
 STOPPED_WITHIN_S: Final = 2.0
 """Real time that the published translator has to stop its measurement when the experiment ends."""
-_STOPS: Final = {ScopeState.SCANNING: STOP_SCAN, ScopeState.SPEC: STOP_SPEC}
+_STOPS: Final = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
 _OWN = b"own"  # the id of this process's own requests, which clients' requests don't have
 
 

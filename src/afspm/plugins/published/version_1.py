@@ -9,9 +9,9 @@ import math
 from collections import deque
 from typing import Final
 
-from afspm.basics.launch import Launch
+from afspm.basics import Launch
 from afspm.model import ControlRequest, ControlResponse, Packet, Request, Response, ScopeState
-from afspm.transport.network import Network
+from afspm.processes import Network
 from afspm.wire import KILL, encode_response, encode_subject
 from afspm.wire.messages import (
     CONTROL_STATE,

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from afspm.basics.formatting import counted
-from afspm.cli.arguments import AFTERWARDS, RUNS, RecordedRun, names_in, opt
+from afspm.basics import counted
+from afspm.processes import AFTERWARDS, RUNS, RecordedRun, names_in, opt
 
 app = typer.Typer(rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
 

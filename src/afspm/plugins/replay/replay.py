@@ -10,24 +10,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from afspm import wire
-from afspm.basics.addresses import is_address
-from afspm.basics.clock import NS_PER_S, ExperimentClock
-from afspm.basics.errors import ConfigError, FileError
-from afspm.basics.launch import Launch, Sockets
-from afspm.client.connect import GUEST
+from afspm import GUEST, Run, open_run, wire
+from afspm.basics import NS_PER_S, ConfigError, ExperimentClock, FileError, Launch, Sockets, is_address
 from afspm.model import Frame
 from afspm.plugins.replay.replayer import Replayer
-from afspm.record.packets import RecordPlayback
-from afspm.record.run import Run, open_run
-from afspm.record.run_json import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR
-from afspm.record.run_lock import lock_run
+from afspm.processes import FreePorts, RateLimitedLog, is_local
+from afspm.processes import run_time as now
+from afspm.record import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, RecordPlayback, lock_run
 from afspm.supervisor import run_folder
-from afspm.supervisor.ports import FreePorts
-from afspm.supervisor.run import now
-from afspm.transport.network import is_local
 from afspm.transport.process import signals
-from afspm.transport.rate_limited_log import RateLimitedLog
 
 BEFORE_S = 1.0
 """Real time before the first packet, so that programs that join at once miss no packet."""

@@ -8,16 +8,20 @@ from collections.abc import Callable
 from itertools import islice
 
 from afspm import wire
-from afspm.basics.clock import NS_PER_S, ExperimentClock
-from afspm.basics.errors import TransportError, WireError
+from afspm.basics import NS_PER_S, ExperimentClock, TransportError, WireError
 from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlResponse, Packet, Response
-from afspm.record.packets import RecordPlayback
-from afspm.transport.late_joiners import PublishedHistory
-from afspm.transport.network import Network
-from afspm.transport.polling import Poller, WakeUp, milliseconds
-from afspm.transport.publisher import Publisher
-from afspm.transport.rate_limited_log import RateLimitedLog
-from afspm.transport.router import PeerAsked, Router
+from afspm.processes import (
+    Network,
+    PeerAsked,
+    Poller,
+    PublishedHistory,
+    Publisher,
+    RateLimitedLog,
+    Router,
+    WakeUp,
+    milliseconds,
+)
+from afspm.record import RecordPlayback
 
 REASON = "this is a replay of a recorded run: it takes no requests"
 FAREWELL_S = 0.5  # real: for the end to reach all subscribers

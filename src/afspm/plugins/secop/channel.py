@@ -16,9 +16,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from afspm.basics.errors import UnitError
-from afspm.basics.formatting import escaped
-from afspm.basics.units import convert
+from afspm.basics import UnitError, convert, escaped
 from afspm.plugins.secop import lines
 from afspm.plugins.secop.lines import SecopLine, number_in
 

@@ -9,9 +9,8 @@ from contextlib import suppress
 from typing import ClassVar, Literal
 from urllib.parse import urlsplit
 
-from afspm.basics.clock import ExperimentClock
-from afspm.basics.errors import ConfigError, TransportError
-from afspm.client.component import Component
+from afspm import Component
+from afspm.basics import ConfigError, ExperimentClock, TransportError
 from afspm.model import InstrumentReadings
 from afspm.plugins.secop import lines
 from afspm.plugins.secop.channel import ServerUnfit

@@ -6,8 +6,7 @@ import json
 from dataclasses import dataclass
 from itertools import chain
 
-from afspm.basics.formatting import escaped
-from afspm.basics.plain_data import from_json
+from afspm.basics import escaped, from_json
 
 IDENTIFY, DESCRIBE, ACTIVATE = "*IDN?", "describe", "activate"
 LONGEST = 1 << 20

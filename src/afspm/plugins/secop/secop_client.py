@@ -11,9 +11,7 @@ from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from afspm.basics.errors import ConfigError, UnitError
-from afspm.basics.plain_data import Plain, PlainMapping
-from afspm.basics.units import convert
+from afspm.basics import ConfigError, Plain, PlainMapping, UnitError, convert
 from afspm.model import ControlResponse, InstrumentOrder, InstrumentReading, OrderOutcome
 from afspm.plugins.secop import lines
 from afspm.plugins.secop.channel import ROUNDED, Channel, ServerRamp, ServerUnfit

@@ -8,17 +8,11 @@ import tomllib
 from collections import OrderedDict
 from pathlib import Path
 
-from afspm import wire
-from afspm.basics.errors import AfspmError
-from afspm.basics.plain_data import Plain
-from afspm.basics.units import si
-from afspm.model import ProblemNames, Region, Scan, Spectrum
-from afspm.model.events import PERSON
+from afspm import open_run, wire
+from afspm.basics import AfspmError, Plain, si
+from afspm.model import PERSON, ProblemNames, Region, Scan, Spectrum
 from afspm.plugins.web.frames import ChannelFrame, FrameKey
-from afspm.record.journal import JOURNAL_FILE
-from afspm.record.overview import Overview
-from afspm.record.run import open_run
-from afspm.record.run_json import EXPERIMENT_FILE
+from afspm.record import EXPERIMENT_FILE, JOURNAL_FILE, Overview
 
 KEPT = 6
 _AGENT = "Agent"

@@ -9,17 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from afspm.basics.plain_data import Plain, PlainMapping
-from afspm.cli.arguments import MEANWHILE, RUNS, Where, opt
+from afspm.basics import Plain, PlainMapping
+from afspm.processes import MEANWHILE, RUNS, Where, opt
 
 if TYPE_CHECKING:
     from types import FrameType
 
-    from afspm.experiment import Experiment
     from afspm.plugins.web.dashboard import Dashboard
     from afspm.plugins.web.dashboard.recorded import RecordedSettings
-    from afspm.supervisor.resume import ResumableRun
-    from afspm.transport.port import Port
+    from afspm.processes import Experiment, Port, ResumableRun
 
 NAME_OF_CLASS = "Dashboard"
 
@@ -49,7 +47,7 @@ def dashboard(
     If the experiment runs on another computer, name its experiment file: the page connects to the scheduler's address
     in it. A password for viewers who only look may be in the environment: AFSPM_DASHBOARD_PASSWORD.
     """
-    from afspm.record.run_lock import goes_on
+    from afspm.record import goes_on
 
     if make_password:
         _print_password()
@@ -98,7 +96,7 @@ def page_of(experiment: Experiment, started: Sequence[str]) -> tuple[str, PlainM
 
 def with_page(files: list[Path]) -> Experiment:
     """Return the experiment, with a dashboard added if its files define none."""
-    from afspm.experiment import load
+    from afspm.processes import load_experiment as load
 
     experiment = load(*files)
     return experiment if _has_dashboard(experiment) else load(*files, _overlay())
@@ -133,7 +131,7 @@ def _people_in(file: Path) -> dict[str, str]:
     # keys may begin with `people.`, as `--make-password` prints them
     import tomllib
 
-    from afspm.basics.errors import ConfigError
+    from afspm.basics import ConfigError
 
     try:
         found = tomllib.loads(file.read_text(encoding="utf-8"))
@@ -149,8 +147,8 @@ def _people_in(file: Path) -> dict[str, str]:
 
 def _run_here(where: Path) -> Path | None:
     # None: an experiment file without a run here; its run was started on another computer
-    from afspm.basics.errors import FileError
-    from afspm.client.connect import find_run
+    from afspm import find_run
+    from afspm.basics import FileError
 
     try:
         return find_run(where)
@@ -164,12 +162,10 @@ def _join(folder: Path, settings: Plain) -> int:
     import logging
     import sys
 
-    from afspm.basics.exit_codes import ExitCode
-    from afspm.basics.requirements import require
-    from afspm.cli.joining import looking
-    from afspm.experiment.process_starts import DASHBOARD
+    from afspm.basics import ExitCode, require
     from afspm.plugins.web.dashboard import Dashboard
-    from afspm.record.run_json import read_run_json
+    from afspm.processes import DASHBOARD, looking
+    from afspm.record import read_run_json
 
     url = _url_in(read_run_json(folder).get("processes"), folder, DASHBOARD)
     if url is not None:
@@ -186,9 +182,9 @@ def _join(folder: Path, settings: Plain) -> int:
 
 
 def _url_in(processes: object, folder: Path, name: str) -> str | None:
-    from afspm.basics.errors import FileError
-    from afspm.record.run_json import STATE_DIR
-    from afspm.storage.memory import Memory
+    from afspm import Memory
+    from afspm.basics import FileError
+    from afspm.record import STATE_DIR
 
     if not isinstance(processes, dict) or name not in processes:
         return None
@@ -204,13 +200,11 @@ def _run_as_guest(folder: Path, dashboard: Dashboard, name: str) -> int:
     import dataclasses
     import logging
 
-    from afspm.basics.clock import ExperimentClock
-    from afspm.client.connect import guest_of
-    from afspm.record.run_json import STATE_DIR
-    from afspm.supervisor.own_runs import own_messages
-    from afspm.transport.process.context import ProcessActivity, ProcessContext, new_session
-    from afspm.transport.zmq_port import open_port
-    from afspm.wire.message_types import register_all
+    from afspm import guest_of
+    from afspm.basics import ExperimentClock
+    from afspm.processes import ProcessActivity, ProcessContext, new_session, open_port, own_messages
+    from afspm.processes import register_messages as register_all
+    from afspm.record import STATE_DIR
 
     launch = guest_of(folder, name)
     register_all(own_messages(folder, launch.messages))
@@ -234,7 +228,7 @@ def _ended_by_ctrl_c(port: Port) -> Iterator[None]:
     # a dashboard that joins has no parent process: a signal stands for the parent's end
     import signal
 
-    from afspm.transport.port import ParentGone
+    from afspm.processes import ParentGone
 
     def end(_number: int, _frame: FrameType | None) -> None:
         port.wake_up(ParentGone())
@@ -248,10 +242,10 @@ def _ended_by_ctrl_c(port: Port) -> Iterator[None]:
 
 
 def _serve_recorded(folder: Path, settings: Plain) -> None:
-    from afspm.basics.requirements import require
-    from afspm.experiment.process_starts import DASHBOARD
+    from afspm.basics import require
     from afspm.plugins.web.dashboard import Dashboard
     from afspm.plugins.web.dashboard.recorded import serve
+    from afspm.processes import DASHBOARD
 
     require(Dashboard)
     serve(_recorded(folder, DASHBOARD, settings), typer.echo)
@@ -268,15 +262,15 @@ def _start_part(file: Path) -> int:
     # the scheduler runs elsewhere, so the dashboard is started as `afspm run --only` would start it
     import sys
 
-    from afspm.basics.errors import ConfigError
-    from afspm.supervisor import run as running
+    from afspm.basics import ConfigError
+    from afspm.processes import RunOptions, dry_run, run_experiment
 
     experiment = with_page([file])
     names = [one.name for one in experiment.resolved.processes.values() if one.class_path.endswith(f".{NAME_OF_CLASS}")]
     try:
-        running.dry_run(experiment, running.RunOptions(only=tuple(names)))
+        dry_run(experiment, RunOptions(only=tuple(names)))
     except ConfigError as error:
         what = f"nothing of it runs here, and where its scheduler would be is not in the file: {error.what}"
         raise ConfigError(what, where=str(file), hint="start it with `afspm run`") from error
-    ended = running.run(experiment, running.RunOptions(only=tuple(names)), terminal=sys.stdout)
+    ended = run_experiment(experiment, RunOptions(only=tuple(names)), terminal=sys.stdout)
     return ended.outcome.exit_code

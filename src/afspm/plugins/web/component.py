@@ -5,23 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from afspm.basics.clock import NS_PER_S
-from afspm.basics.errors import ConfigError
-from afspm.client.component import Component
+from afspm import Component
+from afspm.basics import NS_PER_S, ConfigError
 from afspm.plugins.web.archive import Archive
 from afspm.plugins.web.server import STALLED_S, WebServer, listening, url_of
 from afspm.plugins.web.watch import Watch
-from afspm.record.allowed_bands import allowed_bands
-from afspm.record.expected_end import plans_of
-from afspm.record.run_json import run_json_or_empty
-from afspm.record.run_lock import cut_off_message
-from afspm.transport.process.context import step_back
+from afspm.processes import step_back
+from afspm.record import bands_allowed as allowed_bands
+from afspm.record import cut_off_message, plans_of, run_json_or_empty
 
 if TYPE_CHECKING:
     import socket
 
     from afspm.plugins.web.asgi import AsgiApp
-    from afspm.transport.process.context import ProcessContext
+    from afspm.processes import ProcessContext
 
 
 class WebComponent(Component):

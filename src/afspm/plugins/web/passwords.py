@@ -12,7 +12,7 @@ import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
 
 LONGEST_NAME = 40
 # some hundredths of a second per password: slow for guessing, quick enough for a request

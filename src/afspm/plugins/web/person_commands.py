@@ -6,14 +6,12 @@ import math
 from collections import deque
 from collections.abc import Callable
 
-from afspm import wire
-from afspm.client.experiment_link import ExperimentLink
-from afspm.client.parameter_text import Value, to_parameter
-from afspm.client.targets import FITS, is_set
+from afspm import FITS, Value, is_set, to_parameter, wire
 from afspm.model import (
     LEASE_REQUEST,
     RELAY_REQUEST,
     RESTART_REQUEST,
+    XY,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -27,9 +25,9 @@ from afspm.model import (
     ScopeState,
     names,
 )
-from afspm.model.geometry import XY
 from afspm.plugins.web.watch import Watch, is_free
-from afspm.record.overview import Overview
+from afspm.processes import ExperimentLink
+from afspm.record import Overview
 
 ANSWER_S = 20.0  # real time for an answer
 FREE_S = 60.0  # real time for the microscope to reach a place

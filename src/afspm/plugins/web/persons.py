@@ -9,16 +9,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from afspm.basics.clock import Clock
-from afspm.basics.launch import Launch
-from afspm.client.experiment_link import ExperimentLink
-from afspm.model.events import PERSON
+from afspm.basics import Clock, Launch
+from afspm.model import PERSON
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.watch import Watch
-from afspm.transport.network import Network
-from afspm.transport.port import ParentGone
-from afspm.transport.process.context import new_session
-from afspm.transport.zmq_port import ZmqPort
+from afspm.processes import ExperimentLink, Network, ParentGone, ZmqPort, new_session
 
 MOST_PERSONS = 32  # each takes a thread and a connection
 T = TypeVar("T")

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
 
 if TYPE_CHECKING:
     from afspm.plugins.web.asgi import AsgiApp, Message, Receive, Send

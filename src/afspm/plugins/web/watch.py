@@ -11,14 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from afspm.basics.clock import Clock
-from afspm.components.tip_verdict import OF_LINES, read_line_verdict
+from afspm import Array, tip_verdict
+from afspm.basics import Clock
 from afspm.model import ChannelRoles, ProblemNames, Scan, ScanLines, ScopeState, Spectrum
-from afspm.model.line_levelling import Array
 from afspm.plugins.web.frames import FrameStore
-from afspm.record.allowed_bands import AllowedBands
-from afspm.record.expected_end import Plans, expected_end_ns
-from afspm.record.overview import Overview
+from afspm.record import AllowedBands, Overview, Plans, expected_end_ns
 
 MOST_SPECTRA, SPECTRA_BYTES = 200, 64 << 20
 
@@ -127,7 +124,7 @@ class Watch:
                 self.frames.roles = thing
             elif isinstance(thing, Spectrum):
                 self.spectra.take(thing, time_ns)
-            elif message == OF_LINES and (verdict := read_line_verdict(thing)) is not None:
+            elif message == tip_verdict.OF_LINES and (verdict := tip_verdict.read_line_verdict(thing)) is not None:
                 self.frames.take_change(verdict.began_ns, verdict.since_row)
             elif message == "DriftMapping":
                 # without correction components use tip coordinates, so the map needs no conversion

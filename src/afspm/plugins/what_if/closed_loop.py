@@ -11,19 +11,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TextIO, TypeAlias
 
-from afspm.basics.clock import NS_PER_S, utc_time
-from afspm.basics.errors import ConfigError, InvalidValue
-from afspm.basics.formatting import duration_text
-from afspm.basics.plain_data import Plain, PlainMapping, from_json
-from afspm.experiment.toml_writer import dumps
+from afspm import Run, open_run
+from afspm.basics import NS_PER_S, ConfigError, InvalidValue, Plain, PlainMapping, duration_text, from_json, utc_time
 from afspm.plugins.what_if.what_if import changed_experiment
-from afspm.record.report import story
-from afspm.record.report.story import RunStory
-from afspm.record.run import Run, open_run
-from afspm.record.run_json import ENDED, EXPERIMENT_FILE, run_json_or_empty
-from afspm.supervisor.own_runs import own_homes
-from afspm.supervisor.run import RunOptions
-from afspm.supervisor.run import run as run_experiment
+from afspm.processes import RunOptions, own_homes, run_experiment
+from afspm.processes import toml_text as dumps
+from afspm.record import ENDED, EXPERIMENT_FILE, RunStory, read_story, run_json_or_empty
 
 _TRUTH = "truth.jsonl"
 _LASTED = "lasted"
@@ -129,14 +122,14 @@ def _overlay(changes: SettingChanges | str | Path, facts: PlainMapping) -> str:
 
 
 def _rows(before: Run, now: Run) -> dict[str, tuple[str, str]]:
-    sides = [(story.read(one), one, _truth(one.folder)) for one in (before, now)]
+    sides = [(read_story(one), one, _truth(one.folder)) for one in (before, now)]
     texts = {head: tuple(text(*side) for side in sides) for head, text in _OUTCOMES.items()}
     return {head: (both[0], both[1]) for head, both in texts.items()}
 
 
 def _lasted_alike(before: Run, now: Run, speed: float | None) -> bool:
     # the start of the processes takes real time, which is a part of the night
-    lasted_s, lasts_s = (story.read(one).lasted_ns / NS_PER_S for one in (before, now))
+    lasted_s, lasts_s = (read_story(one).lasted_ns / NS_PER_S for one in (before, now))
     return abs(lasted_s - lasts_s) <= max(_ALIKE * lasted_s, _ALIKE_REAL_S * (speed or 1.0))
 
 

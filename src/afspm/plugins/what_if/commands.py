@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
-from afspm.basics.clock import iso_utc
-from afspm.basics.errors import AfspmError
-from afspm.basics.formatting import counted, day_and_time
-from afspm.cli.arguments import AFTERWARDS, NoProgress, names_in, opt
+from afspm.basics import AfspmError, counted, day_and_time, iso_utc
+from afspm.processes import AFTERWARDS, NoProgress, names_in, opt
 
 if TYPE_CHECKING:
     from afspm.plugins.what_if.alignment import Difference, Output
@@ -130,7 +128,7 @@ def _replay(
     as_json: bool,
     quiet: bool,
 ) -> int:
-    from afspm.basics.progress_line import ProgressLine
+    from afspm.basics import ProgressLine
     from afspm.plugins.what_if.page import DifferencePage
     from afspm.plugins.what_if.what_if import what_if
 
@@ -162,8 +160,8 @@ def _replay(
 
 
 def _rerun(folder: Path, changes: GivenChanges, runs: Path) -> bool:
-    from afspm.cli.joining import plain_console, plain_table
     from afspm.plugins.what_if.closed_loop import rerun
+    from afspm.processes import plain_console, plain_table
 
     found = rerun(folder, changes or {}, runs=runs, terminal=sys.stderr)
     typer.echo(f"{folder.name} and, with the change, {found.folder.name} (SIMULATED)")
@@ -173,8 +171,8 @@ def _rerun(folder: Path, changes: GivenChanges, runs: Path) -> bool:
 
 
 def _print(result: WhatIf) -> None:
-    from afspm.cli.joining import plain_console, plain_table
     from afspm.plugins.what_if.side_by_side import sides, where
+    from afspm.processes import plain_console, plain_table
 
     first = result.first
     typer.echo(f"{result.run.name}: {'differs' if first else 'no difference'}")

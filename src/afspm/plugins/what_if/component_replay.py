@@ -14,20 +14,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from afspm.basics.clock import NS_PER_S, ExperimentClock
-from afspm.basics.errors import AfspmError, ConfigError
-from afspm.basics.launch import Launch
+from afspm.basics import NS_PER_S, AfspmError, ConfigError, ExperimentClock, Launch
 from afspm.model import ProblemNames
 from afspm.plugins.what_if.alignment import Difference, Output, aligned, first_difference
 from afspm.plugins.what_if.hazards import HazardGuard
 from afspm.plugins.what_if.outputs import OutputReader
 from afspm.plugins.what_if.port_replay import Life, LifeOver, PacketOf, Poll, ReplayPort, recorded_outputs
-from afspm.record.run_json import EXPERIMENT_FILE, RUN_FILE
+from afspm.processes import ExperimentProcess, ProcessActivity, ProcessContext
+from afspm.processes import load_class as load
+from afspm.processes import register_messages as register_all
+from afspm.record import EXPERIMENT_FILE, RUN_FILE
 from afspm.storage.disk import SYNCER
 from afspm.storage.memory import SYNCED_WITHIN_S
-from afspm.transport.process.context import ExperimentProcess, ProcessActivity, ProcessContext
-from afspm.transport.process.loading import load
-from afspm.wire.message_types import register_all
 
 Make = Callable[[Launch], ExperimentProcess]
 """A function that creates the component of a launch line."""

@@ -12,10 +12,10 @@ import sys
 import zlib
 from pathlib import Path
 
+from afspm import open_run
 from afspm.client import port_log
 from afspm.plugins.what_if import component_replay
 from afspm.plugins.what_if.port_replay import read_lives
-from afspm.record.run import open_run
 
 _SEEDS = ("1", "1", "2")
 _WITHIN_S = 600.0

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from afspm import wire
-from afspm.basics.errors import AfspmError, WireError
-from afspm.basics.frozen import replace
+from afspm.basics import AfspmError, WireError, replace
 from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlRequest, ProblemNames, request_name
 from afspm.plugins.what_if.alignment import Output, PacketName
-from afspm.scheduler.control.descriptions import request_text
+from afspm.scheduler import request_text
 
 _PROBLEMS = (ControlRequest.ADD_EXP_PRBLM, ControlRequest.RMV_EXP_PRBLM)
 _CREATION_TIMES = {"time_ns", "written_ns"}

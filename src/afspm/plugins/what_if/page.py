@@ -7,13 +7,12 @@ from datetime import UTC
 from html import escape
 from pathlib import Path
 
-from afspm.basics.errors import FileError
-from afspm.basics.formatting import counted, day_and_time
+from afspm import replace_file
+from afspm.basics import FileError, counted, day_and_time
 from afspm.plugins.what_if.alignment import Difference
 from afspm.plugins.what_if.side_by_side import changed_fields, message_name, sides, where
 from afspm.plugins.what_if.what_if import Row, WhatIf
-from afspm.record.report.markup import document, section, table
-from afspm.storage.atomic import replace_file
+from afspm.record import document, section, table
 
 MOST_SHOWN = 100
 """The largest number of differences of a night on the page."""

@@ -10,15 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from afspm import wire
-from afspm.basics.clock import NeverLate
-from afspm.basics.errors import FileError, WireError
-from afspm.basics.plain_data import PlainList
+from afspm.basics import FileError, NeverLate, PlainList, WireError
 from afspm.client.port_log import LifeFacts
 from afspm.model import CLOCK_REQUEST, LEASE_REQUEST, RELAY_REQUEST, ControlRequest, ControlResponse, Packet, Response
 from afspm.plugins.what_if.alignment import Output, PacketName
 from afspm.plugins.what_if.outputs import OutputReader
-from afspm.storage.line_log import read_lines
-from afspm.transport.port import (
+from afspm.processes import (
     CaughtUp,
     ControlConnected,
     ControlDisconnected,
@@ -28,6 +25,7 @@ from afspm.transport.port import (
     ParentGone,
     ReplyReceived,
 )
+from afspm.storage.line_log import read_lines
 
 PacketOf = Callable[[int, str], Packet]
 """A function that returns the recorded packet of a time and an envelope."""

@@ -11,22 +11,29 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import NoReturn
 
-from afspm.basics.clock import ExperimentClock
-from afspm.basics.errors import ConfigError, FileError, WireError
-from afspm.basics.launch import Launch
-from afspm.basics.plain_data import PlainList
-from afspm.model.snapshot import restored
+from afspm import restored
+from afspm.basics import ConfigError, ExperimentClock, FileError, Launch, PlainList, WireError
 from afspm.plugins.what_if.alignment import Difference, Output, PacketName, aligned
-from afspm.scheduler import events
-from afspm.scheduler.coordinate_frame import TIP_FRAME, CoordinateFrame
-from afspm.scheduler.saved_state import KIND, VERSION, SavedState
-from afspm.scheduler.scheduler import Scheduler
-from afspm.scheduler.scheduler_core import SchedulerCore
-from afspm.scheduler.step_log import Restored, StateSums, Step, facts_of, read_cached, read_event
-from afspm.scheduler.wire_codec import WireCodec
+from afspm.processes import ProcessActivity, ProcessContext
+from afspm.processes import load_class as load
+from afspm.scheduler import STATE_KIND as KIND
+from afspm.scheduler import STATE_VERSION as VERSION
+from afspm.scheduler import (
+    TIP_FRAME,
+    CoordinateFrame,
+    Restored,
+    SavedState,
+    Scheduler,
+    SchedulerCore,
+    StateSums,
+    Step,
+    WireCodec,
+    events,
+    facts_of,
+    read_cached,
+    read_event,
+)
 from afspm.storage.line_log import read_lines
-from afspm.transport.process.context import ProcessActivity, ProcessContext
-from afspm.transport.process.loading import load
 
 MakeCore = Callable[[], SchedulerCore]
 CoreOf = Callable[[Launch], tuple[MakeCore, CoordinateFrame]]

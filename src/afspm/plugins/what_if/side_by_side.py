@@ -12,8 +12,7 @@ import numpy as np
 from google.protobuf.message import Message
 
 from afspm import wire
-from afspm.basics.errors import AfspmError
-from afspm.basics.formatting import day_and_time
+from afspm.basics import AfspmError, day_and_time
 from afspm.plugins.what_if.alignment import Difference, Output
 
 _LONGEST, _AROUND = 120, 25

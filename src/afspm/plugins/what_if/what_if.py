@@ -11,31 +11,31 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from afspm.basics.clock import NS_PER_S
-from afspm.basics.errors import ConfigError, FileError, InvalidValue
-from afspm.basics.formatting import day_and_time, duration_text
-from afspm.basics.launch import Launch
-from afspm.basics.named_imports import trusting_only
+from afspm import Component, Run, open_run
+from afspm.basics import (
+    NS_PER_S,
+    ConfigError,
+    FileError,
+    InvalidValue,
+    Launch,
+    day_and_time,
+    duration_text,
+    trusting_only,
+)
 from afspm.client import port_log
-from afspm.client.component import Component
-from afspm.experiment import Experiment
-from afspm.experiment.class_loader import importing_from
-from afspm.experiment.experiment import load_expanded
 from afspm.experiment.parts import ExperimentPart
-from afspm.experiment.toml_writer import dumps
 from afspm.model import Role
 from afspm.plugins.what_if import component_replay, hash_seeds, scheduler_replay
 from afspm.plugins.what_if.alignment import Difference
 from afspm.plugins.what_if.component_replay import ComponentReplay
 from afspm.plugins.what_if.port_replay import Life, PacketOf, read_lives
 from afspm.plugins.what_if.scheduler_replay import SchedulerReplay
-from afspm.record.run import Run, open_run
-from afspm.record.run_json import EXPERIMENT_FILE, run_json_or_empty
+from afspm.processes import Experiment, FreePorts, find_class, importing_from, load_expanded, own_homes
+from afspm.processes import load_class as load
+from afspm.processes import toml_text as dumps
+from afspm.record import EXPERIMENT_FILE, run_json_or_empty
 from afspm.scheduler import step_log
 from afspm.storage.line_log import REQUESTS_FOLDER, read_lines
-from afspm.supervisor.own_runs import own_homes
-from afspm.supervisor.ports import FreePorts
-from afspm.transport.process.loading import find_class, load
 
 _SHIFTED_S = 1.0
 _EMPTY = "its log is empty"

@@ -18,7 +18,7 @@ from afspm.model import (
     Proposal,
     component_of,
 )
-from afspm.model.names import BASE_PARAMETERS
+from afspm.model.parameter_names import BASE_PARAMETERS
 from afspm.model.problems import STOPPER
 from afspm.record.report.markup import PageTimes, table
 from afspm.record.run import Run

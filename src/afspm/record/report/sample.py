@@ -14,7 +14,7 @@ from afspm.basics.clock import NS_PER_S
 from afspm.basics.formatting import counted, duration_text, quantity, scale, typeset_area, typeset_position
 from afspm.model import Frame, RegistrationOutcome
 from afspm.model.geometry import XY
-from afspm.model.names import CRASH, PULSE
+from afspm.model.parameter_names import CRASH, PULSE
 from afspm.record.drawing.chart import Axis
 from afspm.record.drawing.image_html import data_url, scale_bar
 from afspm.record.report import markup

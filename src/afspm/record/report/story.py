@@ -163,6 +163,7 @@ class RunStory:
 
 
 def read(run: Run) -> RunStory:
+    """Return a run as the numbers and events of its report."""
     overview, scans, spectra, late = run.overview(), run.scans, run.spectra, _late_flags(run.journal)
     clock = run.facts.get("clock") or {}
     # a resumed run has recorded only the clock of its last part

@@ -33,9 +33,9 @@ from afspm.model import (
     RegionChange,
     Request,
     ScanParameters,
-    ShapeChange,
     request_name,
 )
+from afspm.model.scan import ShapeChange
 from afspm.scheduler.control.arbitration import (
     ArbitrationEvent,
     ArbitrationState,

@@ -10,8 +10,6 @@ from afspm import wire
 from afspm.basics.formatting import duration_text
 from afspm.basics.frozen import replace
 from afspm.model import (
-    LogLines,
-    MeasurementSettings,
     Note,
     ProcessCondition,
     ProcessState,
@@ -20,9 +18,16 @@ from afspm.model import (
     Proposal,
     RelayedMessage,
     component_of,
+)
+from afspm.model.events import (
+    LONGEST_ANNOUNCEMENT,
+    LONGEST_PROCESS_NAME,
+    PERSON,
+    SUPERVISOR,
+    LogLines,
+    MeasurementSettings,
     is_process_name,
 )
-from afspm.model.events import LONGEST_ANNOUNCEMENT, LONGEST_PROCESS_NAME, PERSON, SUPERVISOR
 from afspm.scheduler.events import Codec, RequestIn
 from afspm.scheduler.saved_state import SavedSupervisor
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field, replace
 from afspm.basics.errors import UnitError
 from afspm.basics.formatting import duration_text, quantity
 from afspm.basics.units import convert
-from afspm.model import InstrumentReading, instrument_of
-from afspm.model.names import START_SCAN, START_SPEC
+from afspm.model import InstrumentReading
+from afspm.model.instruments import instrument_of
+from afspm.model.parameter_names import START_SCAN, START_SPEC
 from afspm.scheduler.safety.limits import ExperimentLimits
 
 OLDEST_S = 4.0

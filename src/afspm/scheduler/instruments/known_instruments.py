@@ -6,16 +6,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 from afspm.basics.frozen import replace
-from afspm.model import (
-    ControlResponse,
-    InstrumentOrder,
-    InstrumentReading,
-    InstrumentReadings,
-    OrderOutcome,
-    Parameter,
-    instrument_of,
-)
-from afspm.model.instruments import GivenOrder
+from afspm.model import ControlResponse, InstrumentOrder, InstrumentReading, InstrumentReadings, OrderOutcome, Parameter
+from afspm.model.instruments import GivenOrder, instrument_of
 from afspm.scheduler.instruments.conditions import OLDEST_S, ConditionState, InstrumentSettings
 from afspm.scheduler.requests.forwarder import ForwardedRequest
 

@@ -15,7 +15,6 @@ from afspm.model import (
     ControlRequest,
     ControlResponse,
     InstrumentOrder,
-    InstrumentOrders,
     InstrumentReading,
     InstrumentReadings,
     OrderOutcome,
@@ -25,10 +24,9 @@ from afspm.model import (
     Response,
     ResponseDetail,
     component_of,
-    instrument_of,
 )
 from afspm.model.idempotency_cache import RequestStatus
-from afspm.model.instruments import PARTS
+from afspm.model.instruments import PARTS, InstrumentOrders, instrument_of
 from afspm.model.problems import CONDITIONS
 from afspm.scheduler.control import control_change
 from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlInput

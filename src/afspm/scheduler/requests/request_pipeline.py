@@ -30,7 +30,6 @@ from afspm.model import (
     GRANT_REQUEST,
     HAS_ENDED,
     LEASE_REQUEST,
-    OTHER_RUN_RESPONSE,
     RELAY_REQUEST,
     RESTART_REQUEST,
     ControlMode,
@@ -46,6 +45,7 @@ from afspm.model import (
 )
 from afspm.model.idempotency_cache import TOO_OLD, RequestStatus
 from afspm.model.microscope_status import feedback_of
+from afspm.model.requests import OTHER_RUN_RESPONSE
 from afspm.model.sessions import Hearing, run_of
 from afspm.scheduler.control import control_change
 from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlChange, ControlInput, Rules, reason, row_for

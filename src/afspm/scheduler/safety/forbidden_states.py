@@ -19,8 +19,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from afspm.basics.formatting import quantity
-from afspm.model import ControlRequest, Feedback, Parameter, Request, ScopeState, instrument_of, names
-from afspm.model.names import BASE_PARAMETERS
+from afspm.model import ControlRequest, Feedback, Parameter, Request, ScopeState, names
+from afspm.model.instruments import instrument_of
+from afspm.model.parameter_names import BASE_PARAMETERS
 from afspm.scheduler.safety import rule_language
 from afspm.scheduler.safety.limits import ExperimentLimits, ForbiddenState, Limit
 from afspm.scheduler.safety.parameter_values import ParameterValueError, values_of

@@ -39,7 +39,7 @@ from afspm.model import (
     names,
 )
 from afspm.model.geometry import XY
-from afspm.model.names import BASE_PARAMETERS
+from afspm.model.parameter_names import BASE_PARAMETERS
 from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES
 from afspm.model.snapshot import to_plain
 from afspm.scheduler.control.arbitration import ArbitrationState, Rules

@@ -32,12 +32,11 @@ from afspm.model import (
     Request,
     Response,
     ScanParameters,
-    ShapeChange,
     component_of,
     names,
 )
 from afspm.model.geometry import XY
-from afspm.model.names import BASE_PARAMETERS
+from afspm.model.parameter_names import BASE_PARAMETERS
 from afspm.model.positions import (
     PROBE_CHANGES,
     REGION_CHANGES,
@@ -46,6 +45,7 @@ from afspm.model.positions import (
     changes_by,
     moved,
 )
+from afspm.model.scan import ShapeChange
 from afspm.scheduler.safety import forbidden_states
 from afspm.scheduler.safety.forbidden_states import PresentState
 from afspm.scheduler.safety.limit_state import LastUse, LimitState, Usage

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from afspm.basics.errors import AfspmError
 from afspm.basics.units import convert
 from afspm.model import Feedback, Parameter, PositionChange, ProbePosition, ScanParameters, names
-from afspm.model.names import BASE_PARAMETERS
+from afspm.model.parameter_names import BASE_PARAMETERS
 from afspm.model.positions import scan_values
 from afspm.scheduler.safety.limits import Limit
 

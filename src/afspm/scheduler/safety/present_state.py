@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from afspm.model import Parameter, Request, instrument_of
+from afspm.model import Parameter, Request
+from afspm.model.instruments import instrument_of
 from afspm.scheduler.safety.forbidden_states import STATES, PresentState, in_states, judging
 from afspm.scheduler.state import StateDraft
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from afspm.basics.errors import ConfigError, FileError
+from afspm.basics import ConfigError, FileError
 
 _NAMES = {
     "driver": ("my_scope", "MyScope"),

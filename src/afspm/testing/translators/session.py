@@ -18,6 +18,7 @@ from afspm.basics.errors import ConfigError
 from afspm.basics.launch import Launch, Sockets
 from afspm.client.component import Component
 from afspm.client.experiment_link import ExperimentLink
+from afspm.driver import Driver
 from afspm.experiment import Experiment, ProcessStart, Role, load
 from afspm.model import Frame
 from afspm.model.events import LOGGED_AS
@@ -31,7 +32,6 @@ from afspm.testing.conformance import Lost
 from afspm.testing.processes import Processes
 from afspm.testing.translators.client import CheckClient
 from afspm.testing.translators.support import Support, find_out
-from afspm.translator import Driver
 from afspm.transport.port import ParentGone, Port
 from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import open_port

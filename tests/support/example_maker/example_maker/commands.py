@@ -12,7 +12,7 @@ app = typer.Typer(help="Files of Acme.", no_args_is_help=True)
 @app.command()
 def channels(file: Path) -> None:
     """List the channels of a file."""
-    from afspm.storage.formats import read
+    from afspm import read
 
     typer.echo(", ".join(scan.channel for scan in read(file).scans))
 

@@ -7,11 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from afspm.basics.errors import AfspmError
+from afspm.basics import AfspmError
+from afspm.driver import Driver, Receiver, TcpConnection, Value, action, host_and_port, read
 from afspm.model import Scan, ScopeState, ScopeStatus, Spectrum, names
-from afspm.storage.formats import read
-from afspm.translator import Driver, Value, action
-from afspm.translator.tcp import Receiver, TcpConnection, host_and_port
 
 
 class Acme(Driver):

@@ -6,12 +6,18 @@ import json
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from afspm.basics.errors import AfspmError
+from afspm.basics import AfspmError
+from afspm.emulation import (
+    LOOPBACK,
+    ClientConnection,
+    Emulator,
+    MakerProgram,
+    NamedFile,
+    ScanActivity,
+    SpectrumActivity,
+    TcpServer,
+)
 from afspm.model import Region, Scan
-from afspm.simulation.activities import ScanActivity, SpectrumActivity
-from afspm.simulation.emulation.emulator import LOOPBACK, Emulator
-from afspm.simulation.emulation.program import MakerProgram, NamedFile
-from afspm.simulation.emulation.tcp_server import ClientConnection, TcpServer
 from afspm.simulation.faults import INSTRUMENT_FAULTS
 from example_maker.files import packed
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from afspm.basics.errors import FileError
+from afspm import Run
+from afspm.basics import FileError
+from afspm.driver import FileContent, OtherFormat, netcdf
 from afspm.model import Region, Scan
-from afspm.record.run import Run
-from afspm.record.tables import ScanRow, SpectrumRow
-from afspm.storage.formats import FileContent, OtherFormat, netcdf
+from afspm.record import ScanRow, SpectrumRow
 
 
 def packed(scans: Iterable[Scan]) -> bytes:

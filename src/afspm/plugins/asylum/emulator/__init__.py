@@ -8,15 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Final
 
-from afspm.basics.errors import AfspmError, ConfigError
-from afspm.basics.plain_data import Plain
-from afspm.basics.units import Duration
+from afspm.basics import AfspmError, ConfigError, Duration, Plain
+from afspm.emulation import LOOPBACK, Crashed, Emulator
 from afspm.plugins.asylum.emulator import wire
 from afspm.plugins.asylum.emulator.controller import FAULT_KINDS, AsylumController, AsylumSettings
 from afspm.plugins.asylum.emulator.functions import AsylumFunctions, DialogOpen
 from afspm.plugins.asylum.emulator.server import QueuedCall, XopServer
 from afspm.plugins.asylum.emulator.values import IgorValues
-from afspm.simulation.emulation.emulator import LOOPBACK, Crashed, Emulator
 
 PROCEDURES: Final = ("afspm", "spots", "none")
 _NOT_COMPILED, _ABORTED, _UNKNOWN = 100, 107, 1

@@ -9,13 +9,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from afspm.basics.errors import AfspmError, InvalidValue
+from afspm.basics import AfspmError, InvalidValue
+from afspm.emulation import Faults, PendingWrites, SimulatedInstrument
 from afspm.model import Region
 from afspm.plugins.asylum.emulator import files
 from afspm.plugins.asylum.emulator.values import IgorValues
-from afspm.simulation.emulation.pending_writes import PendingWrites
-from afspm.simulation.faults import Faults
-from afspm.simulation.instrument import SimulatedInstrument
 
 FAULT_KINDS: Final = {
     "scan-refused": "DoScan does nothing",

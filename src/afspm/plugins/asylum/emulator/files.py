@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
+from afspm.emulation import ScanActivity, SpectrumActivity
 from afspm.plugins.asylum.emulator.values import IgorValues
-from afspm.simulation.activities import ScanActivity, SpectrumActivity
 
 AMPLITUDE_M_PER_V = 1e-7
 _SINCE_1904_S: Final = 2_082_844_800

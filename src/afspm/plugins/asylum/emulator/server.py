@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import zmq
 
+from afspm.emulation import LOOPBACK
 from afspm.plugins.asylum.emulator.wire import LONGEST_REQUEST, CallFailed, FunctionCall, call, failure
-from afspm.simulation.emulation.emulator import LOOPBACK
 
 if TYPE_CHECKING:
     from _typeshed import HasFileno

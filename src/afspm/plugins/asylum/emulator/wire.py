@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NoReturn
 
-from afspm.basics.plain_data import Plain
+from afspm.basics import Plain
 
 LONGEST_REQUEST: Final = 1024
 

@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from afspm.basics.errors import RequestError
+from afspm.basics import RequestError
 from afspm.model import Region
 from afspm.plugins.bench.session import TrialSession
 

@@ -15,7 +15,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from afspm.basics.errors import InvalidValue
+from afspm.basics import InvalidValue
 from afspm.plugins.bench.evidence import Report
 
 MOST_TURNS: Final = 60

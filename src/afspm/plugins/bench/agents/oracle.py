@@ -6,8 +6,8 @@ import json
 
 import numpy as np
 
-from afspm.basics.plain_data import PlainMapping
-from afspm.components.tip_judge import Opinion, TipJudge
+from afspm import Opinion, TipJudge
+from afspm.basics import PlainMapping
 from afspm.model import Region
 from afspm.plugins.bench import analysis
 from afspm.plugins.bench.agents.script import XY, Script

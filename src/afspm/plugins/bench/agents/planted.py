@@ -10,8 +10,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from afspm.basics.errors import RequestError
-from afspm.basics.plain_data import PlainMapping
+from afspm.basics import PlainMapping, RequestError
 from afspm.model import ControlMode, Region, ScanSet, names
 from afspm.plugins.bench.agents.script import Script
 from afspm.plugins.bench.session import TrialSession

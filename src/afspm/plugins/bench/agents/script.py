@@ -11,10 +11,8 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from afspm.basics.errors import MeasurementFailed
-from afspm.basics.plain_data import PlainMapping
-from afspm.basics.units import si
-from afspm.components.tip_judge import Opinion, TipJudge
+from afspm import Opinion, TipJudge
+from afspm.basics import MeasurementFailed, PlainMapping, si
 from afspm.model import Region, ScanSet, ScopeState, Spectrum, names
 from afspm.plugins.bench import analysis
 from afspm.plugins.bench.session import TrialSession

@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from afspm.emulation import World
 from afspm.model import Region, Scan, names
 from afspm.plugins.bench import analysis
 from afspm.plugins.bench.evidence import Evidence, times_of, true_heights
 from afspm.plugins.bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, place_text
-from afspm.simulation import World
 
 _SIGMAS = 2.0  # the error bar has to cover the truth within this many standard deviations
 _FAST = {names.SCAN_SPEED: "10 um/s"}

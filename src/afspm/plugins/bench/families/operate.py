@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from afspm.basics.formatting import quantity
+from afspm.basics import quantity
 from afspm.model import names
 from afspm.plugins.bench.evidence import Evidence
 from afspm.plugins.bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, nm, place_text, rounded
-from afspm.record.tables import ScanRow
+from afspm.record import ScanRow
 
 _WITHIN = 0.01  # relative, of every setting
 _SURFACE = {"kind": "particles"}

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from afspm.basics.errors import ConfigError
-from afspm.basics.plain_data import PlainMapping
+from afspm.basics import ConfigError, PlainMapping
 from afspm.plugins.drift.estimators.guarded import Guarded, PairFailure, Report, log_failure
 from afspm.plugins.drift.naming import named
 from afspm.plugins.drift.registration import Estimator

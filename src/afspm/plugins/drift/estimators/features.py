@@ -14,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
 from afspm.plugins.drift.estimators.evidence import ConsensusEvidence, Standards, covariance_m2, weighed
 from afspm.plugins.drift.estimators.images import CommonGrid, Image, Unusable, onto_common_grid, prepare
 from afspm.plugins.drift.estimators.keypoints import KINDS, Keypoints, matched

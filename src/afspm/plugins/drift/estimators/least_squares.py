@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
 from afspm.plugins.drift.estimators.acceptance import WRONG_AT_MOST, MatchEvidence, above_repeats, agreement
 from afspm.plugins.drift.estimators.alignment import (
     COARSE,

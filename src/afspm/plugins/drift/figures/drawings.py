@@ -13,8 +13,7 @@ from matplotlib.patches import ConnectionPatch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from afspm.basics.errors import InvalidValue
-from afspm.basics.formatting import typeset_length
+from afspm.basics import InvalidValue, typeset_length
 from afspm.plugins.drift.figures.style import (
     BLUE,
     GREEN,
@@ -38,7 +37,7 @@ from afspm.plugins.drift.figures.style import (
 )
 from afspm.plugins.drift.record import DriftRecord
 from afspm.plugins.drift.registration import DriftScan, Matches
-from afspm.record.drawing.image_html import round_length_m
+from afspm.record import round_length_m
 
 
 def draw_offsets(

@@ -16,12 +16,10 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from afspm.basics.formatting import scale
-from afspm.basics.plain_data import Plain
-from afspm.model.line_levelling import flattened
+from afspm import flattened
+from afspm.basics import Plain, scale
 from afspm.plugins.drift.registration import DriftScan
-from afspm.record.drawing.raster import ValueRange, shared_range
-from afspm.record.plotting import draw_scale_bar
+from afspm.record import ValueRange, draw_scale_bar, shared_range
 
 Array = NDArray[np.float64]
 

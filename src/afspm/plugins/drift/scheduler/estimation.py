@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from afspm.basics.errors import ConfigError
-from afspm.basics.plain_data import Plain
+from afspm.basics import ConfigError, Plain
 from afspm.model import Region
 from afspm.plugins.drift.estimators import PairFailure
 from afspm.plugins.drift.overlap import too_far_off, too_little_shared

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from afspm.basics.plain_data import Plain
-from afspm.model import Region, RegistrationOutcome, RescanKind, Scan
-from afspm.model.geometry import XY
+from afspm.basics import Plain
+from afspm.model import XY, Region, RegistrationOutcome, RescanKind, Scan
 from afspm.plugins.drift.mapping import Mapping
 from afspm.plugins.drift.scheduler.positions import PlaceCodec
 

@@ -6,8 +6,7 @@ from collections.abc import Callable
 from collections.abc import Mapping as Table
 from dataclasses import dataclass, field, fields
 
-from afspm.basics.errors import AfspmError, InvalidValue
-from afspm.basics.formatting import position_text
+from afspm.basics import AfspmError, InvalidValue, position_text
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -23,7 +22,6 @@ from afspm.model import (
     ScanParameters,
     names,
 )
-from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, scan_values
 from afspm.plugins.drift.mapping import Mapping
 from afspm.plugins.drift.scheduler.positions import (
     PlaceCodec,
@@ -35,8 +33,7 @@ from afspm.plugins.drift.scheduler.positions import (
     value_in,
 )
 from afspm.plugins.drift.scheduler.scan_timing import ScanDurations
-from afspm.scheduler.coordinate_frame import MappedRequest
-from afspm.scheduler.safety.parameter_values import number_of
+from afspm.scheduler import PROBE_CHANGES, REGION_CHANGES, MappedRequest, number_of, scan_values
 from afspm.wire.messages import PROBE_POSITION, SCAN_LINES, SCAN_PARAMETERS, SPECTRUM
 
 MOVES_PX = 0.01

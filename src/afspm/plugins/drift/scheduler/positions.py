@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import Generic, Protocol, TypeVar
 
-from afspm.basics.units import convert
+from afspm.basics import convert
 from afspm.model import Parameter, ProbePosition, Region, names
-from afspm.model.names import BASE_PARAMETERS
-from afspm.scheduler.events import Codec
+from afspm.scheduler import Codec
 
 P = TypeVar("P", bound=Region | ProbePosition)
 
@@ -121,9 +120,10 @@ def in_reported_unit(name: str, value: float, reported: Parameter | None) -> Par
     """
     unit = _unit(reported or Parameter(name))
     # 15 digits: a value set as 0.1 nm reads as 0.1, not as 0.09999999999999999
-    return Parameter(name, f"{convert(value, BASE_PARAMETERS[name] or '', unit):.15g}", unit)
+    return Parameter(name, f"{convert(value, names.BASE_PARAMETERS[name] or '', unit):.15g}", unit)
 
 
 def _unit(parameter: Parameter) -> str:
     # without a unit an angle is in degrees on the wire, everything else in SI
-    return parameter.unit or ("deg" if parameter.name == names.SCAN_ANGLE else BASE_PARAMETERS[parameter.name] or "")
+    si = names.BASE_PARAMETERS[parameter.name] or ""
+    return parameter.unit or ("deg" if parameter.name == names.SCAN_ANGLE else si)

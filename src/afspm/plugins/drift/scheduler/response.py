@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from afspm.basics.frozen import replace
+from afspm.basics import replace
 from afspm.model import (
     ControlMode,
     ControlRequest,
@@ -23,8 +23,7 @@ from afspm.plugins.drift.scheduler.messages import Compensated, RescanWanted, Sc
 from afspm.plugins.drift.scheduler.positions import is_same
 from afspm.plugins.drift.scheduler.state import CallPerson, DriftDraft, FollowUp, RespondToFailure, RespondToScan
 from afspm.plugins.drift.scheduler.tally import LATELY
-from afspm.scheduler.coordinate_frame import AskMicroscope
-from afspm.scheduler.events import Announced, Delegate, ProblemSeen
+from afspm.scheduler import Announced, AskMicroscope, Delegate, ProblemSeen
 
 RESCAN = "DriftRescan"
 _DRIFT, _MALFUNCTION = int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFUNCTION)

@@ -22,8 +22,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, get_args
 
-from afspm.basics.errors import AfspmError
-from afspm.basics.frozen import replace
+from afspm import from_plain
+from afspm.basics import AfspmError, replace
 from afspm.model import (
     ControlRequest,
     LoggedPacket,
@@ -36,23 +36,25 @@ from afspm.model import (
     Response,
     names,
 )
-from afspm.model.snapshot import from_plain
 from afspm.plugins.drift.scheduler import response, scan_intake
 from afspm.plugins.drift.scheduler.messages import DriftCodec, StartWorker, WorkerReport
 from afspm.plugins.drift.scheduler.place_mapper import PlaceMapper
 from afspm.plugins.drift.scheduler.response import RateGiven
 from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings
 from afspm.plugins.drift.scheduler.state import DriftDraft, DriftEnvironment, DriftState, SavedDrift
-from afspm.scheduler.control.arbitration import ArbitrationState
-from afspm.scheduler.coordinate_frame import AskMicroscope, FrameOutput, MappedRequest, SaveNow
-from afspm.scheduler.events import (
+from afspm.scheduler import (
+    ArbitrationState,
+    AskMicroscope,
     ControlChanged,
     Delegate,
     FrameAnswered,
+    FrameOutput,
     FrameReported,
     Input,
+    MappedRequest,
     PacketIn,
     RequestIn,
+    SaveNow,
     Started,
     Tick,
     TranslatorCaughtUp,

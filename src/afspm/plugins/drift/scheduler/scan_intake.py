@@ -14,10 +14,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from afspm.basics.errors import AfspmError
-from afspm.basics.formatting import lengths_text
-from afspm.basics.frozen import replace
-from afspm.basics.plain_data import Plain
+from afspm.basics import AfspmError, Plain, lengths_text, replace
 from afspm.model import (
     ChannelRoles,
     Frame,
@@ -52,8 +49,7 @@ from afspm.plugins.drift.scheduler.state import (
     RespondToFailure,
     RespondToScan,
 )
-from afspm.scheduler.coordinate_frame import HoldControl, Reconsider, SaveNow
-from afspm.scheduler.events import Announced, Delegate, PacketIn
+from afspm.scheduler import Announced, Delegate, HoldControl, PacketIn, Reconsider, SaveNow
 
 MAPPING = "DriftMapping"
 _HOW = {

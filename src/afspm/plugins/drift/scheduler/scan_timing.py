@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from afspm.basics.frozen import replace
+from afspm.basics import replace
 from afspm.model import ScopeState, ScopeStatus
 
 XY = tuple[float, float]

@@ -6,11 +6,8 @@ from pathlib import Path
 from typing import ClassVar
 
 from afspm import wire
-from afspm.basics.clock import NS_PER_S
-from afspm.basics.errors import ConfigError
-from afspm.basics.plain_data import PlainMapping
-from afspm.model import Frame
-from afspm.model.geometry import XY
+from afspm.basics import NS_PER_S, ConfigError, PlainMapping
+from afspm.model import XY, Frame
 from afspm.plugins.drift.scheduler.messages import Matrix, Registered, RescanWanted
 from afspm.plugins.drift.scheduler.response import RESCAN
 from afspm.plugins.drift.scheduler.sample_frame import SampleFrame
@@ -18,10 +15,9 @@ from afspm.plugins.drift.scheduler.scan_intake import MAPPING
 from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings
 from afspm.plugins.drift.scheduler.worker import DriftWorkerInProcess
 from afspm.plugins.drift.scheduler.worker_process import DriftWorkerProcess
-from afspm.scheduler.scheduler import Coordinates, Scheduler
-from afspm.scheduler.wire_codec import WireCodec
-from afspm.transport.process.context import ProcessContext
-from afspm.wire.mapping import timestamp
+from afspm.processes import ProcessContext
+from afspm.scheduler import Coordinates, Scheduler, WireCodec
+from afspm.wire import timestamp
 from afspm.wire.messages import DriftMapping, DriftRescan, ScanParameters2d
 
 

@@ -7,9 +7,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
-from afspm.basics.errors import ConfigError, InvalidValue
-from afspm.basics.plain_data import Plain
-from afspm.basics.units import Duration, Length
+from afspm.basics import ConfigError, Duration, InvalidValue, Length, Plain
 from afspm.model import ChannelName
 
 _STRICT = {"extra": "forbid"}

@@ -6,11 +6,8 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 
-from afspm.basics.frozen import replace
-from afspm.basics.plain_data import Plain
-from afspm.basics.units import same_kind
-from afspm.model import TOPOGRAPHY, ChannelRoles, Scan
-from afspm.model.geometry import XY
+from afspm.basics import Plain, replace, same_kind
+from afspm.model import TOPOGRAPHY, XY, ChannelRoles, Scan
 from afspm.plugins.drift.mapping import Mapping as DriftMapping
 from afspm.plugins.drift.scheduler.messages import DriftCodec, Matrix, Registered, ScanJob
 from afspm.plugins.drift.scheduler.place_mapper import Places, SavedPlaces
@@ -19,9 +16,7 @@ from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings
 from afspm.plugins.drift.scheduler.tally import RegistrationTally
 from afspm.plugins.drift.trackers import forecast_from_dict
 from afspm.plugins.drift.tracking import Forecast, Prediction
-from afspm.scheduler.control.arbitration import ArbitrationState
-from afspm.scheduler.coordinate_frame import FrameOutput
-from afspm.scheduler.events import Log, PacketIn, TranslatorCaughtUp
+from afspm.scheduler import ArbitrationState, FrameOutput, Log, PacketIn, TranslatorCaughtUp
 
 Waits = PacketIn | TranslatorCaughtUp
 

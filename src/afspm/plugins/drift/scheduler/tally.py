@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from afspm.basics.frozen import replace
+from afspm.basics import replace
 from afspm.model import RegistrationOutcome, registration_summary
 
 LATELY = 10

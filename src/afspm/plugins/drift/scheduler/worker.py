@@ -22,9 +22,7 @@ from typing import Protocol
 
 import numpy as np
 
-from afspm.basics.errors import AfspmError, FileError
-from afspm.basics.exit_codes import ExitCode
-from afspm.basics.plain_data import Plain
+from afspm.basics import AfspmError, ExitCode, FileError, Plain
 from afspm.plugins.drift.estimators import PairFailure, estimator
 from afspm.plugins.drift.registration import DriftScan
 from afspm.plugins.drift.scheduler.estimation import Estimation
@@ -40,7 +38,7 @@ from afspm.plugins.drift.scheduler.messages import (
 from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings
 from afspm.plugins.drift.scheduler.worker_state import WorkerStateFile
 from afspm.plugins.drift.trackers import tracker
-from afspm.transport.process.parent import leave_interrupts_to_parent
+from afspm.processes import leave_interrupts_to_parent
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from afspm.basics.errors import FileError
-from afspm.basics.plain_data import Plain
-from afspm.storage.atomic import write_atomic
+from afspm import write_atomic
+from afspm.basics import FileError, Plain
 
 _JSON = "json"
 _ARRAY = "array"

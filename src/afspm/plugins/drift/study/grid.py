@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from afspm.basics.errors import ConfigError, FileError
+from afspm.basics import ConfigError, FileError
 from afspm.plugins.drift.study.settings import PARTS, NightSettings
 
 

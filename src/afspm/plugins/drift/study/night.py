@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.emulation import World
 from afspm.model import Frame, Region
 from afspm.plugins.drift.estimators import estimator
 from afspm.plugins.drift.overlap import too_far_off, too_little_shared
@@ -16,7 +17,6 @@ from afspm.plugins.drift.registration import DriftScan
 from afspm.plugins.drift.study.settings import NightSettings
 from afspm.plugins.drift.trackers import tracker
 from afspm.plugins.drift.tracking import Tracker, Update
-from afspm.simulation import World
 
 Array = NDArray[np.float64]
 

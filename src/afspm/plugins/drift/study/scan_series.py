@@ -8,12 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from afspm.basics.clock import NS_PER_S
-from afspm.basics.errors import InvalidValue
+from afspm.basics import NS_PER_S, InvalidValue
+from afspm.driver import FileContent
 from afspm.model import Frame, Region, Scan
 from afspm.plugins.drift.mapping import Mapping
 from afspm.plugins.drift.registration import DriftScan
-from afspm.storage.formats import FileContent
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import difflib
 from dataclasses import dataclass, field, fields
 
-from afspm.basics.errors import ConfigError, InvalidValue
-from afspm.basics.plain_data import Plain, PlainMapping
+from afspm.basics import ConfigError, InvalidValue, Plain, PlainMapping
 from afspm.plugins.drift.estimators import DEFAULT as DEFAULT_ESTIMATOR
 from afspm.plugins.drift.overlap import F_RESCAN
 from afspm.plugins.drift.trackers import DEFAULT as DEFAULT_TRACKER

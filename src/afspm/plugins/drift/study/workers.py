@@ -14,7 +14,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any
 
-from afspm.basics.errors import AfspmError, ConfigError
+from afspm.basics import AfspmError, ConfigError
 
 _FEW_PIXELS = 100_000  # of all scans: up to here, starting processes takes longer than the registration
 _MOST_DEATHS = 3  # of workers in a row without a finished task

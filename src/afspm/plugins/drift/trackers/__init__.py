@@ -9,9 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping as Table
 
-from afspm.basics.errors import ConfigError, InvalidValue
-from afspm.basics.plain_data import PlainMapping
-from afspm.model.snapshot import restored
+from afspm import restored
+from afspm.basics import ConfigError, InvalidValue, PlainMapping
 from afspm.plugins.drift.estimators import estimator as default_estimator
 from afspm.plugins.drift.naming import named
 from afspm.plugins.drift.registration import Estimator

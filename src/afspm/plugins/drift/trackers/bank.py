@@ -8,9 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from afspm.basics.errors import InvalidValue
-from afspm.basics.plain_data import Plain, PlainMapping
-from afspm.model.snapshot import restored, snapshot
+from afspm import restored, snapshot
+from afspm.basics import InvalidValue, Plain, PlainMapping
 from afspm.plugins.drift.registration import DriftScan, Estimator, Registration
 from afspm.plugins.drift.shear import velocity_from_up_down
 from afspm.plugins.drift.trackers.filters import Filters

@@ -9,8 +9,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.plain_data import Plain
-from afspm.model.snapshot import snapshot
+from afspm import snapshot
+from afspm.basics import Plain
 from afspm.plugins.drift.mapping import Mapping
 from afspm.plugins.drift.trackers.filters import Filters, Models, mixed
 from afspm.plugins.drift.tracking import FORECAST_VERSION, Prediction

@@ -14,9 +14,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import ConfigError
-from afspm.basics.plain_data import Plain, PlainMapping
-from afspm.model.snapshot import restored, snapshot
+from afspm import restored, snapshot
+from afspm.basics import ConfigError, Plain, PlainMapping
 from afspm.plugins.drift.mapping import Mapping, unlike_drift
 from afspm.plugins.drift.overlap import intersection_ratio, sr_norm
 from afspm.plugins.drift.registration import DriftScan, Estimator, Registration

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from afspm.basics.errors import ConfigError
-from afspm.basics.plain_data import Plain
+from afspm.basics import ConfigError, Plain
 from afspm.plugins.drift.registration import DriftScan
 from afspm.plugins.drift.trackers.filters import Filters, Models
 from afspm.plugins.drift.trackers.references import Choice

@@ -10,16 +10,14 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
-from afspm.basics.errors import ConfigError
-from afspm.basics.plain_data import PlainMapping
-from afspm.basics.units import Length
+from afspm.basics import ConfigError, Length, PlainMapping
+from afspm.emulation import Crashed, Emulator
 from afspm.plugins.gxsm.emulator import block, calls, file_writer, files, program
 from afspm.plugins.gxsm.emulator.block import SharedMemoryBlock
 from afspm.plugins.gxsm.emulator.calls import GxsmFunctions, NoAnswer, WrongArguments
 from afspm.plugins.gxsm.emulator.console import SCRIPT, ScriptCall, ScriptConsole
 from afspm.plugins.gxsm.emulator.entries import USER_UNITS
 from afspm.plugins.gxsm.emulator.program import GxsmProgram
-from afspm.simulation.emulation.emulator import Crashed, Emulator
 
 PROCESS: Final = "emulated-gxsm4"
 _TRANSPORTS: Final = ("bridge", "shm")

@@ -12,13 +12,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
+from afspm.emulation import Crashed, Faults
 from afspm.plugins.gxsm import pickles
 from afspm.plugins.gxsm.emulator.console import ScriptCall
 from afspm.plugins.gxsm.emulator.signalled import CONTENT, SIZE
 from afspm.plugins.gxsm.errors import BadReply
-from afspm.simulation.emulation.emulator import Crashed
-from afspm.simulation.faults import Faults
 
 FAULT_KINDS: Final[Mapping[str, str]] = {
     "bad-pickle": "shared memory: the result is not a pickle",

@@ -9,8 +9,8 @@ from typing import Final, TypeVar
 
 import numpy as np
 
+from afspm.emulation import InstrumentBusy
 from afspm.plugins.gxsm.emulator.program import ANGSTROM_M, GxsmProgram
-from afspm.simulation.instrument import InstrumentBusy
 
 FAULT_KINDS: Final[Mapping[str, str]] = {
     "error": "a call raises an error",

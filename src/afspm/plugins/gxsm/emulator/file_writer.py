@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from afspm.simulation.faults import Faults
+from afspm.emulation import Faults
 
 FAULT_KINDS: Final[Mapping[str, str]] = {
     "file-late": "a file appears only after the duration",

@@ -10,18 +10,14 @@ from typing import Final
 
 import numpy as np
 
-from afspm.basics.clock import Clock
-from afspm.basics.errors import InvalidValue
-from afspm.basics.plain_data import Plain
+from afspm.basics import Clock, InvalidValue, Plain
+from afspm.driver import read
+from afspm.emulation import Faults, ScanActivity, SimulatedInstrument, SpectrumActivity
 from afspm.model import Region
 from afspm.plugins.gxsm.emulator import files
 from afspm.plugins.gxsm.emulator.entries import GxsmEntries, GxsmEntry, lengths, simulated_3, subscan
 from afspm.plugins.gxsm.emulator.file_writer import GxsmFileWriter
 from afspm.plugins.gxsm.emulator.files import CHANNELS, SIMULATED_3, UNITS, GxsmChannel
-from afspm.simulation.activities import ScanActivity, SpectrumActivity
-from afspm.simulation.faults import Faults
-from afspm.simulation.instrument import SimulatedInstrument
-from afspm.storage.formats import read
 
 CARDS: Final = {"SRanger": "SRangerMK2:SPM", "RPSPMC": "RPSPMC:SPM", "simulator": "SPM-SIM:SPM"}
 FAULT_KINDS: Final[Mapping[str, str]] = {

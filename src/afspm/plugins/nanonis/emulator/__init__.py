@@ -9,15 +9,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
-from afspm.basics.errors import ConfigError, InvalidValue
-from afspm.basics.plain_data import PlainMapping
-from afspm.basics.units import Length
+from afspm.basics import ConfigError, InvalidValue, Length, PlainMapping
+from afspm.emulation import LOOPBACK, ClientConnection, Crashed, Emulator, InstrumentBusy, TcpServer
 from afspm.plugins.nanonis.emulator import logger, wire
 from afspm.plugins.nanonis.emulator.dispatch import DeferredResult, FunctionRefused, Results
 from afspm.plugins.nanonis.emulator.software import NanonisSoftware
-from afspm.simulation.emulation.emulator import LOOPBACK, Crashed, Emulator
-from afspm.simulation.emulation.tcp_server import ClientConnection, TcpServer
-from afspm.simulation.instrument import InstrumentBusy
 
 RELEASES: Final = {"2021": 10862, "2022": 11798, "2023": 13742, "2024": 14429, "2025": 14573}
 """The first release with each version of the protocol, by the year of the software."""

@@ -6,13 +6,11 @@ import math
 from dataclasses import dataclass, field
 from typing import Final
 
-from afspm.basics.clock import Clock
-from afspm.basics.plain_data import Plain
+from afspm.basics import Clock, Plain
+from afspm.emulation import Faults, SimulatedInstrument
 from afspm.plugins.nanonis.emulator.dispatch import Answer, DeferredResult
 from afspm.plugins.nanonis.emulator.registers import Registers
 from afspm.plugins.nanonis.emulator.session import SessionFolder
-from afspm.simulation.faults import Faults
-from afspm.simulation.instrument import SimulatedInstrument
 
 _Z_CONTROLLERS: Final = {
     "current": ("log Current", "A"),

@@ -9,14 +9,13 @@ from typing import Any, Final
 
 import numpy as np
 
+from afspm.emulation import MOST_PIXELS, RETRACE, ScanActivity
 from afspm.model import Region
 from afspm.plugins.nanonis.emulator import files
 from afspm.plugins.nanonis.emulator.core import NanonisCore
 from afspm.plugins.nanonis.emulator.dispatch import Answer, DeferredResult, FunctionRefused, Results, answers, chosen
 from afspm.plugins.nanonis.emulator.session import checked_name
 from afspm.plugins.nanonis.emulator.signals import CHANNELS, NAMES, Signals, name_and_unit
-from afspm.simulation.activities import RETRACE, ScanActivity
-from afspm.simulation.scanning import MOST_PIXELS
 
 Image = tuple[str, str, np.ndarray, np.ndarray]
 """Name, unit, values forward and backward [y, x]."""

@@ -6,8 +6,8 @@ import logging
 from pathlib import Path, PureWindowsPath
 from typing import Final
 
-from afspm.basics.errors import InvalidValue
-from afspm.simulation.faults import Faults
+from afspm.basics import InvalidValue
+from afspm.emulation import Faults
 
 _NO_FILE_NAME: Final = frozenset('\\/:*?"<>|') | {chr(number) for number in range(32)}
 _LONGEST_NAME: Final = 200

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+from afspm.emulation import RETRACE, SpectrumActivity
 from afspm.plugins.nanonis.emulator.core import NanonisCore
 from afspm.plugins.nanonis.emulator.dispatch import Answer, FunctionRefused, answers
 from afspm.plugins.nanonis.emulator.logger import LARGEST_OVERSAMPLING, TcpLogger
-from afspm.simulation.activities import RETRACE, SpectrumActivity
 
 CHANNELS: Final = {"Current": 0, "Height": 14, "Phase": 16, "Amplitude": 17, "Frequency Shift": 18}
 """Index of the signal by simulated channel."""

@@ -8,7 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from afspm.basics.clock import Clock
+from afspm.basics import Clock
+from afspm.emulation import Faults, SimulatedInstrument
 from afspm.plugins.nanonis.emulator.core import NanonisCore
 from afspm.plugins.nanonis.emulator.dispatch import Answer, Dispatcher, FunctionRefused, answers, chosen
 from afspm.plugins.nanonis.emulator.files import read_dat
@@ -17,8 +18,6 @@ from afspm.plugins.nanonis.emulator.session import SessionFolder, checked_name
 from afspm.plugins.nanonis.emulator.signals import Signals
 from afspm.plugins.nanonis.emulator.spectra import SpectroscopyModules
 from afspm.plugins.nanonis.emulator.tip import TipModules, ZController
-from afspm.simulation.faults import Faults
-from afspm.simulation.instrument import SimulatedInstrument
 
 _RANGE_Z_M: Final = 2e-6
 _EXPERIMENTS: Final = {"Bias Spectroscopy": "IV", "Z Spectroscopy": "force"}

@@ -7,12 +7,12 @@ from typing import Final
 
 import numpy as np
 
+from afspm.emulation import SpectrumActivity
 from afspm.plugins.nanonis.emulator import files
 from afspm.plugins.nanonis.emulator.core import NanonisCore
 from afspm.plugins.nanonis.emulator.dispatch import Answer, DeferredResult, FunctionRefused, Results, answers, chosen
 from afspm.plugins.nanonis.emulator.session import checked_name
 from afspm.plugins.nanonis.emulator.signals import Signals, name_and_unit, spectrum_columns, spectrum_signal
-from afspm.simulation.activities import SpectrumActivity
 
 _KINDS: Final = {"BiasSpectr": "IV", "ZSpectr": "force"}
 _CHANNELS: Final = {"BiasSpectr": (0, 22), "ZSpectr": (20, 21)}

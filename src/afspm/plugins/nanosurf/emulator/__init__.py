@@ -6,14 +6,20 @@ import struct
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Final, cast
 
-from afspm.basics.plain_data import PlainMapping
-from afspm.basics.units import Duration
+from afspm.basics import Duration, PlainMapping
+from afspm.emulation import (
+    LOOPBACK,
+    Client,
+    ClientConnection,
+    MakerProgram,
+    OnRequest,
+    ScriptedEmulator,
+    ScriptWire,
+    TcpServer,
+    Unfinished,
+)
 from afspm.plugins.nanosurf.emulator.studio import StudioProgram
 from afspm.plugins.nanosurf.emulator.tree import CommandTree
-from afspm.simulation.emulation.emulator import LOOPBACK
-from afspm.simulation.emulation.program import MakerProgram
-from afspm.simulation.emulation.scripted import Client, OnRequest, ScriptedEmulator, ScriptWire, Unfinished
-from afspm.simulation.emulation.tcp_server import ClientConnection, TcpServer
 
 if TYPE_CHECKING:
     from _typeshed import HasFileno

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from afspm.basics.plain_data import PlainMapping
-from afspm.simulation.activities import RETRACE, ScanActivity, SpectrumActivity
-from afspm.simulation.fields import Array
+from afspm.basics import PlainMapping
+from afspm.emulation import RETRACE, Array, ScanActivity, SpectrumActivity
 
 if TYPE_CHECKING:
     import h5py

@@ -11,12 +11,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from afspm.basics.errors import InvalidValue
-from afspm.basics.plain_data import Plain
+from afspm.basics import InvalidValue, Plain
+from afspm.emulation import RETRACE, Channels, MakerProgram, NamedFile, ScanActivity, SpectrumActivity
 from afspm.model import Region
 from afspm.plugins.nanosurf.emulator import files
-from afspm.simulation.activities import RETRACE, Channels, ScanActivity, SpectrumActivity
-from afspm.simulation.emulation.program import MakerProgram, NamedFile
 
 _INTEGRAL_GAIN: Final = 0.5
 """Simulated integral gain, in 1/s, for a gain of 1 in Studio."""

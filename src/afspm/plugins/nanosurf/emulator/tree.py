@@ -10,10 +10,10 @@ from functools import partial
 from pathlib import Path, PureWindowsPath
 from typing import Any, Final
 
-from afspm.basics.plain_data import Plain, PlainMapping
+from afspm.basics import Plain, PlainMapping
+from afspm.emulation import ScriptFailed
 from afspm.plugins.nanosurf.emulator.studio import CYCLES, MODES, PANEL, PROCEDURES_S, SETPOINT, StudioProgram
 from afspm.plugins.nanosurf.emulator.workspace import MeasurementQueue, Workspace
-from afspm.simulation.emulation.scripted import ScriptFailed
 
 SESSION: Final = "91-01-000"
 """Name of the only session: the maker's client has this name for a simulated controller."""

@@ -10,9 +10,9 @@ from pathlib import Path, PureWindowsPath
 from typing import Final
 from xml.etree import ElementTree
 
-from afspm.basics.errors import AfspmError, InvalidValue
+from afspm.basics import AfspmError, InvalidValue
+from afspm.emulation import InstrumentBusy
 from afspm.plugins.nanosurf.emulator.studio import FRAMES, StudioProgram
-from afspm.simulation.instrument import InstrumentBusy
 
 NO_ITEM: Final = str(uuid.UUID(int=0))
 _MOST_ITEMS: Final = 1000

@@ -10,21 +10,19 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NoReturn, cast
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from afspm.basics.errors import AfspmError
-from afspm.basics.plain_data import Plain, PlainMapping
-from afspm.basics.units import Duration
-from afspm.plugins.park.emulator.engine import Script
-from afspm.plugins.park.emulator.smartscan import GEOMETRY, SmartScanProgram
-from afspm.simulation.emulation.emulator import LOOPBACK
-from afspm.simulation.emulation.program import MakerProgram
-from afspm.simulation.emulation.scripted import (
+from afspm.basics import AfspmError, Duration, Plain, PlainMapping
+from afspm.emulation import (
+    LOOPBACK,
     Client,
+    MakerProgram,
     OnRequest,
     ScriptedEmulator,
     ScriptFailed,
     ScriptWire,
     Unfinished,
 )
+from afspm.plugins.park.emulator.engine import Script
+from afspm.plugins.park.emulator.smartscan import GEOMETRY, SmartScanProgram
 
 if TYPE_CHECKING:
     from _typeshed import HasFileno

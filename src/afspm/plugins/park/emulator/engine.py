@@ -16,8 +16,8 @@ from queue import Empty, SimpleQueue
 from threading import Event, Thread
 from typing import Final
 
-from afspm.basics.errors import AfspmError
-from afspm.simulation.emulation.scripted import ScriptFailed
+from afspm.basics import AfspmError
+from afspm.emulation import ScriptFailed
 
 LONGEST_S: Final = 5.0
 """Limit of a script's computing between two requests to the instrument, in real seconds.

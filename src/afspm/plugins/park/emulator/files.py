@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.emulation import RETRACE, Array, ScanActivity, SpectrumActivity
 from afspm.plugins.park.file_header import (
     CURVE_KINDS,
     CURVES,
@@ -28,8 +29,6 @@ from afspm.plugins.park.file_header import (
     VERSION_TAG,
     VERSIONS,
 )
-from afspm.simulation.activities import RETRACE, ScanActivity, SpectrumActivity
-from afspm.simulation.fields import Array
 
 _VERSION = max(VERSIONS)
 _FLOATS = 2

@@ -9,14 +9,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
-from afspm.basics.errors import InvalidValue
-from afspm.basics.plain_data import Plain
+from afspm.basics import InvalidValue, Plain
+from afspm.emulation import RETRACE, MakerProgram, NamedFile, ScanActivity, SpectrumActivity
 from afspm.model import Region
 from afspm.plugins.park.emulator import files
 from afspm.plugins.park.emulator.engine import Wait
 from afspm.plugins.park.file_header import MICROMETRE
-from afspm.simulation.activities import RETRACE, ScanActivity, SpectrumActivity
-from afspm.simulation.emulation.program import MakerProgram, NamedFile
 
 GEOMETRY: Final[dict[str, tuple[type, float, float]]] = {
     "pixelHeight": (int, 1, 8192),

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
 from afspm.plugins.web.dashboard.sessions import Sessions
 from afspm.plugins.web.passwords import Passwords, check_name, hashed
 

@@ -9,15 +9,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 
-from afspm import wire
-from afspm.basics.errors import AfspmError, UnitError
-from afspm.basics.formatting import counted, quantity, typeset_position
-from afspm.basics.plain_data import Plain
-from afspm.basics.units import parse_quantity
-from afspm.client.parameter_text import from_parameter, value_in
+from afspm import from_parameter, value_in, wire
+from afspm.basics import AfspmError, Plain, UnitError, counted, parse_quantity, quantity, typeset_position
 from afspm.model import (
     CLOCK_REQUEST,
     GRANT_REQUEST,
+    XY,
     ControlMode,
     ControlResponse,
     Grant,
@@ -26,7 +23,6 @@ from afspm.model import (
     Response,
     names,
 )
-from afspm.model.geometry import XY
 from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.persons import Persons

@@ -8,11 +8,8 @@ from html import escape
 
 from nicegui import background_tasks, ui
 
-from afspm.basics.errors import AfspmError
-from afspm.basics.formatting import counted, day_and_time, escaped, quantity, typeset_area, typeset_position
-from afspm.basics.plain_data import Plain
-from afspm.model import Approval, Frame, Grant, Proposal, names
-from afspm.model.events import PERSON
+from afspm.basics import AfspmError, Plain, counted, day_and_time, escaped, quantity, typeset_area, typeset_position
+from afspm.model import PERSON, Approval, Frame, Grant, Proposal, names
 from afspm.plugins.agent.approval import of_plan, of_table, simulated, summary
 from afspm.plugins.agent.plan import Plan, plan_of, title_of
 from afspm.plugins.agent.simulated_run import repeated

@@ -9,12 +9,10 @@ from html import escape
 
 import numpy as np
 
-from afspm.basics.formatting import quantity, time_of_day, typeset_position, zone_offset_s
-from afspm.basics.plain_data import Plain
+from afspm import Array
+from afspm.basics import Plain, quantity, time_of_day, typeset_position, zone_offset_s
 from afspm.model import RegistrationOutcome, Spectrum, registration_summary
-from afspm.record.drawing.chart import Axis, Curve
-from afspm.record.drawing.curves import Array, thinned
-from afspm.record.overview import DriftPoint
+from afspm.record import Axis, Curve, DriftPoint, thinned
 
 Options = Plain
 BEFORE = 6  # spectra that are shown faintly behind the newest

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from html import escape
 
-from afspm.basics.clock import NS_PER_S
-from afspm.basics.formatting import day_and_time, duration_text, time_of_day, typeset_area
+from afspm.basics import NS_PER_S, day_and_time, duration_text, time_of_day, typeset_area
 from afspm.model import (
+    PERSON,
     ControlMode,
     Feedback,
     JournalEntry,
@@ -22,15 +22,22 @@ from afspm.model import (
     Region,
     TipStatus,
 )
-from afspm.model.events import PERSON
 from afspm.plugins.web.dashboard.charts import Chart, drift_chart
 from afspm.plugins.web.dashboard.flags import Flag, flags
 from afspm.plugins.web.dashboard.sample_map import MapContent, map_html, picture_url
 from afspm.plugins.web.watch import Watch
-from afspm.record.allowed_bands import AllowedBands, instrument_curves
-from afspm.record.drawing.timeline import TimelineRow, timeline_html, tint_class
-from afspm.record.overview import OVER, Overview, ScanSummary
-from afspm.record.timeline import Span, Timeline
+from afspm.record import (
+    OVER,
+    AllowedBands,
+    Overview,
+    ScanSummary,
+    Span,
+    Timeline,
+    TimelineRow,
+    instrument_curves,
+    timeline_html,
+    tint_class,
+)
 
 LEAST_AGE_S = 0.4  # age of the content before it is made again, at any rate of messages
 SLOWLY_S = 2.0  # the same for slow content

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
-from afspm.basics.addresses import Listens
-from afspm.basics.clock import ExperimentClock
+from afspm.basics import ExperimentClock, Listens
 from afspm.plugins.web.archive import adjustable_parameters, agents_in, allowed_region
 from afspm.plugins.web.component import WebComponent
 from afspm.plugins.web.dashboard.access import Access
@@ -16,8 +15,8 @@ from afspm.plugins.web.dashboard.sessions import Sessions
 from afspm.plugins.web.passwords import is_loopback
 from afspm.plugins.web.server import USUAL_PORT
 from afspm.plugins.web.watch import Audience
-from afspm.record.allowed_bands import allowed_bands
-from afspm.record.run_json import experiment_name
+from afspm.record import bands_allowed as allowed_bands
+from afspm.record import experiment_name
 
 END_SHOWN_WITHIN_S = 1.5  # time for the pages to show the end
 

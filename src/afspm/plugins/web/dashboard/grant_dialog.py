@@ -11,9 +11,7 @@ from dataclasses import dataclass, field
 
 from nicegui import ui
 
-from afspm.basics.errors import AfspmError, InvalidValue
-from afspm.basics.formatting import quantity
-from afspm.basics.plain_data import Plain
+from afspm.basics import AfspmError, InvalidValue, Plain, quantity
 from afspm.model import Region, names
 from afspm.plugins.web.dashboard.actions import ActionResult, Actions
 from afspm.plugins.web.dashboard.approvals import grant_of

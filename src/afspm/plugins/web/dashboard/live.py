@@ -20,9 +20,7 @@ from afspm.plugins.web.dashboard.pictures import Look, PictureCache, RenderedFra
 from afspm.plugins.web.dashboard.scan_facts import Facts, began_ns, scan_facts
 from afspm.plugins.web.frames import ChannelFrame, number_or_none
 from afspm.plugins.web.watch import Bell, Watch
-from afspm.record.drawing.curves import profile
-from afspm.record.drawing.palette import DIVERGING, LEVELS, PALETTES
-from afspm.record.drawing.raster import png
+from afspm.record import DIVERGING, LEVELS, PALETTES, png, profile
 
 POLL_S = 20.0  # then the browser repeats its request: proxies may close a connection that is silent for longer
 GROWING_S = 0.2  # between two pictures of a growing scan

@@ -11,17 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from afspm.basics.clock import NeverLate
-from afspm.basics.errors import FileError
-from afspm.model import Note, Scan
-from afspm.model.geometry import XY
-from afspm.model.line_levelling import Array
+from afspm import Array, Run, open_run
+from afspm.basics import FileError, NeverLate
+from afspm.model import XY, Note, Scan
 from afspm.plugins.web.frames import FrameStore
 from afspm.plugins.web.watch import SpectrumStore, Watch
-from afspm.record.allowed_bands import allowed_bands
-from afspm.record.overview import Overview
-from afspm.record.packets import RecordPlayback
-from afspm.record.run import Run, open_run
+from afspm.record import Overview, RecordPlayback
+from afspm.record import bands_allowed as allowed_bands
 
 if TYPE_CHECKING:
     from afspm.wire.messages import DriftMapping

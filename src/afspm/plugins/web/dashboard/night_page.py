@@ -18,12 +18,9 @@ from fastapi import FastAPI, Response
 from fastapi.responses import FileResponse, PlainTextResponse
 from nicegui import events, ui
 
-from afspm.basics.clock import ExperimentClock
-from afspm.basics.errors import AfspmError, InvalidValue
-from afspm.basics.formatting import time_of_day, typeset_area, zone_offsets_s
-from afspm.basics.plain_data import Plain
-from afspm.model.events import PERSON
-from afspm.model.line_levelling import Levelling, levelled
+from afspm import Levelling, append_note, levelled
+from afspm.basics import AfspmError, ExperimentClock, InvalidValue, Plain, time_of_day, typeset_area, zone_offsets_s
+from afspm.model import PERSON
 from afspm.plugins.drift.scan_pair import onto_first
 from afspm.plugins.web.archive import Archive, allowed_region
 from afspm.plugins.web.dashboard import shadow_marks
@@ -34,13 +31,9 @@ from afspm.plugins.web.dashboard.night import Night, NightWatch
 from afspm.plugins.web.dashboard.page import ASSETS, TABS, Page, Services, section
 from afspm.plugins.web.dashboard.pictures import Look, RenderedFrame
 from afspm.plugins.web.frames import ChannelFrame
-from afspm.record.allowed_bands import allowed_bands
-from afspm.record.drawing.palette import DIVERGING
-from afspm.record.drawing.raster import ValueRange, indices, png, value_range
-from afspm.record.notes import append_note
-from afspm.record.report import REPORT_FILE, write
-from afspm.record.run_lock import describe_state
-from afspm.record.tables import ScanRow
+from afspm.record import DIVERGING, REPORT_FILE, ScanRow, ValueRange, describe_state, indices, png, value_range
+from afspm.record import bands_allowed as allowed_bands
+from afspm.record import write_report as write
 
 _HEAD = """<link rel="stylesheet" href="assets/night.css"><script type="module" src="assets/night.js"></script>"""
 

@@ -12,7 +12,7 @@ from typing import ClassVar
 
 from nicegui import ui
 
-from afspm.model.line_levelling import Levelling
+from afspm import Levelling
 from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.dashboard.actions import Steering
 from afspm.plugins.web.dashboard.approvals import ApprovalBar
@@ -23,15 +23,14 @@ from afspm.plugins.web.dashboard.sign_in import SIGN_IN
 from afspm.plugins.web.dashboard.steering_panel import ModeButtons, ProblemBar, SteeringPanel
 from afspm.plugins.web.dashboard.steering_session import SteeringSession
 from afspm.plugins.web.watch import Audience, Watch
-from afspm.record.drawing import timeline
-from afspm.record.drawing.palette import PALETTES
+from afspm.record import PALETTES, TIMELINE_CSS
 
 ASSETS = Path(__file__).with_name("assets")
 REFRESH_S = 0.5
 ANSWER_S = 5.0  # a browser that has not drawn the last update within this time gets no more until it has
 THEMES = {"": None, "light": False, "dark": True}
 # relative addresses: behind a proxy the page may lie on a path of its own
-_HEAD = f"""<style>{timeline.CSS}</style><link rel="stylesheet" href="assets/dashboard.css">
+_HEAD = f"""<style>{TIMELINE_CSS}</style><link rel="stylesheet" href="assets/dashboard.css">
 <script type="module" src="assets/page.js"></script>"""
 LEVELLINGS = {Levelling.LINES: "line by line"}
 """Labels of levellings whose value is no word."""

@@ -8,12 +8,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
-from afspm.model.line_levelling import Array, Levelling, flattened, levelled
+from afspm import Array, Levelling, flattened, levelled
 from afspm.plugins.web.dashboard.scan_facts import Facts
 from afspm.plugins.web.frames import ChannelFrame
-from afspm.record.drawing.image_html import shown
-from afspm.record.drawing.palette import PALETTES
-from afspm.record.drawing.raster import Contrast, ValueRange, indices, png, shared_range
+from afspm.record import PALETTES, Contrast, ValueRange, indices, png, shared_range
+from afspm.record import shown_image as shown
 
 KEPT, THUMBNAILS_KEPT = 8, 600
 SIDE_PX = 128

@@ -16,14 +16,13 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
-from afspm.basics.clock import ExperimentClock
-from afspm.basics.errors import AfspmError, FileError
+from afspm import Memory
+from afspm.basics import AfspmError, ExperimentClock, FileError
 from afspm.plugins.web.archive import Archive, allowed_region
 from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.dashboard.sessions import Sessions
 from afspm.plugins.web.server import USUAL_PORT, WebServer, listening, url_of
-from afspm.record.run_json import STATE_DIR
-from afspm.storage.memory import Memory
+from afspm.record import STATE_DIR
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,10 @@ from urllib.parse import quote
 
 import numpy as np
 
-from afspm.basics.formatting import counted, quantity, scale, time_of_day, typeset_area, typeset_position
-from afspm.model import Region
-from afspm.model.geometry import XY
-from afspm.record.drawing.chart import Axis
-from afspm.record.drawing.curves import Array
-from afspm.record.overview import FoundPlace, ScanSummary, SpectrumSummary
+from afspm import Array
+from afspm.basics import counted, quantity, scale, time_of_day, typeset_area, typeset_position
+from afspm.model import XY, Region
+from afspm.record import Axis, FoundPlace, ScanSummary, SpectrumSummary
 
 MOST_PLACES = 1500
 MOST_PICTURES = 300

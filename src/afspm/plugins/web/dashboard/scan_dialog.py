@@ -8,10 +8,16 @@ from dataclasses import dataclass, replace
 
 from nicegui import ui
 
-from afspm.basics.errors import InvalidValue, UnitError
-from afspm.basics.formatting import quantity, typeset_position
-from afspm.basics.plain_data import PlainMapping
-from afspm.basics.units import convert, parse_quantity, si_or_text
+from afspm.basics import (
+    InvalidValue,
+    PlainMapping,
+    UnitError,
+    convert,
+    parse_quantity,
+    quantity,
+    si_or_text,
+    typeset_position,
+)
 from afspm.model import Region
 from afspm.plugins.web.dashboard.steering_session import ask_in_dialog
 

@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
-from afspm.basics.clock import NS_PER_S
-from afspm.basics.formatting import duration_text, scale, time_of_day, typeset, typeset_area
-from afspm.model import ActByHand, ChannelRoles, TipStatus
-from afspm.model.channels import RETRACE
-from afspm.model.geometry import XY
+from afspm.basics import NS_PER_S, duration_text, scale, time_of_day, typeset, typeset_area
+from afspm.model import RETRACE, XY, ActByHand, ChannelRoles, TipStatus
 from afspm.plugins.web.frames import ChannelFrame
-from afspm.record.overview import Overview, ScanSummary
+from afspm.record import Overview, ScanSummary
 
 Facts = list[tuple[str, str]]
 """Pairs of label and text."""

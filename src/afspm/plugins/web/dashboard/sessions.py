@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from afspm.basics.plain_data import from_json
-from afspm.storage.atomic import replace_file
+from afspm import replace_file
+from afspm.basics import from_json
 
 if TYPE_CHECKING:
     from itsdangerous import URLSafeSerializer

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from nicegui import context, ui
 
-from afspm.basics.formatting import time_of_day
+from afspm import open_run
+from afspm.basics import time_of_day
 from afspm.plugins.web.dashboard.access import Visitor
 from afspm.plugins.web.dashboard.actions import Steering
-from afspm.record.report import shadow
-from afspm.record.run import open_run
+from afspm.record import shadow_report as shadow
 
 
 class ShadowMarks:

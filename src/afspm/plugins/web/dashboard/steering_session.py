@@ -9,7 +9,7 @@ from pathlib import Path
 
 from nicegui import background_tasks, context, ui
 
-from afspm.basics.formatting import time_of_day
+from afspm.basics import time_of_day
 from afspm.plugins.web.dashboard.access import Visitor
 from afspm.plugins.web.dashboard.actions import Action, ActionResult, Steering
 from afspm.plugins.web.dashboard.content import Content

@@ -15,7 +15,7 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import Request
 from starlette.responses import Response
 
-from afspm.basics.plain_data import Plain
+from afspm.basics import Plain
 from afspm.plugins.web.asgi import AsgiApp
 from afspm.plugins.web.gateway.command_routes import CommandRoutes
 from afspm.plugins.web.gateway.guard import GatewayGuard, answer

@@ -11,9 +11,8 @@ from fastapi.security import HTTPBasic, HTTPBearer
 from starlette.requests import Request
 from starlette.responses import Response as HttpResponse
 
-from afspm.basics.errors import AfspmError
-from afspm.basics.plain_data import Plain
-from afspm.client.targets import ScanTarget, SpectrumTarget, Target, xy_of
+from afspm import ScanTarget, SpectrumTarget, Target, xy_of
+from afspm.basics import AfspmError, Plain
 from afspm.model import WAIT_FOR_CONTROL, ControlMode, ControlState, Region, Response, names
 from afspm.plugins.web.gateway.measurements import Measurement
 from afspm.plugins.web.gateway.models import (

@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 
 from google.protobuf.message import Message
 
-from afspm import wire
-from afspm.basics.clock import iso_utc
-from afspm.basics.errors import AfspmError, WireError
+from afspm import open_run, to_plain, wire
+from afspm.basics import AfspmError, WireError, iso_utc
 from afspm.model import (
     ControlResponse,
     ControlState,
@@ -28,10 +27,8 @@ from afspm.model import (
     ScopeStatus,
     Spectrum,
 )
-from afspm.model.snapshot import to_plain
-from afspm.record.journal import JOURNAL_FILE
-from afspm.record.run import open_run
-from afspm.storage.packet_log import log_folder, logged_packets
+from afspm.processes import log_folder, logged_packets
+from afspm.record import JOURNAL_FILE
 
 _log = logging.getLogger("afspm.plugins.web.gateway")
 

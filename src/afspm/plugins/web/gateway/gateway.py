@@ -6,14 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
-from afspm.basics.addresses import Listens
-from afspm.basics.clock import ExperimentClock
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError, ExperimentClock, Listens
 from afspm.model import Frame
 from afspm.plugins.web.component import WebComponent
 from afspm.plugins.web.passwords import Passwords, is_loopback
 from afspm.plugins.web.watch import Bell
-from afspm.record.run_json import experiment_name
+from afspm.record import experiment_name
 
 MOST_REQUESTS = 200
 

@@ -12,17 +12,14 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from afspm.basics.plain_data import Plain
-from afspm.client.cycle import Cycle, CycleOutcome
-from afspm.client.measurement import BEGUN_WITHIN_S
-from afspm.client.targets import ScanTarget, Target, target_from
+from afspm import BEGUN_WITHIN_S, Cycle, CycleOutcome, Memory, ScanTarget, Target, target_from
+from afspm.basics import Plain
 from afspm.model import ControlResponse, Response, Scan, ScopeStatus, Spectrum
 from afspm.model.sessions import KEYED
 from afspm.plugins.web.gateway.models import MeasurementModel, MeasurementState
 from afspm.plugins.web.gateway.problems import RefusalCode, RefusalModel, RefusedRequest, refused
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.watch import Watch
-from afspm.storage.memory import Memory
 
 MOST_KEPT = 10_000
 """Measurements that are remembered, newest first: a client may begin an older key again."""

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
 
 from afspm import wire
-from afspm.model.events import LONGEST_NOTE
+from afspm.model import LONGEST_NOTE
 from afspm.plugins.web.gateway.problems import RefusalModel
 
 LONGEST_LEASE_S = 3600.0

@@ -7,9 +7,9 @@ from http import HTTPStatus
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from afspm.basics.errors import AfspmError, ExperimentEnded, NoResponse
+from afspm.basics import AfspmError, ExperimentEnded, NoResponse
 from afspm.model import HAS_ENDED, ControlResponse, Response, ResponseDetail
-from afspm.transport.process.parent import StopRequested
+from afspm.processes import StopRequested
 
 
 class RefusalCode(Enum):

@@ -10,11 +10,9 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import wire
-from afspm.basics.clock import iso_utc
-from afspm.client.parameter_text import from_parameter
+from afspm import Levelling, from_parameter, levelled, wire
+from afspm.basics import iso_utc
 from afspm.model import Region, Response, names
-from afspm.model.line_levelling import Levelling, levelled
 from afspm.plugins.web.frames import number_or_none
 from afspm.plugins.web.gateway.models import (
     ArrayModel,
@@ -25,8 +23,7 @@ from afspm.plugins.web.gateway.models import (
     ScanModel,
     SpectrumModel,
 )
-from afspm.record.drawing.raster import indices, png, value_range
-from afspm.record.overview import Overview, ScanSummary, SpectrumSummary
+from afspm.record import Overview, ScanSummary, SpectrumSummary, indices, png, value_range
 
 CHUNK_BYTES = 3 << 16  # a multiple of three, so that pieces of base64 fit together
 

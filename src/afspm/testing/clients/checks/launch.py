@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from afspm.basics.exit_codes import ExitCode
-from afspm.model import OTHER_RUN_RESPONSE
+from afspm.model.requests import OTHER_RUN_RESPONSE
 from afspm.testing.clients.bench import BEAT_S, TOKEN, ClientBench
 from afspm.testing.clients.client_suite import client_check
 from afspm.testing.clients.heartbeats import BeatRecorder

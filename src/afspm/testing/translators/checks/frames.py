@@ -4,17 +4,8 @@ from __future__ import annotations
 
 import math
 
-from afspm.model import (
-    ControlRequest,
-    Feedback,
-    ProbePosition,
-    Region,
-    RegionChange,
-    ScanParameters,
-    ScopeState,
-    ShapeChange,
-    names,
-)
+from afspm.model import ControlRequest, Feedback, ProbePosition, Region, RegionChange, ScanParameters, ScopeState, names
+from afspm.model.scan import ShapeChange
 from afspm.testing.conformance import Failed, Skipped, expect, near
 from afspm.testing.translators.client import Observation, describe_all, states
 from afspm.testing.translators.measuring import CheckMeasurements, FrameSetting, difference, number

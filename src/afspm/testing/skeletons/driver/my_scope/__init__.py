@@ -11,10 +11,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from afspm.basics.clock import Clock
-from afspm.basics.errors import FileError
+from afspm.basics import Clock, FileError
+from afspm.driver import Driver, Value, action
 from afspm.model import Region, Scan, ScopeState, ScopeStatus, Spectrum, names
-from afspm.translator import Driver, Value, action
 
 
 class MyScope(Driver):

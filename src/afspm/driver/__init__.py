@@ -1,0 +1,122 @@
+"""The door for authors of drivers: what a driver of a maker's controller is made of.
+
+A driver is a class derived from `Driver` with a table of parameters. It reads and sets their values, starts and stops
+measurements, and returns their results; `docs/how-to/write-a-driver.md` goes through it in order. Nothing is defined
+here: each name is imported from its module when it is first used.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from afspm.basics.lazy import lazily
+
+if TYPE_CHECKING:
+    from afspm.storage.formats import hdf5_reading
+    from afspm.storage.formats.content import FileContent, OtherFormat, local_ns, name_and_unit, text_of
+    from afspm.translator.activity import Activity, TipWay
+    from afspm.translator.driver import Driver
+    from afspm.translator.driver_base import ControllerLost, action, connected
+    from afspm.translator.folder_files import FolderFiles
+    from afspm.translator.long_call import ANSWERS_S, LongCall
+    from afspm.translator.parameters import FEEDBACK_ON, Value
+    from afspm.translator.result_files import (
+        SCAN,
+        Content,
+        Entry,
+        FilePrecision,
+        ResultFiles,
+        as_list,
+        as_region,
+        lines_missing,
+        modified_ns,
+        read_result,
+    )
+    from afspm.translator.setting_groups import (
+        FRAME,
+        POSITION,
+        KeptSettings,
+        SettingsGroup,
+        check_speed,
+        frame,
+        frame_values,
+    )
+    from afspm.translator.shadow import ShadowDriver, refusal, require_question
+    from afspm.translator.state import Kept
+    from afspm.translator.tcp import Receiver, TcpConnection, host_and_port
+    from afspm.translator.zmq_connection import ZmqConnection
+
+if TYPE_CHECKING:  # one maker's controller has it today, and another's may
+    from afspm.storage.formats import igor, netcdf, read
+    from afspm.storage.formats.content import clock_ns
+    from afspm.translator.driver_base import LOST, Introduction
+    from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
+    from afspm.translator.parameters import ParameterSpec, ParameterTable, refuse_value
+    from afspm.translator.result_files import NEW_FRAME, XY, missing_text, newest
+    from afspm.translator.trace import TCP, TRACE
+
+__all__ = [
+    "ANSWERS_S",
+    "FEEDBACK_ON",
+    "FRAME",
+    "LOST",
+    "NEW_FRAME",
+    "POSITION",
+    "SCAN",
+    "TCP",
+    "TRACE",
+    "XY",
+    "Activity",
+    "Content",
+    "ControllerLost",
+    "Driver",
+    "Entry",
+    "FileContent",
+    "FileFacts",
+    "FilePrecision",
+    "FolderFiles",
+    "Introduction",
+    "Kept",
+    "KeptSettings",
+    "LongCall",
+    "OtherFormat",
+    "ParameterSpec",
+    "ParameterTable",
+    "Receiver",
+    "ResultFiles",
+    "SettingsGroup",
+    "ShadowDriver",
+    "TcpConnection",
+    "TipWay",
+    "Value",
+    "ZmqConnection",
+    "action",
+    "as_list",
+    "as_region",
+    "check_speed",
+    "clock_ns",
+    "connected",
+    "encode_scan",
+    "encode_spectrum",
+    "frame",
+    "frame_values",
+    "hdf5_reading",
+    "host_and_port",
+    "igor",
+    "lines_missing",
+    "local_ns",
+    "missing_text",
+    "modified_ns",
+    "name_and_unit",
+    "netcdf",
+    "newest",
+    "read",
+    "read_result",
+    "refusal",
+    "refuse_value",
+    "require_question",
+    "text_of",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazily(__name__)

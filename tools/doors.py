@@ -1,0 +1,189 @@
+"""Holds plug-ins to the doors of the core: `python tools/doors.py`, and writes their page for tools/docs.py.
+
+A door is a package whose `__init__` lists what others may use. A plug-in, or a distribution in packages/, imports
+doors, its own folder, and the modules of PAST_THE_DOORS, a list that may only get shorter.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Final, get_origin
+
+ROOT = Path(__file__).resolve().parents[1]
+CORE = ROOT / "src" / "afspm"
+DOORS: Final = {
+    "afspm": "components and scripts",
+    "afspm.basics": "all: errors, units, quantities as text, clocks, plain data",
+    "afspm.model": "all: scans, spectra, regions, states, requests",
+    "afspm.driver": "drivers of controllers",
+    "afspm.emulation": "emulated controllers",
+    "afspm.record": "readers, pictures and reports of recorded nights",
+    "afspm.scheduler": "coordinate frames, approvals, replays",
+    "afspm.processes": "pages, gateways, bridges, commands",
+    "afspm.testing": "tests of any of these",
+}
+WHOLE: Final = {"afspm", "afspm.basics", "afspm.model", "afspm.testing"}
+"""Doors for authors outside this tree, or with whole families of data and errors: a name may have one user here."""
+MOST_NAMES: Final = 80
+PAST_THE_DOORS: Final = {
+    "afspm.client.port_log": "what_if",
+    "afspm.experiment.document": "published",
+    "afspm.experiment.findings": "published",
+    "afspm.experiment.parts": "published what_if",
+    "afspm.experiment.resolved_experiment": "published",
+    "afspm.experiment.toml_lines": "published",
+    "afspm.experiment.toml_writer": "published",
+    "afspm.experiment.wiring_classes": "published",
+    "afspm.model.fencing": "published",
+    "afspm.model.sessions": "published web",
+    "afspm.scheduler.events": "what_if",
+    "afspm.scheduler.publishing.envelopes": "published",
+    "afspm.scheduler.step_log": "what_if",
+    "afspm.storage.disk": "what_if",
+    "afspm.storage.line_log": "what_if",
+    "afspm.storage.memory": "what_if",
+    "afspm.supervisor.process": "published",
+    "afspm.supervisor.run_folder": "replay",
+    "afspm.translator.requests": "published",
+    "afspm.transport.process.signals": "replay",
+    "afspm.wire": "agent drift published replay web what_if",
+    "afspm.wire.messages": "drift line_watch published web",
+    "afspm_nion.microscope": "afspm-nion",
+}
+"""Modules behind the doors that plug-ins still import, with these plug-ins."""
+
+
+def main() -> int:
+    """Print what is wrong with the doors and their use; return the exit code."""
+    wrong = [*_wrong_imports(), *_wrong_doors()]
+    sys.stdout.writelines(f"{line}\n" for line in wrong)
+    return int(bool(wrong))
+
+
+def plug_in_interface() -> str:
+    """Return the tables of all doors."""
+    lines = []
+    for door, of in DOORS.items():
+        lines += [f"## `{door}`: {of}", "", "| name | |", "| --- | --- |"]
+        lines += [f"| `{name}` | {_about(door, name)} |" for name in sorted(_names(door), key=str.casefold)]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def past_the_doors() -> dict[str, set[str]]:
+    """Return each module of the core that is no door, with the plug-ins that import it."""
+    past: dict[str, set[str]] = defaultdict(set)
+    for plug_in, module, name in _used():
+        target = f"{module}.{name}" if _file(f"{module}.{name}") else module
+        if target not in DOORS:
+            past[target].add(plug_in)
+    return past
+
+
+def _wrong_imports() -> Iterator[str]:
+    past = past_the_doors()
+    for module, plug_ins in sorted(past.items()):
+        for plug_in in sorted(plug_ins - set(PAST_THE_DOORS.get(module, "").split())):
+            yield f"{plug_in} imports {module}, which is behind a door: see docs/reference/plug-in-interface.md"
+    for module, listed in PAST_THE_DOORS.items():
+        for plug_in in sorted(set(listed.split()) - past.get(module, set())):
+            yield f"{plug_in} no longer imports {module}: strike it from the list in tools/doors.py"
+
+
+def _wrong_doors() -> Iterator[str]:
+    users: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for plug_in, module, name in _used():
+        users[module, name].add(plug_in)
+    for door in DOORS:
+        names = _names(door)
+        if len(names) > MOST_NAMES:
+            yield f"{door} has {len(names)} names, more than {MOST_NAMES}: move what one plug-in alone needs"
+        if unlisted := {name for _, name, _ in _homes(door)} ^ set(names):
+            yield f"{door}: __all__ and its imports differ in {', '.join(sorted(unlisted))}"
+        yield from (f"{door}.{name} has no docstring" for name in names if not _about(door, name))
+        if door in WHOLE:
+            continue
+        for _, name, has_reason in _homes(door):
+            if not has_reason and len(users[door, name]) < 2:
+                yield f"{door}.{name} has {len(users[door, name])} user: give a reason, beside `if TYPE_CHECKING:`"
+
+
+def _used() -> Iterator[tuple[str, str, str]]:
+    """Yield (plug-in, module of the core, name) for each import of a plug-in."""
+    folders = [(file, file.relative_to(CORE).parts[1]) for file in (CORE / "plugins").rglob("*.py")]
+    for file in (ROOT / "packages").glob("*/src/**/*.py"):
+        folders.append((file, file.relative_to(ROOT / "packages").parts[0]))
+    for file, plug_in in folders:
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.ImportFrom) or not (module := node.module or "").startswith("afspm"):
+                continue
+            if not module.startswith("afspm.plugins"):
+                yield from ((plug_in, module, alias.name) for alias in node.names)
+
+
+def _homes(door: str) -> Iterator[tuple[str, str, bool]]:
+    """Yield (module, name, whether a reason is given) for each name that a door imports."""
+    file = _file(door)
+    assert file is not None
+    source = file.read_text(encoding="utf-8")
+    lines = source.splitlines()
+    for block in ast.parse(source).body:
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING":
+            for node in block.body:
+                assert isinstance(node, ast.ImportFrom)
+                for alias in node.names:
+                    yield node.module or "", alias.asname or alias.name, "#" in lines[block.lineno - 1]
+
+
+@cache
+def _names(door: str) -> list[str]:
+    return list(importlib.import_module(door).__all__)
+
+
+def _file(module: str) -> Path | None:
+    path = ROOT / "src" / Path(*module.split("."))
+    return next((f for f in (path / "__init__.py", path.with_suffix(".py")) if f.is_file()), None)
+
+
+def _about(door: str, name: str) -> str:
+    thing = getattr(importlib.import_module(door), name)
+    if inspect.ismodule(thing) or inspect.isclass(thing) or inspect.isfunction(thing):
+        text = (inspect.getdoc(thing) or "").partition("\n")[0]
+        if inspect.isclass(thing) and "dataclass" not in text and text.startswith(f"{name}("):
+            text = ""  # the signature that Python writes in place of a docstring
+        text = text or _of_constant(door, name)  # a type under a name of its own
+    else:
+        text = _of_constant(door, name) or ("a type" if get_origin(thing) else f"`{_short(thing)}`")
+    return text.replace("|", "\\|")
+
+
+def _of_constant(door: str, name: str) -> str:
+    """Return the text under the assignment of a constant or a type in its module, "" if there is none."""
+    home = next((module for module, own, _ in _homes(door) if own == name), None)
+    file = _file(home) if home else None
+    body = ast.parse(file.read_text(encoding="utf-8")).body if file else []
+    for node, after in pairwise(body):
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        if any(isinstance(target, ast.Name) and target.id == name for target in targets):
+            text = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else ""
+            return str(text).partition("\n")[0]
+    return ""
+
+
+def _short(thing: object) -> str:
+    text = repr(thing)
+    if " at 0x" in text:  # an address of this run
+        return type(thing).__name__
+    return text if len(text) <= 60 else text[:59] + "…"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
