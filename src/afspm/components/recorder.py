@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import math
 import tomllib
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.plain_data import Plain
 from afspm.client.component import Component
-from afspm.model import Frame
+from afspm.model import Frame, ProblemNames, ProcessStates
 from afspm.record.run_json import EXPERIMENT_FILE, METADATA, experiment_name, run_json_or_empty
-from afspm.storage.packet_log import log_folder
+from afspm.storage.packet_log import LogReader, commit, committed, log_folder
 from afspm.storage.segment import segments
 from afspm.transport.port import Killed, PacketReceived, ParentGone
 from afspm.transport.process.context import step_back
 
 if TYPE_CHECKING:
+    from afspm.basics.clock import Clock
+    from afspm.basics.launch import Launch
     from afspm.record.store import RecordSettings
     from afspm.transport.process.context import ProcessContext
 
@@ -25,6 +28,7 @@ REST_S = 0.5
 """Shortest real time to stay after the end of the experiment, for the last packets of other components."""
 LONGEST_REST_S = 30.0
 """Longest real time to stay after the end; usually the supervisor ends the recorder before."""
+MOST_LAST_BYTES = 1 << 20
 SIGNS_OF_LIFE = ("ControlState",)
 """The subscription to a scheduler whose log is read: only a sign that the scheduler is alive."""
 
@@ -63,7 +67,7 @@ class Recorder(Component):
         writer = RecordWriter(
             run_dir,
             log,
-            _about(context, run_dir, scans=self.scans),
+            _settings(launch, context.clock, scans=self.scans),
             context.clock,
             context.log,
             step=context.activity.step,
@@ -100,10 +104,42 @@ class Recorder(Component):
             port.close()
 
 
-def _about(context: ProcessContext, run_dir: Path, *, scans: bool) -> RecordSettings:
+def record_last_reports(launch: Launch, clock: Clock) -> None:
+    """Record the reports of processes that came after a recorder's end, so that its run needs no packet log any more.
+
+    The last report, that the recorder itself has ended, always comes too late for it. If the log holds anything else
+    that is not recorded, or the recorder's class is a user's own, nothing is done, and the log stays.
+
+    Args:
+        launch: the recorder's launch line.
+
+    Raises:
+        OSError: the log can't be read, or the disk is full.
+        FileError, sqlite3.Error: the journal is damaged.
+    """
+    from afspm.record.journal import SCHEDULER
+    from afspm.record.store import RecordStore
+
+    log = log_folder(Path(launch.state_dir or launch.run_dir))
+    position = committed(log)
+    if launch.class_ != f"{Recorder.__module__}.{Recorder.__name__}" or position is None:
+        return
+    left = LogReader(log, position).read(MOST_LAST_BYTES)
+    packets = [entry.packet for entry, _ in left]
+    if not left or any(packet.envelope.partition("_")[0] != ProcessStates.__name__ for packet in packets):
+        return
+    settings = _settings(launch, clock, scans=bool(launch.settings.get("scans", True)))
+    with closing(RecordStore(Path(launch.run_dir), settings)) as store:
+        store.take((packet, SCHEDULER) for packet in packets)
+        store.sync()
+        commit(log, left[-1][1])
+        store.settle()
+
+
+def _settings(launch: Launch, clock: Clock, *, scans: bool) -> RecordSettings:
     from afspm.record.store import RecordSettings
 
-    launch = context.launch
+    run_dir = Path(launch.run_dir or ".")
     frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
     facts: Plain = {
         "experiment": experiment_name(run_dir),
@@ -113,7 +149,8 @@ def _about(context: ProcessContext, run_dir: Path, *, scans: bool) -> RecordSett
         "frame": frame.value,
         METADATA: run_json_or_empty(run_dir).get(METADATA, {}),
     }
-    return RecordSettings(facts, context.problems, frame, measured=scans, speed=1.0 / context.clock.real_s(1.0))
+    problems = ProblemNames(launch.problems)
+    return RecordSettings(facts, problems, frame, measured=scans, speed=1.0 / clock.real_s(1.0))
 
 
 def _seeds(file: Path) -> Plain:

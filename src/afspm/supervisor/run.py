@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import platform
+import sqlite3
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
@@ -13,7 +14,7 @@ from typing import TextIO
 
 from afspm.basics.addresses import connectable
 from afspm.basics.clock import ExperimentClock
-from afspm.basics.errors import ConfigError
+from afspm.basics.errors import AfspmError, ConfigError
 from afspm.basics.formatting import counted, duration_text
 from afspm.basics.launch import Launch, Sockets
 from afspm.client.connect import GUEST, guest_facts
@@ -52,6 +53,7 @@ RUN, HOW, FILES, ONLY, WITHOUT = "run", "how", "files", "only", "without"
 
 # a hanging disk must not keep the supervisor from ending
 WRITTEN_WITHIN_S = 5.0
+RECORDED_WITHIN_S = 40.0
 
 
 CLOCK_FILE = "clock"
@@ -169,11 +171,23 @@ def go(
         except OSError as error:  # a full disk must not prevent the notification of the end
             log.write(LOGGED_AS, logging.ERROR, f"how it ended is not in run.json: {error}")
         if outcome.why.is_final:
+            recorders = [start.launch for start in starts if start.launch.name in experiment.recorders]
             with suppress(OSError):  # leftover files only take space
-                run_bounded(lambda: discard_if_recorded(log_folder(folder / STATE_DIR)), WRITTEN_WITHIN_S)
+                run_bounded(lambda: _discard_log(folder, recorders, clock, log), RECORDED_WITHIN_S)
         ended = EndedRun(name, folder, outcome, common.simulated)
         post_run.follow(experiment, ended, starts, clock, log, with_report=options.report)
     return FinishedRun(folder, outcome)
+
+
+def _discard_log(folder: Path, recorders: Sequence[Launch], clock: ExperimentClock, log: RunLog) -> None:
+    from afspm.components.recorder import record_last_reports
+
+    try:
+        for launch in recorders:
+            record_last_reports(launch, clock)
+    except (AfspmError, OSError, sqlite3.Error) as error:
+        log.write(LOGGED_AS, logging.WARNING, f"the last reports of processes are not in the record: {error}")
+    discard_if_recorded(log_folder(folder / STATE_DIR))
 
 
 def _ahead_of_wall(clock: ExperimentClock) -> str:

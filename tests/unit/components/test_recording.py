@@ -26,7 +26,19 @@ from afspm.basics.exit_codes import ExitCode
 from afspm.basics.launch import Launch
 from afspm.components import recorder, recording
 from afspm.components.recording import RecordWriter
-from afspm.model import ControlMode, ControlState, LoggedPacket, LogLine, Packet, Region, Scan, ScanLines
+from afspm.model import (
+    ControlMode,
+    ControlState,
+    LoggedPacket,
+    LogLine,
+    Packet,
+    ProcessCondition,
+    ProcessState,
+    ProcessStates,
+    Region,
+    Scan,
+    ScanLines,
+)
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.storage.packet_log import LogReader, PacketLog, committed, expect_recorder
@@ -314,6 +326,23 @@ def test_writer_wakes_the_port_that_is_open_now(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(recorder, "step_back", lambda: None)
     assert recorder.Recorder().run_process(context) == ExitCode.ORPHAN
     assert [port.woken for port in ports] == [1, 1]
+
+
+@pytest.mark.parametrize("late", [[], [control(5)]], ids=["reports alone", "and control"])
+def test_reports_after_the_recorder_has_ended_are_recorded_unless_more_is_missing(
+    bench: Bench, late: list[Packet]
+) -> None:
+    bench.publish(control(1))
+    bench.writer().finish(ended=True)
+    states = ProcessStates(4, "afspm", (ProcessState("recorder", "component", ProcessCondition.ENDED, 3),))
+    bench.publish(Packet("ProcessStates_afspm", wire.encode(states)[1], 4), *late)
+    launch = Launch(
+        "recorder", "afspm.components.recorder.Recorder", run_dir=str(bench.folder), state_dir=str(bench.packets.parent)
+    )
+    recorder.record_last_reports(launch, ExperimentClock.real())
+    assert bench.is_committed is not bool(late)
+    with afspm.open_run(bench.folder) as run:
+        assert [packet.time_ns for packet in run.packets()] == ([1] if late else [1, 4])
 
 
 class _Disk:
