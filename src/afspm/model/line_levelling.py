@@ -12,6 +12,7 @@ Mask = NDArray[np.bool_]
 # standard deviation of a normal distribution, in median absolute deviations
 _SD_PER_MAD = 1.4826
 _OUTLIERS_SD = 4.0
+_NO_NOISE = 1e-12
 _LINE_LEFT = 0.01
 """Largest line that is left in a row, in parts of the row's spread, if a line was subtracted from it."""
 _LEAST_ROWS = 16
@@ -80,7 +81,9 @@ def _are_lines_subtracted(values: Array, finite: Mask) -> bool:
     if len(whole) < _LEAST_ROWS or whole.shape[1] < _LEAST_ROWS:
         return False
     line = _lines(whole, np.ones(whole.shape, dtype=bool))
-    ratio = line.std(axis=1) / np.maximum((whole - line).std(axis=1), np.finfo(np.float64).tiny)
+    left = (whole - line).std(axis=1)
+    # a row without noise is computed, not measured: it counts as a row with its line
+    ratio = np.divide(line.std(axis=1), left, out=np.ones(len(left)), where=left > _NO_NOISE * np.abs(whole).max())
     return bool(np.percentile(ratio, 95.0) < _LINE_LEFT)
 
 
@@ -108,7 +111,7 @@ def _robust_lines(steps: Array, there: Mask) -> Array:
     for _ in range(_ROUNDS):
         left = np.abs(steps - lines)
         usual = np.median(left, axis=1, keepdims=True)
-        lines = _lines(steps, there / np.maximum(left, 0.05 * usual + np.finfo(np.float64).tiny))
+        lines = _lines(steps, there / np.maximum(left, np.where(usual > 0.0, 0.05 * usual, 1.0)))
     reach = _OUTLIERS_SD * _SD_PER_MAD * np.median(np.abs(steps - lines)[there]) if there.any() else 0.0
     for _ in range(_ROUNDS if reach > 0.0 else 0):
         part = np.minimum(np.abs(steps - lines) / reach, 1.0)

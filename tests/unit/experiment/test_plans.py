@@ -54,8 +54,7 @@ def test_impossible_plan_is_an_error_at_its_line(write: Write, plan: str, settin
     error = only_error(experiment)
     assert what in error.what
     assert hint in error.hint
-    of_all = "apart" in what  # of spacing and counts together
-    assert error.place.line == line_of(experiment, "[grid]" if of_all else setting.split(" ")[0])
+    assert error.place.line == line_of(experiment, setting.split(" ")[0])
 
 
 @pytest.mark.parametrize("setting", ["every = 0", 'every = "0 s"', 'every = "15 min"', "end_when_done = false"])

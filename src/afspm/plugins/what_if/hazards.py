@@ -31,7 +31,7 @@ _CLOCKS = {"time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf
 _SILENT = ("logging", "tempfile", "threading", "importlib", "traceback", "linecache")
 """Modules of Python that read clocks, random bytes and files for purposes of their own."""
 _READS_ENVIRONMENT = type(os.environ).__getitem__.__code__
-"""Code of the method through which `os.environ[…]`, `os.environ.get` and `os.getenv` read."""
+"""Code of the method through which `os.environ[…]`, its `get`, and the function getenv of `os` read."""
 _IMPORT = "<frozen importlib"
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_TRUNC
 _PROGRAMS = {"subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "os.startfile"}
