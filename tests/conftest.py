@@ -49,7 +49,9 @@ SLOW = (
     "tests/docs/test_notebook_page.py",
     "tests/docs/test_snippets.py",
 )
-"""Where the tests of `make test-all` are: they start processes, a browser or whole experiments, and wait for them."""
+"""Where the tests of `make test-all` are: they start processes, a browser or whole experiments, and wait for them.
+
+All tests together would hold up a change for 25 to 40 minutes. `make test` finds most mistakes soonest."""
 SLOW_MODULES = ("_faults.py",)
 """Of the tests of controllers, those that wait for timeouts in real time."""
 QUICK = ("tests/system/scheduler/", "tests/system/supervisor/", "tests/system/process/")

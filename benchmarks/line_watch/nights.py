@@ -1,7 +1,7 @@
 """Simulated nights for the watch on running scans: surfaces, drift, tips and noise are drawn, in two halves.
 
 A night has three scans to learn from, then good scans with a planted hard negative each, then a scan during which the
-tip changes. All tuning uses the half "fitted"; figures are from the half "unseen" (decision 0053).
+tip changes. All tuning uses the half "fitted"; figures are from the half "unseen".
 
 A change is visible if, without noise, it changes at least a quarter of the 20 rows after it by more than the white
 noise (rms of a levelled row). A blunt tip on flat terraces is no visible change.

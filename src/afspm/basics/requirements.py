@@ -3,7 +3,9 @@
     class Ridges(Component):
         requires = ("afspm[features]", "torch>=2.4")
 
-`afspm check` and `afspm run` report missing packages before anything starts.
+`afspm check` and `afspm run` report missing packages before anything starts. Only the metadata of installed packages is
+read, so a check imports no large package. A table in afspm would not know the classes of other packages. A caught
+ImportError appears first when the class runs, in the worst case at the end of the night.
 """
 
 from __future__ import annotations

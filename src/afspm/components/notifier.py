@@ -1,4 +1,8 @@
-"""`Notifier`: the component that notifies people during the experiment; in every experiment with [notify]."""
+"""`Notifier`: the component that notifies people during the experiment; in every experiment with [notify].
+
+Notifications come from a component and not from a thread of the supervisor: a failure there would end the experiment,
+while a component is restarted, and keeps undelivered notifications on disk.
+"""
 
 from __future__ import annotations
 

@@ -40,7 +40,11 @@ from afspm.transport.process.loading import find_object
 
 MAPPING = "DriftMapping"
 LEAST_ZOOM_PX = 20
-"""Least width of a zoom in pixels of the survey: narrower zooms are often not registered, below 8 px never."""
+"""Least width of a zoom in pixels of the survey: narrower zooms are often not registered, below 8 px never.
+
+Of zooms 13 px wide 22 % were registered, of zooms 20 px wide 60 %. In 23 of 24 surveys of particles with 208 pixels,
+all 12 scans were registered; with 128 pixels 5 to 7 of 12. The survey takes finer pixels, since the size of zooms is
+the user's choice; above 512 pixels a registration would take seconds."""
 USUAL_PX, MOST_PX, _STEP_PX = 128, 512, 16
 
 

@@ -1,4 +1,8 @@
-"""Import of the classes named in an experiment file by `class = "module.Name"`, for its check and its start."""
+"""Import of the classes named in an experiment file by `class = "module.Name"`, for its check and its start.
+
+Only `class` and the few keys of the reference that name a function are imported; all other text stays text. The
+published implementation imports any text with a dot, so `path = "scans.night"` can run a module.
+"""
 
 from __future__ import annotations
 

@@ -207,6 +207,8 @@ class LogLines:
 class Progress:
     """The progress of the component `name` with its task.
 
+    Progress is no journal entry: its entries would hide the events, and only the last of each component matters.
+
     Attributes:
         done, of: number of finished parts, and of all parts.
         left_s: experiment time until the end at the present rate; None if unknown.

@@ -138,7 +138,11 @@ class Request:
 
 
 class ResponseDetail(IntEnum):
-    """A detail for programs beside the code of a response; numbers as on the wire."""
+    """A detail for programs beside the code of a response; numbers as on the wire.
+
+    Programs never parse the reason, whose text may change. A detail is no further ControlResponse: an old client would
+    not know whether that is a success. Receivers ignore unknown frames and take an unknown detail for NONE.
+    """
 
     NONE = 0
     NOT_SENT = 1

@@ -1,4 +1,9 @@
-"""The rule that marks a scan as bad: for tables, the report, its map, and pictures of the night."""
+"""The rule that marks a scan as bad: for tables, the report, its map, and pictures of the night.
+
+A flag follows the scan that caused it, often after another scan. In a night with three repairs, framing the scans taken
+during a flag missed the first bad scan of each repair, and framed the scan that proved it. So verdicts count, and flags
+only in a run without verdicts. Scans of the corrector are not bad as such: most of them prove that the tip is good.
+"""
 
 from __future__ import annotations
 

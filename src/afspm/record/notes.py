@@ -1,4 +1,9 @@
-"""Notes written into the record after the end of a run."""
+"""Notes written into the record after the end of a run.
+
+During a run the scheduler publishes a note, so it is in the packet log before its author gets the answer. Journal
+entries are gathered for a tenth of a second, which a kill may lose, and a separate file of notes would be unknown to
+replay, late joiners and other computers. Files of scans are never rewritten, so they contain no notes.
+"""
 
 from __future__ import annotations
 

@@ -5,6 +5,11 @@
 place. The shell around the function (`shell`) turns messages into events. It writes the effects to disk
 (`write_ahead`), and then carries them out.
 
+Each part of the state is a frozen dataclass, and its transitions are methods, which return the next part: half as long
+as an event class for each transition, and type-checked at each call. After a step the saved parts are compared with the
+parts before, and a difference becomes the first effect, so no decision has to remember saving. This costs 50 µs for
+each request. The packet cache changes in place, since a copy for each packet would cost more than all decisions.
+
     comes in      requests of components; packets and answers of the translator; connections; time
     state         `SchedulerState`: control, problems, the queue to the translator, values in force, lease, event log;
                   frozen, replaced at every step

@@ -141,6 +141,8 @@ def _times(count: int) -> str:
 def report(folder: Path, log: RunLog) -> None:
     """Write the report of a recorded run, in a separate process; log a failure.
 
+    A crash of a plotting library then costs the report, not the exit code of the run.
+
     The process is given up only if it has used no processor for `REPORT_STALLED_S`, as on a disk that hangs: on a busy
     computer the report of a long night takes long.
     """

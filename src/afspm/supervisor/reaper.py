@@ -1,7 +1,8 @@
 """The reaper: a process that waits for the supervisor's end, and kills processes left behind by a killed supervisor.
 
 A child normally ends by itself at the end of its standard input. A child that can't notice that (a library holds
-Python's lock), or that has children of its own, is killed from here some seconds later.
+Python's lock), or that has children of its own, is killed from here some seconds later. Linux's parent-death signal
+would leave no time to retract the tip, and macOS has none.
 """
 
 from __future__ import annotations

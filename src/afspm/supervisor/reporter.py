@@ -1,6 +1,7 @@
 """The reporter of process states and log lines to the scheduler, which answers with orders.
 
-The reporter has a thread of its own, so that a slow or dead scheduler never delays the supervisor.
+The reporter has a thread of its own, so that a slow or dead scheduler never delays the supervisor. The supervisor opens
+no port: the scheduler publishes all reports, so record, page and late joiners need no connection to a supervisor.
 """
 
 from __future__ import annotations

@@ -1,6 +1,9 @@
 """Sockets between processes: packets, requests and answers, keys, heartbeats. The only package that uses ZeroMQ.
 
-**Theory of operation.** Packets flow one way, requests the other.
+**Theory of operation.** Packets flow one way, requests the other. A microscope publishes some packets a second, at most
+a hundred with live lines, so the public calls of pyzmq are enough: one poller a process, and a bounded number of
+messages from a socket before the next. The ROUTER socket takes requests from its clients in turn, so a flooding client
+costs the others only a share. Queues and polling of afspm's own were faster for thousands of packets a second.
 
     inputs        packets of one publisher (`subscriber`), requests (`router`, `zmq_server`), answers (`control_client`,
                   `scheduler_sockets`)

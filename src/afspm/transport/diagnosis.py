@@ -1,4 +1,10 @@
-"""Diagnoses from the measurements of `afspm doctor`: each problem in plain terms, with its remedy."""
+"""Diagnoses from the measurements of `afspm doctor`: each problem in plain terms, with its remedy.
+
+A refused connection comes from the other computer; silence means a firewall or a computer that is off; a wrong greeting
+means another program. The scheduler's authenticator refuses an unknown key with a reason; a wrong public key of the
+scheduler ends the key exchange without one. `afspm doctor` needs no service on the other computers, which could not be
+reached when the network fails.
+"""
 
 from __future__ import annotations
 

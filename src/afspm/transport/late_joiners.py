@@ -6,6 +6,10 @@ A subscriber of afspm subscribes to a marker: a topic for this subscriber that a
 
 The publisher sends the kept packets as `[topic, envelope, message, timestamp]` and finally `[topic]` alone; the topic
 is the first part of the marker, to which only this subscriber is subscribed.
+
+The publisher's socket (XPUB in manual mode) subscribes the peer to its topic and its prefixes at once, between two
+packets. So replayed and new packets come through one pipe, in order and without a gap. A snapshot over the request
+socket would have to be joined with the live packets by time, and a replay to all subscribers reaches every component.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""State of GXSM, derived from polls: GXSM reports neither the start nor the end of a measurement."""
+"""State of GXSM, derived from polls: GXSM reports neither the start nor the end of a measurement.
+
+Recordings of Gxsm3 and Gxsm4, and the source, agree: the number in the file names (`chfname(0)`) rises when a scan
+begins, saved or not, and the lines (`y_current`) begin again. Either ends the scan before. A scan was complete if the
+row scanned last differs from the row that the memory held before; otherwise it is not published.
+"""
 
 from __future__ import annotations
 
@@ -135,6 +140,10 @@ class ConnectedGxsm:
 
 class AutosaveSwitch:
     """The switch of GXSM's Auto Save: on for scans from the panel, off for the translator's own scans.
+
+    With *Repeat* on at the panel, no poll falls between two scans, and the next scan overwrites GXSM's memory: only
+    GXSM itself can save there. Auto Save off for the whole run lost these scans, and those of a person while the
+    translator was down. The price is a whole-looking file for each scan stopped at the panel.
 
     Attributes:
         on: state set by this translator; None: unknown.

@@ -2,7 +2,9 @@
 
 The bridge listens on the loopback interface, and passes on only calls of the functions listed below. A client and the
 bridge first prove to each other that they know a secret, which is in a file that only this user can read. The secret
-itself is never sent, so a program that listens here in place of the bridge learns nothing (`Introduction`). A line that
+itself is never sent, so a program that listens here in place of the bridge learns nothing (`Introduction`). TLS would
+need certificates for a connection within one computer; a Unix socket excludes Windows and tunnels from there; a code on
+each line protects only against the administrator, who can read the secret anyway. A line that
 is neither a proof nor a call ends its connection, so that no page in a browser can command GXSM. Several clients are
 served, one call at a time. Set `script-control` to 0 to end the bridge. This file needs only the standard library.
 """

@@ -1,4 +1,8 @@
-"""State of Studio, and the measurements in progress."""
+"""State of Studio, and the measurements in progress.
+
+No command of the lowest licence reports whether a scan runs, so Studio counts its own signals, and the driver reads the
+counts. Curves, approach and withdrawal have no signals; their commands return at the end.
+"""
 
 from __future__ import annotations
 

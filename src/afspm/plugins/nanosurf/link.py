@@ -1,4 +1,8 @@
-"""Connections to Nanosurf Studio: one for quick scripts, one for each long command."""
+"""Connections to Nanosurf Studio: one for quick scripts, one for each long command.
+
+The maker's own client is no dependency: it waits for replies without a limit, takes a lost connection for a slow one,
+and writes Python files into its own folder.
+"""
 
 from __future__ import annotations
 

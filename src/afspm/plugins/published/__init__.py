@@ -21,6 +21,7 @@ have no request ids; inside, its answer has the id of the request. Subscribers o
 that a peer would miss are delayed (`version_1.Pacing`).
 
 Experiment files of the published form are converted as they are read (`files`), and `afspm check --explain` writes them
-in afspm's form (`short_form`). This module imports nothing, so that reading a file does not load the sockets of the
-bridge.
+in afspm's form (`short_form`). Code that imports published modules is not run: an imitation of these modules would
+bring back their loops and sockets, and a guess at the effect of a function would move the tip. This module imports
+nothing, so that reading a file does not load the sockets of the bridge.
 """

@@ -21,7 +21,8 @@ _NAME = re.compile(r"[\w][\w .'-]*", re.UNICODE)
 _TRIES, _TRIES_WITHIN_S = 5, 60.0
 AGAIN_S = 3.0
 """Real seconds between two checked tries, after too many wrong tries. Refusing all tries would lock out the owner of
-the right password, since any program on the same computer could try wrong passwords under the same name."""
+the right password, since any program on the same computer could try wrong passwords under the same name. Delayed
+answers instead would hold connections."""
 # bounded: addresses and wrong names are chosen by clients
 _MOST_REMEMBERED = 1000
 

@@ -38,6 +38,7 @@ def size_text(size_m: float) -> str:
     >>> size_text(2e-6), size_text(2.5e-10)
     ('2000.0', '0.25')
     """
+    # In nm for every unit of the scan: rounded metres would give scans of 5 nm and of 200 nm the same envelope.
     size_nm = size_m * 1e9
     if not math.isfinite(size_nm):
         return str(size_nm)

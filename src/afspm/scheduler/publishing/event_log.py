@@ -32,7 +32,8 @@ from afspm.scheduler.control.arbitration import ArbitrationState, ControlInput, 
 from afspm.scheduler.control.descriptions import request_text
 
 PERIOD_S = 0.1
-"""Real time from the first entry of a batch to its publication."""
+"""Real time from the first entry of a batch to its publication. A kill of the scheduler loses at most this time of
+entries; control, mode and problems are saved before they are announced."""
 MOST = 1000
 """The largest number of entries gathered within `PERIOD_S`; further requests are only counted."""
 LONGEST = 1000

@@ -198,7 +198,8 @@ class Emulator(ABC):
         """Show a button until a person presses it or it is removed. Only one button is shown at a time.
 
         A person, or a test, presses the button by deleting the file `delete-to-NAME.txt` in `folder`: so any program
-        with access to the folder can press it, inside an experiment and standalone.
+        with access to the folder can press it, inside an experiment and standalone. In an experiment the standard input
+        belongs to the supervisor, Windows has no signal for it, and a port would be a protocol that no controller has.
 
         Args:
             why: the reason to press the button, for the log and the file.

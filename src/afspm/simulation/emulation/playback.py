@@ -2,7 +2,9 @@
 
 A request (`TracedExchange.command`) must be repeated as it was recorded, in the same order. A read of the controller
 may be repeated more or less often and in another order: its frequency depends on timing. Request ids of the client are
-not compared, and secrets are left out: they differ each time.
+not compared, and secrets are left out: they differ each time. Comparing all bytes in order would fail at once;
+answering each question by its newest answer would accept a translator that starts a scan before it has set the frame.
+The trace is made at the connection and not at the driver, since drivers are mostly wrong in reading answers.
 """
 
 from __future__ import annotations

@@ -1,4 +1,10 @@
-"""Igor binary waves of version 5 (WaveMetrics, Technical Note 003, "Igor Binary Format")."""
+"""Igor binary waves of version 5 (WaveMetrics, Technical Note 003, "Igor Binary Format").
+
+The translator reads files that Asylum is still writing, so damaged and incomplete files must be refused. The package
+igor2 (0.5.15) ignores the checksum and returns other numbers after one wrong bit, takes over 2 GB of memory for a
+wrong length of a text, and needs 25 ms instead of 0.05 ms for a scan of 256² pixels with six channels. Its correct
+results are the reference of the tests.
+"""
 
 from __future__ import annotations
 

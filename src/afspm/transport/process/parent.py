@@ -1,6 +1,7 @@
 """The bond to the parent process: a pipe from the parent to the standard input of this process.
 
-The pipe closes when the parent stops the process, and when the parent dies in any way, on every system.
+The pipe closes when the parent stops the process, and when the parent dies in any way, on every system. A program in
+another language needs no library for that.
 """
 
 from __future__ import annotations

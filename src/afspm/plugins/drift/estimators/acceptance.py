@@ -1,7 +1,9 @@
 """Acceptance of a match, since even scans of different places have a best match.
 
 A logistic regression turns the evidence into the probability that the match is wrong by more than a pixel. The
-coefficients are fitted by `python -m benchmarks.drift.fit`.
+coefficients are fitted by `python -m benchmarks.drift.fit`. It replaced thirteen limits in sequence, set on one
+benchmark, which refused half of the right matches on other surfaces. Mutual information, the correlation of edges and
+of parts, and outliers of the residual added nothing to the figures below.
 """
 
 from __future__ import annotations

@@ -35,14 +35,18 @@ GAIN_SD = 1.0  # prior standard deviation of the logarithm of the gain
 BEND_SD = 0.15
 BORDER_PX = 1  # filters and splines have no data beyond the border
 FARTHEST_PX = 8.0  # largest distance of a fit from the result of the search
-TURNED = 0.03  # sine of the angle between the lines of two scans, above which the lines cross
+TURNED = 0.03
+"""Sine of the angle between the lines of two scans, above which the lines cross. Then a parabola of each line of either
+scan is unknown; otherwise scans turned by 30° were wrong with confidence (95 % ellipses held 81 %, now 91 %). It takes
+250 ms instead of 110 ms for 128 pixels. Noise counts as white there, and creep of crossing lines is not modelled."""
 ELSEWHERE_PX = 32  # largest distance of repeats with which a match is compared
 EXPECTED = 2.0
 """Factor on the allowed probability where a displacement is expected: nearly all wrong matches are of unrelated scans
 without a prior, and most doubtful right matches are zooms with one."""
 DISTRUST = 4.0
 """Factor on the noise model's variance where the images are weighed against nuisances. The factor of the ellipses,
-which grows with doubt, would give the images too little weight there."""
+which grows with doubt, would give the images too little weight there: errors on 80 stampers were 17 % larger. Constants
+from 1 to 5 differ by 6 %."""
 
 
 class LeastSquares:

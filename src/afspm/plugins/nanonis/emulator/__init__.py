@@ -21,6 +21,9 @@ _ACTS: Final = ("Start", "Action", "Set", "Pulse", "Withdraw", "StartMove", "Hom
 _LOGS_EVERY_S: Final = 0.005
 """Real time between two polls of the TCP Logger."""
 _OTHER_NAME: Final = "Util.RTFreqGet"
+# An STM with a qPlus sensor, since most users of Nanonis have an STM. As a tapping AFM with a current beside it, the
+# emulated controller passed every check of the tip with any tip. A sharp tip shows -8 Hz, a blunt one -37 Hz, a
+# contaminated one -14 Hz. Z does not depend on setpoint and bias: the simulated I(V) curves would have to, too.
 _QPLUS: Final[PlainMapping] = {"resonance_hz": 30e3, "spring_n_per_m": 1800.0, "oscillation_m": 100e-12}
 _STM: Final[PlainMapping] = {"mode": "current", "setpoint": 100e-12, "qplus": True}
 

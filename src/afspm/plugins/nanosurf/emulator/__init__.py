@@ -1,4 +1,9 @@
-"""Emulated Nanosurf Studio: its socket, its scripts in a real Lua engine, and its files, with simulated physics."""
+"""Emulated Nanosurf Studio: its socket, its scripts in a real Lua engine, and its files, with simulated physics.
+
+Scripts run in a real Lua, so that the maker's own client, its demo and its notebook run unmodified, and test more than
+the agreement of this driver with itself. The tree has the commands in them; any other command fails, as in a Studio
+without its licence. Values without effect would let a user's script end without having done anything.
+"""
 
 from __future__ import annotations
 

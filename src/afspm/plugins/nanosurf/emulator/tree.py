@@ -27,7 +27,9 @@ _SYNCHRONIZED: Final = 3
 _MEMORY: Final = 64 << 20
 """Highest memory of all scripts together, in bytes."""
 _ROOM: Final = 16 << 20
-"""Highest memory that scripts may keep after their end, in bytes."""
+"""Highest memory that scripts may keep after their end, in bytes. All scripts share one Lua, as in Studio. If
+collecting garbage does not help, a new Lua replaces it: deleting globals is not enough, since handlers of signals keep
+values."""
 _WRAPPER: Final = Path(__file__).with_name("wrapper.py.in")
 
 _SCAN_SIGNALS: Final = ("scanning_started", "scanning_finished")

@@ -1,5 +1,8 @@
 """`python -m afspm.plugins.web.dashboard.recorded`: server of the page of a recorded night, until Ctrl-C.
 
+The page reads only the run folder. A component kept alive after the end would hold the lock of a run that is over, and
+a replay to a live dashboard has one moment for all viewers and can't go back. Here each viewer has a moment.
+
 The page needs a separate process, because a process can hold only one NiceGUI application. The settings are read as one
 line of JSON from standard input; the page ends when standard input is closed.
 """

@@ -41,7 +41,8 @@ _PASSWORD = """<label for="password">Password</label>
 class Guard:
     """ASGI middleware: checks each request and each websocket, and sets scope["state"][VISITOR].
 
-    The guard refuses a wrong origin. A viewer needs the cookie, or a password as Bearer token (not in the URL).
+    The guard refuses a wrong origin. A viewer needs the cookie, or a password as Bearer token (not in the URL:
+    a link on any page would sign its reader in under the name of its author).
     """
 
     def __init__(self, app: AsgiApp, access: Access, host: str) -> None:
