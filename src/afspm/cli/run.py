@@ -139,6 +139,7 @@ def _keep_page(experiment: Experiment, ended: FinishedRun, wanted: bool | None) 
     from afspm.supervisor.supervision.run_end import EndReason
 
     started = [report.name for report in ended.outcome.reports if report.starts]
+    # without a terminal (a service, a script) no person could press Ctrl-C, and the run would never end
     if ended.outcome.why is EndReason.STOPPED or not (sys.stdout.isatty() if wanted is None else wanted):
         return
     try:

@@ -112,6 +112,7 @@ def address(webhook: str, environment: Mapping[str, str] = os.environ, *, key: s
     from urllib.parse import urlsplit
 
     where = f"[notify] {key}"
+    # the experiment file is copied into each run folder, which is passed on: a secret belongs in the environment
     if webhook.startswith("$"):
         name = webhook[1:]
         where = f"{where} = {webhook!r}"

@@ -1,4 +1,7 @@
-"""The provenance of a measurement, searched in the journal among earlier publications."""
+"""The provenance of a measurement, searched in the journal among earlier publications.
+
+The journal alone is searched, and nothing is kept in memory, so a restarted recorder finds the same provenance.
+"""
 
 from __future__ import annotations
 

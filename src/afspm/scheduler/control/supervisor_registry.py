@@ -125,6 +125,7 @@ class SupervisorRegistry:
         known = self.supervisors.get(supervisor)
         if known is None or not known.orders:
             return self, ()
+        # removed before the supervisor has acted: if both processes die, a restart is lost rather than done twice
         return replace(self, supervisors={**self.supervisors, supervisor: replace(known, orders=())}), known.orders
 
     def order(self, process: str, now_s: float) -> tuple[SupervisorRegistry, str]:

@@ -43,6 +43,7 @@ class Session:
 
 @dataclass
 class _Kept:
+    # a reader of this file can sign cookies; with the same rights it reads the run's keys, which also steer
     key: str = field(default_factory=lambda: secrets.token_urlsafe(32))
     ended: dict[str, float] = field(default_factory=dict)
     generations: dict[str, int] = field(default_factory=dict)
