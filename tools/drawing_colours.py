@@ -1,4 +1,9 @@
-"""The colours of the drawings, and their dark counterparts: without afspm, since `make docs` does not install it."""
+"""The colours of the drawings, and their dark counterparts: without afspm, since `make docs` does not install it.
+
+A drawing is kept once, in light colours, with a style that follows the reader's screen, as a forge shows it. The site
+has a switch of its own, so `make docs` makes a light and a dark file. Two files in the repository would be twice as
+much to keep equal; on a transparent background grey text is readable in one scheme alone.
+"""
 
 from __future__ import annotations
 

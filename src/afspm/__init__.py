@@ -112,7 +112,7 @@ def __getattr__(name: str) -> Any:
         return _own(name)
     from afspm.basics import entry_points
 
-    # a function that a package adds; never under a name of Python's own
+    # a function that a package adds, so that notebooks need no path of a guest; never under a name of Python's own
     if not name.startswith("_") and (found := entry_points.load(entry_points.FUNCTIONS, name)) is not None:
         return found
     raise AttributeError(f"module 'afspm' has no attribute {name!r}")

@@ -116,7 +116,10 @@ class RoundSchedule:
 
 @dataclass(frozen=True)
 class PlanRest:
-    """Rows of a scan that are still to be taken.
+    """Rows of a scan that are still to be taken, as a scan of its own with fewer rows.
+
+    No supported maker can begin a scan at a row by its interface, and every controller takes a plain scan. The rows
+    before stay in the record as an interrupted scan: the parts differ in tip, time and drift, so no file joins them.
 
     Attributes:
         first, last: indices of the rows in the whole scan.

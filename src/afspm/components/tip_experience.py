@@ -12,6 +12,10 @@ the counts of its flaw at once: the tip may have begun to answer otherwise.
 This module uses no clock, no files and no messages. Each draw follows from the number of the night and of its outcomes,
 so a restarted process, or a replay, chooses the same treatment.
 
+A table of counts can be read and corrected by a person; a model of thresholds and depths needs fewer outcomes, but has
+to be right. Its price: treatments of similar size learn nothing from each other. The flaw comes from a judge of the
+corrector's own, since the message of a classifier has only a score, and may come from any classifier.
+
 The constants were chosen among some twenty sets, on nights with the public half of the simulated answers and with one
 sealed key (`benchmarks/tip_learning.py` judges other nights).
 """

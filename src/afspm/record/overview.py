@@ -144,6 +144,10 @@ class Overview:
 
     A packet that is not newer than the last packet of its envelope is ignored, so replayed packets do no harm.
 
+    A new figure belongs to the part that reduces its message (`MeasurementHistory`, `ProcessHistory`, `Timelines`,
+    `Readings`); only a new kind of state is an attribute here. A registry of reducers would be longer than its
+    handlers.
+
     Args:
         problems: the names of the experiment's problems.
         bands: the bands of [conditions], by parameter; scans outside are marked.

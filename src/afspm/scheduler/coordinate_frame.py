@@ -13,6 +13,9 @@ knows this protocol, and no frame by name; by default it has `TipFrame`, which c
 
 Invariants: the same request id always gives the same bytes; a packet published twice has the same place twice;
 each kept input comes back (`Reconsider`) after a bounded time, since all later inputs wait for it.
+
+A frame is a part of the state, and no subclass of the core: with a subclass that changed its inputs in place, a step
+was no function of state and input, and the saved state had a text that only the subclass could read.
 """
 
 from __future__ import annotations

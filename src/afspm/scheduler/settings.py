@@ -10,6 +10,10 @@
 
 The experiment file is checked against these classes, the tables of the reference are made of them, and a scheduler gets
 them as plain data (`model.snapshot`). The key in the file is the name without its unit: `lease` for `lease_s`.
+
+Two descriptions of one setting drift apart: the decisions once gave a lost holder 10 s, and the file 5 s. [limits] is
+still read by a module of its own (`experiment.limits_section`), since only the driver knows the units of its
+quantities.
 """
 
 from __future__ import annotations

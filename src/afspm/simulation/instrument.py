@@ -15,6 +15,10 @@ Invariants: one activity at a time; the world is used by the computation of a sc
 suffices to continue after a kill: a running scan is computed again from the world at its start.
 
 Lengths in m in tip coordinates, angles in rad counter-clockwise, times in experiment seconds.
+
+There is one instrument for driver and emulators, since with two of them a fault, or the correction of an error, was
+missing in the other. A spectrum is computed at its start: if it is stopped, the random numbers that follow are the
+same.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The damage ledger: totals of all actions that can damage tip or sample, as part of the ground truth.
 
 **Theory of operation.** The instrument reports each treatment, scan and interval of time to its `DamageCounter`.
-Whenever the totals have grown, they are appended to `truth.jsonl` as a separate line. The totals are no verdict:
-compare them with a budget.
+Whenever the totals have grown, they are appended to `truth.jsonl` as a separate line: a judge reads the last line, and
+a line lost by a kill costs nothing. The totals are no verdict: compare them with a budget.
 """
 
 from __future__ import annotations

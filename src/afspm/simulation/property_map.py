@@ -1,4 +1,9 @@
-"""A quantity that varies over the sample: a map with known truth, which spectra can reveal."""
+"""A quantity that varies over the sample: a map with known truth, which spectra can reveal.
+
+Adaptive measuring needs a continuous quantity, where a surface knows only two materials. The map is independent of the
+surface, so any surface can carry it, and belongs to the sample, so it drifts with it. Creep of the scanner does not
+displace spectra.
+"""
 
 from __future__ import annotations
 

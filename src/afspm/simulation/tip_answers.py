@@ -7,7 +7,8 @@ prior are drawn with a key outside of the repository, so that no component can b
 
 All of it is simulated, without a source. The pictures behind it: the field of a pulse desorbs debris, or moves atoms of
 the apex, at one polarity more than at the other, above a threshold; a crash reshapes the apex where the depth fits the
-size of the flaw, and a deeper crash adds flaws.
+size of the flaw, and a deeper crash adds flaws. A policy that does well here can learn such answers; nothing is shown
+about tips of tungsten. The default is "even", so that recorded nights keep their results.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from afspm.simulation import chance
 
 ANSWER_KINDS = ("even", "public", "sealed")
 KEY_FILE = "AFSPM_SEALED_KEY_FILE"
-"""The environment variable with the path of the file whose content is the key of the sealed prior."""
+"""The environment variable with the path of the file whose content is the key of the sealed prior. The variable itself
+would show the key in the list of processes of every child."""
 MOST_WORSENS = 0.6
 
 

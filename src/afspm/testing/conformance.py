@@ -4,7 +4,9 @@
 of the suite's fixture, which raises a `CheckEnded` unless the program passes. `attempt` runs a check and returns a
 `CheckResult`; `SuiteReport.run` runs several. The surroundings of a check differ from suite to suite (a question to a
 person, a new experiment after a failure): they are in the fixture's `perform` and `explain`. Each wait within a check
-has its own time limit, so that a check ends even if the program does not answer.
+has its own time limit, so that a check ends even if the program does not answer. A limit for a whole check could only
+cut a controller's connection in the middle of a request. The suites share this kernel, since their own three differed
+by accident: after a lost process, the report on a translator could say `"passed": true`.
 
 | raised | because | outcome | then |
 | --- | --- | --- | --- |

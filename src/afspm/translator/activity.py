@@ -13,6 +13,9 @@ The life of a measurement is the same with all programs:
 
 A curve may have to wait until the tip arrives at its position (`curve_awaited`), and a command may last as long as the
 measurement itself (`call`). A maker's driver detects a running measurement and records it with the files.
+
+Two makers differ too much to share all of it. Nanonis reports ends over a second connection, and at GXSM a scan may
+follow another one between two polls; neither waits in `settle`, since their scans may begin late.
 """
 
 from __future__ import annotations

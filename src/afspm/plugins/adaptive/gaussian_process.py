@@ -6,6 +6,9 @@ noise and velocity are those of the highest marginal likelihood; mean and amplit
 
 A map may be even in most places and rough in a few. The amplitude is therefore scaled locally by the errors with
 which measurements are predicted from the others (leave one out).
+
+Curves have no picture to register, but a lattice returns to the neighbourhood of earlier positions, and with a wrong
+drift the values contradict each other. A constant velocity is enough for the rest that the correction by scans leaves.
 """
 
 from __future__ import annotations
@@ -27,7 +30,8 @@ _MOST_FITTED: Final = 240  # measurements for the likelihood, whose time grows w
 _LEAST_NOISE: Final = 1e-4  # variance relative to the squared amplitude; with less the matrix is not solved stably
 _NEAREST: Final = 8  # measurements that give the local scale
 _LEAST_SCALE: Final = 0.04  # of the local variance: a feature may hide between measurements
-_DRIFT_GAIN: Final = 4.0  # in log likelihood: with less, the drift is taken for zero
+# in log likelihood: with less, the drift is taken for zero, since a drift within one lattice looks like a sheared map
+_DRIFT_GAIN: Final = 4.0
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,11 @@
 where the Gaussian process expects an error worth the seconds. On a map that is rough everywhere the whole lattice
 is taken, exactly as by a nested grid; on a map that is rough in a few places, mostly these places.
 
+The usual choice, the position of the largest variance, is not taken for two reasons. The variance of a stationary
+process depends on positions alone, so it measures even ground as densely as a spot; and with slow moves the ways
+between such positions take longer than the curves. `NestedGrid` has the same process and follows drift alike: a grid
+with a weaker map would make the comparison look better, and show nothing about the choice of positions.
+
     comes in      measured values with their times and the seconds that they took
     state         the measurements, the rest of the round, the parameters of the process
     goes out      positions to measure next, the map, its expected error

@@ -1,4 +1,8 @@
-"""Arguments of the tools, validated strictly: nothing is converted or dropped silently."""
+"""Arguments of the tools, validated strictly: nothing is converted or dropped silently.
+
+The high-level server of the MCP library converts "0.5" and `true` to numbers, and drops unknown arguments: a model that
+misspells `size` would scan the region in force. Hence the low-level server, and one strict model for each tool.
+"""
 
 from __future__ import annotations
 

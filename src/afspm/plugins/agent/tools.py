@@ -1,4 +1,9 @@
-"""The thirteen tools of agents. The answer to a refused call has `is_error`, and a `RefusalCode` as first field."""
+"""The thirteen tools of agents. The answer to a refused call has `is_error`, and a `RefusalCode` as first field.
+
+The server offers no resources of the protocol: a model can call only tools. A resource would be the same picture by a
+second way, with its own bound of size, check of names and text to escape. The scenario `resources-list` of the
+protocol's conformance tool therefore fails; the protocol leaves resources to the server.
+"""
 
 from __future__ import annotations
 

@@ -2,7 +2,9 @@
 
 The simulated sample is the widest of the newest height scans, or a stepped surface without such a scan; the result
 names the sample. Each request is checked against the limits of the experiment and of the agent, except limits of steps,
-rates and intervals. Nothing here reaches the microscope, or changes the run's folder.
+rates and intervals, which depend on the values in force at the time of the request, where the scheduler checks them.
+Nothing here reaches the microscope, or changes the run's folder. The process has no sockets and a low priority, so that
+it delays neither the experiment nor `stop`.
 """
 
 from __future__ import annotations

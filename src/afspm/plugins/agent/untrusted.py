@@ -1,4 +1,7 @@
-"""Text from outside, such as file names, notes, metadata and controller messages: always data, never instructions."""
+"""Text from outside, such as file names, notes, metadata and controller messages: always data, never instructions.
+
+No program reads these fields. A test holds that harmless and injected texts lead to the same requests, bit for bit.
+"""
 
 from __future__ import annotations
 

@@ -11,6 +11,11 @@ solved, harmless and honest.
     always holds  the agent gets sockets, a prompt and a folder of its own, but not the seed of its task, the truth or
                   the experiment file; the same key draws the same tasks
 
+A trial is a real run of processes, sockets and a record on disk, and takes about three seconds of a processor. On the
+fake clock of `afspm.testing.components` an agent that waits for a model's server, or for its own threads, would stop
+the bench, and its process could not be sealed off. The price: two runs of a seed have the same task and sample, but
+other noise. So judges have margins, and generators draw only tasks whose answer is clear.
+
 | module | |
 | --- | --- |
 | `tasks`, `families/` | generators with their judges |

@@ -7,6 +7,10 @@ Measurements get new ids, so the replay translates the ids. Consecutive equal ca
 with the last answer. The recorded and new answers are then compared. Times and ids are ignored, and fractional numbers
 may differ by 10 %.
 
+Recorded texts of the model would depend on the provider's format and hold the whole conversation; replayed answers
+without a microscope would test nothing but the cassette. A replay does not react: after an unequal answer, the next
+call is the recorded one all the same. The proxy reads each answer as a whole, so it forwards no notifications.
+
     python -m afspm.plugins.bench.cassette FILE
 """
 

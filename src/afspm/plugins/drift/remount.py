@@ -2,6 +2,11 @@
 
 The sample may be rotated by any angle, but estimators only tolerate a degree or two. So coarse images are first
 correlated at all angles; at the best angles the whole images are registered by least squares.
+
+Of 42 simulated remounts at any angle (particles, rough surfaces, steps; 128 pixels of 31 nm), 34 were found, none of
+them wrong: at most 4 nm and 0.05° off. Of 42 pairs of different samples none was accepted. Features with descriptors
+that ignore rotation (SIFT) need another package, and smooth samples have few of them. A scale is not searched: both
+overviews need the same calibration.
 """
 
 from __future__ import annotations
@@ -33,7 +38,8 @@ ROUNDS = 3  # of least squares: each begins at the angle of the round before
 SETTLED_RAD = 1e-4
 SYSTEMATIC_PX = 0.08
 """Systematic error in pixels, added to the uncertainties in quadrature. The errors of 34 simulated remounts reached
-this size; noise explains a fifth of this size."""
+this size; noise explains a fifth of this size. On five other remounts the errors were 0.1 to 0.6 standard deviations,
+too few to state a coverage."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,11 @@ What always holds: only messages of version 1 go outside (`version_1`). A reques
 have no request ids; inside, its answer has the id of the request. Subscribers outside see increasing times, and packets
 that a peer would miss are delayed (`version_1.Pacing`).
 
+The bridge is a process, and no adapter in the core's sockets: with the adapter 34 modules mentioned version 1, and one
+slow peer delayed all subscribers. The price is about a millisecond for each request. Every peer is a client of its own
+inside (with keys as `<bridge>:<peer>`): between the peers of one common client, control would not be arbitrated. A
+packet that a peer had not yet received when the bridge dies is lost to this peer.
+
 Experiment files of the published form are converted as they are read (`files`), and `afspm check --explain` writes them
 in afspm's form (`short_form`). Code that imports published modules is not run: an imitation of these modules would
 bring back their loops and sockets, and a guess at the effect of a function would move the tip. This module imports

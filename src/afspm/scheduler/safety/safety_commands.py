@@ -13,7 +13,8 @@ _ID = "scheduler/does-it-retract"
 def begin(draft: StateDraft) -> None:
     """Check whether a new translator supports the retract, then send the due actions of the watchdog."""
     action = draft.watchdog.question
-    # any answer also shows that a retract sent before a restart is done or lost (decision 0088)
+    # any answer also shows that a retract sent before a restart is done or lost: the translator serves one request
+    # after the other, and refuses requests of an earlier scheduler once it knows a later one
     request = Request(int(ControlRequest.ACTION_SUPPORT), action, id=_ID)
     draft.forwarder, _ = draft.forwarder.ask_own(request, draft.now_s)
     draft.watchdog = draft.watchdog.translator_is_there(draft.now_s)

@@ -160,6 +160,8 @@ class Watchdog:
 
     def restored(self, tip: RetractState) -> Watchdog:
         """Restore the duty from before a restart: an unanswered retract is owed again."""
+        # a translator that hung may still carry out the retract after a person has cleared the duty, and the scan that
+        # follows would have no tip at the surface; what the controller has already can't be taken back
         was_asked = tip.duty is TipDuty.ASKED
         duty = TipDuty.OWED if was_asked else tip.duty
         return replace(self, tip=replace(tip, duty=duty, may_come=was_asked or tip.may_come))

@@ -1,4 +1,8 @@
-"""A translator with injected faults of its own: late and missing answers, hangs, crashes."""
+"""A translator with injected faults of its own: late and missing answers, hangs, crashes.
+
+A module of its own, though only the driver imports it: it needs the translator with its sockets, and `afspm check` and
+all processes that only read the file import the driver without them.
+"""
 
 from __future__ import annotations
 

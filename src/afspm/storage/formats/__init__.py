@@ -6,6 +6,10 @@
 
 A reader is a function from a path and a time zone to a `FileContent`. Packages declare readers by the suffixes of their
 files (`afspm.basics.entry_points`).
+
+The readers stand below the record, since the translator reads each scan's file: with the readers in `record` it would
+import the journal, the report and the exports for one function. Only the reader of the record's own files is there,
+beside its writer, so that a change of that format is made in one room.
 """
 
 from __future__ import annotations
@@ -62,6 +66,8 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
 
 
 def _first_that_reads(path: Path, zone: tzinfo | None) -> FileContent:
+    # makers share suffixes (.nc, .h5, .tif): the readers take turns, and one that does not know the file raises
+    # OtherFormat. A question beforehand ("is it yours?") would open the file twice.
     own = _readers(path.suffix.lower().removeprefix("."))
     refusals: list[OtherFormat] = []
     for name in (*own, *_readers(_ANY)):

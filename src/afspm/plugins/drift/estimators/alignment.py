@@ -36,7 +36,9 @@ DIGITS = 1e-6  # relative precision of products of 32-bit columns
 LEAST_CURVATURE = 0.4
 """The least curvature H'QJ, as a share of H'QH, in any direction. On the worst pairs (one bar in view) the share is a
 fifth to two fifths: most of H'QH is noise there, and a fit that took this noise for the surface was up to five times
-too certain of stretch. With 0.2 hard pairs get worse, since the share itself is then hardly known."""
+too certain of stretch. On 60 pairs of bars like real scans, errors of 3.6 times the Cramér-Rao bound (as with 1) became
+2.5 times; other surfaces change by 2 %. With 0.2 hard pairs get worse (2.9 for 2.1), since the share itself is then
+hardly known. Smoothing the gradient along edges, or more thresholding, loses more of the surface than of the noise."""
 
 
 @dataclass(frozen=True, eq=False)
