@@ -1,7 +1,8 @@
 """Verdicts on the tip as messages.
 
 The verdict on a complete scan is a message of the contract: a list of places, each with a score. The verdict on the
-lines of a running scan is a `TipVerdict`.
+lines of a running scan is a `TipVerdict`, since the message of the contract names a scan by its end and has no field
+for a row: reports that count judged scans would count a scan that never was.
 """
 
 from __future__ import annotations

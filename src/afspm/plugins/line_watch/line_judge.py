@@ -47,7 +47,9 @@ JUMP_REACH = (12, 16)  # the same for a sample that has jumped
 NEAR = (1, 2)  # the same about a shift that a search has found
 MOST_JUMPS = 3  # in one scan
 REMEMBERED = 24  # lines for the search after a jump
-EXPLAINED = 1.5  # standard deviations beyond the usual, by the median of these lines, up to which a jump explains them
+EXPLAINED = 1.5
+"""Standard deviations beyond the usual, by the median of these lines, up to which a jump explains them. With 1, a jump
+of the sample was taken for a changed tip in row 11 of an unseen night."""
 NEWEST = 4  # lines since a change that a jump must explain, at least
 PER_PIXEL = 0.03  # standard deviations that a pixel of a jump costs: short jumps are likelier than long ones
 DRIFT = 1.0  # standard deviations above the usual difference beyond which a line lets the sum grow
@@ -55,13 +57,19 @@ LEAST_PER_SLOPE = 0.06  # pixels: two scans without drift between them show too 
 SPIKE = 6.0  # standard deviations beyond which a single pixel of a good scan is removed as a spike
 SCAR = 4.0  # standard deviations beyond which a row of a good scan is no measure of later ones
 MOST = 6.0  # standard deviations that one line adds at most
-FLOOR, FACTOR = 15.0, 2.0  # least threshold, and ratio of a threshold to the highest sum of good scans
-FEWEST_SUSPECT = 6  # rows since a change before an alarm: fewer don't show whether the sample has jumped
-FEWEST_STOP = 10  # rows since a change before a scan is stopped, after a second search for a jump with more lines
+FLOOR, FACTOR = 15.0, 2.0
+"""Least threshold, and ratio of a threshold to the highest sum of good scans. A floor of 20, in place of the least
+alike of few pairs (`ENOUGH_PAIRS`), stopped 8 of 512 good scans instead of 6."""
+FEWEST_SUSPECT = 6  # rows since a change before an alarm: three fit wrong places of a flat step, as after a jump
+FEWEST_STOP = 10
+"""Rows since a change before a scan is stopped, after a second search for a jump with more lines. With six, an unseen
+night was stopped 68 rows before its tip changed; with ten, 7 rows after."""
 LOOK = 0.6  # share of the threshold above which a person should look
 PARTS = ((1, 1 / 4), (2, 1 / 8))  # number and width, relative to the line, of parts that a changed sample may fill
 ELSEWHERE = 0.4  # share of the threshold that the rest of the lines must reach before a scan is stopped
-LASTING = 3 / 8  # of the rows: a change that grows for so long is no single adsorbate
+LASTING = 3 / 8
+"""Share of the rows for which a sum grows before the change counts as the tip's, and not as a single adsorbate's.
+Without this rule a double tip among few particles in 64 rows never stopped a scan."""
 LEAST_SPREAD = 0.05  # of the image's part
 NEWER = 0.15  # weight of the newest line in the spectrum of the noise
 GOOD_DECAY = 5.0  # decay, with the evidence, of the share of good scans that reach it: assumed, not fitted
@@ -444,7 +452,8 @@ class ScanJudge:
         return len(self._sums) >= rows and self._sums[-1] > self._sums[-1 - rows // 4]
 
     def _differ(self, lines: Sequence[tuple[int, Sequence[Array]]], where: NDArray[np.bool_]) -> bool:
-        # fitted again: an adsorbate moves the shift of its line, which then differs everywhere
+        # fitted again: an adsorbate moves the shift of its line, which then differs everywhere (3 of 20 scans with a
+        # new adatom were stopped)
         again, cusum, highest = _Comparer(self._comparer.place, self._comparer.registration), Cusum(), 0.0
         for row, line in lines:
             if fits := again.fits(row, [np.where(where, values, np.nan) for values in line]):

@@ -1,4 +1,7 @@
-"""Curves over one variable as SVG, with ticks and units; colours follow the text of the page, light or dark."""
+"""Curves over one variable as SVG, with ticks and units; colours follow the text of the page, light or dark.
+
+Axes are labelled "name / unit" in SVG and on the page, and times of day have ticks at round times.
+"""
 
 from __future__ import annotations
 

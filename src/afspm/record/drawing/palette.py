@@ -23,7 +23,10 @@ DIVERGING: Final = "change"
 PALETTES: Final = tuple(name for name in _STOPS if name != DIVERGING)
 
 CATEGORICAL: Final = ("#4477AA", "#228833", "#AA3377", "#66CCEE", "#CCBB44")
-"""P. Tol's bright scheme, safe for colour-blind readers. Its red is reserved for problems."""
+"""P. Tol's bright scheme, safe for colour-blind readers. Its red is reserved for problems.
+
+A report colours a component by its place in the list, so that no two are alike; the page by its name, before it knows
+the others."""
 PROBLEM: Final = "#EE6677"
 NEUTRAL: Final = "#BBBBBB"
 

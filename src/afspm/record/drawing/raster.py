@@ -1,4 +1,11 @@
-"""Arrays as images: the shown range of values, indices into a colour map, PNG."""
+"""Arrays as images: the shown range of values, indices into a colour map, PNG.
+
+One convention for report, night, survey and page, since two scans side by side once had colours that meant different
+heights. Lines are levelled by `model.line_levelling`; the colour map ends at the 1st and 99th percentile. Compared
+images share one range. Scans of one size and unit share the range of all their values together (`pooled_range`), which
+one bad scan does not widen. Scans of another size are not compared: a flat zoom beside a steep overview keeps its
+contrast. The price: a scan that is nothing but a slope becomes a uniform image.
+"""
 
 from __future__ import annotations
 
