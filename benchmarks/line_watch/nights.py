@@ -158,7 +158,7 @@ class Night:
             adjusted = [Adjustment(at_s + self.row * self.line_s, other, 0.1)]
         channels = self._taken(world, at_s, adjusted)
         if negative == "jump":
-            # the sample slips by some pixels, and stays there
+            # the sample slips by some pixels, and stays there: a rolled picture would wrap its rows around
             slipped = World.from_settings(self.settings, self.seed, 0.0)
             slipped.restore(world_before)
             pixels = self.random.integers(-4, 5, 2)
