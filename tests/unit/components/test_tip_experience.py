@@ -157,7 +157,7 @@ def test_equal_parts_fill_a_budget_in_spite_of_rounding() -> None:
 
 
 def test_negative_budget_is_refused() -> None:
-    with pytest.raises(ConfigError, match="^night_pulses: a budget can't be negative"):
+    with pytest.raises(ConfigError, match=r"^night_pulses: a budget can't be negative"):
         RepairBudget(pulses=-1, time_s=-1.0)
 
 
