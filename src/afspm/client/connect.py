@@ -18,7 +18,7 @@ from afspm.client.scope import Scope
 from afspm.model import Frame, ProblemNames
 from afspm.model.events import is_process_name
 from afspm.record.run_json import RUN_FILE, STATE_DIR, latest_run, read_run_json, run_json_or_empty
-from afspm.record.run_lock import cut_off_message
+from afspm.record.run_lock import cut_off_message, is_locked
 from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import open_port
 from afspm.wire.message_types import register_all
@@ -27,6 +27,8 @@ GUEST = "guest"
 GUEST_KEYS = "guest.keys"
 """The file with the keys of guests, in the state folder of the run; see `supervisor.key_handout`."""
 JOINED_WITHIN_S = 5.0
+STARTED_WITHIN_S = 60.0
+"""Limit for a run that holds its lock on this computer: a busy one takes long to start its scheduler."""
 HEARD_WITHIN_S = 30.0  # the cache may hold many large scans
 
 
@@ -46,7 +48,8 @@ def connect(where: str | Path = "runs", name: str = "notebook", *, messages: Seq
     Raises:
         FileError: there is no such run.
         ConfigError: the run has no scheduler to connect to, `messages` can't be imported, or `name` can't be a name.
-        NoResponse: the scheduler does not answer within 5 s, or its cached packets do not arrive within 30 s.
+        NoResponse: the scheduler does not answer within 5 s (60 s if the run is going on on this computer), or its
+            cached packets do not arrive within 30 s.
         ExperimentEnded: the experiment has just ended.
     """
     if not is_process_name(name):
@@ -69,7 +72,11 @@ def join(folder: Path, name: str, messages: Sequence[str] = ()) -> Scope:
     port = open_port(launch, clock)
     link = ExperimentLink.of_launch(launch, port, new_session(launch.run), log=log)
     try:
-        if not link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S)):
+        is_joined = link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S))
+        if not is_joined and is_locked(folder):
+            log.info("%s is still starting …", folder)
+            is_joined = link.wait(lambda: link.connected, link.until(STARTED_WITHIN_S - JOINED_WITHIN_S))
+        if not is_joined:
             hint = cut_off_message(folder) or "is the experiment still running?"
             raise NoResponse("the scheduler does not answer", where=str(folder), hint=hint)
         link.wait_caught_up(link.until(HEARD_WITHIN_S))  # so that the scope shows the present state at once

@@ -55,6 +55,11 @@ def goes_on(folder: Path) -> bool:
     return not run_json_or_empty(folder).get(ENDED) and not cut_off_message(folder)
 
 
+def is_locked(folder: Path) -> bool:
+    """Return whether a run is going on on this computer."""
+    return (folder / STATE_DIR / LOCK_FILE).exists() and not _is_left(folder)
+
+
 def describe_state(folder: Path) -> str:
     """Return the state of a run as text: its end, running, or cut off."""
     if ended := run_json_or_empty(folder).get(ENDED):
