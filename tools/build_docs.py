@@ -53,7 +53,12 @@ def main() -> None:
         *(ROOT / "docs").rglob("*.md"),
         *(ROOT / "experiments").rglob("*.md"),
     ]
-    for page in [*pages, *(ROOT / "src").rglob("README.md"), *(ROOT / "clients").glob("*/README.md")]:
+    for page in [
+        *pages,
+        *(ROOT / "src").rglob("README.md"),
+        *(ROOT / "clients").glob("*/README.md"),
+        *(ROOT / "packages").glob("*/README.md"),
+    ]:
         _write(page.relative_to(ROOT).as_posix(), _for_site(page))
     shutil.copytree(ROOT / "docs" / "pictures", SOURCE / "docs" / "pictures")
     for drawing in (SOURCE / "docs" / "pictures").glob("*.svg"):

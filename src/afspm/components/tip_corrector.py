@@ -27,8 +27,8 @@ Frame = list[list[float]]
 """Region and pixels in JSON's types: centre, size and angle; rows and columns.
 
 The frame of the fault comes from the verdict, not from the flag: in a survey the region set last is often another kind
-of scan, which never showed the fault, and a flag of version 1 or of a person has no frame. The classifier publishes a
-bad verdict before it flags."""
+of scan, which never showed the fault, and a flag of a published peer or of a person has no frame. The classifier
+publishes a bad verdict before it flags."""
 LAST_FRAMES = 16  # scans whose verdict may still arrive
 MOVES_SHARE = 1.2  # time of a treatment and its test scans, relative to the test scans alone
 VERDICT_WITHIN_S = 20.0  # real time: after that no verdict is expected

@@ -15,7 +15,7 @@ from afspm.basics.units import convert
 from afspm.model.scan import ShapeChange
 from afspm.wire.generated import control_pb2, scan_pb2, spectroscopy_pb2
 
-# In metres, a setting and its published value are equal to the last bit; version 1 assumes degrees without a unit.
+# In metres, a setting and its published value are equal to the last bit; published peers assume degrees without a unit.
 LENGTH_UNIT = "m"
 ANGLE_UNIT = "deg"
 

@@ -52,7 +52,7 @@ class Support:
 
 def find_out(client: CheckClient, actions: Iterable[str] = (), parameters: Iterable[str] = ()) -> Support:
     """Query the support of all generic names and of the microscope's own names."""
-    # There is no request for a table: translators of version 1 answer single queries too, and a query changes nothing.
+    # There is no request for a table: published translators answer single queries too, and a query changes nothing.
     found = Support()
     for name in dict.fromkeys((*ACTIONS, *actions)):
         found.actions[name] = _has_action(client, name, found.errors)
