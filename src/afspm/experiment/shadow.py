@@ -6,6 +6,7 @@ from pathlib import Path
 
 from afspm.basics import entry_points
 from afspm.basics.errors import ConfigError
+from afspm.experiment import class_loader
 from afspm.experiment.findings import nearest
 from afspm.experiment.resolved_experiment import ResolvedExperiment
 from afspm.model import Role
@@ -43,7 +44,8 @@ def shadow_file(maker: str, folder: Path) -> Path:
         raise ConfigError(f"there is no driver {maker!r}", where="--on", hint=nearest(maker.lower(), drivers))
     name = drivers[maker.lower()]
     driver: type[DriverBase] = entry_points.load(entry_points.DRIVERS, name)
-    has_lines = driver.lines is not DriverBase.lines
+    watcher: type[DriverBase] = class_loader.load(driver.shadow) if driver.shadow else driver  # refused by the overlay
+    has_lines = watcher.lines is not DriverBase.lines
     lines = ["[microscope]", "component = true", f'class = "{name}"', *(['live_lines_s = "1 s"'] if has_lines else [])]
     file = folder / f"{maker.lower()}_shadow.toml"
     file.write_text("\n".join(lines) + "\n" + _DETECTORS + (_OF_LINES if has_lines else ""), encoding="utf-8")

@@ -74,7 +74,7 @@ def test_experiment_without_a_controller_is_refused(tmp_path: Path) -> None:
         ("Asylum", "", False),
         ("gxsm", "", True),
         ("park", "", False),
-        ("nanosurf", "[microscope]\nrelease = 18\n", True),
+        ("nanosurf", "[microscope]\nrelease = 18\n", False),
     ],
 )
 def test_maker_alone_gives_all_detectors(tmp_path: Path, maker: str, settings: str, has_lines: bool) -> None:

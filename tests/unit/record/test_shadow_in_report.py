@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -141,17 +142,27 @@ def test_row_is_found_by_its_number() -> None:
         night.row(3)
 
 
-def test_frame_that_is_set_again_has_the_place_where_a_run_would_have_had_it() -> None:
-    frames = [(0.0, 0.0), (1e-6, 0.0), (0.0, 0.0)]
-    drifts = [(0.0, 0.0), (3e-9, 1e-9), (10e-9, -5e-9)]
-    scans = [
+def night_of_frames(frames: Sequence[tuple[float, float]]) -> list[ScanRow]:
+    return [
         ScanRow(n + 1, (n + 1) * S, n * S + 1, (), Region(center, (1e-7, 1e-7)), (8, 8), False, None, None, (), "", "")
         for n, center in enumerate(frames)
     ]
+
+
+def test_frame_that_is_set_again_has_the_place_where_a_run_would_have_had_it() -> None:
+    scans = night_of_frames([(0.0, 0.0), (1e-6, 0.0), (0.0, 0.0)])
+    drifts = [(0.0, 0.0), (3e-9, 1e-9), (10e-9, -5e-9)]
     points = [DriftPoint((n + 1) * S, drift, (0.0, 0.0), sd_m=2e-10) for n, drift in enumerate(drifts)]
     second, third = of_drift(points, scans)
     assert second.would == "scan 2: the sample had moved by (3, 1) nm ± 200 pm"
     assert third.would.endswith("a run would have had the frame of scan 1 at (10, -5) nm instead of (0, 0) nm")
+
+
+def test_drift_across_a_tip_change_is_marked() -> None:
+    scans = night_of_frames([(0.0, 0.0)] * 4)
+    points = [DriftPoint(scan.time_ns, (1e-9 * n, 0.0), (0.0, 0.0), sd_m=1e-10) for n, scan in enumerate(scans)]
+    rows = list(of_drift(points, scans, changes=[scans[0].time_ns, scans[2].time_ns]))
+    assert ["the tip changed meanwhile" in row.would for row in rows] == [False, True, True]
 
 
 def test_verdicts_that_components_publish_are_rows(night: Night, store: RecordStore, tmp_path: Path) -> None:

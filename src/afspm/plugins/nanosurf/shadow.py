@@ -44,6 +44,7 @@ class NanosurfShadow(ShadowDriver, Nanosurf):
     """
 
     link: ClassVar[type[Link]] = QuestionLink
+    lines = ShadowDriver.lines  # none: `SCRIPTS` has no script for the buffer of a running scan
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)

@@ -47,6 +47,9 @@ _SAME_FRAME: Final = 1e-3
 """Frames are equal if their edges differ by less than this part of their size."""
 
 
+_TIP_CHANGED: Final = "; the tip changed meanwhile, which may have shifted the image"
+
+
 class ShadowKind(StrEnum):
     """The kind of a row: a decision of afspm, or an act of the person without one."""
 
@@ -193,7 +196,8 @@ def read(run: Run) -> ShadowNight:
     if not is_shadow:
         return ShadowNight()
     scans, names, solvers = run.scans, run.problem_names, _solvers(run)
-    decisions = [*of_drift(run.drift, scans)]
+    judgements = list(run.judgements())
+    decisions = [*of_drift(run.drift, scans, changes=_tip_changes(judgements, scans))]
     taken = [
         ShadowRow(scan.time_ns, ShadowKind.TAKEN, _judged(scan), f"took scan {scan.number} to its last line")
         for scan in scans
@@ -202,7 +206,7 @@ def read(run: Run) -> ShadowNight:
     acts = [PersonAct(scan.time_ns, _ENDED_EARLY, answers=True) for scan in scans if scan.interrupted]
     for _, _, act in run.messages(("ActByHand",)):
         acts.append(PersonAct(act.time_ns, str(act), act.act in ANSWERS))
-    for time_ns, verdict in run.judgements():
+    for time_ns, verdict in judgements:
         if isinstance(verdict, TipVerdict):
             decisions.append(_of_lines(time_ns, verdict, scans))
         elif (judged := read_verdict(verdict)) is not None and judged[1] == BAD:
@@ -388,8 +392,21 @@ def _asked(journal: Sequence[JournalEntry]) -> Iterator[ShadowRow]:
         yield ShadowRow(times_ns[0], ShadowKind.CONTROL, would)
 
 
-def of_drift(points: Sequence[DriftPoint], scans: Sequence[ScanRow]) -> Iterator[ShadowRow]:
-    """Yield a row of each scan after the first: the drift so far, and where a run would have had a repeated frame."""
+def _tip_changes(judgements: Sequence[tuple[int, object]], scans: Sequence[ScanRow]) -> list[int]:
+    # the verdict on a scan may come after the next scan: the change was there when the scan ended
+    bad = [scan.time_ns for scan in scans if scan.tip_score == BAD]
+    return bad + [time_ns for time_ns, verdict in judgements if isinstance(verdict, TipVerdict) and verdict.stops]
+
+
+def of_drift(
+    points: Sequence[DriftPoint], scans: Sequence[ScanRow], changes: Sequence[int] = ()
+) -> Iterator[ShadowRow]:
+    """Yield a row of each scan after the first: the drift so far, and where a run would have had a repeated frame.
+
+    Args:
+        changes: times in ns at which a tip was seen to be changed. A second apex or another length shifts the image, so
+            the rows after the first of them are marked.
+    """
     # a frame that a person sets again is meant for the same place on the sample, which has moved meanwhile
     first = dict[int, tuple[float, float]]()
     placed: list[ScanRow] = []
@@ -408,6 +425,8 @@ def of_drift(points: Sequence[DriftPoint], scans: Sequence[ScanRow]) -> Iterator
             first[scan.number] = moved_m
         how = "" if point.outcome is RegistrationOutcome.REGISTERED else f" ({point.outcome.label}: {point.reason})"
         text = f"scan {scan.number}: the sample had moved by {_place(moved_m)} ± {doubt}{how}"
+        if placed and any(placed[0].time_ns < changed_ns <= scan.time_ns for changed_ns in changes):
+            text += _TIP_CHANGED
         if before is not None:
             (x, y), (x_now, y_now), (x_then, y_then) = scan.region.center_m, moved_m, first[before.number]
             way_m = (x_now - x_then, y_now - y_then)
