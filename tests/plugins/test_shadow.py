@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from tests.plugins.panel_table import PANELS, Panel
 from tests.plugins.test_makers import MAKERS, Maker
-from tests.plugins.vendor_bench import SOON, Peer, VendorBench, scans, states
+from tests.plugins.vendor_bench import PATIENT, SOON, Peer, VendorBench, scans, states
 from tests.plugins.wire_tap import lua_scripts, nanonis_names, tapped, zmtp_objects
 
 from afspm.model import ActByHand, ControlResponse, PanelAct, ScopeState, names
@@ -70,7 +70,13 @@ WATCHED = {
     for one in (
         Watched("nanonis", nanonis_names, r"\w+\.\w*Get|Scan\.(WaitEndOfScan|FrameDataGrab)"),
         Watched("asylum", _igor, r"GV|GS|ARGetStatus|GetBaseName|AfspmLook|AfspmController|AfspmFeedbackOn"),
-        Watched("gxsm", lambda sent: iter(()), r"get\w*|list_\w+|rtquery|y_current|chfname", fault="garbage"),
+        Watched(
+            "gxsm",
+            lambda sent: iter(()),
+            r"get\w*|list_\w+|rtquery|y_current|chfname",
+            settings=dict(PATIENT),  # garbage is an error at once, and a busy computer answers late
+            fault="garbage",
+        ),
         Watched(
             "nanosurf",
             _studio,  # functions that are called, and values of Studio that are assigned: of these there are none
