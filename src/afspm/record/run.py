@@ -48,7 +48,7 @@ from afspm.record.run_json import EXPERIMENT_FILE, METADATA, REPLAY_OF, latest_r
 from afspm.record.tables import ControlRow, NoteRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
 from afspm.record.treatment_ledger import KEEP_AWAY_M, TreatmentLedger, treatment_ledger
 from afspm.wire.message_types import register_all
-from afspm.wire.messages import SpatialROIWithScoreList, TipVerdict
+from afspm.wire.messages import SpatialROIWithScoreList, TipVerdict, WatchCounts
 
 if TYPE_CHECKING:
     from afspm.record.allowed_bands import AllowedBands
@@ -309,6 +309,16 @@ class Run:
             ended_ns = next((end_ns for end_ns in ends_ns if end_ns > began_ns), None)
             if ended_ns is not None:
                 found[ended_ns] = verdict.since_row
+        return found
+
+    def watch_counts(self) -> dict[str, WatchCounts]:
+        """Return what each watch on running scans has counted, by the name of the component."""
+        name, found = WatchCounts.DESCRIPTOR.name, {}
+        sql = "SELECT envelope, payload FROM packets WHERE message = ? ORDER BY time_ns, rowid"
+        for envelope, payload in self._query(sql, (name,)):
+            counts = self._decoded(name, payload)
+            if isinstance(counts, WatchCounts):
+                found[envelope.removeprefix(f"{name}_")] = counts
         return found
 
     # --- everything ---

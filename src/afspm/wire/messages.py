@@ -46,7 +46,7 @@ from afspm.wire.generated.analysis_pb2 import SpatialPointWithScoreList, Spatial
 from afspm.wire.generated.control_pb2 import ParameterMsg
 from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
 from afspm.wire.generated.feedback_pb2 import ZCtrlParameters
-from afspm.wire.generated.lines_pb2 import TipVerdict
+from afspm.wire.generated.lines_pb2 import TipVerdict, WatchCounts
 from afspm.wire.generated.scan_pb2 import ScanParameters2d
 from afspm.wire.generated.spectroscopy_pb2 import ProbePosition
 
@@ -59,6 +59,7 @@ __all__ = [
     "SpatialPointWithScoreList",
     "SpatialROIWithScoreList",
     "TipVerdict",
+    "WatchCounts",
     "ZCtrlParameters",
 ]
 
@@ -330,6 +331,9 @@ FEEDBACK_ANALYSIS: Final = MessageDeclaration(
 )
 TIP_VERDICT: Final = MessageDeclaration(
     type=TipVerdict, kind=MessageKind.RESULT, source=Role.COMPONENT, always=False, named=True
+)
+WATCH_COUNTS: Final = MessageDeclaration(
+    type=WatchCounts, kind=MessageKind.RESULT, source=Role.COMPONENT, always=False, named=True
 )
 
 _MODULES = (

@@ -122,6 +122,8 @@ def test_adsorbate_that_stays_is_looked_at_twice_and_is_then_the_reference(caplo
     assert [one.began_ns for one in verdicts(lab)] == [began_ns(LEARNT), began_ns(LEARNT + 1)]
     assert flags(lab) == 0
     assert "4 of 7 complete scans were watched; 0 lines came after the end of their scan" in caplog.messages
+    counted = [wire.decode("WatchCounts", data) for name, data in lab.published if name == "WatchCounts_line_watch"]
+    assert [(one.complete, one.watched) for one in counted] == [(1, 0), (2, 0), (3, 0), (4, 1), (5, 2), (6, 3), (7, 4)]
 
 
 def test_more_noise_is_reported_once_a_scan(caplog: pytest.LogCaptureFixture) -> None:

@@ -30,6 +30,7 @@ from afspm.record.run_json import EXPERIMENT_FILE, UNFINISHED
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.record.timeline import Span
 from afspm.record.treatment_ledger import TreatmentLedger, TreatmentPlace
+from afspm.wire.messages import WatchCounts
 
 S = 1_000_000_000
 START = 1_700_000_000 * S
@@ -692,3 +693,16 @@ def test_readings_of_an_instrument_lie_on_the_time_line_with_their_band(tmp_path
     assert 'class="allowed"' in drawn
     assert 'class="outside"' in drawn
     assert drawn.index("lane curve") < drawn.index("lane-axis")
+
+
+def test_report_shows_how_many_scans_a_watch_judged(run: Path) -> None:
+    store = RecordStore(run)
+    for at_s, counted in ((190, (1, 0, 0)), (1390, (3, 2, 1))):
+        counts = WatchCounts(complete=counted[0], watched=counted[1], late_lines=counted[2])
+        packet = model.Packet("WatchCounts_watch", counts.SerializeToString(), START + at_s * S)
+        store.take([(packet, "watch")])
+    store.finish()
+    store.close()
+    text = write(run).read_text(encoding="utf-8")
+    assert "watch watched 2 of 3 complete scans; 1 line came after the end of their scan." in text
+    assert "1 complete scan;" not in text

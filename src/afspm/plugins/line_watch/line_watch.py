@@ -41,8 +41,9 @@ from afspm.plugins.line_watch.line_judge import (
     confidence,
 )
 from afspm.plugins.line_watch.registration import Array
-from afspm.wire.messages import SpatialROIWithScoreList
+from afspm.wire.messages import SpatialROIWithScoreList, WatchCounts
 
+COUNTS = "WatchCounts"  # how many scans were watched: see `proto/lines.proto`
 KEPT_TIMES = 16  # number of scans learnt from whose times are saved: a restarted process may receive them again
 NOISIER = 1.12  # relative noise of the newest lines above which it is reported
 _SCANS_WITHOUT_LINES = 3  # a short scan may end before its first lines are published
@@ -144,6 +145,7 @@ class LineWatch(Component):
     replace the earlier scan from which they differ, as after the arrival of an adsorbate.
 
     The component publishes a `TipVerdict` with the row of the alarm, the first row with the change, and a confidence.
+    After each complete scan it publishes `WatchCounts`: how many scans it watched so far, and how many lines came late.
     The confidence is 1 - exp(-5 evidence), where the evidence is relative to the threshold: an assumed decay, which
     ranks alarms and is no measured probability. A `ScanSeries` with `missed = "rest"` then measures only the rest of
     the scan. The microscope must publish lines of running scans. After an alarm, a component that judges complete scans
@@ -158,7 +160,7 @@ class LineWatch(Component):
     """
 
     flags: ClassVar = ("tip-shape-changed",)
-    publishes: ClassVar = (tip_verdict.OF_LINES,)
+    publishes: ClassVar = (tip_verdict.OF_LINES, COUNTS)
     listens: ClassVar = (
         "ScanLines", "Scan2d", "ScopeStateMsg", "ControlState", "ZCtrlParameters", tip_verdict.MESSAGE,
     )  # fmt: skip
@@ -177,7 +179,6 @@ class LineWatch(Component):
         self._lines: _Lines | None = None
         self._finished: _Finished | None = None
         self._doubted: WholeScan | None = None  # the newest complete scan, if it raised an alarm
-        self._watched = self._complete = self._late_lines = 0
         self._seen_ns: int | None = None  # time of the newest complete scan
         self._problems: tuple[int, ...] | None = None  # not known yet
         self._condition = ""
@@ -189,18 +190,16 @@ class LineWatch(Component):
         self._missing_lines = _MissingLines(self.log, self.clock.now_ns())
         self._later_states = _LaterStates(self.scope.events("ScopeStateMsg"))
         self._late = ExitStack()
+        self._counts = WatchCounts(**self.memory.get("counts", {}))
         self._await_lines()
         if "line_judge" in self.memory:
             self.judge.restore(self.memory["line_judge"])
 
     def on_end(self) -> None:
         self._late.close()
-        self.log.info(
-            "%d of %d complete scans were watched; %d lines came after the end of their scan",
-            self._watched,
-            self._complete,
-            self._late_lines,
-        )
+        counts = self._counts
+        what = "%d of %d complete scans were watched; %d lines came after the end of their scan"
+        self.log.info(what, counts.watched, counts.complete, counts.late_lines)
 
     def on_control(self, control_state: ControlState) -> None:
         was, before = self._is_flagged, self._problems
@@ -279,12 +278,21 @@ class LineWatch(Component):
         self._learn_finished()
         is_whole = running is None or not (running.is_disturbed or (running.judge is not None and running.judge.alarm))
         downwards = running is not None and running.downwards
-        self._complete += 1
-        self._watched += running is not None and running.judge is not None
+        self._count(running, scan.time_ns)
         has_no_problem = self._problems == () and (running is None or not running.is_disturbed)
         self._finished = _Finished(
             pair, self._kind(scan), downwards, is_whole, is_whole and has_no_problem, not is_whole and has_no_problem
         )
+
+    def _count(self, running: _Lines | None, time_ns: int | None) -> None:
+        # published while the run goes on: what a component publishes at its end is not in the record
+        counts = self._counts
+        counts.complete += 1
+        counts.watched += running is not None and running.judge is not None
+        numbers = {"complete": counts.complete, "watched": counts.watched, "late_lines": counts.late_lines}
+        self.memory["counts"] = numbers  # a restart does not begin again at 0
+        counts.timestamp.FromNanoseconds(self.clock.now_ns() if time_ns is None else time_ns)
+        self.publish(counts, f"{COUNTS}_{self.name}")
 
     def on_state(self, status: ScopeStatus) -> None:
         self._missing_lines.on_state(status, (self.packet and self.packet.time_ns) or 0)
@@ -330,7 +338,7 @@ class LineWatch(Component):
             running.taken.append(row)
             if running.judge is None:
                 continue
-            self._late_lines += self._is_over()
+            self._counts.late_lines += self._is_over()
             alarm = running.judge.add(row, line)
             if alarm is not None:
                 self._announce(lines, running, alarm)

@@ -202,10 +202,19 @@ def _problems(story: RunStory, clock: PageTimes) -> str:
         f'<p class="note">{escape(span.label)} at {clock.both(span.start_ns)} is {escape(ROUTINE)}.</p>'
         for span in story.overview.routine_spans
     )
+    watched = "".join(
+        f'<p class="note">{escape(name)} watched {one.watched} of {counted(one.complete, "complete scan")}; '
+        f"{counted(one.late_lines, 'line')} came after the end of their scan.</p>"
+        for name, one in story.watched.items()
+    )
     return (
-        table(["problem", "flagged", "by", "in control meanwhile", "treatments", "for", "cleared"], rows)
-        or "<p>None.</p>"
-    ) + routine
+        (
+            table(["problem", "flagged", "by", "in control meanwhile", "treatments", "for", "cleared"], rows)
+            or "<p>None.</p>"
+        )
+        + routine
+        + watched
+    )
 
 
 def _alarms(story: RunStory, clock: PageTimes) -> str:

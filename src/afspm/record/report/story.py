@@ -30,6 +30,7 @@ from afspm.record.run_lock import describe_state
 from afspm.record.tables import NoteRow, ScanRow, SpectrumRow
 from afspm.record.timeline import Span, Timeline
 from afspm.record.treatment_ledger import TreatmentLedger, treatments_once
+from afspm.wire.messages import WatchCounts
 
 COLOURS = 5  # of holders, repeated in turn: the CSS classes c0 to c4
 MOST_ROWS = 200
@@ -68,6 +69,7 @@ class RunStory:
         shadow: decisions of a run in shadow mode beside the person's acts.
         unfinished: how each unfinished component was stopped, as text by name.
         beside_instruments: the scans and spectra with values of other instruments.
+        watched: the counts of each watch on running scans, by the name of the component.
     """
 
     name: str
@@ -93,6 +95,7 @@ class RunStory:
     shadow: shadow.ShadowNight = field(default_factory=shadow.ShadowNight)
     unfinished: Mapping[str, str] = field(default_factory=dict)
     beside_instruments: Sequence[ScanRow | SpectrumRow] = ()
+    watched: Mapping[str, WatchCounts] = field(default_factory=dict)
 
     @property
     def end_ns(self) -> int:
@@ -198,6 +201,7 @@ def read(run: Run) -> RunStory:
         shadow=shadow.read(run),
         unfinished=run.facts.get(UNFINISHED) or {},
         beside_instruments=[row for row in (*scans, *spectra) if row.instruments],
+        watched=run.watch_counts(),
     )
 
 
