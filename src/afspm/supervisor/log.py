@@ -45,6 +45,7 @@ class LineReader:
         self._level: int = logging.WARNING
         self.last_error = ""
         """First line of the last error."""
+        self.last_warning = ""
 
     def read(self, stream: Literal["stdout", "stderr"], line: str) -> tuple[int, str]:
         """Return the level (as in `logging`) and the text of a line."""
@@ -56,6 +57,8 @@ class LineReader:
         self._level = _LEVELS[match["level"]]
         if self._level >= logging.ERROR:
             self.last_error = match["text"]
+        elif self._level >= logging.WARNING:
+            self.last_warning = match["text"]
         return self._level, match["text"]
 
 

@@ -69,8 +69,8 @@ class Processes:
 
     @property
     def errors(self) -> str:
-        """The last logged error of each process."""
-        errors = {name: reader.last_error for name, reader in self._readers.items()}
+        """The last logged error of each process, or warning: a controller that was never reached is a warning."""
+        errors = {name: reader.last_error or reader.last_warning for name, reader in self._readers.items()}
         return "; ".join(f"{name}: {error}" for name, error in errors.items() if error)
 
     def close(self) -> None:

@@ -62,7 +62,7 @@ def checked(folder: Path, name: str, *only: str, speed: float = SPEED) -> CheckR
         ("CancelIgnored", "scan/cancel", "expected .*SS_FREE.*; came "),
         ("CancelledSpectrumUntold", "spectrum/cancel", "expected SS_INTERRUPTED.*; came SS_SPEC, SS_FREE"),
         ("SpectrumElsewhere", "spectrum/position", r"expected a spectrum at .*; came \(0, 0\) nm"),
-        ("NotOnlyWhatWasAsked", "frame/position-only", "scan-size-x: the controller set 100 nm instead of 600 nm"),
+        ("NotOnlyWhatWasAsked", "frame/position-only", "scan-size-x: the controller set 100 nm instead of 300 nm"),
         ("NeverFreeAgain", "frame/set", "expected SS_FREE within"),
         ("PublishesTwice", "frame/set", "ScanParameters2d once.*; came SS_MOVING, ScanParameters2d, ScanParameters2d"),
         ("SuccessWithoutChange", "feedback/numbers", "expected ZCtrlParameters with proportional_gain = "),
