@@ -289,8 +289,7 @@ class LimitChecker:
         for name, value in numbers(self._valid_values(subject)):
             if name in self.limits.rated:
                 usage = usage.learn(name, value, now_ns)
-        seen = self.seen(forbidden_states.values_in(subject).values()) if self.limits.forbid else self
-        return seen._with_state(usage, self.state.position.learn(subject))
+        return self._with_seen(subject, usage, self.state.position)
 
     def in_force(self, subject: object, now_ns: int, *, was_read: bool = False) -> LimitChecker:
         """Store values that were set or read: a ScanParameters, Feedback, Parameter …"""
@@ -302,6 +301,9 @@ class LimitChecker:
         for name, value in values:
             if name in self.limits.bounded:
                 usage = usage.learn(name, value, now_ns, was_read=was_read)
+        return self._with_seen(subject, usage, position)
+
+    def _with_seen(self, subject: object, usage: Usage, position: KnownPosition) -> LimitChecker:
         seen = self.seen(forbidden_states.values_in(subject).values()) if self.limits.forbid else self
         return seen._with_state(usage, position.learn(subject))
 
