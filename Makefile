@@ -43,7 +43,7 @@ demo-drift: $(DEMO)
 	@$(BIN)/afspm demo --drift
 	@$(NEXT)
 
-## the tests of every change, in four minutes on two idle cores: units, decisions in simulated nights, protocols, and the
+## the tests of every change, in nine minutes on two idle cores: units, decisions in simulated nights, protocols, and the
 ## processes that everything else stands on. More at a time than there are cores, since many of them wait; each process
 ## of pytest takes 14 s on the reference computer to import and collect all tests
 TESTS_AT_A_TIME ?= 4
