@@ -47,12 +47,12 @@ if TYPE_CHECKING:
     from afspm.translator.zmq_connection import ZmqConnection
 
 if TYPE_CHECKING:  # one maker's controller has it today, and another's may
-    from afspm.storage.formats import igor, netcdf, read
+    from afspm.storage.formats import igor, netcdf
     from afspm.storage.formats.content import clock_ns
     from afspm.translator.driver_base import LOST, Introduction
     from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
     from afspm.translator.parameters import ParameterSpec, ParameterTable, refuse_value
-    from afspm.translator.result_files import NEW_FRAME, XY, missing_text, newest
+    from afspm.translator.result_files import NEW_FRAME, missing_text, newest
     from afspm.translator.trace import TCP, TRACE
 
 __all__ = [
@@ -65,7 +65,6 @@ __all__ = [
     "SCAN",
     "TCP",
     "TRACE",
-    "XY",
     "Activity",
     "Content",
     "ControllerLost",
@@ -110,7 +109,6 @@ __all__ = [
     "name_and_unit",
     "netcdf",
     "newest",
-    "read",
     "read_result",
     "refusal",
     "refuse_value",

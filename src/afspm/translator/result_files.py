@@ -27,7 +27,6 @@ NEW_FRAME: Final = "its frame was changed at the panel while it ran"
 _LISTED: Final = 16
 _OF_A_RESULT: Final = ("what", "frame", "position", "end_ns")
 
-XY = tuple[float, float]
 Content = Sequence[Scan | Spectrum]
 Entry = Plain
 """A measurement in JSON: its kind ("what"), its set "frame" or "position", "end_ns", keys of the driver."""

@@ -30,8 +30,7 @@ from afspm.plugins.bench.judging import TrialVerdict, judge
 from afspm.plugins.bench.sealing import Seal
 from afspm.plugins.bench.session import REPORT_FILE
 from afspm.plugins.bench.tasks import BenchTask
-from afspm.processes import FreePorts
-from afspm.processes import toml_text as dumps
+from afspm.processes import FreePorts, toml_text
 from afspm.record import latest_run
 
 AGENT: Final = "agent"
@@ -195,7 +194,7 @@ def _experiment(task: BenchTask, agent: AgentSpec, folder: Path) -> Iterator[_Ru
             tables[MCP] = {"component": True, "class": "Agent", "port": port}
             mcp_url = f"http://127.0.0.1:{port}/mcp"
     file, runs = folder / "experiment.toml", folder / "runs"
-    file.write_text(dumps(tables), encoding="utf-8")
+    file.write_text(toml_text(tables), encoding="utf-8")
     # without a process for `name`: the bench itself joins under this name
     command = [*python_command("afspm"), "run", str(file), "--no-report", "--runs", str(runs), "--without", name]
     process = subprocess.Popen(

@@ -28,8 +28,7 @@ from afspm.plugins.drift.simulated_truth import true_drift
 from afspm.plugins.drift.study.scan_series import Series, series
 from afspm.plugins.drift.study.workers import on_cores, processes
 from afspm.plugins.drift.trackers import tracker
-from afspm.record import JOURNAL_FILE
-from afspm.record import MEASURED_SUFFIX as RECORDED
+from afspm.record import JOURNAL_FILE, MEASURED_SUFFIX
 
 Array = NDArray[np.float64]
 
@@ -103,7 +102,7 @@ def _files(paths: Sequence[Path]) -> Iterator[Path]:
             continue
         folder = path / _SCANS_OF_A_RUN if (path / _SCANS_OF_A_RUN).is_dir() else path
         found = sorted(file for file in folder.rglob("*") if file.is_file() and file.suffix.lower() in suffixes())
-        of_the_controller = [file for file in found if file.suffix != RECORDED]
+        of_the_controller = [file for file in found if file.suffix != MEASURED_SUFFIX]
         # the record contains the same scans again, with places in sample coordinates where drift was corrected
         yield from of_the_controller if (path / JOURNAL_FILE).exists() and of_the_controller else found
 

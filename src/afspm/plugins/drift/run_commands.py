@@ -40,8 +40,7 @@ def compare(
     from afspm.plugins.drift.scan_pair import onto_first
     from afspm.processes import plain_console, plain_table
     from afspm.record import compare as compared
-    from afspm.record import rows_that_differ
-    from afspm.record import write_comparison as write
+    from afspm.record import rows_that_differ, write_comparison
 
     with ExitStack() as stack:
         found = compared([stack.enter_context(open_run(folder)) for folder in runs], onto_first)
@@ -49,7 +48,7 @@ def compare(
     plain_console().print(plain_table(["", *found.names], rows))
     for reason in found.unread:
         typer.echo(f"not compared: {reason}", err=True)
-    write(found, output)
+    write_comparison(found, output)
     typer.echo(output)
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import ClassVar, Final
 
 from afspm.basics import AfspmError, Clock, Refused
-from afspm.driver import ANSWERS_S, SCAN, XY, Activity, Kept, LongCall, as_list
-from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
+from afspm.driver import ANSWERS_S, SCAN, Activity, Kept, LongCall, as_list
+from afspm.model import XY, ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.plugins.park.link import SmartScanError
 from afspm.plugins.park.result_files import ParkFiles
 from afspm.plugins.park.session import Session

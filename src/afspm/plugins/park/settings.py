@@ -14,7 +14,6 @@ from afspm.basics import InvalidValue
 from afspm.driver import (
     FRAME,
     POSITION,
-    XY,
     KeptSettings,
     LongCall,
     SettingsGroup,
@@ -23,7 +22,7 @@ from afspm.driver import (
     frame,
     frame_values,
 )
-from afspm.model import ControlResponse, Region, names
+from afspm.model import XY, ControlResponse, Region, names
 from afspm.plugins.park.session import Session
 
 MICROMETRE: Final = 1e-6

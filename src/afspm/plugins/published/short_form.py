@@ -13,8 +13,7 @@ from afspm.experiment.toml_writer import value as toml
 from afspm.experiment.wiring_classes import WIRE_KEYS, WiringClass, wire_of
 from afspm.model import Role
 from afspm.plugins.published.files import INSTEAD, last
-from afspm.processes import is_local
-from afspm.processes import toml_text as dumps
+from afspm.processes import is_local, toml_text
 
 if TYPE_CHECKING:
     from afspm.experiment.resolved_experiment import ResolvedExperiment
@@ -37,11 +36,11 @@ def short(resolved: ResolvedExperiment) -> str:
     """
     parts = resolved.parts
     kept = {name: parts.variables[name] for name in _VARIABLES if name in parts.variables}
-    blocks = [dumps(kept)] if kept else []
-    blocks += [dumps({name: table}) for name, table in _sections(resolved).items()]
+    blocks = [toml_text(kept)] if kept else []
+    blocks += [toml_text({name: table}) for name, table in _sections(resolved).items()]
     for part in parts.components:
         if not part.implied:
-            blocks.append(dumps({part.name: _table(part, resolved)}))
+            blocks.append(toml_text({part.name: _table(part, resolved)}))
     blocks += [_instead(name, table) for name, table in parts.instead.items()]
     return "\n".join(blocks)
 
@@ -145,7 +144,7 @@ def _instead(name: str, table: Table) -> str:
     series = _series(table)
     if series is None:
         return f"{was}\n# Instead: {INSTEAD[last(table)]}.\n"
-    return f"{was}\n# It is taken for one region again and again: see that this is so.\n{dumps({name: series})}"
+    return f"{was}\n# It is taken for one region again and again: see that this is so.\n{toml_text({name: series})}"
 
 
 def _series(table: Table) -> Settings | None:

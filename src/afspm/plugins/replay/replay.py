@@ -14,8 +14,7 @@ from afspm import GUEST, Run, open_run, wire
 from afspm.basics import NS_PER_S, ConfigError, ExperimentClock, FileError, Launch, Sockets, is_address
 from afspm.model import Frame
 from afspm.plugins.replay.replayer import Replayer
-from afspm.processes import FreePorts, RateLimitedLog, is_local
-from afspm.processes import run_time as now
+from afspm.processes import FreePorts, RateLimitedLog, is_local, run_time
 from afspm.record import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, RecordPlayback, lock_run
 from afspm.supervisor import run_folder
 from afspm.transport.process import signals
@@ -124,7 +123,7 @@ def _guest(run: Run) -> Launch:
 
 @contextmanager
 def _folder(run: Run, runs: Path, guest: Launch, clock: ExperimentClock, publish: str, serve: str) -> Iterator[Path]:
-    folder = run_folder.create(runs, f"replay-{run.folder.name}", now())
+    folder = run_folder.create(runs, f"replay-{run.folder.name}", run_time())
     sockets = Sockets(subscribe=(publish,), control=serve)
     joined = replace(
         guest,

@@ -96,10 +96,10 @@ def page_of(experiment: Experiment, started: Sequence[str]) -> tuple[str, PlainM
 
 def with_page(files: list[Path]) -> Experiment:
     """Return the experiment, with a dashboard added if its files define none."""
-    from afspm.processes import load_experiment as load
+    from afspm.processes import load_experiment
 
-    experiment = load(*files)
-    return experiment if _has_dashboard(experiment) else load(*files, _overlay())
+    experiment = load_experiment(*files)
+    return experiment if _has_dashboard(experiment) else load_experiment(*files, _overlay())
 
 
 def resumed_with_page(found: ResumableRun) -> ResumableRun:
@@ -202,12 +202,11 @@ def _run_as_guest(folder: Path, dashboard: Dashboard, name: str) -> int:
 
     from afspm import guest_of
     from afspm.basics import ExperimentClock
-    from afspm.processes import ProcessActivity, ProcessContext, new_session, open_port, own_messages
-    from afspm.processes import register_messages as register_all
+    from afspm.processes import ProcessActivity, ProcessContext, new_session, open_port, own_messages, register_messages
     from afspm.record import STATE_DIR
 
     launch = guest_of(folder, name)
-    register_all(own_messages(folder, launch.messages))
+    register_messages(own_messages(folder, launch.messages))
     launch = dataclasses.replace(launch, run_dir=str(folder), state_dir=str(folder / STATE_DIR))
     clock = ExperimentClock.from_dict(launch.clock)
     port = open_port(launch, clock)

@@ -11,8 +11,7 @@ from afspm.plugins.web.archive import Archive
 from afspm.plugins.web.server import STALLED_S, WebServer, listening, url_of
 from afspm.plugins.web.watch import Watch
 from afspm.processes import step_back
-from afspm.record import bands_allowed as allowed_bands
-from afspm.record import cut_off_message, plans_of, run_json_or_empty
+from afspm.record import bands_allowed, cut_off_message, plans_of, run_json_or_empty
 
 if TYPE_CHECKING:
     import socket
@@ -84,7 +83,7 @@ class WebComponent(Component):
             self.clock, problems, archive.past(problems), lambda: cut_off_message(self.run_dir),
             plans=plans_of(run_json_or_empty(self.run_dir)) if launch.run_dir else None,
             began_ns=round(float(launch.clock["start_s"]) * NS_PER_S) if launch.clock else None,
-            bands=allowed_bands(self.run_dir) if launch.run_dir else None,
+            bands=bands_allowed(self.run_dir) if launch.run_dir else None,
         )  # fmt: skip
         return archive, watch
 

@@ -14,8 +14,7 @@ from typing import TextIO, TypeAlias
 from afspm import Run, open_run
 from afspm.basics import NS_PER_S, ConfigError, InvalidValue, Plain, PlainMapping, duration_text, from_json, utc_time
 from afspm.plugins.what_if.what_if import changed_experiment
-from afspm.processes import RunOptions, own_homes, run_experiment
-from afspm.processes import toml_text as dumps
+from afspm.processes import RunOptions, own_homes, run_experiment, toml_text
 from afspm.record import ENDED, EXPERIMENT_FILE, RunStory, read_story, run_json_or_empty
 
 _TRUTH = "truth.jsonl"
@@ -116,7 +115,7 @@ def _overlay(changes: SettingChanges | str | Path, facts: PlainMapping) -> str:
         if not isinstance(table, Mapping):
             raise InvalidValue(f"[{name}] of a night that is run again must be settings, not {table!r}")
     try:
-        return dumps({**start, **tables})
+        return toml_text({**start, **tables})
     except (TypeError, ValueError) as error:
         raise ConfigError(f"the changes can't be written as TOML: {error}") from error
 

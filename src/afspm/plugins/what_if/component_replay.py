@@ -20,9 +20,7 @@ from afspm.plugins.what_if.alignment import Difference, Output, aligned, first_d
 from afspm.plugins.what_if.hazards import HazardGuard
 from afspm.plugins.what_if.outputs import OutputReader
 from afspm.plugins.what_if.port_replay import Life, LifeOver, PacketOf, Poll, ReplayPort, recorded_outputs
-from afspm.processes import ExperimentProcess, ProcessActivity, ProcessContext
-from afspm.processes import load_class as load
-from afspm.processes import register_messages as register_all
+from afspm.processes import ExperimentProcess, ProcessActivity, ProcessContext, load_class, register_messages
 from afspm.record import EXPERIMENT_FILE, RUN_FILE
 from afspm.storage.disk import SYNCER
 from afspm.storage.memory import SYNCED_WITHIN_S
@@ -89,7 +87,7 @@ def replay(
     packet_of: PacketOf,
     run_dir: Path,
     *,
-    make: Make = load,
+    make: Make = load_class,
     settings: Mapping[str, object] | None = None,
     watch: bool = False,
 ) -> ComponentReplay:
@@ -190,7 +188,7 @@ def _launch(life: Life, folder: Path, settings: Mapping[str, object] | None) -> 
 def _run(launch: Launch, port: ReplayPort, life: Life, make: Make) -> ExperimentProcess:
     log = logging.getLogger(f"afspm.what_if.{launch.name}")
     log.propagate, log.disabled = False, True
-    register_all(launch.messages)
+    register_messages(launch.messages)
     component = _made(launch, make)
     port.handled = lambda: getattr(component, "packet", None)
     context = ProcessContext(

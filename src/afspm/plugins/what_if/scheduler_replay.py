@@ -14,11 +14,10 @@ from typing import NoReturn
 from afspm import restored
 from afspm.basics import ConfigError, ExperimentClock, FileError, Launch, PlainList, WireError
 from afspm.plugins.what_if.alignment import Difference, Output, PacketName, aligned
-from afspm.processes import ProcessActivity, ProcessContext
-from afspm.processes import load_class as load
-from afspm.scheduler import STATE_KIND as KIND
-from afspm.scheduler import STATE_VERSION as VERSION
+from afspm.processes import ProcessActivity, ProcessContext, load_class
 from afspm.scheduler import (
+    STATE_KIND,
+    STATE_VERSION,
     TIP_FRAME,
     CoordinateFrame,
     Restored,
@@ -79,7 +78,7 @@ def read_steps(path: Path, core_of: CoreOf) -> Iterator[tuple[MakeCore, Restored
         for kind, *rest in read_lines(path):
             if kind == "life":
                 launch, saved, cached = rest
-                state = None if saved is None else restored(SavedState, saved, KIND, VERSION)
+                state = None if saved is None else restored(SavedState, saved, STATE_KIND, STATE_VERSION)
                 make, frame = core_of(Launch.from_json(json.dumps(launch)))
                 yield make, Restored(state, read_cached(cached))
             elif kind == "step":
@@ -190,7 +189,7 @@ def _input_name(event: events.Input | None) -> str:
 
 def _core_of(launch: Launch, settings: Mapping[str, object] | None) -> tuple[MakeCore, CoordinateFrame]:
     launch = replace(launch, settings=launch.settings if settings is None else dict(settings), keeps_requests=False)
-    scheduler = load(launch)
+    scheduler = load_class(launch)
     if not isinstance(scheduler, Scheduler):
         raise ConfigError(f"{launch.class_} is not afspm's scheduler", where=launch.name)
     clock = ExperimentClock.real()  # the settings do not depend on it

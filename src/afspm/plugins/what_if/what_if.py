@@ -30,9 +30,16 @@ from afspm.plugins.what_if.alignment import Difference
 from afspm.plugins.what_if.component_replay import ComponentReplay
 from afspm.plugins.what_if.port_replay import Life, PacketOf, read_lives
 from afspm.plugins.what_if.scheduler_replay import SchedulerReplay
-from afspm.processes import Experiment, FreePorts, find_class, importing_from, load_expanded, own_homes
-from afspm.processes import load_class as load
-from afspm.processes import toml_text as dumps
+from afspm.processes import (
+    Experiment,
+    FreePorts,
+    find_class,
+    importing_from,
+    load_class,
+    load_expanded,
+    own_homes,
+    toml_text,
+)
 from afspm.record import EXPERIMENT_FILE, run_json_or_empty
 from afspm.scheduler import step_log
 from afspm.storage.line_log import REQUESTS_FOLDER, read_lines
@@ -290,7 +297,7 @@ def _replay(
         result.left_out[name] = why
         return
     settings, make = changed or (None, None)
-    made = component_replay.replay(lives, packet_of, result.run, make=make or load, settings=settings)
+    made = component_replay.replay(lives, packet_of, result.run, make=make or load_class, settings=settings)
     if made.first is not None and made.forbidden and changed is None:
         result.unread[name] = f"a replay does not allow what it does: it {made.forbidden}"
         return
@@ -379,7 +386,7 @@ def _in_si(folder: Path, name: str, change: Mapping[str, object], homes: Sequenc
     with TemporaryDirectory(prefix="afspm-what-if-") as made:
         overlay = Path(made) / "changed.toml"
         try:
-            overlay.write_text(dumps({name: dict(change)}), encoding="utf-8")
+            overlay.write_text(toml_text({name: dict(change)}), encoding="utf-8")
         except (TypeError, ValueError):  # an object, for a class of the caller
             return change
         starts = changed_experiment(folder, homes, overlay).launches(take_address=FreePorts().address)
@@ -466,7 +473,7 @@ def _content(part: ExperimentPart | None) -> object:
 
 
 def _loaded_as(class_path: str) -> component_replay.Make:
-    return lambda launch: load(replace(launch, class_=class_path))
+    return lambda launch: load_class(replace(launch, class_=class_path))
 
 
 def changed_experiment(folder: Path, homes: Sequence[Path], *files: Path) -> Experiment:

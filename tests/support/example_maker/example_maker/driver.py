@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
+from afspm import read
 from afspm.basics import AfspmError
-from afspm.driver import Driver, Receiver, TcpConnection, Value, action, host_and_port, read
+from afspm.driver import Driver, Receiver, TcpConnection, Value, action, host_and_port
 from afspm.model import Scan, ScopeState, ScopeStatus, Spectrum, names
 
 

@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
+from afspm import read
 from afspm.basics import Clock, InvalidValue, Plain
-from afspm.driver import read
 from afspm.emulation import Faults, ScanActivity, SimulatedInstrument, SpectrumActivity
 from afspm.model import Region
 from afspm.plugins.gxsm.emulator import files

@@ -15,8 +15,7 @@ from afspm.plugins.web.dashboard.sessions import Sessions
 from afspm.plugins.web.passwords import is_loopback
 from afspm.plugins.web.server import USUAL_PORT
 from afspm.plugins.web.watch import Audience
-from afspm.record import bands_allowed as allowed_bands
-from afspm.record import experiment_name
+from afspm.record import bands_allowed, experiment_name
 
 END_SHOWN_WITHIN_S = 1.5  # time for the pages to show the end
 
@@ -78,7 +77,7 @@ class Dashboard(WebComponent):
                 allowed_region(self.run_dir),
                 adjustable_parameters(self.run_dir),
                 f"live/thumbnail/{secrets.token_hex(4)}",
-                allowed_bands(self.run_dir),
+                bands_allowed(self.run_dir),
                 agents_in(self.run_dir),
             ),
             self._steering,

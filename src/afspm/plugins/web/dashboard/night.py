@@ -16,8 +16,7 @@ from afspm.basics import FileError, NeverLate
 from afspm.model import XY, Note, Scan
 from afspm.plugins.web.frames import FrameStore
 from afspm.plugins.web.watch import SpectrumStore, Watch
-from afspm.record import Overview, RecordPlayback
-from afspm.record import bands_allowed as allowed_bands
+from afspm.record import Overview, RecordPlayback, bands_allowed
 
 if TYPE_CHECKING:
     from afspm.wire.messages import DriftMapping
@@ -117,7 +116,7 @@ class NightWatch(Watch):
 
     def __init__(self, night: Night) -> None:
         self.moment = StoppedClock(night.end_ns, night.speed)
-        super().__init__(self.moment, night.problems, bands=allowed_bands(night.folder))
+        super().__init__(self.moment, night.problems, bands=bands_allowed(night.folder))
         self._night = night
         self._events: Sequence[NightEvent] = ()
         self._playback: RecordPlayback[NightEvent] = RecordPlayback(())

@@ -31,9 +31,18 @@ from afspm.plugins.web.dashboard.night import Night, NightWatch
 from afspm.plugins.web.dashboard.page import ASSETS, TABS, Page, Services, section
 from afspm.plugins.web.dashboard.pictures import Look, RenderedFrame
 from afspm.plugins.web.frames import ChannelFrame
-from afspm.record import DIVERGING, REPORT_FILE, ScanRow, ValueRange, describe_state, indices, png, value_range
-from afspm.record import bands_allowed as allowed_bands
-from afspm.record import write_report as write
+from afspm.record import (
+    DIVERGING,
+    REPORT_FILE,
+    ScanRow,
+    ValueRange,
+    bands_allowed,
+    describe_state,
+    indices,
+    png,
+    value_range,
+    write_report,
+)
 
 _HEAD = """<link rel="stylesheet" href="assets/night.css"><script type="module" src="assets/night.js"></script>"""
 
@@ -46,7 +55,7 @@ class NightPage(Page):
     def __init__(self, night: Night, pictures: str, services: Services, visitor: Visitor) -> None:
         self._night = night
         self._watch = NightWatch(night)
-        limits, bands = allowed_region(night.folder), allowed_bands(night.folder)
+        limits, bands = allowed_region(night.folder), bands_allowed(night.folder)
         contents = Contents(self._watch, limits, pictures=pictures, bands=bands)
         ui.add_head_html(_HEAD)
         super().__init__(replace(services, watch=self._watch, contents=contents), replace(visitor, recorded=True))
@@ -171,7 +180,7 @@ class NightActions(Actions):
         append_note(self._night.folder, self._who, text, written_ns, scan_ns, time_ns)
         self._night.reload()
         if (self._night.folder / REPORT_FILE).exists():
-            write(self._night.folder)
+            write_report(self._night.folder)
         return ActionResult("Noted.")
 
 

@@ -11,8 +11,7 @@ from functools import lru_cache
 from afspm import Array, Levelling, flattened, levelled
 from afspm.plugins.web.dashboard.scan_facts import Facts
 from afspm.plugins.web.frames import ChannelFrame
-from afspm.record import PALETTES, Contrast, ValueRange, indices, png, shared_range
-from afspm.record import shown_image as shown
+from afspm.record import PALETTES, Contrast, ValueRange, indices, png, shared_range, shown_image
 
 KEPT, THUMBNAILS_KEPT = 8, 600
 SIDE_PX = 128
@@ -122,4 +121,4 @@ class Thumbnails:
         if frame is None:
             # raised, so that the cache does not keep a missing picture
             raise LookupError(time_ns)
-        return shown(flattened(frame.values), SIDE_PX).image
+        return shown_image(flattened(frame.values), SIDE_PX).image
