@@ -523,6 +523,10 @@ class SimulatedInstrument:
         if self.scan is not None:
             self._redraw(self.scan.adjusted)
 
+    def count_on(self, *, scans: int, spectra: int) -> None:
+        """Let the numbers of coming scans and spectra be higher than these."""
+        self._counts = {"scan": max(scans, self._counts["scan"]), "spectrum": max(spectra, self._counts["spectrum"])}
+
     # -- inside
 
     def note(self, time_s: float, event: str, facts: Mapping[str, object]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,15 @@ def scope(request: Any, tmp_path: Path, fake_clock: Any) -> Simulator:
     made = Simulator(faults=[request.param], initial=initial)
     made.clock, made.log, made.run_dir = fake_clock, logging.getLogger("test"), tmp_path
     made.memory, made.wake = {}, lambda: None
+    made.connect()
+    return made
+
+
+def restarted(scope: Simulator, memory: Any) -> Simulator:
+    """The microscope after a restart with this saved state, without faults."""
+    made = Simulator()
+    made.clock, made.log, made.run_dir = scope.clock, scope.log, scope.run_dir
+    made.memory, made.wake = memory, lambda: None
     made.connect()
     return made
 
@@ -107,3 +117,17 @@ def test_requests_are_refused_but_withdrawing_is_not(scope: Simulator) -> None:
     with pytest.raises(Refused, match="simulated fault"):
         scope.set({"scan-speed": 1e-6})
     scope.set({"scan-speed": 1e-6})
+
+
+@pytest.mark.parametrize("scope", [{"kind": "no-file", "at_s": 1e6}], indirect=True)
+def test_file_stays_when_a_power_cut_takes_the_state_back_to_before_it(
+    scope: Simulator, fake_clock: Any, tmp_path: Path
+) -> None:
+    before = copy.deepcopy(scope.memory)
+    assert scanned(scope, fake_clock) is FREE
+    (first,) = scope.results()
+    content = Path(first).read_bytes()
+    again = restarted(scope, before)
+    assert scanned(again, fake_clock) is FREE
+    assert Path(first).read_bytes() == content
+    assert sorted(path.name for path in tmp_path.rglob("*.nc")) == ["scan-0001.nc", "scan-0002.nc"]

@@ -90,6 +90,8 @@ class SimulatedController:
             instrument.restore(kept["instrument"])
         else:
             self._keep()
+        # a power cut may take the state back to before files that are on the disk: they are never overwritten
+        instrument.count_on(scans=self._files.last("scan"), spectra=self._files.last("spectrum"))
         self._actions: dict[str, Callable[[float], None]] = {
             names.START_SCAN: self.start_scan,
             names.STOP_SCAN: self.stop,
@@ -329,6 +331,11 @@ class SavedFiles:
         self._folder = folder
         self._kept = kept
         self._faults = faults
+
+    def last(self, kind: str) -> int:
+        """Return the highest number of a saved "scan" or "spectrum" file; 0 without one."""
+        names = (path.stem.split("-") for path in self._folder.glob(f"{kind}-*.nc"))
+        return max((int(words[1]) for words in names if words[1].isdecimal()), default=0)
 
     def save(self, name: str, content: bytes, end_s: float) -> None:
         """Save the file of a measurement that ended at `end_s`; a fault may omit, delay or halve the file."""
