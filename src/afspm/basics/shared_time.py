@@ -9,6 +9,8 @@ and counts that.
 
 The file holds the origin (real and experiment time of the last change), two numbers derived from the holds, which are
 enough to tell the time, and the holds. Each change moves the origin to its own moment, so that the time is continuous.
+Reads of the time wait until a change is complete: one made while the writer waited for a processor could be seconds of
+experiment time ahead of the slow time that the change begins.
 """
 
 from __future__ import annotations
@@ -34,7 +36,9 @@ LONGEST_HOLD_S = 600.0
 """Real time after which a hold no longer counts: a process that hangs must not slow the night for ever. Registering the
 largest scans takes a minute on a computer with a load of forty."""
 MOST_HOLDS = 64  # a process has one to three at a time; further ones are not kept, which the supervisor logs
-_LOOKS = 1000  # reads while another process writes; if none is valid, the writer was killed: the last valid one counts
+_LOOKS = 1000  # reads while a change is being made; then its maker was stopped or killed: the last valid content counts
+_LOOKS_AT_ONCE = 20  # a change takes some 20 µs, unless its maker waits for a processor
+_LOOK_S = 0.001
 _NEVER_NS = 1 << 62  # experiment time of a hold that begins with a publication: this, and the number of its kind
 _HEAD = struct.Struct("<5q")
 _HOLD = struct.Struct("<4q")
@@ -42,6 +46,7 @@ _AT_ONCE_NS = -_NEVER_NS  # before every start of a clock, which may lie before 
 _LATEST_S = 4e9
 _CHECKSUM = struct.Struct("<I")
 _SIZE = _HEAD.size + MOST_HOLDS * _HOLD.size
+_CHANGING, _UNCHANGING = b"\1", b"\0"  # the last byte of the file
 
 
 class Publication(Enum):
@@ -178,14 +183,14 @@ class SharedSimulationTime:
         self._file = path.open("r+b")  # stays open: opening it may hang with the disk, and a late process must not
         weakref.finalize(self, self._file.close)
         self._turn = threading.RLock()  # threads of one process share the lock of the file
-        self._map = mmap.mmap(self._file.fileno(), _SIZE + _CHECKSUM.size)
+        self._map = mmap.mmap(self._file.fileno(), _SIZE + _CHECKSUM.size + len(_CHANGING))
         self._last = b"", SharedTime(0, 0)  # the file's bytes, and their content
         self._own: list[_OwnHold] = []
 
     @staticmethod
     def create(path: Path, shown_ns: int) -> SharedSimulationTime:
         """Create the file, with an experiment time in ns."""
-        path.write_bytes(SharedTime(time.monotonic_ns(), shown_ns).as_bytes())
+        path.write_bytes(SharedTime(time.monotonic_ns(), shown_ns).as_bytes() + _UNCHANGING)
         return SharedSimulationTime(path)
 
     def now_ns(self, real_ns: int, speed: float) -> int:
@@ -236,14 +241,20 @@ class SharedSimulationTime:
         return is_free
 
     def read(self) -> SharedTime:
-        for _ in range(_LOOKS):
+        for look in range(_LOOKS):
             packed, (before, shared) = self._map[:], self._last
             if packed == before:
                 return shared
-            if (found := SharedTime.from_bytes(packed)) is not None:
+            if packed.endswith(_UNCHANGING) and (found := SharedTime.from_bytes(packed)) is not None:
                 self._last = packed, found
                 return found
-        return self._last[1]
+            if look >= _LOOKS_AT_ONCE:
+                time.sleep(_LOOK_S)  # no event: a byte in memory that another process changes
+        return self._content()
+
+    def _content(self) -> SharedTime:
+        # also of a change that was not finished, unless it was written in part only
+        return SharedTime.from_bytes(self._map[:]) or self._last[1]
 
     def _declare(self, own: _OwnHold, speed: float) -> None:
         def add(shared: SharedTime) -> SharedTime:
@@ -264,8 +275,13 @@ class SharedSimulationTime:
             self._write(change, speed)
 
     def _write(self, change: Callable[[SharedTime], SharedTime], speed: float) -> None:
-        shared = change(self.read().moved_to(time.monotonic_ns(), speed)).settled()
-        self._map[:] = shared.as_bytes()
+        before, end = self._content(), len(self._map)
+        self._map[end - 1 :] = _CHANGING
+        try:
+            shared = change(before.moved_to(time.monotonic_ns(), speed)).settled()
+            self._map[: end - 1] = shared.as_bytes()
+        finally:
+            self._map[end - 1 :] = _UNCHANGING
 
 
 def opened(path: str | None) -> SharedSimulationTime | None:

@@ -126,6 +126,25 @@ def test_time_never_goes_back_however_many_are_late(tmp_path: Path) -> None:
     assert clock.now_ns() >= seen[-1]
 
 
+def test_time_is_not_read_during_a_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = waiting(tmp_path)
+    seen: list[int] = []
+    reader = threading.Thread(target=lambda: seen.append(clock.now_ns()))
+    monotonic_ns = time.monotonic_ns
+
+    def interrupted() -> int:
+        moment_ns = monotonic_ns()
+        monkeypatch.undo()
+        reader.start()
+        reader.join(0.1)  # a writer that waits for a processor; the reader gets no time before it is done
+        return moment_ns
+
+    monkeypatch.setattr("afspm.basics.shared_time.time.monotonic_ns", interrupted)
+    with clock.late():
+        reader.join()
+        assert clock.now_ns() >= seen[0]
+
+
 @pytest.mark.parametrize("is_first", [False, True])
 def test_process_later_than_the_limit_slows_time_no_longer(tmp_path: Path, is_first: bool) -> None:
     clock = waiting(tmp_path)
