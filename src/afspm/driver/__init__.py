@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         modified_ns,
         read_result,
     )
+    from afspm.translator.scripted_driver import ScriptedDriver
     from afspm.translator.setting_groups import (
         FRAME,
         POSITION,
@@ -83,6 +84,7 @@ __all__ = [
     "ParameterTable",
     "Receiver",
     "ResultFiles",
+    "ScriptedDriver",
     "SettingsGroup",
     "ShadowDriver",
     "TcpConnection",

@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.basics import ConfigError, Duration, PollPeriod, Refused
-from afspm.driver import FEEDBACK_ON, FRAME, POSITION, SCAN, Driver, KeptSettings, Value, action, connected, frame
-from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, both_ways, names
+from afspm.driver import FEEDBACK_ON, FRAME, POSITION, SCAN, KeptSettings, ScriptedDriver, Value, action, frame
+from afspm.model import ControlResponse, Region, ScopeState, both_ways, names
 from afspm.plugins.asylum.activity import FORCE, AsylumActivity
 from afspm.plugins.asylum.link import Link
 from afspm.plugins.asylum.result_files import AsylumFiles
@@ -56,7 +56,7 @@ _CHANNELS: Final = both_ways(
 )
 
 
-class Asylum(Driver):
+class Asylum(ScriptedDriver[Session, AsylumActivity]):
     """The microscope behind Asylum Research's software.
 
     Args:
@@ -76,12 +76,12 @@ class Asylum(Driver):
     channel_roles = _CHANNELS
     maker: ClassVar[str] = "Oxford Instruments Asylum Research"
     software: ClassVar[str] = "Asylum Research in Igor Pro"
+    program: ClassVar[str] = "Igor"
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
     start_engages: ClassVar[bool] = True
     shadow: ClassVar[str] = "afspm.plugins.asylum.shadow.AsylumShadow"
     link: ClassVar[type[Link]] = Link
-    _activity: AsylumActivity
 
     def __init__(
         self,
@@ -105,12 +105,11 @@ class Asylum(Driver):
         if spots == "none":
             self.table = self.table.without(POSITION)
         self._reply_timeout_s = reply_timeout_s
-        self._session: Session | None = None
         self._kept = KeptSettings(_AT_FIRST)
-        image = (lambda: self._activity.image) if spots == "image" else None
-        self._place = TipPlace(self._igor, image, lambda: self._activity.moves(move_s))
-        frame_settings = FrameSettings(self._igor, lambda: self.in_force(NAMES), self._see_frame)
-        feedback = FeedbackSwitch(self._igor, lambda holds: self.wait_for(holds, reply_timeout_s))
+        image = (lambda: self.activity.image) if spots == "image" else None
+        self._place = TipPlace(self.session, image, lambda: self.activity.moves(move_s))
+        frame_settings = FrameSettings(self.session, lambda: self.in_force(NAMES), self._see_frame)
+        feedback = FeedbackSwitch(self.session, lambda holds: self.wait_for(holds, reply_timeout_s))
         self.groups = (self._kept, frame_settings, self._place, feedback)
 
     @classmethod
@@ -140,82 +139,60 @@ class Asylum(Driver):
                 "Igor does not include afspm.ipf: values are read one by one, and the feedback can't be switched"
             )
         for what in (SCAN, FORCE):
-            self._activity.folder(what)
+            self.activity.folder(what)
         if self._spots != "none":
             session.do("InitProbePos")
-            self._activity.find_image()
+            self.activity.find_image()
         if self._base_name and session.text("GetBaseName") != self._base_name:
-            self._activity.call_files(self._base_name)
+            self.activity.call_files(self._base_name)
 
     def close(self) -> None:
+        # the activity stays: the way of the tip, and why it was withdrawn, are asked while Igor is away
         if self._session is not None:
             self._session.close()
             self._session = None
-
-    def _igor(self) -> Session:
-        return connected(self._session, "Igor", self.controller_at)
 
     def _frame_in_force(self) -> Region:
         return frame(self.in_force(FRAME))[0]
 
     def _see_frame(self, region: Region) -> None:
         # read for the first time before the activity exists
-        if hasattr(self, "_activity"):
+        if self._activity is not None:
             self._activity.see_frame(region)
 
-    def status(self) -> ScopeStatus:
-        return self._activity.status()
-
     def next_change_s(self) -> float | None:
-        return self._activity.way.next_s
+        return self.activity.way.next_s
 
     def get(self, vendor: str) -> Value:
         if vendor == names.ENGAGED:
-            return self._igor().doing().engaged
+            return self.session().doing().engaged
         if vendor == names.CONTROLLER:
-            return self._igor().controller()
+            return self.session().controller()
         if any(row.vendor == vendor and row.type == "text" for row in self.table.values()):
-            return self._igor().text("GS", vendor)
-        return self._igor().values([vendor])[vendor]
+            return self.session().text("GS", vendor)
+        return self.session().values([vendor])[vendor]
 
-    def set(self, values: Mapping[str, Value]) -> None:
-        for vendor, value in values.items():
-            self._igor().put(vendor, value)
-
-    def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
-        """Return values of the parameter table; numbers are read together, in one request if Igor has `afspm.ipf`."""
-        numbers = [name for name in wanted if self.table[name].type != "text" and name != names.ENGAGED]
-        values = self._igor().values([self.table[name].vendor for name in numbers]) if numbers else {}
-        found = {name: self.table[name].from_vendor(values[self.table[name].vendor]) for name in numbers}
-        return found | super().read_rows([name for name in wanted if name not in found])
-
-    def results(self) -> Sequence[str]:
-        return self._files.results(self.clock.now_ns())
-
-    def stopped_by_hand(self) -> str:
-        return self._activity.stopped_by_hand()
+    def is_read_alone(self, name: str) -> bool:
+        return self.table[name].type == "text" or name == names.ENGAGED
 
     def withdrew_tip(self) -> str:
-        return self._activity.withdrew_tip
-
-    def load(self, result: str) -> Sequence[Scan | Spectrum]:
-        return self._files.load(result)
+        return self.activity.withdrew_tip
 
     # --- actions ---
 
     @action(names.START_SCAN)
     def start_scan(self) -> None:
         """Scan the frame once, in the direction `x-scan-direction`."""
-        self._activity.saves(SCAN)
+        self.activity.saves(SCAN)
         # before the start: the spot still counts from the corner of the image that the scan will replace
         probe_m = self._place.xy_m() if self._spots == "image" else None
-        self._activity.begin(SCAN)
+        self.activity.begin(SCAN)
         up = self._kept[names.SCAN_DIRECTION] == names.UP
         # with LastScan 0 Asylum scans the frame again and again
-        self._igor().put("LastScan", 1)
+        self.session().put({"LastScan": 1})
         self._begin(SCAN, "DoScanFunc", "UpScan" if up else "DownScan")
-        self._igor().put("LastScan", 1)  # again, in case the start has reset it
-        self._activity.await_begin(SCAN)
+        self.session().put({"LastScan": 1})  # again, in case the start has reset it
+        self.activity.await_begin(SCAN)
         # spots count from the corner of the new image now: the same position is another spot
         if probe_m is not None:
             try:
@@ -225,18 +202,18 @@ class Asylum(Driver):
 
     def _begin(self, what: str, function: str, button: str) -> None:
         try:
-            accepted = self._igor().do(function, button)
+            accepted = self.session().do(function, button)
         except XopError:
             # if the measurement has started all the same, the next poll registers its start
-            self._activity.forget()
+            self.activity.forget()
             raise
         if not accepted:
-            raise self._activity.refuse(what)
+            raise self.activity.refuse(what)
 
     @action(names.STOP_SCAN)
     def stop_scan(self) -> None:
         """Stop the scan. Asylum also withdraws the tip."""
-        self._activity.withdraw()
+        self.activity.withdraw()
         # a warning, since a withdrawn tip may surprise the user: StopScan stops more than the scan
         self.log.warning("Asylum withdrew the tip, as it does whenever a scan is stopped")
 
@@ -249,37 +226,37 @@ class Asylum(Driver):
                 present position.
         """
         # ScanStatus and FMapStatus do not show single force curves
-        if self._igor().doing().bits is None:
+        if self.session().doing().bits is None:
             reason = "Igor lacks ARGetStatus, without which the end of a force curve can't be detected"
             raise Refused(ControlResponse.ACTION_ERROR, reason)
-        self._activity.saves(FORCE)
-        if self._activity.was_led_away:
+        self.activity.saves(FORCE)
+        if self.activity.was_led_away:
             self._place.go()
-            self._activity.curve_awaited = FORCE
+            self.activity.curve_awaited = FORCE
         else:
             self._take_curve()
 
     def _take_curve(self) -> None:
-        self._activity.begin_curve()
+        self.activity.begin_curve()
         self._begin(FORCE, "DoForceFunc", "Single")
-        self._activity.await_begin(FORCE)
+        self.activity.await_begin(FORCE)
 
     @action(names.STOP_SPEC)
     def stop_spec(self) -> None:
-        self._igor().do("DoForceFunc", "Reset")
-        self._activity.stopped()
+        self.session().do("DoForceFunc", "Reset")
+        self.activity.stopped()
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
         """Stop scan, force curve and feedback, and withdraw the tip."""
-        self._activity.withdraw()
+        self.activity.withdraw()
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
         """Approach the sample, like the button Engage."""
-        self._activity.withdrew_tip = ""
+        self.activity.withdrew_tip = ""
         # the function takes the name of the pressed button
-        if not self._igor().do("SimpleEngageMe", "SimpleEngageButton"):
+        if not self.session().do("SimpleEngageMe", "SimpleEngageButton"):
             raise Refused(ControlResponse.ACTION_ERROR, "Asylum refused to engage")
 
     @action(names.PULSE, state=ScopeState.BUSY_PARAM)
@@ -294,7 +271,7 @@ class Asylum(Driver):
         except ValueError as error:
             reason = f'{text!r}: arguments as in JSON, PV "SaveImage", 2: {error}'
             raise Refused(ControlResponse.ACTION_ERROR, reason) from error
-        if not self._igor().do(name, *parameters):
+        if not self.session().do(name, *parameters):
             raise Refused(ControlResponse.ACTION_ERROR, f"Asylum refused {name} (it returned 1)")
 
 

@@ -168,7 +168,7 @@ class AsylumActivity(Activity):
         # the file is the only result: no function used here returns images or curves
         if self._session.values([name])[name] != _SAVE:
             self._log.warning("Asylum did not save its measurements (%s); saving is on from now on", name)
-            self._session.put(name, _SAVE)
+            self._session.put({name: _SAVE})
         folder = self.folder(what)
         if not folder.is_dir():
             reason = f"Asylum's folder {folder} does not exist on this computer: set folders"
@@ -181,7 +181,7 @@ class AsylumActivity(Activity):
     def call_files(self, base: str) -> None:
         """Set the files' base name, and a number above all existing files of this name: Asylum overwrites files."""
         self._session.do("SetBaseName", base)
-        self._session.put("BaseSuffix", max(free_suffix(self.folder(what), base) for what in _SAVED_TO))
+        self._session.put({"BaseSuffix": max(free_suffix(self.folder(what), base) for what in _SAVED_TO)})
         try:
             # the panel's own check also sees folders that are not reachable from this computer
             self._session.do("ARCheckSuffix")

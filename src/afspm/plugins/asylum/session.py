@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -113,11 +113,12 @@ class Session:
         return found
 
     # PV checks no range, and updates none of the values that the panel derives.
-    def put(self, name: str, value: Value) -> None:
-        if isinstance(value, str):
-            self.ask("PS", name, value)
-        else:
-            self.ask("PV", name, float(value))
+    def put(self, values: Mapping[str, Value]) -> None:
+        for name, value in values.items():
+            if isinstance(value, str):
+                self.ask("PS", name, value)
+            else:
+                self.ask("PV", name, float(value))
 
     def _look(self, names: Sequence[str]) -> tuple[float, list[float]]:
         # Without `afspm.ipf`, each value is one request. Its absence is remembered: each attempt would cost a request.

@@ -113,10 +113,8 @@ class FrameSettings(SettingsGroup):
     def write(self, values: Mapping[str, Value]) -> None:
         wanted = asylums(values, self._in_force())
         there = self._igor().values(list(wanted))
-        for name, value in wanted.items():
-            # each PV is a request of its own, and takes Igor some ten milliseconds
-            if there[name] != value:
-                self._igor().put(name, value)
+        # each PV is a request of its own, and takes Igor some ten milliseconds
+        self._igor().put({name: value for name, value in wanted.items() if there[name] != value})
 
 
 class TipPlace(SettingsGroup):
@@ -157,7 +155,7 @@ class TipPlace(SettingsGroup):
 
     def go(self) -> None:
         """Start moving the tip to the spot. Raises Refused: PARAM_ERROR."""
-        self._igor().put("ForceSpotNumber", _OUR_SPOT)  # a person may have chosen another spot at the panel
+        self._igor().put({"ForceSpotNumber": _OUR_SPOT})  # a person may have chosen another spot at the panel
         if not self._igor().do("DoForceFunc", "Go"):
             raise Refused(ControlResponse.PARAM_ERROR, "Asylum refused to move the tip")
         self._on_move()

@@ -37,7 +37,7 @@ class AsylumShadow(ShadowDriver, Asylum):
         self.table = self.table.without(POSITION)
         super().connect()
         try:
-            saves = self._igor().values([_SAVES])[_SAVES]
+            saves = self.session().values([_SAVES])[_SAVES]
         except Refused:
             return
         if not saves:

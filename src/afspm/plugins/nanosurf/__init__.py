@@ -12,13 +12,13 @@ share the first connection; each long command (approach, withdrawal, curve) has 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.basics import ConfigError, Duration, PlainMapping, PollPeriod, Refused
-from afspm.driver import FRAME, POSITION, Driver, KeptSettings, Value, action, connected, frame
-from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, both_ways, names
+from afspm.driver import FRAME, POSITION, KeptSettings, ScriptedDriver, Value, action, frame
+from afspm.model import ControlResponse, ScanLines, ScopeState, both_ways, names
 from afspm.plugins.nanosurf import commands
 from afspm.plugins.nanosurf.activity import FORCE, NanosurfFiles, ScanTime, StudioActivity
 from afspm.plugins.nanosurf.link import Link, StudioError
@@ -49,7 +49,7 @@ _CHANNELS: Final = both_ways(
 )
 
 
-class Nanosurf(Driver):
+class Nanosurf(ScriptedDriver[Session, StudioActivity]):
     """The microscope behind Nanosurf Studio.
 
     Args:
@@ -68,6 +68,7 @@ class Nanosurf(Driver):
     channel_roles = _CHANNELS
     maker: ClassVar[str] = "Nanosurf"
     software: ClassVar[str] = "Nanosurf Studio"
+    program: ClassVar[str] = StudioActivity.program
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
     shadow: ClassVar[str] = "afspm.plugins.nanosurf.shadow.NanosurfShadow"
@@ -91,12 +92,10 @@ class Nanosurf(Driver):
         self._release, self._session_name = release, session
         self._gallery_dir, self._image_buffer = gallery_dir, image_buffer
         self._reply_timeout_s = reply_timeout_s
-        self._session: Session | None = None
-        self._activity: StudioActivity | None = None
         self._kept = KeptSettings(_AT_FIRST)
         late = "the tip did not reach the position that it was sent to"
-        self._place = TipPlace(self._studio, lambda: self.clock.now_s(), lambda: self.log.error(late))
-        self.groups = (self._kept, FrameSettings(self._studio), Slopes(self._studio), self._place)
+        self._place = TipPlace(self.session, lambda: self.clock.now_s(), lambda: self.log.error(late))
+        self.groups = (self._kept, FrameSettings(self.session), Slopes(self.session), self._place)
         if commands.is_before_this_tree(release):
             self._leave_out_what_is_unknown()
 
@@ -120,46 +119,16 @@ class Nanosurf(Driver):
         self._save_files(session)
         self._look_at_folder()
 
-    def close(self) -> None:
-        if self._activity is not None:
-            self._activity.close()
-            self._activity = None
-        if self._session is not None:
-            self._session.close()
-            self._session = None
-
-    def status(self) -> ScopeStatus:
-        return self._doing.status()
-
     def get(self, vendor: str) -> Value:
-        return self._studio().values([vendor])[vendor] if vendor != names.CONTROLLER else self._studio().controller
-
-    def set(self, values: Mapping[str, Value]) -> None:
-        self._studio().put(values)
-
-    def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
-        """Return values of the parameter table, all with one request."""
-        rows = [self.table[name] for name in wanted if name != names.CONTROLLER]
-        values = self._studio().values([row.vendor for row in rows]) if rows else {}
-        found = {row.name: row.from_vendor(values[row.vendor]) for row in rows}
-        return found | super().read_rows([name for name in wanted if name not in found])
-
-    def results(self) -> Sequence[str]:
-        return self._files.results(self.clock.now_ns())
-
-    def stopped_by_hand(self) -> str:
-        return self._doing.stopped_by_hand()
-
-    def load(self, result: str) -> Sequence[Scan | Spectrum]:
-        return self._files.load(result)
+        return self.session().values([vendor])[vendor] if vendor != names.CONTROLLER else self.session().controller
 
     def lines(self, start: int) -> Sequence[ScanLines]:
         """Return new lines of the running scan, from the buffer `image_buffer`."""
-        if self._image_buffer is None or self._doing.is_moved:
+        if self._image_buffer is None or self.activity.is_moved:
             return ()
         region, shape = frame(self.in_force(FRAME))
-        upwards = self._studio().values([DIRECTION])[DIRECTION] != direction(names.DOWN)
-        return new_lines(self._studio(), self._image_buffer, region, shape, start, upwards=upwards)
+        upwards = self.session().values([DIRECTION])[DIRECTION] != direction(names.DOWN)
+        return new_lines(self.session(), self._image_buffer, region, shape, start, upwards=upwards)
 
     # --- actions ---
 
@@ -167,38 +136,38 @@ class Nanosurf(Driver):
     def start_scan(self) -> None:
         """Scan the frame once, in the direction `x-scan-direction`."""
         wanted = direction(str(self._kept[names.SCAN_DIRECTION]))
-        self._studio().put({DIRECTION: wanted, "imaging.scan_mode": _ONE_FRAME})
-        self._doing.start_scan()
+        self.session().put({DIRECTION: wanted, "imaging.scan_mode": _ONE_FRAME})
+        self.activity.start_scan()
 
     @action(names.STOP_SCAN)
     def stop_scan(self) -> None:
-        self._studio().do(commands.STOP)
-        self._doing.stopped()
+        self.session().do(commands.STOP)
+        self.activity.stopped()
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
         """Take a force curve at the tip's target position, with the cycle selected in Studio."""
-        self._doing.start_curve()
+        self.activity.start_curve()
 
     @action(names.STOP_SPEC)
     def stop_spec(self) -> None:
-        self._studio().do(commands.STOP_CURVE)
-        self._doing.stopped()
+        self.session().do(commands.STOP_CURVE)
+        self.activity.stopped()
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
         """Stop scan, curve and approach, and withdraw the tip."""
-        self._doing.withdraw()
+        self.activity.withdraw()
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
         """Approach the sample, with the approach selected in Studio."""
-        self._doing.approach()
+        self.activity.approach()
 
     def command(self, text: str) -> None:
         """Run a script, e.g. `root.workflow.approach.stop_approach()`."""
         try:
-            self._studio().run(text)
+            self.session().run(text)
         except StudioError as error:
             raise Refused(ControlResponse.ACTION_ERROR, f"Studio: {error}") from error
 
@@ -206,13 +175,6 @@ class Nanosurf(Driver):
 
     def _open_link(self) -> Link:
         return self.link(self.controller_at, self._reply_timeout_s, self.clock.monotonic_s)
-
-    def _studio(self) -> Session:
-        return connected(self._session, "Studio", self.controller_at)
-
-    @property
-    def _doing(self) -> StudioActivity:
-        return connected(self._activity, "Studio", self.controller_at)
 
     def _scan_time(self) -> ScanTime:
         set_now = self.in_force([*FRAME, names.SCAN_SPEED])
@@ -223,7 +185,7 @@ class Nanosurf(Driver):
 
     def _folder(self) -> Path:
         path = f"{_STORAGE}.gallery_directory"
-        return Path(self._gallery_dir or str(self._studio().values([path])[path]))
+        return Path(self._gallery_dir or str(self.session().values([path])[path]))
 
     def _save_files(self, session: Session) -> None:
         # The other modes append to the current file or save nothing, and results are recognised by new files.

@@ -13,13 +13,13 @@ of SmartScan are unconfirmed: the driver accepts each plausible form, and refuse
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.basics import ConfigError, Duration, Length, PlainMapping, PollPeriod, Refused, lengths_text
-from afspm.driver import FRAME, POSITION, Driver, KeptSettings, LongCall, Value, action, connected, frame
-from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, both_ways, names
+from afspm.driver import FRAME, POSITION, KeptSettings, LongCall, ScriptedDriver, Value, action, frame
+from afspm.model import ControlResponse, Region, ScopeState, both_ways, names
 from afspm.plugins.park.activity import STOP, STOP_CURVE, SmartScanActivity
 from afspm.plugins.park.link import Link, SmartScanError
 from afspm.plugins.park.result_files import SETTLE_S, ParkFiles
@@ -45,7 +45,7 @@ _CHANNELS: Final = both_ways(
 )
 
 
-class Park(Driver):
+class Park(ScriptedDriver[Session, SmartScanActivity]):
     """The microscope behind SmartScan.
 
     Args:
@@ -62,6 +62,7 @@ class Park(Driver):
     channel_roles = _CHANNELS
     maker: ClassVar[str] = "Park Systems"
     software: ClassVar[str] = "SmartScan"
+    program: ClassVar[str] = SmartScanActivity.program
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0 + SETTLE_S
     shadow: ClassVar[str] = "afspm.plugins.park.shadow.ParkShadow"
@@ -95,12 +96,10 @@ class Park(Driver):
                 where="idle_words",
                 hint="remove them from one list",
             )
-        self._session: Session | None = None
-        self._activity: SmartScanActivity | None = None
-        self._place = TipPlace(self._smartscan, self._begun)
+        self._place = TipPlace(self.session, self._begun)
         self._kept = KeptSettings(_AT_FIRST)
-        self._gains = Gains(self._smartscan)
-        self.groups = (self._kept, FrameSettings(self._smartscan, self._see_frame), self._gains, self._place)
+        self._gains = Gains(self.session)
+        self.groups = (self._kept, FrameSettings(self.session, self._see_frame), self._gains, self._place)
         self._whole_table = self.table
 
     @classmethod
@@ -129,75 +128,45 @@ class Park(Driver):
             raise ConfigError(problem, where="data_dir", hint='data_dir = "/where/it/is/mounted"')
         self._files.look(folder)
 
-    def close(self) -> None:
-        if self._activity is not None:
-            self._activity.close()
-            self._activity = None
-        if self._session is not None:
-            self._session.close()
-            self._session = None
-
-    def status(self) -> ScopeStatus:
-        return self._doing.status()
-
     def get(self, vendor: str) -> Value:
-        return "SmartScan" if vendor == names.CONTROLLER else self._smartscan().values([vendor])[vendor]
-
-    def set(self, values: Mapping[str, Value]) -> None:
-        self._smartscan().put(values)
-
-    def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
-        """Return values of the parameter table, all with one request."""
-        rows = [self.table[name] for name in wanted if name != names.CONTROLLER]
-        values = self._smartscan().values([row.vendor for row in rows]) if rows else {}
-        found = {row.name: row.from_vendor(values[row.vendor]) for row in rows}
-        return found | super().read_rows([name for name in wanted if name not in found])
-
-    def results(self) -> Sequence[str]:
-        return self._files.results(self.clock.now_ns())
-
-    def stopped_by_hand(self) -> str:
-        return self._doing.stopped_by_hand()
-
-    def load(self, result: str) -> Sequence[Scan | Spectrum]:
-        return self._files.load(result)
+        return "SmartScan" if vendor == names.CONTROLLER else self.session().values([vendor])[vendor]
 
     # --- actions ---
 
     @action(names.START_SCAN)
     def start_scan(self) -> None:
         """Scan the frame once."""
-        self._doing.start_scan()
+        self.activity.start_scan()
 
     @action(names.STOP_SCAN)
     def stop_scan(self) -> None:
-        self._smartscan().do(STOP)
-        self._doing.stopped()
+        self.session().do(STOP)
+        self.activity.stopped()
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
         """Take a curve of the kind `x-spec-kind` at the tip's target position, with SmartScan's settings."""
-        self._doing.start_curve(str(self._kept[names.SPEC_KIND]), self._place.xy_m())
+        self.activity.start_curve(str(self._kept[names.SPEC_KIND]), self._place.xy_m())
 
     @action(names.STOP_SPEC)
     def stop_spec(self) -> None:
-        self._smartscan().do(STOP_CURVE)
-        self._doing.stopped()
+        self.session().do(STOP_CURVE)
+        self.activity.stopped()
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
         """Stop scan, curve and approach, and withdraw the tip: by the scanner, then by the stage if `lift` is set."""
-        self._doing.withdraw(self._lift_m / MICROMETRE)
+        self.activity.withdraw(self._lift_m / MICROMETRE)
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
         """Approach the sample by SmartScan's quick and safe approach."""
-        self._doing.approach()
+        self.activity.approach()
 
     def command(self, text: str) -> None:
         """Evaluate an expression, e.g. `spm.ncm.sweepAutoFullRange()`. After 0.5 s the microscope counts as busy."""
         try:
-            self._doing.evaluate(text)
+            self.activity.evaluate(text)
         except SmartScanError as error:
             raise Refused(ControlResponse.ACTION_ERROR, f"SmartScan: {error}") from error
 
@@ -206,15 +175,8 @@ class Park(Driver):
     def _open_link(self) -> Link:
         return self.link(self.controller_at, self._reply_timeout_s, self.clock.monotonic_s)
 
-    def _smartscan(self) -> Session:
-        return connected(self._session, "SmartScan", self.controller_at)
-
-    @property
-    def _doing(self) -> SmartScanActivity:
-        return connected(self._activity, "SmartScan", self.controller_at)
-
     def _begun(self, call: LongCall) -> None:
-        self._doing.watch(call)
+        self.activity.watch(call)
 
     def _see_frame(self, region: Region, rows: int, lines_per_s: float) -> None:
         # read for the first time before the activity exists
@@ -225,4 +187,4 @@ class Park(Driver):
         return frame(self.in_force(FRAME))[0]
 
     def _folder(self) -> Path:
-        return Path(self._data_dir or str(self._smartscan().values([_FOLDER])[_FOLDER]))
+        return Path(self._data_dir or str(self.session().values([_FOLDER])[_FOLDER]))
