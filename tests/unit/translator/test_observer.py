@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm.basics.clock import ExperimentClock
+from afspm.basics.clock import NS_PER_S, ExperimentClock
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.basics.shared_time import Publication
 from afspm.model import ControlRequest, Region, ScanLines, ScopeState, ScopeStatus, names
@@ -197,9 +197,9 @@ def test_lines_are_read_during_a_scan_if_a_fast_clock_waits_for_their_receiver(t
     driver = Simulator()
     driver.clock = clock
     live = LiveLines(driver)
-    began_s = clock.now_s()
-    live.begin(clock.now_ns(), lasts_s=0.33)  # of 396 s
-    assert live.due_s == pytest.approx(began_s + 600.0, abs=1.0)
+    began_ns = clock.now_ns()
+    live.begin(began_ns, lasts_s=0.33)  # of 396 s
+    assert live.due_s == pytest.approx(began_ns / NS_PER_S + 600.0, abs=1.0)
     assert live.awaited_s is None
     with clock.late(Publication.LINES):
         live.begin(clock.now_ns(), lasts_s=0.33)
