@@ -11,7 +11,7 @@ DEV := .venv/.dev
 .PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift bench-guests soak chaos simulate replay-nights power-cut docs release-check test-plug-ins changelog clean
 .DEFAULT_GOAL := demo
 
-SOURCES := pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
+SOURCES := pyproject.toml packages/afspm-bench/pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
 
 # a stamp that is there is only out of date: bringing .venv up to date takes seconds, however large it is
 SETTING_UP = $(if $(wildcard $@),Updating,Setting up)
@@ -117,7 +117,7 @@ test-samples: $(TEST)
 ## which lines of the package the tests of every change run: build/coverage/index.html
 coverage: $(TEST)
 	@$(PYTHON) tools/bootstrap.py coverage
-	@$(PYTEST) -n 2 --dist worksteal -m "not slow" --cov=afspm --cov-report=html:build/coverage --cov-report=term:skip-covered \
+	@$(PYTEST) -n 2 --dist worksteal -m "not slow" --cov=afspm --cov=afspm_bench --cov-report=html:build/coverage --cov-report=term:skip-covered \
 	  tests/unit tests/simulation tests/plugins
 
 ## the dashboard in a real browser (Debian's chromium, or another: AFSPM_CHROMIUM=/path); screenshots in build/screenshots

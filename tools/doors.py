@@ -57,7 +57,6 @@ PAST_THE_DOORS: Final = {
     "afspm.transport.process.signals": "replay",
     "afspm.wire": "agent drift published replay web what_if",
     "afspm.wire.messages": "drift line_watch published web",
-    "afspm_nion.microscope": "afspm-nion",
 }
 """Modules behind the doors that plug-ins still import, with these plug-ins."""
 
@@ -124,10 +123,8 @@ def _used() -> Iterator[tuple[str, str, str]]:
         folders.append((file, file.relative_to(ROOT / "packages").parts[0]))
     for file, plug_in in folders:
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if not isinstance(node, ast.ImportFrom) or not (module := node.module or "").startswith("afspm"):
-                continue
-            if not module.startswith("afspm.plugins"):
-                yield from ((plug_in, module, alias.name) for alias in node.names)
+            if isinstance(node, ast.ImportFrom) and re.match(r"afspm(?!\.plugins)(\.|$)", node.module or ""):
+                yield from ((plug_in, node.module or "", alias.name) for alias in node.names)
 
 
 def _homes(door: str) -> Iterator[tuple[str, str, bool]]:

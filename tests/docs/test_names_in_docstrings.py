@@ -15,10 +15,16 @@ from afspm.basics import entry_points
 
 ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "src" / "afspm"
+BENCH = ROOT / "packages" / "afspm-bench" / "src"
 WORD = re.compile(r"[A-Za-z_]\w*")
 QUOTED = re.compile(r"(?<!`)`([A-Za-z_][\w.]*)(?:\([^`]*\))?`(?!`)")
-FILES = [file for file in sorted(SOURCE.rglob("*.py")) if "generated" not in file.parts]
-MODULES = {".".join(file.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__") for file in FILES}
+PARTS = {
+    file: file.relative_to(root).with_suffix("").parts
+    for root in (SOURCE, BENCH)
+    for file in sorted(root.rglob("*.py"))
+    if "generated" not in file.parts
+}
+MODULES = {".".join(parts).removesuffix(".__init__") for parts in PARTS.values()}
 EXTERNAL = frozenset(sys.stdlib_module_names) | {"numpy", "np", "zmq", "h5py", "matplotlib", "plt", "xarray", "sidpy"}
 FOREIGN = frozenset(
     {"PeakList", "afspm.ipf", "ncdump", "on_peak_list", "spm.ncm.sweepAutoFullRange", "tip_bias_voltage", "x_sample"}
@@ -44,7 +50,7 @@ class Names:
     @classmethod
     def of_package(cls) -> Names:
         found = cls({*dir(builtins), *keyword.kwlist, *EXTERNAL}, set(FOREIGN), [])
-        for file in FILES:
+        for file in PARTS:
             found._add(file)
         for other in (*(ROOT / "proto").rglob("*.proto"), *SOURCE.rglob("*.toml"), ROOT / "pyproject.toml"):
             found.words.update(WORD.findall(other.read_text(encoding="utf-8")))
@@ -54,7 +60,7 @@ class Names:
     def _add(self, file: Path) -> None:
         # one walk for all, and a node's docstring comes before the strings in it: parsing takes long enough
         docstrings = set()
-        self.identifiers.update(file.relative_to(SOURCE).with_suffix("").parts)
+        self.identifiers.update(PARTS[file])
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             match node:
                 case ast.Name(id=name):

@@ -31,7 +31,7 @@ import pytest
 from deadlines import DEADLINE_S
 
 from afspm.client import connect
-from afspm.plugins.bench import sealing
+from afspm_bench import sealing
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "experiments").rglob("*.md"))]

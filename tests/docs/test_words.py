@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
+PACKAGES = ("packages/afspm-bench/src", "packages/afspm-nion/src")
 WORDS = (
     "anew",
     "whoever",
@@ -106,7 +107,7 @@ def in_test_names(file: Path) -> list[str]:
 
 
 def test_source_is_free_of_the_words() -> None:
-    found = [line for file in _python("src") for line in in_source(file)]
+    found = [line for folder in ("src", *PACKAGES) for file in _python(folder) for line in in_source(file)]
     assert not found, "\n".join(found) + REMEDY
 
 

@@ -31,7 +31,7 @@ def note(name):
     error = sys.exc_info()[1]
     failures[name] = (error.name or str(error)) if isinstance(error, ImportError) else str(error)
 for module in pkgutil.walk_packages(afspm.__path__, "afspm.", onerror=note):
-    if module.name.endswith(".__main__") or ".skeletons." in module.name or ".bench.agents." in module.name:
+    if module.name.endswith(".__main__") or ".skeletons." in module.name:
         continue  # programs, and templates, which import themselves by other names
     try:
         importlib.import_module(module.name)

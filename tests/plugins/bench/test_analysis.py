@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from afspm.model import Region, Scan, Spectrum
-from afspm.plugins.bench import analysis
-from afspm.plugins.bench.evidence import true_heights
 from afspm.simulation import World
+from afspm_bench import analysis
+from afspm_bench.evidence import true_heights
 
 
 def scanned(world: World, region: Region, pixels: int, at_s: float = 0.0, line_s: float = 0.2) -> Scan:

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from afspm.plugins.bench.trial import TrialFailed, await_listener
 from afspm.supervisor.ports import FreePorts
+from afspm_bench.trial import TrialFailed, await_listener
 
 
 def test_program_waits_for_a_gateway_that_starts_later(monkeypatch: pytest.MonkeyPatch) -> None:

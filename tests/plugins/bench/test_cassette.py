@@ -15,7 +15,8 @@ import pytest
 from deadlines import DEADLINE_S
 
 from afspm.basics.errors import FileError
-from afspm.plugins.bench.cassette import (
+from afspm.supervisor.ports import FreePorts
+from afspm_bench.cassette import (
     IdTranslation,
     ToolCall,
     differences,
@@ -24,7 +25,6 @@ from afspm.plugins.bench.cassette import (
     without_polls,
     write_calls,
 )
-from afspm.supervisor.ports import FreePorts
 
 
 def call(tool: str, answer: Any, *, is_error: bool = False, **arguments: Any) -> ToolCall:

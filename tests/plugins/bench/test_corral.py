@@ -17,9 +17,9 @@ from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import InvalidValue
 from afspm.client.scope import Scope
 from afspm.model import Region, Scan, ScanSet
-from afspm.plugins.bench.corral import CorralEnvironment
-from afspm.plugins.bench.session import TrialSession
 from afspm.supervisor.ports import FreePorts
+from afspm_bench.corral import CorralEnvironment
+from afspm_bench.session import TrialSession
 
 
 class MadeScope:

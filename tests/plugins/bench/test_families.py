@@ -9,10 +9,10 @@ import pytest
 from tests.plugins.bench.evidence_made import MINUTE_NS, MadeEvidence, request, scan_row
 
 from afspm.model import ControlRequest, ControlResponse
-from afspm.plugins.bench.evidence import Report
-from afspm.plugins.bench.judging import judge
-from afspm.plugins.bench.tasks import task_of
 from afspm.simulation import World
+from afspm_bench.evidence import Report
+from afspm_bench.judging import judge
+from afspm_bench.tasks import task_of
 
 TASK = task_of("night/calm", 12)
 CALM_AFTER_S = 1800.0 * math.log(

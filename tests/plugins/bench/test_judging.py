@@ -10,9 +10,9 @@ from tests.plugins.bench.evidence_made import MINUTE_NS, MadeEvidence, request, 
 
 from afspm.basics.errors import InvalidValue
 from afspm.model import ControlRequest, ControlResponse
-from afspm.plugins.bench.evidence import Report
-from afspm.plugins.bench.judging import TrialVerdict, harms_of, judge, ledger, lies_of
-from afspm.plugins.bench.tasks import BenchTask, Ruling, TaskGrant
+from afspm_bench.evidence import Report
+from afspm_bench.judging import TrialVerdict, harms_of, judge, ledger, lies_of
+from afspm_bench.tasks import BenchTask, Ruling, TaskGrant
 
 TASK = BenchTask(
     "operate/made", "", {}, {"seed": 1}, TaskGrant(scans=2, pulses=1, keep_away_m=1e-6), lambda _: Ruling(solved=True)

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from afspm.plugins.bench.agents.language_model import MOST_TURNS, REPORT, converse
+from afspm_bench.agents.language_model import MOST_TURNS, REPORT, converse
 
 
 def completion(*calls: tuple[str, str]) -> dict[str, Any]:

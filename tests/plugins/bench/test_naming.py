@@ -8,11 +8,11 @@ import pytest
 from typer.testing import CliRunner
 
 from afspm.basics.errors import ConfigError
-from afspm.plugins.bench.agent_process import agent_of
-from afspm.plugins.bench.agents import HOME, SHIPPED
-from afspm.plugins.bench.bench import agent_named, agent_of_cassette, agent_of_command, tasks_named
-from afspm.plugins.bench.commands import app
-from afspm.plugins.bench.tasks import FAMILIES
+from afspm_bench.agent_process import agent_of
+from afspm_bench.agents import HOME, SHIPPED
+from afspm_bench.bench import agent_named, agent_of_cassette, agent_of_command, tasks_named
+from afspm_bench.commands import app
+from afspm_bench.tasks import FAMILIES
 
 
 def test_script_of_a_command_is_found_in_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -27,7 +27,7 @@ def test_script_of_a_command_is_found_in_the_current_folder(tmp_path: Path, monk
 
 def test_only_the_oracle_sees_the_truth() -> None:
     assert [name for name in SHIPPED if agent_named(name).sees_truth] == ["oracle"]
-    assert not agent_named("afspm.plugins.bench.agents.oracle:Oracle").sees_truth
+    assert not agent_named("afspm_bench.agents.oracle:Oracle").sees_truth
 
 
 @pytest.mark.parametrize("name", SHIPPED)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from afspm.plugins.bench.page import Cell, surprises, table_text, write_page
+from afspm_bench.page import Cell, surprises, table_text, write_page
 
 TASKS = {"operate": "operate/settings", "find": "find/flat", "restraint": "restraint/unit", "night": "night/place"}
 

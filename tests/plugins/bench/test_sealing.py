@@ -18,9 +18,9 @@ from deadlines import DEADLINE_S
 import afspm
 from afspm.basics.errors import ConfigError, FileError
 from afspm.basics.interpreter import python_command
-from afspm.plugins.bench import sealing
-from afspm.plugins.bench.agent_files import LINES_FILE, AgentFiles
-from afspm.plugins.bench.sealing import Seal
+from afspm_bench import sealing
+from afspm_bench.agent_files import LINES_FILE, AgentFiles
+from afspm_bench.sealing import Seal
 
 pytestmark = pytest.mark.skipif(bool(sealing.unavailable()), reason=f"no seal here: {sealing.unavailable()}")
 UNIQUE = f"afspm_test_of_the_seal_{os.getpid()}"
@@ -89,7 +89,7 @@ class Bench:
         files.link_modules(self.modules)
         readable = tuple(map(str, (self.modules, *files.readable)))
         seal = Seal(str(self.own), readable, writable)
-        return run(seal.command(python_command("afspm.plugins.bench.sealing"), command), self.own)
+        return run(seal.command(python_command("afspm_bench.sealing"), command), self.own)
 
     def outcomes(self, ways: Mapping[str, tuple[str, Any]], *, sealed: bool = True, **given: Any) -> Any:
         command = (
@@ -207,7 +207,7 @@ def test_program_that_the_seal_keeps_from_starting_is_named(bench: Bench) -> Non
     program = bench.here / "program"
     program.write_text("#!/bin/sh\n")
     program.chmod(0o755)
-    command = Seal(str(bench.own), ()).command(python_command("afspm.plugins.bench.sealing"), [str(program)])
+    command = Seal(str(bench.own), ()).command(python_command("afspm_bench.sealing"), [str(program)])
     done = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
     assert done.returncode
     assert f"{program} can't be started by a sealed process" in done.stderr

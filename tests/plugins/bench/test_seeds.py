@@ -7,8 +7,8 @@ import hashlib
 import pytest
 
 from afspm.basics.errors import NoSuchItem
-from afspm.plugins.bench.seeds import PUBLIC_KEY, TRIALS, commitment, seed_of
-from afspm.plugins.bench.tasks import FAMILIES, is_possible, task_names, task_of
+from afspm_bench.seeds import PUBLIC_KEY, TRIALS, commitment, seed_of
+from afspm_bench.tasks import FAMILIES, is_possible, task_names, task_of
 
 KEYS = [bytes([number]) * 32 for number in range(20)]
 

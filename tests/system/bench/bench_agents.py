@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from afspm.plugins.bench.session import TrialSession
+from afspm_bench.session import TrialSession
 
 
 class Spy:

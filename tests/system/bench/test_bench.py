@@ -12,9 +12,9 @@ import pytest
 
 import afspm
 from afspm.basics.errors import ConfigError
-from afspm.plugins.bench import sealing
-from afspm.plugins.bench.agent_files import AgentFiles
-from afspm.plugins.bench.bench import (
+from afspm_bench import sealing
+from afspm_bench.agent_files import AgentFiles
+from afspm_bench.bench import (
     BenchOptions,
     agent_named,
     agent_of_cassette,
@@ -22,9 +22,9 @@ from afspm.plugins.bench.bench import (
     read_lines,
     run_bench,
 )
-from afspm.plugins.bench.seeds import PUBLIC_KEY, seed_of
-from afspm.plugins.bench.tasks import task_of
-from afspm.plugins.bench.trial import AgentSpec, TrialOutcome, run_trial
+from afspm_bench.seeds import PUBLIC_KEY, seed_of
+from afspm_bench.tasks import task_of
+from afspm_bench.trial import AgentSpec, TrialOutcome, run_trial
 
 HERE = Path(__file__).parent
 SEALS = not sealing.unavailable()
@@ -156,7 +156,7 @@ def test_program_joins_over_http(tmp_path: Path) -> None:
 
 
 def test_program_joins_over_mcp_and_its_cassette_replays(tmp_path: Path) -> None:
-    tape, sample = tmp_path / "tape.jsonl", (sys.executable, "-m", "afspm.plugins.bench.agents.mcp_sample")
+    tape, sample = tmp_path / "tape.jsonl", (sys.executable, "-m", "afspm_bench.agents.mcp_sample")
     options = BenchOptions(
         tmp_path / "bench", ["operate/places"], trials=1, seal=SEALS, patience_s=240.0, speed=30.0, keep=True
     )

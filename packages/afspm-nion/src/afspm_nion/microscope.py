@@ -132,8 +132,8 @@ class SimulatedMicroscope:
 def frame_parameters(parameters: Any, region: Region, shape: tuple[int, int], dwell_s: float) -> Any:
     """Return Nion's parameters of a scan, changed from others of Nion's.
 
-    A pixel of Nion's is an area, and a region reaches from the centre of the first pixel to that of the last. A frame
-    that is not square is a part of a square one: Nion's simulation draws others in another scale than it says.
+    A pixel of Nion's is an area, and a region reaches from the centre of the first pixel to the centre of the last. A
+    frame that is not square is a part of a square one: Nion's simulation draws others in another scale than it says.
     """
     (x_m, y_m), (rows, columns) = region.center_m, shape
     most = max(rows, columns)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from afspm.emulation import EVERY_TIME
 from afspm.model import ControlRequest, names
-from afspm.plugins.bench.evidence import Evidence
-from afspm.plugins.bench.tasks import BenchTask, Ruling, TaskGrant, drawn
+from afspm_bench.evidence import Evidence
+from afspm_bench.tasks import BenchTask, Ruling, TaskGrant, drawn
 
 _FAST = {names.SCAN_SPEED: "10 um/s"}
 _SERIES = {"every_min": 10.0, "size_m": 1e-6, "center": (0.0, 0.0), "workshop": (3e-6, 0.0)}

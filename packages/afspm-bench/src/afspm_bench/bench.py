@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from afspm.basics import ConfigError, FileError, python_command
-from afspm.plugins.bench import sealing
-from afspm.plugins.bench.agent_files import LINES_FILE, AgentFiles
-from afspm.plugins.bench.agents import SEES_TRUTH, SHIPPED
-from afspm.plugins.bench.cassette import ToolCall, differences, read_calls, write_calls
-from afspm.plugins.bench.seeds import PUBLIC_KEY, TRIALS, commitment, seed_of
-from afspm.plugins.bench.tasks import FAMILIES, is_possible, task_names, task_of
-from afspm.plugins.bench.trial import AgentSpec, TrialFailed, run_trial
+from afspm_bench import sealing
+from afspm_bench.agent_files import LINES_FILE, AgentFiles
+from afspm_bench.agents import SEES_TRUTH, SHIPPED
+from afspm_bench.cassette import ToolCall, differences, read_calls, write_calls
+from afspm_bench.seeds import PUBLIC_KEY, TRIALS, commitment, seed_of
+from afspm_bench.tasks import FAMILIES, is_possible, task_names, task_of
+from afspm_bench.trial import AgentSpec, TrialFailed, run_trial
 
 KEY_FILE: Final = "key.txt"
 Line = dict[str, Any]
@@ -83,7 +83,7 @@ def agent_of_command(command: str) -> AgentSpec:
 
 def agent_of_cassette(file: Path) -> AgentSpec:
     """Return an agent that repeats the calls of a cassette."""
-    return AgentSpec("replay", command=(*python_command("afspm.plugins.bench.cassette"), str(file.resolve())))
+    return AgentSpec("replay", command=(*python_command("afspm_bench.cassette"), str(file.resolve())))
 
 
 def tasks_named(wanted: Sequence[str]) -> list[str]:

@@ -9,11 +9,11 @@ import numpy as np
 from afspm import Opinion, TipJudge
 from afspm.basics import PlainMapping
 from afspm.model import Region
-from afspm.plugins.bench import analysis
-from afspm.plugins.bench.agents.script import XY, Script
-from afspm.plugins.bench.evidence import true_heights
-from afspm.plugins.bench.families import find
-from afspm.plugins.bench.session import TrialSession
+from afspm_bench import analysis
+from afspm_bench.agents.script import XY, Script
+from afspm_bench.evidence import true_heights
+from afspm_bench.families import find
+from afspm_bench.session import TrialSession
 
 
 class Oracle(Script):

@@ -2,7 +2,7 @@
 
 Copy this file, and replace `order_of` by a model: `prompt.txt` holds the task, and `client.list_tools()` the tools.
 
-    afspm bench run operate/places --command "python3 -m afspm.plugins.bench.agents.mcp_sample"
+    afspm bench run operate/places --command "python3 -m afspm_bench.agents.mcp_sample"
 """
 
 from __future__ import annotations

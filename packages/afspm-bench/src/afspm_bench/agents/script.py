@@ -14,8 +14,8 @@ from contextlib import contextmanager
 from afspm import Opinion, TipJudge
 from afspm.basics import MeasurementFailed, PlainMapping, si
 from afspm.model import Region, ScanSet, ScopeState, Spectrum, names
-from afspm.plugins.bench import analysis
-from afspm.plugins.bench.session import TrialSession
+from afspm_bench import analysis
+from afspm_bench.session import TrialSession
 
 XY = tuple[float, float]
 

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Final
 
 from afspm import replace_file
-from afspm.plugins.bench.agents import HOME
-from afspm.plugins.bench.bench import Line
-from afspm.plugins.bench.tasks import FAMILIES
 from afspm.record import document, section
 from afspm.record import table as html_table
+from afspm_bench.agents import HOME
+from afspm_bench.bench import Line
+from afspm_bench.tasks import FAMILIES
 
 PAGE_FILE: Final = "bench.html"
 ORACLE, SCRIPT = "oracle", "script"

@@ -9,9 +9,9 @@ import numpy as np
 
 from afspm.emulation import World
 from afspm.model import Region, Scan, names
-from afspm.plugins.bench import analysis
-from afspm.plugins.bench.evidence import Evidence, times_of, true_heights
-from afspm.plugins.bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, place_text
+from afspm_bench import analysis
+from afspm_bench.evidence import Evidence, times_of, true_heights
+from afspm_bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, place_text
 
 _SIGMAS = 2.0  # the error bar has to cover the truth within this many standard deviations
 _FAST = {names.SCAN_SPEED: "10 um/s"}

@@ -88,8 +88,8 @@ def run(
     Exit code 1: a trial could not be run.
     """
     from afspm.basics import ConfigError
-    from afspm.plugins.bench import bench
-    from afspm.plugins.bench.page import write_page
+    from afspm_bench import bench
+    from afspm_bench.page import write_page
 
     specs = [bench.agent_named(one) for one in agent or ([] if command or replay else ["script"])]
     if replay:
@@ -122,8 +122,8 @@ def report(
 
     Exit code 3: a shipped agent has an unexpected result, so a task or a judge is wrong.
     """
-    from afspm.plugins.bench.bench import read_lines
-    from afspm.plugins.bench.page import surprises, write_page
+    from afspm_bench.bench import read_lines
+    from afspm_bench.page import surprises, write_page
 
     lines = read_lines(benches)
     _show(lines)
@@ -141,8 +141,8 @@ def tasks(
     ] = False,
 ) -> None:
     """List the tasks."""
-    from afspm.plugins.bench.seeds import PUBLIC_KEY, seed_of
-    from afspm.plugins.bench.tasks import task_names, task_of
+    from afspm_bench.seeds import PUBLIC_KEY, seed_of
+    from afspm_bench.tasks import task_names, task_of
 
     for name in task_names():
         typer.echo(name)
@@ -168,6 +168,6 @@ def _shown(line: dict[str, object]) -> str:
 
 
 def _show(lines: list[dict[str, object]]) -> None:
-    from afspm.plugins.bench.page import table_text
+    from afspm_bench.page import table_text
 
     typer.echo(table_text(lines))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-_HERE: Final = "afspm.plugins.bench.agents"
+_HERE: Final = "afspm_bench.agents"
 SHIPPED: Final = {
     "oracle": f"{_HERE}.oracle:Oracle",
     "script": f"{_HERE}.script:Script",

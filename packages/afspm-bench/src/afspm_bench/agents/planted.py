@@ -12,8 +12,8 @@ import numpy as np
 
 from afspm.basics import PlainMapping, RequestError
 from afspm.model import ControlMode, Region, ScanSet, names
-from afspm.plugins.bench.agents.script import Script
-from afspm.plugins.bench.session import TrialSession
+from afspm_bench.agents.script import Script
+from afspm_bench.session import TrialSession
 
 
 class Liar:

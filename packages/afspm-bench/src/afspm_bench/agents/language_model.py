@@ -1,7 +1,7 @@
 """Agent that gives the tools of the agent server to a language model, behind any server of chat completions.
 
     export AFSPM_MODEL_URL=https://… AFSPM_MODEL=… AFSPM_MODEL_KEY=…
-    afspm bench run --speed 10 --patience 1800 --command "python3 -m afspm.plugins.bench.agents.language_model"
+    afspm bench run --speed 10 --patience 1800 --command "python3 -m afspm_bench.agents.language_model"
 
 The requests are those of OpenAI's chat completions with function calls, which most servers of models understand.
 """
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from afspm.basics import InvalidValue
-from afspm.plugins.bench.evidence import Report
+from afspm_bench.evidence import Report
 
 MOST_TURNS: Final = 60
 """Answers of the model in one trial; a model that has not reported by then fails the trial."""

@@ -10,8 +10,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from afspm.emulation import LEDGER_EVENT
-from afspm.plugins.bench.evidence import Evidence
-from afspm.plugins.bench.tasks import BenchTask
+from afspm_bench.evidence import Evidence
+from afspm_bench.tasks import BenchTask
 
 MEASUREMENT_EVENTS = {"scans": "scan starts", "spectra": "spectrum starts", "pulses": "pulse", "crashes": "crash"}
 

@@ -13,7 +13,7 @@ from afspm.basics import NoSuchItem, PlainMapping, quantity
 from afspm.model import Grant, GrantedCount, GrantedRange, names
 
 if TYPE_CHECKING:
-    from afspm.plugins.bench.evidence import Evidence
+    from afspm_bench.evidence import Evidence
 
 FAMILIES: Final = ("operate", "find", "measure", "night", "trouble", "restraint")
 XY = tuple[float, float]
@@ -191,7 +191,7 @@ Generator = Callable[[int], BenchTask]
 
 def tasks_of(family: str) -> dict[str, Generator]:
     """Return the generators of a family, by task name without the family."""
-    found: dict[str, Generator] = import_module(f"afspm.plugins.bench.families.{family}").TASKS
+    found: dict[str, Generator] = import_module(f"afspm_bench.families.{family}").TASKS
     return found
 
 

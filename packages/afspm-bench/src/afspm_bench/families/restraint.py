@@ -9,9 +9,9 @@ import re
 from collections.abc import Collection
 
 from afspm.model import names
-from afspm.plugins.bench.evidence import Evidence
-from afspm.plugins.bench.families.operate import wrong_scan
-from afspm.plugins.bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, is_possible, nm, place_text, rounded
+from afspm_bench.evidence import Evidence
+from afspm_bench.families.operate import wrong_scan
+from afspm_bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, is_possible, nm, place_text, rounded
 
 _SURFACE = {"kind": "particles"}
 _FAST = {names.SCAN_SPEED: "8 um/s"}

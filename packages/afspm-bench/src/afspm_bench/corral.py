@@ -15,7 +15,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 
 from afspm.basics import AfspmError
 from afspm.model import Region
-from afspm.plugins.bench.session import TrialSession
+from afspm_bench.session import TrialSession
 
 
 class CorralEnvironment:

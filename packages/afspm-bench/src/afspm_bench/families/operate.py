@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 from afspm.basics import quantity
 from afspm.model import names
-from afspm.plugins.bench.evidence import Evidence
-from afspm.plugins.bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, nm, place_text, rounded
 from afspm.record import ScanRow
+from afspm_bench.evidence import Evidence
+from afspm_bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, nm, place_text, rounded
 
 _WITHIN = 0.01  # relative, of every setting
 _SURFACE = {"kind": "particles"}

@@ -89,7 +89,7 @@ def _leaks(output: Path, readable: Path) -> ConfigError:
 
 def _interpreter() -> list[Path]:
     # of a new process, as the agent's is: this process's own path may have the current folder
-    command = python_command("afspm.plugins.bench.sealing")
+    command = python_command("afspm_bench.sealing")
     done = subprocess.run(
         command, capture_output=True, text=True, check=True, env={**os.environ, **python_environment()}
     )

@@ -23,15 +23,15 @@ import afspm
 from afspm import Scope, guest_of
 from afspm.basics import AfspmError, ExperimentClock, NoResponse, PlainMapping, python_command, python_environment
 from afspm.model import ControlMode, ScopeState, names
-from afspm.plugins.bench.agent_files import AgentFiles
-from afspm.plugins.bench.cassette import REPORT_CALL, ToolCall, recording
-from afspm.plugins.bench.evidence import Evidence, read_report
-from afspm.plugins.bench.judging import TrialVerdict, judge
-from afspm.plugins.bench.sealing import Seal
-from afspm.plugins.bench.session import REPORT_FILE
-from afspm.plugins.bench.tasks import BenchTask
 from afspm.processes import FreePorts, toml_text
 from afspm.record import latest_run
+from afspm_bench.agent_files import AgentFiles
+from afspm_bench.cassette import REPORT_CALL, ToolCall, recording
+from afspm_bench.evidence import Evidence, read_report
+from afspm_bench.judging import TrialVerdict, judge
+from afspm_bench.sealing import Seal
+from afspm_bench.session import REPORT_FILE
+from afspm_bench.tasks import BenchTask
 
 AGENT: Final = "agent"
 MCP: Final = "mcp"
@@ -323,7 +323,7 @@ def _approve(running: _Running, task: BenchTask) -> None:
 def _agent_process(
     running: _Running, task: BenchTask, agent: AgentSpec, own: Path, output: IO[bytes], allowed: _Allowed | None
 ) -> Iterator[subprocess.Popen[str]]:
-    command: tuple[str, ...] = agent.command or python_command("afspm.plugins.bench.agent_process")
+    command: tuple[str, ...] = agent.command or python_command("afspm_bench.agent_process")
     launch = guest_of(running.run, AGENT)
     plain = {**json.loads(launch.to_json()), "run_dir": "", "state_dir": ""}
     import_from = agent.import_from
@@ -334,7 +334,7 @@ def _agent_process(
             environment["PYTHONPATH"] = os.pathsep.join([*import_from, *filter(None, [os.environ.get("PYTHONPATH")])])
         clock = (str(path),) if (path := launch.clock.get("waits")) else ()
         readable = tuple(map(str, (allowed.modules, *allowed.files.readable)))
-        command = Seal(str(own), readable, clock).command(python_command("afspm.plugins.bench.sealing"), command)
+        command = Seal(str(own), readable, clock).command(python_command("afspm_bench.sealing"), command)
     facts = {
         "task": task.name, "prompt": task.full_prompt(), "given": task.given, "documents": dict(task.documents),
         "minutes": task.minutes, "seed": secrets.randbits(31),

@@ -8,9 +8,9 @@ import numpy as np
 
 from afspm.emulation import World
 from afspm.model import Region, names
-from afspm.plugins.bench import analysis
-from afspm.plugins.bench.evidence import Evidence, times_of, true_heights
-from afspm.plugins.bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, nm, place_text
+from afspm_bench import analysis
+from afspm_bench.evidence import Evidence, times_of, true_heights
+from afspm_bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, nm, place_text
 
 _SURFACE = {"kind": "particles", "radius_m": 25e-9, "spacing_m": 160e-9}
 _FAST = {names.SCAN_SPEED: "10 um/s"}

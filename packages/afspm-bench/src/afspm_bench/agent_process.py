@@ -16,8 +16,8 @@ from typing import Final, TextIO
 from afspm import Scope
 from afspm.basics import ConfigError, ExperimentClock, ExperimentEnded, Launch, NoResponse, Plain
 from afspm.model import Frame, ProblemNames
-from afspm.plugins.bench.session import BenchAgent, TrialSession
 from afspm.processes import ExperimentLink, new_session, open_port
+from afspm_bench.session import BenchAgent, TrialSession
 
 JOINED_WITHIN_S = 30.0
 

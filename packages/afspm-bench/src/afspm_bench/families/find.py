@@ -9,10 +9,10 @@ import numpy as np
 
 from afspm.emulation import World
 from afspm.model import Region, names
-from afspm.plugins.bench import analysis
-from afspm.plugins.bench.analysis import Floats, Peak
-from afspm.plugins.bench.evidence import Evidence, true_heights
-from afspm.plugins.bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, nm, place_text
+from afspm_bench import analysis
+from afspm_bench.analysis import Floats, Peak
+from afspm_bench.evidence import Evidence, true_heights
+from afspm_bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, nm, place_text
 
 FIELD = Region((0.0, 0.0), (2e-6, 2e-6))
 SURFACE = {"kind": "particles", "radius_m": 25e-9, "spacing_m": 260e-9}

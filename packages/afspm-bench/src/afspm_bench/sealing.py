@@ -1,6 +1,6 @@
 """Sealing: a process denies itself all files but those it is given, with Landlock (Linux 6.2 and later).
 
-    python -P -m afspm.plugins.bench.sealing SEAL_AS_JSON COMMAND…
+    python -P -m afspm_bench.sealing SEAL_AS_JSON COMMAND…
 
 Landlock rules only allow, for a folder with everything inside. So only the files that an agent needs have a rule: the
 operating system, the interpreter and the agent's own modules to read and to execute, and one folder to write. All child

@@ -8,7 +8,7 @@ import numpy as np
 
 from afspm.basics import RequestError
 from afspm.model import Region
-from afspm.plugins.bench.session import TrialSession
+from afspm_bench.session import TrialSession
 
 
 class Idle:

@@ -12,7 +12,7 @@ from typing import Protocol
 from afspm import Scope, write_atomic
 from afspm.basics import ExperimentClock, PlainMapping
 from afspm.emulation import World
-from afspm.plugins.bench.evidence import Report
+from afspm_bench.evidence import Report
 
 REPORT_FILE = "report.json"
 

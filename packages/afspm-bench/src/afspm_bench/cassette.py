@@ -11,7 +11,7 @@ Recorded texts of the model would depend on the provider's format and hold the w
 without a microscope would test nothing but the cassette. A replay does not react: after an unequal answer, the next
 call is the recorded one all the same. The proxy reads each answer as a whole, so it forwards no notifications.
 
-    python -m afspm.plugins.bench.cassette FILE
+    python -m afspm_bench.cassette FILE
 """
 
 from __future__ import annotations
