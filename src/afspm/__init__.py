@@ -26,7 +26,8 @@ if TYPE_CHECKING:  # components judge tips, pair channels, plan work, keep files
     from afspm.components.channel_pairs import ChannelPairing, HeightPair, MissingChannels
     from afspm.components.line_file import LineFile, csv_line
     from afspm.components.tip_judge import Opinion, TipJudge
-    from afspm.model.line_levelling import Array, Levelling, flattened, levelled
+    from afspm.model.arrays import SD_PER_MAD, Array, robust_spread
+    from afspm.model.line_levelling import Levelling, flattened, levelled
     from afspm.model.planned_work import PlannedWork
     from afspm.model.snapshot import from_plain, restored, snapshot, to_plain
     from afspm.record.notes import append_note
@@ -65,6 +66,7 @@ __all__ += [
     "BEGUN_WITHIN_S",
     "FITS",
     "GUEST",
+    "SD_PER_MAD",
     "Array",
     "ChannelPairing",
     "Cycle",
@@ -93,6 +95,7 @@ __all__ += [
     "levelled",
     "replace_file",
     "restored",
+    "robust_spread",
     "snapshot",
     "suffixes",
     "target_from",

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from afspm.basics.errors import InvalidValue
-
-Array = NDArray[np.float64]
+from afspm.model.arrays import Array
 
 _SMALLEST_CURRENT = 0.01  # of the setpoint: smaller values are noise, and may have no logarithm
 _SIGNIFICANT = 4.0  # standard deviations of white noise

@@ -32,12 +32,12 @@ import numpy as np
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.basics.formatting import area_text
 from afspm.basics.plain_data import Plain
-from afspm.components.tip_metrics import LEAST_CONTRAST, Array, TipMetrics, autocorrelation, metrics, slopes
+from afspm.components.tip_metrics import LEAST_CONTRAST, TipMetrics, autocorrelation, metrics, slopes
 from afspm.model import Region
+from afspm.model.arrays import Array, robust_spread
 from afspm.model.snapshot import from_plain, to_plain
 
 REACH_PX = 32  # search range for the second apex of a double tip
-MAD_TO_SIGMA = 1.4826  # of normally distributed values
 SAME_SIZE = 0.02  # relative difference within which sizes count as equal
 SAME_PLACE = 0.2  # share of the size within which a centre counts as the same place
 # limits the saved state: each place keeps an autocorrelation of 33 x 65 values
@@ -183,7 +183,7 @@ class TipReference:
         if len(self.deviations) < 2:
             return floor
         values = np.array([getattr(d, name) for d in self.deviations])
-        return max(floor, MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values)))))
+        return max(floor, robust_spread(values))
 
     def usual_anywhere(self) -> TipMetrics:
         """Return the median metrics of the scans that were learnt from."""

@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.basics.errors import InvalidValue
-
-Array = NDArray[np.float64]
+from afspm.model.arrays import Array
 
 # the long band ends at wavelengths of 32 pixels
 FEWEST_PIXELS = 32

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     )
     from afspm.simulation.emulation.tcp_server import ClientConnection, TcpServer
     from afspm.simulation.faults import Faults
-    from afspm.simulation.fields import Array
     from afspm.simulation.instrument import InstrumentBusy, SimulatedInstrument
     from afspm.simulation.world import World
 
@@ -43,7 +42,6 @@ __all__ = [
     "LOOPBACK",
     "MOST_PIXELS",
     "RETRACE",
-    "Array",
     "Channels",
     "Client",
     "ClientConnection",

@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from afspm.basics.errors import InvalidValue
+from afspm.model.arrays import Array
 from afspm.model.geometry import XY, Region
-
-Array = NDArray[np.float64]
 
 
 def undistorted(

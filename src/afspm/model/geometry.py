@@ -16,10 +16,7 @@ from afspm.basics.formatting import area_text
 from afspm.basics.units import si_or_text
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
+    from afspm.model.arrays import Array
 
 XY = tuple[float, float]
 
@@ -88,7 +85,7 @@ class Region:
         """Return (x, y) in m of the corner of smallest x and y before the rotation."""
         return (self.center_m[0] - self.size_m[0] / 2, self.center_m[1] - self.size_m[1] / 2)
 
-    def corners_m(self) -> NDArray[np.float64]:
+    def corners_m(self) -> Array:
         """Return the four rotated corners in m, shape (4, 2), counter-clockwise.
 
         The first is the corner of smallest x and y before the rotation.
@@ -105,7 +102,7 @@ class Region:
         cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
         return bool(abs(cos * x + sin * y) <= self.size_m[0] / 2 and abs(cos * y - sin * x) <= self.size_m[1] / 2)
 
-    def pixels_m(self, shape: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def pixels_m(self, shape: tuple[int, int]) -> tuple[Array, Array]:
         """Return the arrays of x and y, in m, of every pixel of an array of `shape` (ny, nx)."""
         import numpy as np
 
@@ -115,7 +112,7 @@ class Region:
         u_m, v_m = np.meshgrid(u * self.size_m[0], v * self.size_m[1])
         return self._in_space(u_m, v_m)
 
-    def pixel_at(self, x_m: Floats, y_m: Floats, shape: tuple[int, int]) -> tuple[Floats, Floats]:
+    def pixel_at(self, x_m: Array, y_m: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
         """Return the fractional (row, column) of positions in an array of `shape`: the inverse of `pixels_m`."""
         x, y = x_m - self.center_m[0], y_m - self.center_m[1]
         cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
@@ -130,7 +127,7 @@ class Region:
         """Return a region of the same size and angle around another centre."""
         return replace(self, center_m=center_m)
 
-    def _in_space(self, u_m: Floats, v_m: Floats) -> tuple[Floats, Floats]:
+    def _in_space(self, u_m: Array, v_m: Array) -> tuple[Array, Array]:
         # from offsets along the rotated sides to x and y
         cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
         return cos * u_m - sin * v_m + self.center_m[0], sin * u_m + cos * v_m + self.center_m[1]

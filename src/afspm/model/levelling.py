@@ -11,26 +11,23 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from afspm.basics.errors import InvalidValue
 from afspm.model import line_levelling as drawing
+from afspm.model.arrays import SD_PER_MAD, Array
 from afspm.model.line_levelling import Levelling
 
-Floats = NDArray[np.float64]
 _MOST_PIXELS: Final = 4096
 """Most pixels of a robust fit, spread over the scan."""
 _ROUNDS: Final = 50
 _TRIALS: Final = 200
 # Huber's constant: 95 % of the efficiency of least squares for normally distributed noise
 _HUBER: Final = 1.345
-_MAD: Final = 1.4826
-"""Standard deviation of a normal distribution, in median absolute deviations."""
 
 
 def levelled(
-    values: Floats, order: int = 1, fit: str = "least-squares", quantile: float = 0.5, rows: str | None = None
-) -> Floats:
+    values: Array, order: int = 1, fit: str = "least-squares", quantile: float = 0.5, rows: str | None = None
+) -> Array:
     """Return values [y, x] without a polynomial surface, NaN where nothing was measured.
 
     Arguments and errors as for `Scan.levelled`.
@@ -52,28 +49,28 @@ def levelled(
     scale = float(np.ptp(heights)) or 1.0  # in units of their range: one set of limits fits any height
     solve = partial(_quantile, quantile=quantile) if fit == "quantile" else FITS[fit]
     coefficients = solve(columns, (heights - heights.mean()) / scale)
-    surface: Floats = np.tensordot(coefficients, terms, 1) * scale + heights.mean()
+    surface: Array = np.tensordot(coefficients, terms, 1) * scale + heights.mean()
     return values - surface
 
 
-def _terms(shape: tuple[int, ...], order: int) -> Floats:
+def _terms(shape: tuple[int, ...], order: int) -> Array:
     # [term, y, x]: 1, x, y, x² … up to the order
     y, x = (np.linspace(-1.0, 1.0, count) for count in shape)
     powers = [(i, j) for total in range(order + 1) for i in range(total + 1) for j in [total - i]]
     return np.stack([np.outer(y**j, x**i) for i, j in powers])
 
 
-def _least_squares(columns: Floats, heights: Floats) -> Floats:
+def _least_squares(columns: Array, heights: Array) -> Array:
     found = np.linalg.lstsq(columns, heights, rcond=None)[0]
     return np.asarray(found, dtype=np.float64)
 
 
-def _weighted(columns: Floats, heights: Floats, weights: Floats) -> Floats:
+def _weighted(columns: Array, heights: Array, weights: Array) -> Array:
     root = np.sqrt(weights)
     return _least_squares(columns * root[:, None], heights * root)
 
 
-def _reweighted(columns: Floats, heights: Floats, weigh: Callable[[Floats], Floats]) -> Floats:
+def _reweighted(columns: Array, heights: Array, weigh: Callable[[Array], Array]) -> Array:
     columns, heights = _few(columns, heights)
     coefficients = _least_squares(columns, heights)
     for _ in range(_ROUNDS):
@@ -83,23 +80,23 @@ def _reweighted(columns: Floats, heights: Floats, weigh: Callable[[Floats], Floa
     return coefficients
 
 
-def _huber(columns: Floats, heights: Floats) -> Floats:
-    def weigh(residuals: Floats) -> Floats:
+def _huber(columns: Array, heights: Array) -> Array:
+    def weigh(residuals: Array) -> Array:
         # the floors keep a perfectly flat scan from a division by zero
-        sigma = max(_MAD * float(np.median(np.abs(residuals))), 1e-9)
+        sigma = max(SD_PER_MAD * float(np.median(np.abs(residuals))), 1e-9)
         return np.minimum(1.0, _HUBER * sigma / np.maximum(np.abs(residuals), 1e-12))
 
     return _reweighted(columns, heights, weigh)
 
 
-def _quantile(columns: Floats, heights: Floats, quantile: float) -> Floats:
-    def weigh(residuals: Floats) -> Floats:
+def _quantile(columns: Array, heights: Array, quantile: float) -> Array:
+    def weigh(residuals: Array) -> Array:
         return np.where(residuals > 0.0, quantile, 1.0 - quantile) / np.maximum(np.abs(residuals), 1e-4)
 
     return _reweighted(columns, heights, weigh)
 
 
-def _samples(columns: Floats, heights: Floats) -> Floats:
+def _samples(columns: Array, heights: Array) -> Array:
     # [trial, term]: exact fits through the fewest pixels that determine a surface; with a fixed seed, so that levelling
     # the same scan twice gives the same values
     chance = np.random.default_rng(0)
@@ -107,7 +104,7 @@ def _samples(columns: Floats, heights: Floats) -> Floats:
     return np.array([_least_squares(columns[row], heights[row]) for row in rows])
 
 
-def _theil_sen(columns: Floats, heights: Floats) -> Floats:
+def _theil_sen(columns: Array, heights: Array) -> Array:
     # Theil and Sen: the median over small samples, term by term, then of the height
     columns, heights = _few(columns, heights)
     coefficients = np.median(_samples(columns, heights), axis=0).astype(np.float64)
@@ -115,16 +112,16 @@ def _theil_sen(columns: Floats, heights: Floats) -> Floats:
     return coefficients
 
 
-def _ransac(columns: Floats, heights: Floats) -> Floats:
+def _ransac(columns: Array, heights: Array) -> Array:
     # RANSAC: the surface with the most pixels within the scatter, fitted again to these pixels
     columns, heights = _few(columns, heights)
     residuals = np.abs(heights - _samples(columns, heights) @ columns.T)
-    limit = max(2.5 * _MAD * float(np.median(residuals, axis=1).min()), 1e-9)
+    limit = max(2.5 * SD_PER_MAD * float(np.median(residuals, axis=1).min()), 1e-9)
     inliers = residuals[(residuals <= limit).sum(axis=1).argmax()] <= limit
     return _least_squares(columns[inliers], heights[inliers])
 
 
-def _few(columns: Floats, heights: Floats) -> tuple[Floats, Floats]:
+def _few(columns: Array, heights: Array) -> tuple[Array, Array]:
     step = max(1, len(heights) // _MOST_PIXELS)
     # spread over the scan by chance, but with a fixed seed: the same scan is always levelled alike
     chosen = np.random.default_rng(1).permutation(len(heights))[::step] if step > 1 else slice(None)
@@ -132,7 +129,7 @@ def _few(columns: Floats, heights: Floats) -> tuple[Floats, Floats]:
 
 
 ROWS: Final = {"median": Levelling.MEDIANS, "difference": Levelling.DIFFERENCES, "line": Levelling.LINES}
-FITS: Final[dict[str, Callable[..., Floats]]] = {  # (terms [pixel, term], heights) -> coefficients
+FITS: Final[dict[str, Callable[..., Array]]] = {  # (terms [pixel, term], heights) -> coefficients
     "least-squares": _least_squares,
     "huber": _huber,
     "quantile": _quantile,

@@ -5,12 +5,9 @@ from __future__ import annotations
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-# standard deviation of a normal distribution, in median absolute deviations
-_SD_PER_MAD = 1.4826
+from afspm.model.arrays import SD_PER_MAD, Array, Mask
+
 _OUTLIERS_SD = 4.0
 _NO_NOISE = 1e-12
 _LINE_LEFT = 0.01
@@ -72,7 +69,7 @@ def _without_plane(values: Array) -> Array:
 def _outliers(flat: Array, finite: Mask) -> Mask:
     from_middle = np.abs(flat - np.median(flat[finite]))
     with np.errstate(invalid="ignore"):
-        return np.asarray(from_middle > _OUTLIERS_SD * _SD_PER_MAD * np.median(from_middle[finite]))
+        return np.asarray(from_middle > _OUTLIERS_SD * SD_PER_MAD * np.median(from_middle[finite]))
 
 
 def _are_lines_subtracted(values: Array, finite: Mask) -> bool:
@@ -112,7 +109,7 @@ def _robust_lines(steps: Array, there: Mask) -> Array:
         left = np.abs(steps - lines)
         usual = np.median(left, axis=1, keepdims=True)
         lines = _lines(steps, there / np.maximum(left, np.where(usual > 0.0, 0.05 * usual, 1.0)))
-    reach = _OUTLIERS_SD * _SD_PER_MAD * np.median(np.abs(steps - lines)[there]) if there.any() else 0.0
+    reach = _OUTLIERS_SD * SD_PER_MAD * np.median(np.abs(steps - lines)[there]) if there.any() else 0.0
     for _ in range(_ROUNDS if reach > 0.0 else 0):
         part = np.minimum(np.abs(steps - lines) / reach, 1.0)
         lines = _lines(steps, there * ((1.0 - part**2) ** 2 + _NEVER_NONE))

@@ -11,12 +11,12 @@ from datetime import UTC
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import AfspmError, InvalidValue
 from afspm.basics.formatting import duration_text, period_text
 from afspm.model import Region, Scan
+from afspm.model.arrays import Array
 from afspm.model.line_levelling import flattened
 from afspm.record.report import story
 from afspm.record.report.pictures import topography
@@ -24,7 +24,6 @@ from afspm.record.report.story import RunStory
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow
 
-Array = NDArray[np.float64]
 Aligner = Callable[[Array, Region, Array, Region], tuple[Array, str]]
 """A function that moves the levelled values of a second scan onto the first, and describes the alignment."""
 

@@ -6,11 +6,9 @@ from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from afspm.basics.errors import FileError
 from afspm.basics.formatting import quantity, typeset_area
+from afspm.model.arrays import Array
 from afspm.record.comparison import ComparedRegion, RegionScan, RunComparison, ScanDifference
 from afspm.record.drawing.image_html import Shown, image_html
 from afspm.record.drawing.palette import DIVERGING, PALETTES
@@ -18,7 +16,6 @@ from afspm.record.drawing.raster import ValueRange, indices, png, reduced, share
 from afspm.record.report.markup import document, section, table
 from afspm.storage.atomic import replace_file
 
-Array = NDArray[np.float64]
 _LARGEST_PX = 256
 _WIDTH = "220px"
 # the second picture covers the first in turns of 0.7 s: slow enough for people who are sensitive to flashes

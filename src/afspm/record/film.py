@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import FileError, InvalidValue
 from afspm.basics.formatting import day_and_time, duration_text, quantity, typeset_length
 from afspm.model import Frame, Region, Scan
+from afspm.model.arrays import Array
 from afspm.model.geometry import XY
 from afspm.model.line_levelling import flattened
 from afspm.record.drawing.image_html import round_length_m
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from PIL import Image, ImageDraw
 
     from afspm.record.overview import DriftPoint
-
-Array = NDArray[np.float64]
 
 FORMATS: Final = (".gif", ".mp4")
 WIDTH_PX: Final = 480

@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from afspm.basics.errors import FileError, UnitError
 from afspm.basics.units import convert, same_kind
 from afspm.model import Region, Scan, Spectrum
+from afspm.model.arrays import Array
 from afspm.model.geometry import XY
 from afspm.storage.formats import hdf5_reading
 from afspm.storage.formats.content import FileContent, OtherFormat, clock_ns
@@ -36,8 +36,6 @@ _SYMBOLS: Final = {
 _CLOCKWISE: Final = ("nanonis",)
 """Programs of controllers whose angles are clockwise."""
 _BIAS_SPECTRUM: Final = "NXsts"
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

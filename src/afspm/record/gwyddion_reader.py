@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from afspm.basics.errors import FileError
 from afspm.basics.plain_data import Plain
 from afspm.basics.units import convert
 from afspm.model import Frame, Region, Scan, Spectrum
+from afspm.model.arrays import Array
 from afspm.model.channels import ROLES_APART
 from afspm.storage.formats.content import FileContent, text_of
 
@@ -30,8 +30,6 @@ _GRAPH: Final = re.compile(r"/(?:\d+/)?graph/graph/(\d+)")
 _NUMBERS: Final = {"b": "?", "c": "c", "i": "<i4", "q": "<i8", "d": "<f8"}
 _DEEPEST: Final = 20
 """Most objects in each other; a damaged file may announce any number."""
-
-Array = NDArray[np.float64]
 
 
 def read_gwyddion(path: Path, zone: tzinfo | None) -> FileContent:

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.basics.errors import InvalidValue
+from afspm.model.arrays import Array
 from afspm.model.geometry import XY
 from afspm.model.spectrum import Spectrum
 
-Floats = NDArray[np.float64]
 DIRECTIONS: Final = ("forward", "backward")
 _BACKWARD = re.compile(r"\s*(?:\[bwd\]|\bretrace\b|\bbackward\b|\bbwd\b)", re.IGNORECASE)
 _FORWARD = re.compile(r"\s*(?:\[fwd\]|\btrace\b|\bforward\b|\bfwd\b)", re.IGNORECASE)
@@ -34,8 +34,8 @@ class PointGrid:
         cells: (row, column) of each position.
     """
 
-    x_m: Floats
-    y_m: Floats
+    x_m: Array
+    y_m: Array
     center_m: XY
     angle_rad: float
     cells: tuple[tuple[int, int], ...] = ()
@@ -70,7 +70,7 @@ def grid(positions_m: Sequence[XY]) -> PointGrid:
     return PointGrid(x + x_m, y + y_m, (x, y), angle_rad, cells)
 
 
-def _nearest(places: Floats) -> tuple[float, float]:
+def _nearest(places: Array) -> tuple[float, float]:
     # spacing of neighbours, and the angle of the grid, -45° to 45°
     from scipy.spatial import cKDTree
 
@@ -91,7 +91,7 @@ def _nearest(places: Floats) -> tuple[float, float]:
     return spacing_m, float(np.angle(np.exp(4j * angles).mean()) / 4.0)
 
 
-def _axis(along_m: Floats, spacing_m: float) -> tuple[Floats, NDArray[np.int64]]:
+def _axis(along_m: Array, spacing_m: float) -> tuple[Array, NDArray[np.int64]]:
     # the coordinates of evenly spaced lines, and the line of each position
     order = np.sort(along_m)
     gaps = np.diff(order)
@@ -146,7 +146,7 @@ def alike(spectra: Sequence[Spectrum], *, swept_alike: bool) -> Spectrum:
     return first
 
 
-def ways(spectrum: Spectrum) -> tuple[Floats, list[dict[str, Floats]]]:
+def ways(spectrum: Spectrum) -> tuple[Array, list[dict[str, Array]]]:
     """Return the swept values, and the curves by variable: a mapping for forward, then for backward if measured.
 
     Backward curves are in the order of the returned swept values.
@@ -172,7 +172,7 @@ def columns_of(spectrum: Spectrum) -> list[dict[str, str]]:
     return [plain, back] if back else [plain]
 
 
-def common_sweep(sweeps: Sequence[Floats]) -> Floats:
+def common_sweep(sweeps: Sequence[Array]) -> Array:
     """Return evenly spaced values, ascending, within all sweeps.
 
     Raises:
@@ -184,13 +184,13 @@ def common_sweep(sweeps: Sequence[Floats]) -> Floats:
     return np.linspace(low, high, max(map(len, sweeps)))
 
 
-def at(common: Floats, swept: Floats, values: Floats) -> Floats:
+def at(common: Array, swept: Array, values: Array) -> Array:
     """Return a curve at other values of the swept variable, linear between its points."""
     order = np.argsort(swept)
     return np.interp(common, swept[order], values[order])
 
 
-def _turning_point(swept: Floats) -> int | None:
+def _turning_point(swept: Array) -> int | None:
     # half of a sweep that goes forth and back over the same values; None for a one-way sweep
     half, odd = divmod(len(swept), 2)
     if not np.isfinite(swept).all():
@@ -202,7 +202,7 @@ def _turning_point(swept: Floats) -> int | None:
     return half if abs(swept[half] - swept[0]) > 0.5 * extent else None
 
 
-def _same_sweep(one: Floats, other: Floats) -> bool:
+def _same_sweep(one: Array, other: Array) -> bool:
     finite = one[np.isfinite(one)]  # a stopped sweep has NaN
     atol = 1e-6 * float(np.ptp(finite)) + 1e-30 if finite.size else 0.0
     return one.shape == other.shape and np.allclose(one, other, rtol=0.0, atol=atol, equal_nan=True)

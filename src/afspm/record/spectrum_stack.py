@@ -12,22 +12,12 @@ from numpy.typing import NDArray
 
 from afspm.basics.errors import InvalidValue
 from afspm.basics.requirements import imports_of_extra
+from afspm.model.arrays import Array
 from afspm.model.geometry import Frame, Region
 from afspm.model.scan import Scan
 from afspm.model.spectrum import Spectrum
 from afspm.record.netcdf_encoding import fit_classic_netcdf
-from afspm.record.spectrum_grid import (
-    DIRECTIONS,
-    Floats,
-    PointGrid,
-    alike,
-    at,
-    columns_of,
-    common_sweep,
-    grid,
-    repeats,
-    ways,
-)
+from afspm.record.spectrum_grid import DIRECTIONS, PointGrid, alike, at, columns_of, common_sweep, grid, repeats, ways
 
 if TYPE_CHECKING:
     import xarray
@@ -55,11 +45,11 @@ class SpectrumStack:
     kind: str
     frame: Frame
     points: PointGrid
-    swept: Floats
+    swept: Array
     swept_name: str
     swept_unit: str
     directions: tuple[str, ...]
-    curves: Mapping[str, Floats]
+    curves: Mapping[str, Array]
     units: Mapping[str, str]
     names: tuple[str, ...]
     columns: Sequence[Mapping[str, str]]
@@ -181,7 +171,7 @@ def _grid_of(spectra: Sequence[Spectrum]) -> tuple[PointGrid, list[int]]:
     return points, repeats(points.cells)
 
 
-def mean_over_repeats(values: Floats) -> Floats:
+def mean_over_repeats(values: Array) -> Array:
     """Return the mean over the third axis; NaN where nothing was measured."""
     known = np.isfinite(values)
     count = known.sum(axis=2)

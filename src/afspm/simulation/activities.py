@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from afspm.model import Feedback, Region
-from afspm.simulation.fields import Array
+from afspm.model.arrays import Array
 from afspm.simulation.measuring import Adjustment
 from afspm.simulation.scanning import Course, SimulatedScan
 

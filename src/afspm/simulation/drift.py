@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from afspm.basics.errors import ConfigError, InvalidValue
+from afspm.model.arrays import Array
 from afspm.simulation import chance
-from afspm.simulation.fields import Array
 from afspm.simulation.settings import check
 
 _LONGEST_S = 2.0**20  # twelve days: the coarsest interval of the random walk

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.model import Feedback
-from afspm.simulation.fields import Array
+from afspm.model.arrays import Array
 from afspm.simulation.settings import check, one_of
 
 

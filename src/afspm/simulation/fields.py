@@ -11,9 +11,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.model.arrays import Array
 from afspm.simulation import chance
 
-Array = NDArray[np.float64]
 _MATMUL_LATTICE = 48  # up to this size a dense product is faster than gathering
 # The rms of a B-spline field of unit coefficients, averaged over positions: (sum of w^2)^(1/2) each axis.
 _SPLINE_RMS = 151.0 / 315.0

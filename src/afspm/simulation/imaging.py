@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.simulation.fields import Array, bspline_weights
+from afspm.model.arrays import Array
+from afspm.simulation.fields import bspline_weights
 from afspm.simulation.tip import TipShape
 
 Single = NDArray[np.float32]

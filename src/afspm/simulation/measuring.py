@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.model import Feedback
+from afspm.model.arrays import Array
 from afspm.simulation.feedback import Loop
-from afspm.simulation.fields import Array
 from afspm.simulation.imaging import SampleGrid, Sampler, across_m, felt, reach_m
 from afspm.simulation.noise import NoiseSettings, disturbances, flattened, height_noise
 from afspm.simulation.scanning import Course, ScannerSettings

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from afspm.simulation.fields import Array
+from afspm.model.arrays import Array
 from afspm.simulation.settings import check
 from afspm.simulation.tip import TipShape
 

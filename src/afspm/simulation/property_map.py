@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from afspm.basics.errors import ConfigError
+from afspm.model.arrays import Array
 from afspm.simulation import chance
-from afspm.simulation.fields import Array, smooth_field
+from afspm.simulation.fields import smooth_field
 from afspm.simulation.settings import check, one_of
 from afspm.simulation.spectra import ForceSettings, IVSettings
 from afspm.simulation.surfaces.relief import Sites

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from afspm.model.arrays import Array
 from afspm.simulation import chance
 from afspm.simulation.drift import Drift, DriftSettings, ScannerCompensation
-from afspm.simulation.fields import Array
 from afspm.simulation.surfaces import surface_from
 from afspm.simulation.surfaces.relief import Relief, around
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from afspm.basics.errors import InvalidValue
 from afspm.model import Frame, Region
-from afspm.simulation.fields import Array
+from afspm.model.arrays import Array
 from afspm.simulation.settings import check, one_of
 
 MOST_PIXELS = 1 << 24

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from afspm.model.arrays import Array
 from afspm.simulation.feedback import Loop
-from afspm.simulation.fields import Array
 from afspm.simulation.settings import check
 from afspm.simulation.tip import TipShape
 

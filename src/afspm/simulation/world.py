@@ -16,11 +16,11 @@ from numpy.typing import ArrayLike
 
 from afspm.basics.errors import ConfigError, ErrorCollector, InvalidValue
 from afspm.model import Feedback, Region
+from afspm.model.arrays import Array
 from afspm.model.snapshot import restored, snapshot
 from afspm.simulation import chance, spectra
 from afspm.simulation.drift import DriftSettings, ScannerCompensation
 from afspm.simulation.feedback import FeedbackSettings, Loop
-from afspm.simulation.fields import Array
 from afspm.simulation.measuring import Adjustment, Felt, Setup, SignalSettings, TipTimes, at_rest, feel, measure
 from afspm.simulation.noise import NoiseSettings
 from afspm.simulation.property_map import PropertyMap, PropertyMapSettings

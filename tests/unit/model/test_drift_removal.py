@@ -6,13 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from afspm.basics.errors import InvalidValue
 from afspm.model import Region, Scan
+from afspm.model.arrays import Array
 from afspm.simulation import World
-
-Array = NDArray[np.float64]
 
 SIZE_M = 400e-9
 PIXELS = 128

@@ -10,18 +10,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from tests.unit.record.record_lab import ABOUT, REGION, Night
 
 from afspm.basics.errors import InvalidValue
 from afspm.model import ControlRequest, ControlResponse, JournalEntries, JournalEntry, Region, Scan, ScopeState
+from afspm.model.arrays import Array
 from afspm.record.comparison import RunComparison, compare, differences, flat_settings, roughness, same_region
 from afspm.record.comparison_page import html, roughness_rows, write
 from afspm.record.run import open_run
 from afspm.record.run_json import EXPERIMENT_FILE, RUN_FILE
 from afspm.record.store import RecordStore
 
-Array = NDArray[np.float64]
 PX = 24
 ELSEWHERE = Region((8e-6, -2e-6), REGION.size_m)
 

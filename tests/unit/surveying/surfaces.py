@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from afspm.model import Region, Scan
+from afspm.model.arrays import Array
 
-Floats = NDArray[np.float64]
 SIDE_M = 5e-6
 REGION = Region((0.0, 0.0), (SIDE_M, SIDE_M))
 
@@ -26,10 +25,10 @@ class Ground:
     scars: int = 0
 
 
-def strewn(seed: int, count: int = 60) -> tuple[Floats, Floats]:
+def strewn(seed: int, count: int = 60) -> tuple[Array, Array]:
     """Return places (n, 2) of particles that don't hide each other, and radii."""
     chance = np.random.default_rng(seed)
-    places: list[Floats] = []
+    places: list[Array] = []
     while len(places) < count:
         place = chance.uniform(-SIDE_M / 2, SIDE_M / 2, 2)
         if all(np.hypot(*(place - other)) > 250e-9 for other in places):
@@ -38,7 +37,7 @@ def strewn(seed: int, count: int = 60) -> tuple[Floats, Floats]:
 
 
 def scanned(
-    places_m: Floats, radii_m: Floats, ground: Ground = Ground(), *, pixels: int = 128, seed: int = 0,
+    places_m: Array, radii_m: Array, ground: Ground = Ground(), *, pixels: int = 128, seed: int = 0,
     region: Region = REGION,
 ) -> Scan:  # fmt: skip
     """Return the heights of spheres on their ground, dilated by a tip."""

@@ -13,12 +13,12 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
 
 from afspm.basics.formatting import counted, scale, typeset_area, typeset_length
 from afspm.components.surveying.record import Outcome, SurveyRecord, Visit
 from afspm.components.surveying.targets import flattened
 from afspm.model import Scan, Spectrum
+from afspm.model.arrays import Array
 from afspm.model.geometry import XY
 from afspm.record.drawing.image_html import round_length_m
 from afspm.record.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM
@@ -27,8 +27,6 @@ from afspm.record.plotting import draw_scale_bar, gold
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-Floats = NDArray[np.float64]
 
 MOST_ZOOMS: Final = 15
 _COLUMNS: Final = 5
@@ -101,7 +99,7 @@ class _Picture:
             right = 1 - _LEFT_IN / self._width_in
             self._figure.text(right, y, "SIMULATED", size=10, weight="bold", color=PROBLEM, ha="right", va="center")
 
-    def _survey(self, zooms: Sequence[Floats]) -> tuple[float, Normalize]:
+    def _survey(self, zooms: Sequence[Array]) -> tuple[float, Normalize]:
         scan = self._record.survey
         values = flattened(scan, 2)
         factor, colours = self._colour_bar([values, *zooms], scan, _LEFT_IN + _SURVEY_IN + _GAP_IN, _SURVEY_IN)
@@ -202,7 +200,7 @@ class _Picture:
     def _colours(self) -> list[str]:
         return [_CURVES[index % len(_CURVES)] for index in range(len(self._record.curves))]
 
-    def _image(self, scan: Scan, values: Floats, colours: Normalize, place: tuple[float, float, float]) -> Axes:
+    def _image(self, scan: Scan, values: Array, colours: Normalize, place: tuple[float, float, float]) -> Axes:
         left_in, top_in, side_in = place
         axes = self._axes(left_in, top_in, side_in, side_in)
         axes.set(facecolor=NEUTRAL, xticks=[], yticks=[])
@@ -214,7 +212,7 @@ class _Picture:
         return axes
 
     def _colour_bar(
-        self, images: Sequence[Floats], scan: Scan, left_in: float, side_in: float
+        self, images: Sequence[Array], scan: Scan, left_in: float, side_in: float
     ) -> tuple[float, Normalize]:
         span = shared_range(images)
         low, high = span.low, span.high
@@ -239,7 +237,7 @@ def _shown_size(scan: Scan) -> tuple[float, float]:
     return 1e9 * width, 1e9 * height
 
 
-def _within(scan: Scan, places_m: Sequence[XY] | Floats) -> Floats:
+def _within(scan: Scan, places_m: Sequence[XY] | Array) -> Array:
     # places in nm from the lower left corner of a scan, along its sides
     region = scan.region
     x, y = (np.asarray(places_m, dtype=np.float64) - region.center_m).T
@@ -247,7 +245,7 @@ def _within(scan: Scan, places_m: Sequence[XY] | Floats) -> Floats:
     return 1e9 * (np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1) + np.asarray(region.size_m) / 2)
 
 
-Variable = tuple[str, str, Floats]
+Variable = tuple[str, str, Array]
 """Name, unit and values of one variable of a curve."""
 
 
@@ -267,7 +265,7 @@ def _scale_of(variables: Sequence[Variable]) -> tuple[float, str]:
     return scale(largest, variables[0][1])
 
 
-def _range(curves: Sequence[Floats]) -> tuple[float, float]:
+def _range(curves: Sequence[Array]) -> tuple[float, float]:
     known = np.concatenate([curve[np.isfinite(curve)] for curve in curves])
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
     margin = 0.04 * (high - low) or 1.0

@@ -11,17 +11,13 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from afspm.basics.requirements import require_installed
 from afspm.model import Scan
+from afspm.model.arrays import Array, robust_spread
 from afspm.model.geometry import XY
 from afspm.model.levelling import levelled
 
-Floats = NDArray[np.float64]
-
-_MAD: Final = 1.4826
-"""Factor from the median of absolute deviations to a standard deviation."""
 _SIGMAS: Final = 6.0
 """Default least height in units of the noise: no height in 128 x 128 pixels of noise is that large."""
 _WIDEST: Final = 0.2
@@ -106,7 +102,7 @@ def lowest_beside(scan: Scan, center_m: XY, distance_m: float) -> XY:
     return float(x_m[lowest]), float(y_m[lowest])
 
 
-def flattened(scan: Scan, order: int) -> Floats:
+def flattened(scan: Scan, order: int) -> Array:
     """Return the values less a robust polynomial surface of this order, and less the offset of each line.
 
     The ground is at 0; NaN where not measured.
@@ -127,14 +123,14 @@ def _blur_px(detail_m: float, pixel_m: Sequence[float]) -> list[float]:
     return [max(_LEAST_BLUR_PX, detail_m / 20.0 / size) for size in pixel_m]
 
 
-def _smooth(flat: Floats, blur_px: Sequence[float]) -> Floats:
+def _smooth(flat: Array, blur_px: Sequence[float]) -> Array:
     # scars removed, blurred; missing values are ground
     from scipy import ndimage
 
     return np.asarray(ndimage.gaussian_filter(_without_scars(np.nan_to_num(flat)), blur_px))
 
 
-def _above_ground(heights: Floats, widest_px: Sequence[float]) -> Floats:
+def _above_ground(heights: Array, widest_px: Sequence[float]) -> Array:
     # the rest after everything narrow is cut off
     from scipy import ndimage
 
@@ -144,11 +140,11 @@ def _above_ground(heights: Floats, widest_px: Sequence[float]) -> Floats:
     return np.asarray(above - np.median(above))
 
 
-def _scatter(values: Floats) -> float:
-    return _MAD * float(np.nanmedian(np.abs(values - np.nanmedian(values))))
+def _scatter(values: Array) -> float:
+    return robust_spread(values[~np.isnan(values)])
 
 
-def _line_offsets(flat: Floats) -> Floats:
+def _line_offsets(flat: Array) -> Array:
     # the median of each line's ground; 0 for a line without ground
     is_ground = np.abs(flat - np.nanmedian(flat)) < 2.5 * _scatter(flat)
     offsets = np.zeros(len(flat))
@@ -157,7 +153,7 @@ def _line_offsets(flat: Floats) -> Floats:
     return offsets
 
 
-def _without_scars(flat: Floats) -> Floats:
+def _without_scars(flat: Array) -> Array:
     # long stretches that rise above the ground of both neighbours become their mean
     from scipy import ndimage
 
@@ -169,7 +165,7 @@ def _without_scars(flat: Floats) -> Floats:
     return np.where(is_scar, (below + over) / 2.0, flat)
 
 
-def _tops(above: Floats, scan: Scan, least: float) -> list[Target]:
+def _tops(above: Array, scan: Scan, least: float) -> list[Target]:
     # height, and centre of the part above half of it, up to the saddles around
     require_installed("finding particles", "afspm[features]")
     import skimage
@@ -192,7 +188,7 @@ def _tops(above: Floats, scan: Scan, least: float) -> list[Target]:
     ]
 
 
-def _at(values: Floats, scan: Scan, x_m: Floats, y_m: Floats) -> Floats:
+def _at(values: Array, scan: Scan, x_m: Array, y_m: Array) -> Array:
     # linear between pixels; NaN outside
     from scipy import ndimage
 

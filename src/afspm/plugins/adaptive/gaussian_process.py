@@ -20,11 +20,10 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
-Floats = NDArray[np.float64]
+from afspm import Array
 
 _MOST_FITTED: Final = 240  # measurements for the likelihood, whose time grows with the cube
 _LEAST_NOISE: Final = 1e-4  # variance relative to the squared amplitude; with less the matrix is not solved stably
@@ -59,9 +58,9 @@ class GaussianProcess:
         parameters: parameters of the process.
     """
 
-    def __init__(self, xy_m: Floats, values: Floats, times_s: Floats, parameters: Parameters) -> None:
+    def __init__(self, xy_m: Array, values: Array, times_s: Array, parameters: Parameters) -> None:
         self.parameters = parameters
-        self._at_m: Floats = xy_m - np.outer(times_s - times_s[0], parameters.velocity_m_s)
+        self._at_m: Array = xy_m - np.outer(times_s - times_s[0], parameters.velocity_m_s)
         factor = cho_factor(_covariance(self._at_m, parameters), lower=True, overwrite_a=True, check_finite=False)
         solved = cho_solve(factor, np.stack([values, np.ones(len(values))], axis=1), check_finite=False)
         self.mean = float(solved[:, 0].sum() / solved[:, 1].sum())
@@ -69,11 +68,11 @@ class GaussianProcess:
         square = float((values - self.mean) @ self._weights) / len(values)
         self.amplitude = math.sqrt(max(square, 1e-300))
 
-    def predict(self, xy_m: Floats) -> Floats:
+    def predict(self, xy_m: Array) -> Array:
         """Return the expected values (m,) at positions (m, 2) on the sample as it lay at the first time."""
         return np.asarray(self.mean + self._related(xy_m) @ self._weights)
 
-    def variance(self, xy_m: Floats, also_m: Floats | None = None) -> Floats:
+    def variance(self, xy_m: Array, also_m: Array | None = None) -> Array:
         """Return the expected square error (m,) at positions (m, 2), scaled by the local roughness.
 
         Args:
@@ -86,23 +85,23 @@ class GaussianProcess:
         return np.asarray(self.amplitude**2 * np.maximum(left, 0.0) * self._scale(xy_m))
 
     @property
-    def positions_m(self) -> Floats:
+    def positions_m(self) -> Array:
         """The measured positions on the sample as it lay at the first time, (n, 2)."""
         return self._at_m
 
     @cached_property
-    def _inverse(self) -> Floats:
+    def _inverse(self) -> Array:
         return np.asarray(np.linalg.inv(_covariance(self._at_m, self.parameters)))
 
     @cached_property
-    def _surprise(self) -> Floats:
+    def _surprise(self) -> Array:
         # squares of the leave-one-out errors, each as a part of its variance: Rasmussen and Williams, eq. 5.12
         return np.asarray(self._weights**2 / np.diag(self._inverse) / self.amplitude**2)
 
-    def _related(self, xy_m: Floats) -> Floats:
+    def _related(self, xy_m: Array) -> Array:
         return matern(distances(xy_m, self._at_m), self.parameters.length_m)
 
-    def _scale(self, xy_m: Floats) -> Floats:
+    def _scale(self, xy_m: Array) -> Array:
         square = distances(xy_m, self._at_m)
         count = min(_NEAREST, square.shape[1])
         nearest = np.argpartition(square, count - 1, axis=1)[:, :count]
@@ -113,7 +112,7 @@ class GaussianProcess:
 
 
 def fitted(
-    xy_m: Floats, values: Floats, times_s: Floats, start: Parameters, shortest_m: float, *, drifts: bool, seed: int = 0
+    xy_m: Array, values: Array, times_s: Array, start: Parameters, shortest_m: float, *, drifts: bool, seed: int = 0
 ) -> Parameters:
     """Return the parameters of the highest marginal likelihood, searched from `start`.
 
@@ -129,7 +128,7 @@ def fitted(
     since_s = times_s - times_s.min()
     unit_s = max(float(since_s.max()), 1e-9)
 
-    def cost(at: Floats) -> float:
+    def cost(at: Array) -> float:
         length_m, noise = shortest_m * math.exp(at[0]), math.exp(at[1])
         shift_m = np.outer(since_s / unit_s, at[2:] * shortest_m) if len(at) > 2 else 0.0
         bounds = 50.0 * (max(0.0, -at[0]) ** 2 + max(0.0, at[0] - math.log(100.0)) ** 2)
@@ -152,24 +151,24 @@ def fitted(
     return Parameters(length_m, noise, (float(velocity[0]), float(velocity[1])))
 
 
-def matern(distance_m: Floats, length_m: float) -> Floats:
+def matern(distance_m: Array, length_m: float) -> Array:
     """Return the Matérn 5/2 correlation over distances."""
     r = distance_m * (math.sqrt(5.0) / length_m)
     return np.asarray((1.0 + r + r * r / 3.0) * np.exp(-r))
 
 
-def distances(a_m: Floats, b_m: Floats) -> Floats:
+def distances(a_m: Array, b_m: Array) -> Array:
     """Return the distances between two sets of points, shape (len(a_m), len(b_m))."""
     return np.hypot(a_m[:, None, 0] - b_m[None, :, 0], a_m[:, None, 1] - b_m[None, :, 1])
 
 
-def _covariance(at_m: Floats, parameters: Parameters) -> Floats:
+def _covariance(at_m: Array, parameters: Parameters) -> Array:
     matrix = matern(distances(at_m, at_m), parameters.length_m)
     matrix[np.diag_indices(len(at_m))] += parameters.noise
     return matrix
 
 
-def _lowest(cost: Callable[[Floats], float], first: Floats, steps: Floats) -> Floats:
+def _lowest(cost: Callable[[Array], float], first: Array, steps: Array) -> Array:
     simplex = np.vstack([first, first + np.diag(steps)])
     found = minimize(
         cost,
@@ -180,7 +179,7 @@ def _lowest(cost: Callable[[Floats], float], first: Floats, steps: Floats) -> Fl
     return np.asarray(found.x)
 
 
-def _log_likelihood(at_m: Floats, values: Floats, length_m: float, noise: float) -> float:
+def _log_likelihood(at_m: Array, values: Array, length_m: float, noise: float) -> float:
     n = len(values)
     matrix = _covariance(at_m, Parameters(length_m, noise))
     factor = cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)

@@ -10,14 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics import counted, scale
 from afspm.model import Region
 from afspm.plugins.adaptive.mapping import MapProgress
 from afspm.record import CATEGORICAL, PROBLEM, Contrast, draw_scale_bar, gold, value_range
 
-Floats = NDArray[np.float64]
 _LONGER: Final = 120  # pixels along the longer side
 _WIDTH_IN, _TEXT = 9.6, 9.0
 
@@ -57,7 +56,7 @@ def draw_map(found: MapProgress, region: Region, path: Path, *, title: str = "",
 
 def _panel(
     axes: Axes,
-    values: Floats,
+    values: Array,
     size_um: tuple[float, ...],
     name: str,
     unit: str,
@@ -78,7 +77,7 @@ def _panel(
     bar.ax.tick_params(labelsize=_TEXT)
 
 
-def _pictures(found: MapProgress, region: Region) -> tuple[Floats, Floats]:
+def _pictures(found: MapProgress, region: Region) -> tuple[Array, Array]:
     # [y, x] over the region, along its own axes
     longer = max(region.size_m)
     columns, rows = (max(2, round(_LONGER * size / longer)) for size in region.size_m)
@@ -88,7 +87,7 @@ def _pictures(found: MapProgress, region: Region) -> tuple[Floats, Floats]:
     return model.predict(places).reshape(rows, columns), np.sqrt(model.variance(places)).reshape(rows, columns)
 
 
-def _in_region(xy_m: Floats, region: Region) -> Floats:
+def _in_region(xy_m: Array, region: Region) -> Array:
     # positions along the axes of the region, from its middle
     cos, sin = np.cos(region.angle_rad), np.sin(region.angle_rad)
     return np.asarray((xy_m - np.asarray(region.center_m)) @ np.array([[cos, -sin], [sin, cos]]))

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics import ConfigError, InvalidValue
 from afspm.model import Spectrum
 from afspm.processes import find_object
 
-Floats = NDArray[np.float64]
 _EDGE: Final = (0.2, 0.65)
 """Limits of the fit to a band edge, as shares of the largest conductance on its side. Between them the conductance
 rises as the square root of the energy beyond the edge."""
@@ -112,7 +111,7 @@ def evaluation(quantity: str, unit: str = "", kind: str | None = None) -> Evalua
     return Evaluation(quantity.rpartition(".")[2], unit, kind, function)
 
 
-def _edge(outwards: Floats, conductance: Floats) -> float:
+def _edge(outwards: Array, conductance: Array) -> float:
     # `outwards` rises from the middle of the gap; the result is the bias of the edge
     conductance = conductance[: len(outwards)]
     outwards = outwards[: len(conductance)]

@@ -23,14 +23,13 @@ from collections.abc import Iterable, Mapping, Sequence, Set
 from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics import InvalidValue
 from afspm.model import Region
 from afspm.plugins.adaptive.gaussian_process import GaussianProcess, Parameters, fitted
 from afspm.plugins.adaptive.tours import Cell, MeasurementCost, learnt_cost, short_tour, snake, way_m
 
-Floats = NDArray[np.float64]
 Point = Mapping[str, Any]
 
 ID: Final = "_id"
@@ -94,7 +93,7 @@ class NestedLattices:
         rows = {cell[1] - cell[1] % coarse, cell[1] + -cell[1] % coarse}
         return [(i, j) for i in columns for j in rows]
 
-    def xy_m(self, cells: Iterable[Cell]) -> Floats:
+    def xy_m(self, cells: Iterable[Cell]) -> Array:
         """Return the positions of cells, shape (n, 2), in m."""
         at = np.array(list(cells), dtype=np.float64).reshape(-1, 2)
         last = np.array(self.counts, dtype=np.float64) - 1.0
@@ -205,7 +204,7 @@ class LatticeMap:
     # -- the map
 
     @property
-    def measurements(self) -> Floats:
+    def measurements(self) -> Array:
         """The measurements, (n, 4): x and y in m, value, time in s."""
         return np.array(self._rows, dtype=np.float64).reshape(-1, 4)
 
@@ -230,7 +229,7 @@ class LatticeMap:
         )  # fmt: skip
         self._model = None
 
-    def map(self, xy_m: Floats) -> Floats:
+    def map(self, xy_m: Array) -> Array:
         """Return the expected values at positions (m, 2) of the sample as it lay at the first measurement."""
         return self.model.predict(xy_m)
 
@@ -256,10 +255,10 @@ class LatticeMap:
     def _reached_m(self) -> float:
         return self.lattice.spacing_m(self._reached(self._done))
 
-    def _at_m(self) -> Floats:
+    def _at_m(self) -> Array:
         return np.array(self._rows[-1][:2]) if self._rows else self.lattice.xy_m([(0, 0)])[0]
 
-    def _under_tip(self, cell: Cell, before: Sequence[Point]) -> Floats:
+    def _under_tip(self, cell: Cell, before: Sequence[Point]) -> Array:
         # where the sample's position is expected when the probe gets there
         home = self.lattice.xy_m([cell])
         if not self._rows:
@@ -346,11 +345,11 @@ class AdaptiveMap(LatticeMap):
     def _seconds_of(self, order: list[Cell]) -> float:
         return len(order) * self.cost.fixed_s + self.cost.per_m_s * way_m(self.lattice.xy_m(order), self._at_m())
 
-    def _candidates(self) -> tuple[list[Cell], Floats]:
+    def _candidates(self) -> tuple[list[Cell], Array]:
         cells, areas = self._beside(self._done)
         return cells, self.model.variance(self.lattice.xy_m(cells)) * areas if cells else areas
 
-    def _beside(self, done: Set[Cell]) -> tuple[list[Cell], Floats]:
+    def _beside(self, done: Set[Cell]) -> tuple[list[Cell], Array]:
         # the next finer cells around these, and the area that each stands for
         found = [
             (cell, level)

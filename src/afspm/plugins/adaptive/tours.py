@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.plugins.adaptive.gaussian_process import distances
 
-Floats = NDArray[np.float64]
 Cell = tuple[int, int]
 _PASSES: Final = 6  # largest number of passes that improve a tour
 _REMEMBERED: Final = 60  # latest measurements, from which the costs are learnt
@@ -57,7 +56,7 @@ def snake(cells: Sequence[Cell]) -> list[Cell]:
     return order
 
 
-def short_tour(xy_m: Floats, start_m: Floats) -> list[int]:
+def short_tour(xy_m: Array, start_m: Array) -> list[int]:
     """Return an order of positions (n, 2) with a short way from `start_m`: nearest neighbours, then 2-opt."""
     n = len(xy_m)
     apart = distances(xy_m, xy_m)
@@ -72,12 +71,12 @@ def short_tour(xy_m: Floats, start_m: Floats) -> list[int]:
     return _untangled(order, apart, np.hypot(*(xy_m - start_m).T))
 
 
-def way_m(xy_m: Floats, start_m: Floats) -> float:
+def way_m(xy_m: Array, start_m: Array) -> float:
     """Return the length in m of the way from `start_m` through positions in their order."""
     return float(np.hypot(*np.diff(np.vstack([start_m, xy_m]), axis=0).T).sum())
 
 
-def _untangled(order: list[int], apart: Floats, from_start: Floats) -> list[int]:
+def _untangled(order: list[int], apart: Array, from_start: Array) -> list[int]:
     # reverse a part of the way wherever that shortens it; the end is free
     path = np.array(order)
     n = len(path)

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array, robust_spread
 from afspm.basics import AfspmError, Plain
 from afspm.model import Frame, ProblemNames
 from afspm.plugins.agent.plan import Plan
@@ -23,7 +24,7 @@ from afspm.plugins.agent.twin import LONGEST_S
 from afspm.plugins.web.archive import Archive
 from afspm.record import ScanSummary
 
-Values = Callable[[ScanSummary], NDArray[np.float64] | None]
+Values = Callable[[ScanSummary], Array | None]
 """Returns the values of a scan; None if they are no longer known."""
 
 
@@ -82,7 +83,7 @@ async def repeated(plan: Plan, who: str, *, frame: Frame, run_dir: Path, speed_m
     archive = Archive(run_dir)
     past = await asyncio.to_thread(archive.past, ProblemNames())
 
-    def values(scan: ScanSummary) -> NDArray[np.float64] | None:
+    def values(scan: ScanSummary) -> Array | None:
         found = archive.frame(scan.time_ns, scan.channel)
         return None if found is None else found.values
 
@@ -118,8 +119,8 @@ def _sample(scans: Iterable[ScanSummary], values_of: Values, folder: Path) -> Pl
     return {"of": "no overview was measured: steps as a stand-in"}
 
 
-def _noise_m(values: NDArray[np.float64]) -> float:
-    # from second differences along lines, in which steps and slopes hardly appear. 1.4826 converts the median absolute
-    # deviation to a standard deviation; a second difference has 1 + 4 + 1 = 6 times the variance of a pixel
+def _noise_m(values: Array) -> float:
+    # from second differences along lines, in which steps and slopes hardly appear;
+    # a second difference has 1 + 4 + 1 = 6 times the variance of a pixel
     second = values[:, 2:] - 2.0 * values[:, 1:-1] + values[:, :-2]
-    return float(1.4826 * np.median(np.abs(second - np.median(second))) / np.sqrt(6.0))
+    return robust_spread(second) / math.sqrt(6.0)

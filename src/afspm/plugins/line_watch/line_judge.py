@@ -26,19 +26,18 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import from_plain, to_plain
+from afspm import Array, from_plain, to_plain
 from afspm.basics import Plain
 from afspm.model import Region
 from afspm.plugins.line_watch.registration import (
     CLIP_SIGMAS,
-    Array,
     RowFit,
     RowRegistration,
     RowTemplate,
     Shift,
     levelled,
     likely_shifts,
-    robust_spread,
+    residual_spread,
 )
 
 ACQUIRE = 6  # lines that only find the shift, before the first is judged
@@ -736,6 +735,6 @@ def _expected(fits: Sequence[RowFit]) -> tuple[float, float]:
     residual, steepness = residual[there], steepness[there]
     flat = steepness <= np.quantile(steepness, 0.4)
     steep = steepness >= np.quantile(steepness, 0.9)
-    flat_m = robust_spread(residual[flat])
-    beyond = max(0.0, robust_spread(residual[steep]) ** 2 - flat_m**2)
+    flat_m = residual_spread(residual[flat])
+    beyond = max(0.0, residual_spread(residual[steep]) ** 2 - flat_m**2)
     return flat_m, max(LEAST_PER_SLOPE, math.sqrt(beyond) / max(float(np.median(steepness[steep])), 1e-15))

@@ -10,6 +10,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from afspm import (
+    Array,
     ChannelPairing,
     Component,
     Events,
@@ -40,7 +41,6 @@ from afspm.plugins.line_watch.line_judge import (
     WholeScan,
     confidence,
 )
-from afspm.plugins.line_watch.registration import Array
 from afspm.wire.messages import SpatialROIWithScoreList, WatchCounts
 
 COUNTS = "WatchCounts"  # how many scans were watched: see `proto/lines.proto`

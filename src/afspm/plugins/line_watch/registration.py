@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-Array = NDArray[np.float64]
+from afspm import SD_PER_MAD, Array
+
 Shift = tuple[float, float]
 """(rows, columns) from the running scan to the same feature in the template."""
 
@@ -30,7 +31,6 @@ STEADY = 0.75  # share of the cost that a shift elsewhere must stay below: on a 
 HALF_PX = 0.35  # standard deviation of a shift rounded to whole pixels, both directions combined
 CANDIDATES = 6  # of a search: on a lattice many shifts are nearly as good
 CLIP_SIGMAS = 4.0  # limit of a slope in the cost of a shift, and of a pixel in a residual
-MAD_TO_SIGMA = 1.4826  # for normally distributed values
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,12 +254,12 @@ def levelled(rows: Array) -> Array:
         return np.asarray(level - np.median(level, axis=1, keepdims=True))
 
 
-def robust_spread(values: Array) -> float:
+def residual_spread(values: Array) -> float:
     """Return the standard deviation, estimated from the median absolute value; never zero."""
     there = values[np.isfinite(values)]
     half = there.size // 2
     # the upper of the two middle values: a tenth of the time that numpy's median takes on a row
-    spread = MAD_TO_SIGMA * float(np.partition(np.abs(there), half)[half]) if there.size else 0.0
+    spread = SD_PER_MAD * float(np.partition(np.abs(there), half)[half]) if there.size else 0.0
     return spread or float(there.std() if there.size else 0.0) or 1e-15
 
 
@@ -296,7 +296,7 @@ def _unexplained(
     prior = np.array([0.0, 0.0, 1.0 / PRIOR_PX**2, 1.0 / PRIOR_PX**2])
     pulled = prior * np.array([0.0, 0.0, *moved])
     for _ in range(rounds):
-        unit = robust_spread(residual[inside])
+        unit = residual_spread(residual[inside])
         weighted = basis * (weights / unit**2)[:, None]
         matrix = weighted.T @ basis
         matrix[[0, 1, 2, 3], [0, 1, 2, 3]] += prior

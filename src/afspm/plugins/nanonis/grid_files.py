@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics import FileError
 from afspm.driver import FileContent, local_ns, name_and_unit, text_of
 from afspm.model import XY, Region, Scan, Spectrum
@@ -31,8 +31,6 @@ _SETTINGS: Final = ("X", "Y", "Z offset", "Z sweep distance", "Settling time", "
 """Experiment parameters that are set, not measured."""
 _MOST: Final = 1 << 22
 """Most points of a grid: months of measurement. A damaged header may announce any number."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

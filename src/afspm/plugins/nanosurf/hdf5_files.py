@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics import FileError, PlainMapping
 from afspm.driver import FileContent, hdf5_reading
 from afspm.model import Region, Scan, Spectrum
@@ -30,8 +31,6 @@ _TYPES: Final = {0: "int32", 1: "uint8", 2: "uint16", 3: "uint32", 4: "uint64", 
 _SPECTROSCOPY: Final = ("spectroscopy", "spectroscopy_grid")
 _MEASUREMENTS: Final = (*_SPECTROSCOPY, "image_line_based", "wavemode_nma")
 """Kinds of groups with measurements; format 2 also has other groups, such as calibrations."""
-
-Array = NDArray[np.float64]
 
 
 def read_nhf(path: Path, zone: tzinfo | None) -> FileContent:

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics import FileError, si
 from afspm.driver import FileContent, local_ns, text_of
 from afspm.model import Region, Scan, Spectrum
@@ -30,7 +30,6 @@ _FREQUENCY: Final = re.compile(r"Spectrum .+|Frequency sweep.*")
 _BITS: Final = {8: "<i1", 16: "<i2", 32: "<i4"}
 
 Section = dict[str, str]
-Array = NDArray[np.float64]
 
 
 def read_nid(path: Path, zone: tzinfo | None) -> FileContent:

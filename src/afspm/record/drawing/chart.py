@@ -12,7 +12,8 @@ from html import escape
 import numpy as np
 
 from afspm.basics.formatting import scale
-from afspm.record.drawing.curves import Array, round_ticks, thinned
+from afspm.model.arrays import Array
+from afspm.record.drawing.curves import round_ticks, thinned
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 8.0, 8.0, 34.0
 _MOST_POINTS = 200

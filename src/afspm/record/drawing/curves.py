@@ -6,9 +6,9 @@ import itertools
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from afspm.model.arrays import Array
+
 MOST_POINTS = 600
 MOST_PROFILE_POINTS = 1024
 Pixel = tuple[float, float]

@@ -10,8 +10,9 @@ from html import escape
 import numpy as np
 
 from afspm.basics.formatting import quantity, scale, typeset_length
+from afspm.model.arrays import Array
 from afspm.record.drawing.palette import PALETTES, colour_map
-from afspm.record.drawing.raster import Array, ValueRange, indices, png, reduced, value_range, webp
+from afspm.record.drawing.raster import ValueRange, indices, png, reduced, value_range, webp
 
 _LABEL = "font:11px/1.2 system-ui,sans-serif;white-space:nowrap"
 _PILL = "background:rgba(0,0,0,.55);padding:0 3px;border-radius:2px"

@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.model.arrays import Array
 from afspm.record.drawing.palette import LEVELS, PALETTES, UNMEASURED, colour_map
 
 if TYPE_CHECKING:
     from PIL import Image
 
-Array = NDArray[np.float64]
 _SAMPLED = 65_536  # percentiles of larger images are estimated from an even sample
 _OUTLIERS_PERCENT = 1.0
 _FAST = 1  # zlib's fastest level: dozens of images are made, each is viewed once

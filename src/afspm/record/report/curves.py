@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from html import escape
 
 import numpy as np
-from numpy.typing import NDArray
 
 from afspm.basics.errors import AfspmError, InvalidValue
 from afspm.basics.formatting import typeset_position
 from afspm.model import Spectrum
+from afspm.model.arrays import Array
 from afspm.model.geometry import XY
 from afspm.record.drawing.chart import BACKWARD, Axis, Band, Curve, chart
 from afspm.record.report import markup
@@ -26,8 +26,6 @@ MOST_SMALL = 100
 _WIDEST_GRID = 12
 _LEAST_AVERAGED = 3
 _log = logging.getLogger("afspm.report")
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,11 @@ import numpy as np
 from afspm.basics import entry_points
 from afspm.basics.errors import AfspmError
 from afspm.model import TOPOGRAPHY, ControlMode, ControlState, ScanSet, names
+from afspm.model.arrays import Array
 from afspm.model.line_levelling import flattened
 from afspm.record.bad_scans import bad_scans
 from afspm.record.drawing.image_html import Shown, shown
-from afspm.record.drawing.raster import Array, pooled_range, reduced
+from afspm.record.drawing.raster import pooled_range, reduced
 from afspm.record.night_record import NightMark, NightRecord, Shot, Thumbnail, thumbnail
 from afspm.record.report.story import RunStory
 from afspm.record.run import Run

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from afspm.model.arrays import Array
 from afspm.simulation import chance
-from afspm.simulation.fields import Array, is_separable, rough_field, smooth_field
+from afspm.simulation.fields import is_separable, rough_field, smooth_field
 from afspm.simulation.settings import check
 from afspm.simulation.surfaces.relief import Relief, Sites, around, grain, patches, smooth_step, turned
 

@@ -8,8 +8,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from afspm.model.arrays import Array
 from afspm.simulation import chance
-from afspm.simulation.fields import Array, smooth_field
+from afspm.simulation.fields import smooth_field
 from afspm.simulation.settings import check
 from afspm.simulation.surfaces.relief import Relief, around, grain, patches, smooth_step, turned
 

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from afspm.basics.errors import ConfigError, FileError
-from afspm.simulation.fields import Array, is_separable
+from afspm.model.arrays import Array
+from afspm.simulation.fields import is_separable
 from afspm.simulation.settings import check
 from afspm.simulation.surfaces.relief import Relief
 from afspm.storage import formats as files

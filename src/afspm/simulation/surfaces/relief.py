@@ -10,8 +10,9 @@ from typing import Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.model.arrays import Array
 from afspm.simulation import chance
-from afspm.simulation.fields import Array, is_separable, rough_field, smooth_field
+from afspm.simulation.fields import is_separable, rough_field, smooth_field
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm import SD_PER_MAD, Array, robust_spread
 from afspm.plugins.drift.registration import DriftScan
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 LEAST_ROWS = 0.5  # least share of measured rows in a scan
@@ -75,7 +75,7 @@ def flatten_rows(values: Array, known: Mask) -> Array:
     """Subtract a straight line from each row, fitted by two rounds of weighted least squares that suppress outliers."""
     flat = _less_lines(values, known.astype(np.float64))
     for _ in range(2):
-        scale = 1.4826 * np.median(np.abs(flat[known]), overwrite_input=True)
+        scale = SD_PER_MAD * np.median(np.abs(flat[known]), overwrite_input=True)
         flat = _less_lines(values, known / (1.0 + (flat / max(2.0 * scale, 1e-12)) ** 2))
     return flat
 
@@ -136,7 +136,7 @@ def standing_out(level: Array, thick: int) -> tuple[Array, Array, Array]:
 def spread_of(values: Array) -> float:
     """Return a robust standard deviation, from the median absolute deviation of at most twice `COUNTED` values."""
     values = values.ravel()[:: max(1, values.size // COUNTED)]
-    return 1.4826 * float(np.median(abs(values - np.median(values))))
+    return robust_spread(values)
 
 
 COUNTED = 1 << 16

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from afspm import Array
 from afspm.basics import PlainMapping
-from afspm.emulation import RETRACE, Array, ScanActivity, SpectrumActivity
+from afspm.emulation import RETRACE, ScanActivity, SpectrumActivity
 
 if TYPE_CHECKING:
     import h5py

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.model import Region, names
+from afspm.model.arrays import Array
 from afspm.testing.conformance import Failed, Skipped
 from afspm.testing.translators.measuring import CheckMeasurements, FrameSetting, Taken
 from afspm.testing.translators.translator_suite import check
 
-Array = NDArray[np.float64]
 LIKE = 0.6
 """The least correlation of two pictures of the same structure."""
 CLEARLY = 0.1
