@@ -12,9 +12,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from numpy.typing import NDArray
 from scipy import fft, ndimage
 
+from afspm import Array
 from afspm.model import Region
 from afspm.plugins.drift.estimators import estimator
 from afspm.plugins.drift.figures.style import (
@@ -35,8 +35,6 @@ from afspm.plugins.drift.figures.style import (
 from afspm.plugins.drift.registration import DriftScan
 from afspm.plugins.drift.study import NightSettings, night
 from afspm.simulation import World
-
-Array = NDArray[np.float64]
 
 PICTURES = Path(__file__).resolve().parents[1] / "docs" / "pictures"
 NM = 1e9

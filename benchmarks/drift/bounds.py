@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from benchmarks.drift.conditions import Array, Condition, one_over_f_power
+from afspm import Array
+from benchmarks.drift.conditions import Condition, one_over_f_power
 from benchmarks.drift.pairs import Pair
 from benchmarks.drift.surfaces import rough_power
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from afspm import Array
+
 WANDERS = ("steady", "smooth", "swinging")
 """Spectra of lines that wander: of a first-order process, of one smoothed once more, and with a period."""
 

@@ -13,11 +13,12 @@ from functools import cache
 import numpy as np
 from scipy import ndimage
 
+from afspm import Array
 from afspm.model import Region
 from afspm.plugins.drift.registration import DriftScan, Prior
 from afspm.storage.formats import read
 from benchmarks.data_folder import DATA
-from benchmarks.drift.conditions import Array, flattened, measured
+from benchmarks.drift.conditions import flattened, measured
 from benchmarks.drift.families import Half, drawn_condition, source
 from benchmarks.drift.pairs import HEIGHT_M, PIXEL_M, ROW_S, Frame, Sampling, Truth, framed, prior_of, truth_of
 

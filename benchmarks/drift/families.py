@@ -16,7 +16,8 @@ from typing import Literal
 
 import numpy as np
 
-from benchmarks.drift.conditions import CONDITIONS, WANDERS, Array, Condition
+from afspm import Array
+from benchmarks.drift.conditions import CONDITIONS, WANDERS, Condition
 from benchmarks.drift.surfaces import SURFACES, Grid, Random, contaminated
 
 Half = Literal["fitted", "unseen"]

@@ -24,10 +24,10 @@ from scipy import sparse
 from scipy.optimize import linprog, minimize
 from scipy.stats import beta
 
+from afspm import Array
 from afspm.plugins.drift.estimators import DEFAULT, acceptance
 from afspm.plugins.drift.estimators.acceptance import MatchEvidence
 from afspm.plugins.drift.estimators.coefficients import SPREAD
-from benchmarks.drift.conditions import Array
 from benchmarks.drift.families import HALVES, Half
 from benchmarks.drift.surfaces import SURFACES
 from benchmarks.drift.trials import ELLIPSE_95, Outcome, Trial

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, linalg, ndimage, signal
 
+from afspm import Array
 from afspm.model import Region
 from afspm.plugins.drift.registration import DriftScan, Prior
 
-Array = NDArray[np.float64]
 Random = np.random.Generator
 Flattening = Literal["none", "median", "line", "parabola", "steps"]
 

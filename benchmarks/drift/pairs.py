@@ -9,9 +9,10 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage
 
+from afspm import Array
 from afspm.model import Region
 from afspm.plugins.drift.registration import DriftScan, Prior
-from benchmarks.drift.conditions import CONDITIONS, Array, Condition, measured, wandered
+from benchmarks.drift.conditions import CONDITIONS, Condition, measured, wandered
 from benchmarks.drift.families import HALVES, Half, Relief, drawn_condition, drawn_surface, source
 from benchmarks.drift.surfaces import SURFACES, Grid, imaged
 

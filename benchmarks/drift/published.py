@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from afspm import Array
 from afspm.plugins.drift.estimators.keypoints import Descriptors, matched
 from afspm.plugins.drift.estimators.ransac import FORMS, Search
 from afspm.plugins.drift.overlap import overlap_center_m
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
-from benchmarks.drift.conditions import Array
 
 THRESHOLD = 0.05  # of the diagonal: of RANSAC, and of the score
 ITERATIONS = 100

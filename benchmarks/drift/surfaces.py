@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-Array = NDArray[np.float64]
+from afspm import Array
+
 Random = np.random.Generator
 
 OVERSAMPLING = 4

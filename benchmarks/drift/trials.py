@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from afspm import Array
 from afspm.plugins.drift.estimators import unguarded
 from afspm.plugins.drift.registration import Registration
 from benchmarks.drift import cuts
 from benchmarks.drift.bounds import bounds
-from benchmarks.drift.conditions import Array
 from benchmarks.drift.cuts import Cut
 from benchmarks.drift.families import Half
 from benchmarks.drift.pairs import PIXEL_M, Pair, Sampling, pair

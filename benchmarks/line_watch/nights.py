@@ -15,15 +15,14 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.model import Feedback, Region
 from afspm.plugins.line_watch.line_judge import AlarmLevel, Kind, LineJudge, ScanJudge
 from afspm.plugins.line_watch.registration import levelled
 from afspm.simulation.measuring import Adjustment
 from afspm.simulation.world import World
 
-Array = NDArray[np.float64]
 Half = Literal["fitted", "unseen"]
 HALVES: tuple[Half, ...] = ("fitted", "unseen")
 SURFACES = ("particles", "stamper", "rough", "steps", "lattice")

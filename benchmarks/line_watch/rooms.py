@@ -17,15 +17,14 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage, spatial
 
+from afspm import Array
 from afspm.model import Region
 from afspm.plugins.line_watch.line_judge import AlarmLevel, Kind, LineJudge
 from afspm.plugins.line_watch.registration import levelled
 from benchmarks.drift import foreign_pairs
 
-Array = NDArray[np.float64]
 Random = np.random.Generator
 Half = Literal["tried", "kept"]
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from benchmarks.drift import cuts, families
-from benchmarks.drift.conditions import Array
 from scipy import ndimage
 
+from afspm import Array
 from afspm.plugins.drift.registration import DriftScan
 
 QUIET: dict[str, Any] = {

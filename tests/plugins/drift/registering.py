@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.model import Region
 from afspm.plugins.drift.registration import DriftScan
 
-Array = NDArray[np.float64]
 PIXEL_M = 10e-9
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from benchmarks.drift.foreign_pairs import PIXEL_M, foreign_pair
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.plugins.drift.estimators.alignment import Doubt
 from afspm.plugins.drift.estimators.coefficients import DOUBT, SPREAD
 from afspm.plugins.drift.estimators.images import Image, without_scars
@@ -15,7 +15,6 @@ from afspm.plugins.drift.estimators.noise import CrossingLines
 from afspm.plugins.drift.estimators.spikes import without_scars_of_one, without_spikes
 from afspm.plugins.drift.estimators.warp import COUNT, OverlapBox, Scene, Spline, WarpedPair
 
-Array = NDArray[np.float64]
 SHIFT_PX = 3
 
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from tests.plugins.drift.trackers_lab import FRAME_S, SIZE_M, scan_at
 
+from afspm import Array
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 from afspm.plugins.drift.shear import (
     delay_per_length_s_m,
@@ -18,8 +18,6 @@ from afspm.plugins.drift.shear import (
     velocity_from_up_down,
 )
 from afspm.plugins.drift.trackers import BankTracker
-
-Array = NDArray[np.float64]
 
 NM = 1e-9
 VELOCITY = np.array([0.11, -0.07]) * NM

@@ -6,15 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 from benchmarks.drift.pairs import PIXEL_M, Pair, pair
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.plugins.drift.estimators.images import Image, prepare
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
 from afspm.plugins.drift.estimators.spikes import without_spikes
 from afspm.plugins.drift.estimators.warp import COUNT, Scene
 from afspm.plugins.drift.registration import DriftScan, Registration
 
-Array = NDArray[np.float64]
 PAIRS = [pair("stamper", "real", seed) for seed in range(40, 44)]
 
 

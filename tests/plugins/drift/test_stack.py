@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics.errors import InvalidValue
 from afspm.model import Frame, Region
 from afspm.plugins.drift.offline import corrected
 from afspm.plugins.drift.registration import DriftScan
 
-Array = NDArray[np.float64]
 PIXEL_M = 1e-6 / 63
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from tests.plugins.drift.trackers_lab import (
     FRAME_S,
     INTERVAL_S,
@@ -20,12 +20,11 @@ from tests.plugins.drift.trackers_lab import (
     walked,
 )
 
+from afspm import Array
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 from afspm.plugins.drift.trackers import BankTracker, PaperTracker, forecast_from_dict, tracker
 from afspm.plugins.drift.tracking import Prediction, Update
-
-Array = NDArray[np.float64]
 
 NM = 1e-9
 STEADY = steady((0.05 * NM, -0.03 * NM))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tests.plugins.drift.registering import PIXEL_M, Waves
 from tests.plugins.drift.trackers_lab import World, follow
 
+from afspm import Array
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.model import Frame, Region
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
@@ -23,8 +24,6 @@ from afspm.plugins.drift.trackers import BankTracker, forecast_from_dict
 from afspm.plugins.drift.tracking import Update
 
 pytestmark = pytest.mark.slow
-
-Array = NDArray[np.float64]
 
 NM = 1e-9
 SIZE_M = 0.64e-6

@@ -7,15 +7,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.model import Region
 from afspm.plugins.drift.overlap import intersection_ratio, overlap_center_m
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 from afspm.plugins.drift.shear import row_delay_s
 from afspm.plugins.drift.tracking import Tracker, Update
 
-Array = NDArray[np.float64]
 Drift = Callable[[Any], Array]
 """Returns the displacement (x, y) at a time, or at an array of times: shape of the times + (2,)."""
 

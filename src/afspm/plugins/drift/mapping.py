@@ -10,12 +10,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from afspm import Array
 from afspm.basics import InvalidValue
 from afspm.model import Frame, Region
-
-Array = NDArray[np.float64]
 
 _STRETCHED = 2.0  # generous: thermal expansion, creep and shear by drift stay below a few per cent
 

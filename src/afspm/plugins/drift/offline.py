@@ -8,16 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics import FileError, InvalidValue
 from afspm.model import Frame, Region, RegistrationOutcome
 from afspm.plugins.drift.record import DriftRecord
 from afspm.plugins.drift.registration import DriftScan, Registration
 from afspm.plugins.drift.shear import delay_per_length_s_m, row_delay_s
 from afspm.plugins.drift.tracking import Tracker, Update
-
-Array = NDArray[np.float64]
 
 
 def followed(scans: Sequence[DriftScan], tracker: Tracker) -> Iterator[Update]:

@@ -6,12 +6,11 @@ Both after the paper, "Overarching workflow": intersection_ratio, sr_norm, f'.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from afspm import Array
 from afspm.basics import InvalidValue
 from afspm.model import XY, Frame, Region
-
-Array = NDArray[np.float64]
 
 
 def intersection_m(first: Region, second: Region) -> Array:

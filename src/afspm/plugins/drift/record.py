@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics import FileError
 from afspm.model import RegistrationOutcome, registration_summary
 from afspm.plugins.drift.registration import DriftScan
 from afspm.plugins.drift.tracking import Update
 from afspm.record import drift_at
-
-Array = NDArray[np.float64]
 
 COLUMNS = (
     "scan", "time_s", "center_x_m", "center_y_m", "drift_x_m", "drift_y_m", "var_x_m2", "var_y_m2", "cov_xy_m2",

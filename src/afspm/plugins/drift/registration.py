@@ -9,10 +9,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics import InvalidValue
 from afspm.model import Region, RegistrationOutcome
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,9 +16,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from afspm import Run
+from afspm import Array, Run
 from afspm.basics import InvalidValue
 from afspm.model import XY, Frame, Region, Scan, ScanSet
 from afspm.plugins.drift.estimators.correlation import Correlation
@@ -26,8 +25,6 @@ from afspm.plugins.drift.estimators.images import Unusable, prepare
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
 from afspm.plugins.drift.registration import DriftScan, Registration
 from afspm.record import ScanRow, reduced, topography
-
-Array = NDArray[np.float64]
 
 COARSE_PX = 64
 STEP_RAD = math.radians(2.0)

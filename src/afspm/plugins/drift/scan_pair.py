@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics import typeset_position
 from afspm.model import Region
 from afspm.plugins.drift.estimators import estimator
 from afspm.plugins.drift.registration import DriftScan
 
-Array = NDArray[np.float64]
 _ALIKE = 1e-3
 
 

@@ -14,13 +14,11 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics import InvalidValue
 from afspm.plugins.drift.registration import DriftScan, Estimator, Prior, Registration
 from afspm.scheduler import undistorted
-
-Array = NDArray[np.float64]
 
 _SAFETY = 2.0  # on the standard deviation of the shear, which is only derived from the displacement
 _CONTRADICTION = 16.0  # chi2 of the difference between both routes

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics import AfspmError, FileError, Plain, from_json
 from afspm.emulation import World
 from afspm.plugins.drift.registration import DriftScan
-
-Array = NDArray[np.float64]
 
 TRUTH_FILE = "truth.jsonl"
 

@@ -7,14 +7,12 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics import InvalidValue, Plain, PlainMapping
 from afspm.model import RegistrationOutcome
 from afspm.plugins.drift.mapping import Mapping
 from afspm.plugins.drift.registration import DriftScan, Registration
-
-Array = NDArray[np.float64]
 
 FORECAST_VERSION = 2
 """Version of all forecasts as plain data."""

@@ -14,9 +14,9 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.plugins.drift.estimators.coefficients import INTERCEPT, RIGHT, WEIGHTS
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 PARTS = 8  # largest number of parts of the overlap in each direction

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.plugins.drift.estimators.coefficients import DOUBT, SPREAD
 from afspm.plugins.drift.estimators.images import Unusable, flatten_rows
 from afspm.plugins.drift.estimators.noise import (
@@ -23,7 +24,6 @@ from afspm.plugins.drift.estimators.noise import (
 )
 from afspm.plugins.drift.estimators.warp import BEND, COUNT, GAIN, LINEAR, SLOPES, WarpedPair, derivative
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Both = tuple[Array, Array]
 

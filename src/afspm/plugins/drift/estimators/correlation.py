@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics import ConfigError
 from afspm.plugins.drift.estimators.images import CommonGrid, Image, Unusable, onto_common_grid, prepare
 from afspm.plugins.drift.estimators.search import MaskedCorrelation
 from afspm.plugins.drift.overlap import overlap_center_m
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
-
-Array = NDArray[np.float64]
 
 _SMOOTH_PX = 1.0
 _APART_PX = 4.0  # shifts nearer to the highest peak belong to this peak

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.model import Region
 from afspm.plugins.drift.estimators.ransac import (
     FORMS,
@@ -23,8 +24,6 @@ from afspm.plugins.drift.estimators.ransac import (
 )
 from afspm.plugins.drift.overlap import overlap_ratio
 from afspm.plugins.drift.registration import Prior
-
-Array = NDArray[np.float64]
 
 _RADIUS_PX = 1.5  # least radius of agreement for the chance and for rivals
 _REACH_PX = 4.0  # matches nearer to each other count as the same feature

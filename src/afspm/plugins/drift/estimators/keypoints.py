@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from afspm import Array
 from afspm.plugins.drift.estimators.images import Image
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,8 @@ import math
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics import ConfigError
 from afspm.plugins.drift.estimators.acceptance import WRONG_AT_MOST, MatchEvidence, above_repeats, agreement
 from afspm.plugins.drift.estimators.alignment import (
@@ -33,8 +33,6 @@ from afspm.plugins.drift.estimators.search import ExpectedShift, MaskedCorrelati
 from afspm.plugins.drift.estimators.spikes import without_scars_of_one, without_spikes
 from afspm.plugins.drift.estimators.warp import COUNT, CREEP, LINEAR, SLOPES, OverlapBox, Scene, WarpedPair
 from afspm.plugins.drift.registration import DriftScan, LinearSeen, Prior, Registration
-
-Array = NDArray[np.float64]
 
 WIDEST = (0.01, 0.03)  # prior standard deviations of shear and rotation in the first stage, by x and by y
 GAIN_SD = 1.0  # prior standard deviation of the logarithm of the gain

@@ -10,7 +10,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from afspm import Array
+
 Real = TypeVar("Real", np.float32, np.float64)
 
 MEDIAN_POWER = 0.4549  # median of the square of a normal value of unit variance

@@ -18,11 +18,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.plugins.drift.estimators.warp import CREEP, CREEP_PX, LINEAR
-
-Array = NDArray[np.float64]
 
 SHEARS: Final = (0.003, 0.01)
 """Candidate shears by drift during the scans, pixels per pixel along y, for an unknown velocity."""

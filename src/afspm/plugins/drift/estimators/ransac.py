@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from afspm import Array
+
 Mask = NDArray[np.bool_]
 
 _ENOUGH = 0.9  # share of agreeing pairs at which the search ends

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.plugins.drift.estimators.alignment import SHIFT, Believed, least_squares
 from afspm.plugins.drift.estimators.images import CommonGrid, Mask
 from afspm.plugins.drift.estimators.noise import independent_values, without_lines
 from afspm.plugins.drift.estimators.warp import COUNT, Scene, WarpedPair
 from afspm.plugins.drift.registration import DriftScan, Prior
-
-Array = NDArray[np.float64]
-
 
 GATE = 25.0  # chi² of an expected shift, the limit of the search
 

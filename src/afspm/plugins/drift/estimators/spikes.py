@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.plugins.drift.estimators.images import (
     SCAR_PX,
     Image,
@@ -28,7 +29,6 @@ from afspm.plugins.drift.estimators.images import (
 )
 from afspm.plugins.drift.estimators.warp import GAIN, LINEAR, Scene, Spline
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 SPIKE_PX = 2  # largest width of a spike along its row

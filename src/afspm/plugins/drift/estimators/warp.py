@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.plugins.drift.estimators.images import Image
 from afspm.plugins.drift.estimators.noise import CrossingLines
 
-Array = NDArray[np.float64]
 Columns = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 

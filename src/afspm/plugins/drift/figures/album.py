@@ -6,10 +6,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.plugins.drift.figures import style
 from afspm.plugins.drift.figures.drawings import (
     ScanPair,
@@ -23,8 +22,6 @@ from afspm.plugins.drift.figures.drawings import (
 from afspm.plugins.drift.offline import spread_pairs
 from afspm.plugins.drift.record import DriftRecord
 from afspm.plugins.drift.registration import DriftScan, Registration
-
-Array = NDArray[np.float64]
 
 PAIRS_APART_S = 2 * 3600.0
 _PAIRS = 2

@@ -13,6 +13,7 @@ from matplotlib.patches import ConnectionPatch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.basics import InvalidValue, typeset_length
 from afspm.plugins.drift.figures.style import (
     BLUE,
@@ -24,7 +25,6 @@ from afspm.plugins.drift.figures.style import (
     SIMULATED,
     TIME_COLOURS,
     WIDTH_IN,
-    Array,
     colour_bar,
     figure,
     letter,

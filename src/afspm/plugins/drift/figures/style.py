@@ -14,14 +14,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.ticker import FuncFormatter
-from numpy.typing import NDArray
 
-from afspm import flattened
+from afspm import Array, flattened
 from afspm.basics import Plain, scale
 from afspm.plugins.drift.registration import DriftScan
 from afspm.record import ValueRange, draw_scale_bar, shared_range
-
-Array = NDArray[np.float64]
 
 WIDTH_IN = 7.2  # two columns of a journal
 ORANGE, BLUE, GREEN, MAGENTA, GREY = "#EE7733", "#0077BB", "#009988", "#EE3377", "#999999"  # P. Tol's vibrant scheme

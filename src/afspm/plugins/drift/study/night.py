@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.emulation import World
 from afspm.model import Frame, Region
 from afspm.plugins.drift.estimators import estimator
@@ -17,8 +17,6 @@ from afspm.plugins.drift.registration import DriftScan
 from afspm.plugins.drift.study.settings import NightSettings
 from afspm.plugins.drift.trackers import tracker
 from afspm.plugins.drift.tracking import Tracker, Update
-
-Array = NDArray[np.float64]
 
 SETTLED_S = 7200.0  # at the start the rate is unknown; the metrics judge tracking after that
 _95_PERCENT = -2.0 * math.log(0.05)  # of the square of a normal error of two components, in standard deviations

@@ -6,9 +6,9 @@ from collections.abc import Mapping as Table
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from afspm import restored, snapshot
+from afspm import Array, restored, snapshot
 from afspm.basics import InvalidValue, Plain, PlainMapping
 from afspm.plugins.drift.registration import DriftScan, Estimator, Registration
 from afspm.plugins.drift.shear import velocity_from_up_down
@@ -19,8 +19,6 @@ from afspm.plugins.drift.trackers.references import ReferenceScan, ReferenceScan
 from afspm.plugins.drift.trackers.settings import BankSettings
 from afspm.plugins.drift.trackers.similarity import Similarity, SimilarityMeasurement
 from afspm.plugins.drift.tracking import Forecast, Prediction, Update, require_newer
-
-Array = NDArray[np.float64]
 
 VERSION = 4
 _LIKE = 1.2  # largest relative difference of a second surprise that confirms the first (doubled by a new velocity)

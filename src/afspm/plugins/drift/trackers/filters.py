@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from afspm import Array
 
 _SHORT = 1e-2  # share of the fading time: below, differences of exponentials lose digits, and a series is exact enough
 

@@ -7,15 +7,12 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from afspm import snapshot
+from afspm import Array, snapshot
 from afspm.basics import Plain
 from afspm.plugins.drift.mapping import Mapping
 from afspm.plugins.drift.trackers.filters import Filters, Models, mixed
 from afspm.plugins.drift.tracking import FORECAST_VERSION, Prediction
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.plugins.drift.overlap import overlap_center_m
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 from afspm.plugins.drift.shear import delay_per_length_s_m, row_delay_s, slow_axis
 from afspm.plugins.drift.trackers.filters import Filters
 from afspm.plugins.drift.trackers.references import ReferenceScan
 from afspm.plugins.drift.trackers.similarity import Similarity
-
-Array = NDArray[np.float64]
 
 AGREEMENT = 25.0  # chi2 of the difference of two references' results
 _WEIGHED_OTHERWISE = 0.02

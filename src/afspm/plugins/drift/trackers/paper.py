@@ -12,16 +12,13 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from afspm import restored, snapshot
+from afspm import Array, restored, snapshot
 from afspm.basics import ConfigError, Plain, PlainMapping
 from afspm.plugins.drift.mapping import Mapping, unlike_drift
 from afspm.plugins.drift.overlap import intersection_ratio, sr_norm
 from afspm.plugins.drift.registration import DriftScan, Estimator, Registration
 from afspm.plugins.drift.tracking import FORECAST_VERSION, Forecast, Prediction, Update, require_newer
-
-Array = NDArray[np.float64]
 
 TRANSFORMS = ("translation", "euclidean", "similarity", "affine")
 

@@ -6,13 +6,9 @@ from collections.abc import Iterable, Iterator
 from collections.abc import Mapping as Table
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
+from afspm import Array
 from afspm.plugins.drift.overlap import overlap_ratio, sr_norm
 from afspm.plugins.drift.registration import DriftScan
-
-Array = NDArray[np.float64]
 
 _LIKE = 0.5  # least ratio of the resolutions of scans of one kind
 

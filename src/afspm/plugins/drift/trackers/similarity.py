@@ -13,11 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm import Array
 from afspm.model import Frame
 from afspm.plugins.drift.mapping import Mapping
 from afspm.plugins.drift.registration import DriftScan, LinearSeen
-
-Array = NDArray[np.float64]
 
 _SHEAR_SD = 0.03  # displacement per length along the slow axis, by unknown drift during the scans
 _LEAST_SD = 1e-5  # of a measurement
