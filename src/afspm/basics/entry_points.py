@@ -35,7 +35,7 @@ TRACKERS = "afspm.trackers"  # of drift, by name
 FIGURES = "afspm.figures"  # of the report: (run, title), draws into the folder of the run
 DISPLAYS = "afspm.displays"  # of scans and spectra: what their `plot`, `to_sidpy` and notebook pictures call
 FUNCTIONS = "afspm.functions"  # of `afspm` itself, for scripts and notebooks: afspm.NAME
-FORMS = "afspm.forms"  # of experiment files: experiment.forms.FileForm
+FORMS = "afspm.forms"  # of experiment files: experiment.parts.FileForm
 COMMANDS = "afspm.commands"  # afspm NAME: a function, or a typer.Typer
 PAGES = "afspm.pages"  # `afspm run --dashboard`: a module with the functions of afspm.cli.run.RunPage
 

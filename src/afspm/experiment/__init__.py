@@ -1,7 +1,15 @@
 """The experiment file: read, checked, expanded, and made into the launch lines of processes.
 
-**Theory of operation.** TOML files are laid over each other (`document`), references replaced, defaults filled in
-(`resolution`), classes found by entry points (`class_loader`), and everything checked before a process starts.
+**Theory of operation.** A file passes through six functions, in this order, before a process starts:
+
+    document.read              TOML files laid over each other, with the line of each key
+    parts.sort                 tables by kind, references replaced, files of another form converted
+    resolution.resolve         classes found (`class_loader`), settings in SI (`component_settings`), sections parsed
+    implied_parts.complete     recorder and notifier added, unless the file has them
+    wiring.wire                sockets connected, open addresses left for the start
+    structure_checks.check     what only all parts together show: roles, names, problems, needs, handlers
+
+`resolve` calls `complete` and `wire`; all results stand in one `ResolvedExperiment`.
 
     comes in      TOML files
     state         none: an `Experiment` is frozen

@@ -23,16 +23,19 @@ RECORDS, NOTIFIES = "records", "notifies"
 NO_PROGRAM = "give its path, or install it; a file of yours must be executable (chmod +x)"
 
 
-def recorder(resolved: ResolvedExperiment) -> ExperimentPart | None:
-    """Return the recorder of [record]; None if it is switched off or in the file, or there is no scheduler."""
+def complete(resolved: ResolvedExperiment) -> list[ExperimentPart]:
+    """Return a recorder and a notifier, each unless it is switched off or in the file; none without a scheduler."""
+    return [part for part in (_recorder(resolved), _notifier(resolved)) if part is not None]
+
+
+def _recorder(resolved: ResolvedExperiment) -> ExperimentPart | None:
     section = resolved.sections.record
     if not section.on or resolved.declaring(RECORDS) or not resolved.with_role(Role.SCHEDULER):
         return None
     return _implied(resolved, RECORDER, {} if section.scans else {"scans": False}, "record")
 
 
-def notifier(resolved: ResolvedExperiment) -> ExperimentPart | None:
-    """Return the notifier of [notify]; None if nothing is sent during the experiment, or the file has a notifier."""
+def _notifier(resolved: ResolvedExperiment) -> ExperimentPart | None:
     section = resolved.sections.notify
     occasions = (set(OCCASIONS) - {END}) & set(section.on)
     is_wanted = section.ping or ((section.command or section.webhook) and occasions)

@@ -11,12 +11,12 @@ from afspm.basics.errors import AfspmError, InvalidValue, individual_errors
 from afspm.experiment import (
     capabilities,
     class_loader,
+    component_settings,
     conditions_section,
     default_limits,
     implied_parts,
     limits_section,
     planned_measurements,
-    settings,
     validation_messages,
     wiring,
 )
@@ -28,7 +28,7 @@ from afspm.experiment.parts import ExperimentPart, ExperimentParts
 from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
 from afspm.experiment.sections import parse, read_sections
 from afspm.experiment.toml_lines import Table
-from afspm.experiment.wiring_classes import BoundSocket
+from afspm.experiment.wiring import BoundSocket
 from afspm.model import STOPPED_BY_AGENT, ChannelRoles, PacketHeader, Parameter, ProblemNames, Role
 from afspm.model.problems import HIGHEST_PROBLEM
 from afspm.scheduler.publishing.envelopes import CacheSettings, Envelopes
@@ -63,11 +63,11 @@ def resolve(parts: ExperimentParts, document: Document) -> ResolvedExperiment:
     with class_loader.importing_from(document.folders):
         for part in parts.components:
             _add(part, resolved)
-        for added in filter(None, (implied_parts.recorder(resolved), implied_parts.notifier(resolved))):
+        for added in implied_parts.complete(resolved):
             parts.components.append(added)
             _add(added, resolved)
         _resolve_sections(resolved)
-    resolved.net = wiring.connect(resolved.processes, document)
+    resolved.net = wiring.wire(resolved.processes, document)
     return resolved
 
 
@@ -78,7 +78,7 @@ def _add(part: ExperimentPart, resolved: ResolvedExperiment) -> None:
     process.declared = ComponentDeclaration.of_table(part.own)
     process.role = _written_role(part, resolved)
     process.settings = {
-        key: settings.jsonable(one, document.folder_of(name, key)) for key, one in part.settings.items()
+        key: component_settings.jsonable(one, document.folder_of(name, key)) for key, one in part.settings.items()
     }
     if part.command:
         return
@@ -99,17 +99,17 @@ def _add(part: ExperimentPart, resolved: ResolvedExperiment) -> None:
     errors = document.findings.errors
     given = FROM_SECTIONS if role is Role.SCHEDULER else ()
     wrong: set[str] = set()
-    process.settings = settings.check(component, part.settings, (name,), document, given, wrong)
+    process.settings = component_settings.resolve(component, part.settings, (name,), document, given, wrong)
     if document.findings.errors > errors:
         process.wrong = frozenset(wrong)
-    for setting, address, keyed in settings.listening(component, process.settings):
+    for setting, address, keyed in component_settings.listening(component, process.settings):
         resolved.listening.append(BoundSocket(name, setting, address, setting, document.place(name, setting), keyed))
 
 
 def _declared(component: type, part: ExperimentPart) -> ComponentDeclaration:
     # a setting `problem` replaces its default value in what the class solves and flags
     declaration = ComponentDeclaration.of_class(component)
-    default, given = settings.default_of(component, "problem"), part.settings.get("problem")
+    default, given = component_settings.default_of(component, "problem"), part.settings.get("problem")
     if not isinstance(given, str) or not isinstance(default, str):
         return declaration
 
@@ -169,7 +169,7 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
 
 
 def _check_channels(process: ResolvedProcess, component: type, document: Document, there: ChannelRoles) -> None:
-    for path, channel in settings.channels(component, process.settings):
+    for path, channel in component_settings.channels(component, process.settings):
         if reason := there.refuses(channel):
             what = f"[{process.name}] {'.'.join(path)}: {reason}"
             hint = f"it has {there.described()}; [microscope.channels] names others"

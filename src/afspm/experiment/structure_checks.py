@@ -15,12 +15,12 @@ from afspm.basics.addresses import EXAMPLE, hint_on, is_address, reaches
 from afspm.basics.errors import InvalidValue
 from afspm.basics.formatting import quantity
 from afspm.client.component import Component
-from afspm.experiment import class_loader, settings
+from afspm.experiment import class_loader, component_settings
 from afspm.experiment.findings import Finding, Level, closest, nearest
 from afspm.experiment.implied_parts import NO_PROGRAM, RECORDS, check_notify, is_program
 from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
 from afspm.experiment.toml_lines import Settings
-from afspm.experiment.wiring_classes import WIRE_SETTINGS, BoundSocket, wire_of
+from afspm.experiment.wiring import WIRE_SETTINGS, BoundSocket, wire_of
 from afspm.model import Role, component_of, is_of_instrument, names
 from afspm.model.events import LONGEST_PROCESS_NAME, PERSON, is_process_name
 from afspm.transport.network import is_local
@@ -232,7 +232,7 @@ def shared_files(resolved: ResolvedExperiment, names: Collection[str]) -> Iterat
 
 
 def _file_of(process: ResolvedProcess) -> object:
-    default = None if process.component is None else settings.default_of(process.component, "file")
+    default = None if process.component is None else component_settings.default_of(process.component, "file")
     return process.settings.get("file", default)
 
 
@@ -411,7 +411,7 @@ def check_replaced_choices(resolved: ResolvedExperiment) -> None:
     """Warn of a variable with the name of a choice of a setting, which the variable replaces."""
     for name, process in resolved.processes.items():
         written = resolved.document.data.get(name, {})
-        words = {} if process.component is None else settings.choices(process.component)
+        words = {} if process.component is None else component_settings.choices(process.component)
         for key in written.keys() & words.keys():
             text = written[key]
             if isinstance(text, str) and text in words[key] and text in resolved.parts.variables:

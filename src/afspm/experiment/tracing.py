@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from afspm.experiment.component_settings import default_of
 from afspm.experiment.resolved_experiment import ResolvedExperiment
-from afspm.experiment.settings import default_of
 from afspm.model import Role
 
 

@@ -15,7 +15,7 @@ import typing_extensions
 from numpy.typing import NDArray
 
 from afspm.basics.type_aliases import unaliased
-from afspm.experiment import settings
+from afspm.experiment import component_settings
 from afspm.experiment.document import read
 from afspm.model.snapshot import from_plain, to_plain
 from afspm.simulation.settings import build
@@ -84,5 +84,5 @@ def test_settings_of_a_component_may_be_aliases(alias: Maker, tmp_path: Path) ->
     file = tmp_path / "experiment.toml"
     file.write_text("[own]\non = 1\n", encoding="utf-8")
     document = read([file])
-    settings.check(Component, {"on": 1}, ("own",), document)
+    component_settings.resolve(Component, {"on": 1}, ("own",), document)
     assert document.findings.errors, "1 is not accepted as true"

@@ -1,4 +1,4 @@
-"""Check of a component's settings against its constructor: names, types and units, before anything starts."""
+"""Settings of a component: checked against its constructor (names, types, units), in SI, before anything starts."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _KINDS_WITHOUT_NAME = {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_K
 _TYPES = pydantic.ConfigDict(arbitrary_types_allowed=True)
 
 
-def check(
+def resolve(
     component: type,
     settings: Table,
     path: tuple[str, ...],
@@ -181,7 +181,7 @@ def _user_intermediary(value: Settings, path: tuple[str, ...], document: Documen
     if not isinstance(wanted, type):
         document.error(f"[{path[0]}] {'.'.join(path[1:])}: {value['class']} is not a class", *path)
         return {"class": value["class"]}
-    return {"class": value["class"], **check(wanted, settings, path, document)}
+    return {"class": value["class"], **resolve(wanted, settings, path, document)}
 
 
 def _is_quantity(value: object) -> bool:
