@@ -13,13 +13,13 @@ from typing import Any, Final
 import numpy as np
 from control_transfer import excerpt
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch
 from PIL import Image
 
 import afspm
-from afspm.record.drawing.palette import CATEGORICAL, PROBLEM, colour_map
+from afspm.record.drawing.palette import CATEGORICAL, PROBLEM
+from afspm.record.plotting import gold
 
 PICTURE: Final = Path(__file__).resolve().parents[1] / "docs" / "pictures" / "repair.png"
 WIDTH_PX, HEIGHT_PX, DPI = 830, 390, 200
@@ -46,7 +46,7 @@ def draw(folder: Path) -> Figure:
         end_s = round((row.time_ns - flagged_ns) / 1e9, 1)
         holder = next((name for begin, until, name in night["control"] if begin <= ends_s[end_s][0] < until), "series")
         axes = figure.add_axes((0.006 + place * 0.1105, 0.62, 0.104, 0.104 * WIDTH_PX / HEIGHT_PX))
-        axes.imshow(picture, cmap=ListedColormap(colour_map("gold") / 255), vmin=low, vmax=high, origin="lower")
+        axes.imshow(picture, cmap=gold(), vmin=low, vmax=high, origin="lower")
         bad = ends_s[end_s][1]
         for side in axes.spines.values():
             side.set(color=PROBLEM if bad else COLOURS[holder], linewidth=3.0)
