@@ -124,12 +124,12 @@ def channels(component: type, settings: Table) -> Iterator[tuple[tuple[str, ...]
 
 def _names_channel(annotation: Any) -> bool:
     inside = (*getattr(annotation, "__metadata__", ()), *typing.get_args(annotation))
-    return any(isinstance(one, NamesChannel) or _names_channel(one) for one in inside)
+    return any(isinstance(part, NamesChannel) or _names_channel(part) for part in inside)
 
 
 def _dataclass_of(annotation: Any) -> type | None:
-    those = (annotation, *typing.get_args(annotation))
-    return next((one for one in those if isinstance(one, type) and is_dataclass(one)), None)
+    kinds = (annotation, *typing.get_args(annotation))
+    return next((kind for kind in kinds if isinstance(kind, type) and is_dataclass(kind)), None)
 
 
 def jsonable(value: object, folder: Path) -> Any:
@@ -207,12 +207,12 @@ def _has_own_config(annotation: object) -> bool:
 
 @cache
 def _parameters(component: type) -> Mapping[str, inspect.Parameter]:
-    found: dict[str, inspect.Parameter] = {}
+    parameters: dict[str, inspect.Parameter] = {}
     for init in _constructors(component):
         own = list(inspect.signature(init).parameters.values())[1:]  # without self
-        found = {p.name: p for p in own if p.name not in found} | found
-        found = {n: p for n, p in found.items() if p.kind is not inspect.Parameter.VAR_KEYWORD or p in own}
-    return found
+        parameters = {p.name: p for p in own if p.name not in parameters} | parameters
+        parameters = {n: p for n, p in parameters.items() if p.kind is not inspect.Parameter.VAR_KEYWORD or p in own}
+    return parameters
 
 
 @cache

@@ -41,9 +41,8 @@ class Document:
     def place(self, *path: str | int) -> SourceLocation:
         """Return the file and line that set `path`, or the innermost table around `path`; else the first file."""
         for depth in range(len(path), 0, -1):
-            found = self.places.get(path[:depth])
-            if found is not None:
-                return found
+            if (place := self.places.get(path[:depth])) is not None:
+                return place
         return SourceLocation(str(self.files[0]))
 
     def folder_of(self, *path: str | int) -> Path:

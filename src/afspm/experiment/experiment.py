@@ -217,10 +217,10 @@ class Experiment:
             sections["security"] = sections["security"] | {"keys": str(resolved.keys_folder)}
         components = []
         for part in parts.components:
-            given, found = dict(part.settings), resolved.processes[part.name].settings
+            given, in_si = dict(part.settings), resolved.processes[part.name].settings
             given |= {
-                key: _with_paths(one, found.get(key))
-                for key, one in given.items()
+                key: _with_paths(value, in_si.get(key))
+                for key, value in given.items()
                 if self._is_elsewhere(part.name, key)
             }
             components.append(replace(part, settings=given))
@@ -233,7 +233,7 @@ class Experiment:
 def _with_paths(given: Any, resolved: Any) -> Any:
     # `given` as in the file, with its relative paths as they were resolved
     if isinstance(given, dict) and isinstance(resolved, dict):
-        return {key: _with_paths(one, resolved.get(key)) for key, one in given.items()}
+        return {key: _with_paths(value, resolved.get(key)) for key, value in given.items()}
     if isinstance(given, list) and isinstance(resolved, list) and len(given) == len(resolved):
         return [_with_paths(*pair) for pair in zip(given, resolved, strict=True)]
     is_path = isinstance(given, str) and isinstance(resolved, str) and Path(resolved).is_absolute()

@@ -41,9 +41,9 @@ _EXAMPLE_HEADERS = (
     PacketHeader("Scan2d", "Height", (1e-6, 1e-6)),
     PacketHeader("Spec1d", kind="IV"),
     *(
-        PacketHeader(one.name)
-        for one in wire.declared()
-        if one.kind is wire.MessageKind.STATE and one.source is Role.TRANSLATOR
+        PacketHeader(message.name)
+        for message in wire.declared()
+        if message.kind is wire.MessageKind.STATE and message.source is Role.TRANSLATOR
     ),
 )
 """Packet headers for a trial of the user's mapping from packets to envelopes."""
@@ -78,7 +78,7 @@ def _add(part: ExperimentPart, resolved: ResolvedExperiment) -> None:
     process.declared = ComponentDeclaration.of_table(part.own)
     process.role = _written_role(part, resolved)
     process.settings = {
-        key: component_settings.jsonable(one, document.folder_of(name, key)) for key, one in part.settings.items()
+        key: component_settings.jsonable(value, document.folder_of(name, key)) for key, value in part.settings.items()
     }
     if part.command:
         return
@@ -207,10 +207,10 @@ def _report_errors_inside(process: ResolvedProcess, component: type, resolved: R
     try:
         planned_measurements.plan_of(component, process.settings)
     except AfspmError as error:
-        for one in individual_errors(error):
-            inside = _inside(one)
+        for fault in individual_errors(error):
+            inside = _inside(fault)
             if len(inside) > 1 and inside[0] in sound:
-                _report(process.name, one, resolved)
+                _report(process.name, fault, resolved)
     except Exception:  # made of wrong settings, its constructor may raise anything
         return
 
@@ -226,11 +226,11 @@ def _report_errors_beside(
         try:
             planned_measurements.plan_of(component, remaining)
         except AfspmError as error:
-            for one in individual_errors(error):
-                inside = _at_fault(component, remaining, one)
-                named = {*_WORDS.findall(f"{one.what} {one.hint}")}
+            for fault in individual_errors(error):
+                inside = _at_fault(component, remaining, fault)
+                named = {*_WORDS.findall(f"{fault.what} {fault.hint}")}
                 if len(inside) == 1 and inside[0] in remaining and not named & left_out:
-                    _report(process.name, one, resolved, inside)
+                    _report(process.name, fault, resolved, inside)
                 left_out |= {str(key) for key in inside[:1]}
         except Exception:  # without a setting that it needs, a constructor may raise anything
             return
@@ -246,7 +246,7 @@ def _at_fault(component: type, given: Table, error: AfspmError) -> tuple[str | i
         try:
             planned_measurements.plan_of(component, others)
         except AfspmError as another:
-            if all(str(one) != str(error) for one in individual_errors(another)):
+            if all(str(fault) != str(error) for fault in individual_errors(another)):
                 return (name,)
         except Exception:  # a setting that it needs is left out
             needed.append(name)
@@ -276,9 +276,9 @@ def _resolve_plan(
         plan = planned_measurements.plan_of(component, process.settings)
     except AfspmError as error:
         wrong = set()
-        for one in individual_errors(error):
-            inside = _at_fault(component, process.settings, one)
-            _report(name, one, resolved, inside)
+        for fault in individual_errors(error):
+            inside = _at_fault(component, process.settings, fault)
+            _report(name, fault, resolved, inside)
             wrong |= {str(key) for key in inside[:1]}
         _report_errors_beside(process, component, wrong, resolved)
         return
@@ -299,8 +299,9 @@ def _resolve_plan(
             resolved.document.warning(f"[{name}] {doubt.what}", name, doubt.where, hint=doubt.hint)
     if has is None:
         return
-    wanted: list[tuple[tuple[str, ...], Parameter]] = [((name,), one) for one in plan.frame()]
-    wanted += [((name, key, one.name), one) for key, given in plan.parameters.items() for one in given]
+    wanted: list[tuple[tuple[str, ...], Parameter]] = [((name,), parameter) for parameter in plan.frame()]
+    for key, parameters in plan.parameters.items():
+        wanted += [((name, key, parameter.name), parameter) for parameter in parameters]
     for path, parameter in wanted:
         if reason := has.refuses(parameter):
             resolved.document.error(f"[{name}] plans what its microscope refuses: {reason}", *path)
@@ -320,22 +321,22 @@ def _written_role(part: ExperimentPart, resolved: ResolvedExperiment) -> Role:
 
 
 def _messages(given: object, document: Document) -> tuple[str, ...]:
-    if not isinstance(given, list) or not all(isinstance(one, str) for one in given):
+    if not isinstance(given, list) or not all(isinstance(entry, str) for entry in given):
         document.error("`messages` is not a list of texts", "messages", hint='messages = ["my.proto"]')
         return ()
-    found = []
-    for i, one in enumerate(given):
-        if not one.endswith(".proto"):
-            found.append(one)
-            if class_loader.find_module(one, document.folders) is None:
-                document.error(f"messages: there is no module {one!r}", "messages", i, hint="or give a .proto file")
+    sources = []
+    for i, entry in enumerate(given):
+        if not entry.endswith(".proto"):
+            sources.append(entry)
+            if class_loader.find_module(entry, document.folders) is None:
+                document.error(f"messages: there is no module {entry!r}", "messages", i, hint="or give a .proto file")
             continue
-        file = document.folder_of("messages") / one
-        found.append(str(file))
+        file = document.folder_of("messages") / entry
+        sources.append(str(file))
         if not file.is_file():
             hint = "it is looked for beside the experiment file"
-            document.error(f"messages: there is no file {one!r}", "messages", i, hint=hint)
-    return tuple(found)
+            document.error(f"messages: there is no file {entry!r}", "messages", i, hint=hint)
+    return tuple(sources)
 
 
 def _problems(table: Table, document: Document) -> dict[str, int]:

@@ -132,11 +132,11 @@ class ResolvedExperiment:
     @property
     def instruments(self) -> dict[str, tuple[str, ...]]:
         """Parameters of each instrument, by component."""
-        found = {}
+        parameters = {}
         for name in self.declaring("is_instrument"):
-            given = self.processes[name].settings.get("parameters")
-            found[name] = tuple(given) if isinstance(given, dict) else ()
-        return found
+            setting = self.processes[name].settings.get("parameters")
+            parameters[name] = tuple(setting) if isinstance(setting, dict) else ()
+        return parameters
 
     @property
     def keys_folder(self) -> Path | None:

@@ -56,8 +56,8 @@ def check(resolved: ResolvedExperiment) -> None:
 
     If scheduler or translator is missing, or a class can't be loaded, checks that depend on them are left out.
     """
-    for one in CHECKS if _is_complete(resolved) else ALWAYS:
-        one(resolved)
+    for check_part in CHECKS if _is_complete(resolved) else ALWAYS:
+        check_part(resolved)
 
 
 def _is_complete(resolved: ResolvedExperiment) -> bool:
@@ -270,8 +270,10 @@ def _number(resolved: ResolvedExperiment, problem: str) -> int | None:
 def check_envelopes(resolved: ResolvedExperiment) -> None:
     """Require that every envelope subscribed to is published."""
     processes, made = resolved.processes.values(), resolved.caching.envelopes
-    declared = [one for one in wire.declared() if one.always and one.source in (Role.TRANSLATOR, Role.SCHEDULER)]
-    published = {*(one.name for one in declared), *made}
+    declared = [
+        message for message in wire.declared() if message.always and message.source in (Role.TRANSLATOR, Role.SCHEDULER)
+    ]
+    published = {*(message.name for message in declared), *made}
     published.update(envelope for process in processes for envelope in process.declared.publishes)
     if any(map(_may_publish_lines, resolved.with_role(Role.TRANSLATOR))):
         published.add(SCAN_LINES.name)
@@ -311,7 +313,7 @@ def _check_clock_of_lines(resolved: ResolvedExperiment) -> None:
 
 def _is_published(prefix: str, published: set[str], made: Collection[str]) -> bool:
     # names of scans, spectra, and rules of the cache with {fields} go on after their beginning
-    continued = [*(f"{one.name}_" for one in wire.declared() if one.named), *filter(None, made)]
+    continued = [*(f"{message.name}_" for message in wire.declared() if message.named), *filter(None, made)]
     return any(name.startswith(prefix) for name in published) or prefix.startswith(tuple(continued))
 
 
@@ -430,13 +432,13 @@ def _texts(value: object, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[s
 
 def check_needs(resolved: ResolvedExperiment) -> None:
     """Require the parameters of instruments that components need, and those of the microscope and actions if known."""
-    of_instruments = tuple(one for parameters in resolved.instruments.values() for one in parameters)
+    of_instruments = tuple(parameter for parameters in resolved.instruments.values() for parameter in parameters)
     for name, process in resolved.processes.items():
-        for one in filter(is_of_instrument, process.declared.needs_parameters):
-            if one not in of_instruments:
-                what = f"[{name}] needs {one!r}, which is a parameter of no instrument"
+        for parameter in filter(is_of_instrument, process.declared.needs_parameters):
+            if parameter not in of_instruments:
+                what = f"[{name}] needs {parameter!r}, which is a parameter of no instrument"
                 resolved.document.error(
-                    what, name, hint=nearest(one, of_instruments) or "see `parameters` of the instrument"
+                    what, name, hint=nearest(parameter, of_instruments) or "see `parameters` of the instrument"
                 )
     for translator in resolved.with_role(Role.TRANSLATOR):
         has = translator.capabilities()
@@ -448,18 +450,18 @@ def check_needs(resolved: ResolvedExperiment) -> None:
                 ("action", declared.needs_actions, has.actions),
                 ("parameter", [*filterfalse(is_of_instrument, declared.needs_parameters)], has.parameters),
             ):
-                for one in [one for one in needed if one not in offered]:
-                    what = f"[{name}] needs the {kind} {one!r}, which [{translator.name}] does not have"
-                    resolved.document.error(what, name, hint=nearest(one, offered))
+                for missing in [name for name in needed if name not in offered]:
+                    what = f"[{name}] needs the {kind} {missing!r}, which [{translator.name}] does not have"
+                    resolved.document.error(what, name, hint=nearest(missing, offered))
 
 
 def check_treatments(resolved: ResolvedExperiment) -> None:
     """Warn of treatments of a real tip without limits."""
     translators = resolved.with_role(Role.TRANSLATOR)
-    if "limits" in resolved.document.data or all(one.is_microscope for one in translators):
+    if "limits" in resolved.document.data or all(translator.is_microscope for translator in translators):
         return
     for name, process in resolved.processes.items():
-        treatments = [one for one in process.declared.needs_actions if one in names.TREATMENTS]
+        treatments = [action for action in process.declared.needs_actions if action in names.TREATMENTS]
         if treatments:
             what = f"[{name}] uses {' and '.join(treatments)} on a microscope that is not simulated, without [limits]"
             hint = "bound the voltage and the place: [limits] region = …, parameters = { tip-bias-voltage = … }"
