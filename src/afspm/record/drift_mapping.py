@@ -7,14 +7,12 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from afspm.model.arrays import Array
 from afspm.model.registration_outcome import RegistrationOutcome
 
 if TYPE_CHECKING:
     from afspm.wire.messages import DriftMapping
-
-Array = NDArray[np.float64]
 
 
 def drift_at(matrix: Array, center_m: Sequence[float]) -> Array:

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from afspm.basics.clock import iso_utc
 from afspm.basics.plain_data import Plain, PlainMapping
@@ -35,8 +34,6 @@ if TYPE_CHECKING:
     import h5py
 
     _Fill = Callable[[h5py.Group, h5py.Group], None]
-
-Array = NDArray[np.float64]
 
 _SHOWN = ("in_control", "mode", "interrupted", "number", "run", "frame")
 """Facts that are also attributes, so that a viewer of HDF5 files shows them."""

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from afspm import Array
 from afspm.model import Region, Scan, Spectrum
 
-Floats = NDArray[np.float64]
 XY = tuple[float, float]
 
 
@@ -26,7 +26,7 @@ class Peak:
     height_m: float
 
 
-def above_ground(values: Floats) -> Floats:
+def above_ground(values: Array) -> Array:
     """Return heights above the ground, estimated as the 25th percentile of each line, which particles hardly affect.
 
     The median of the lower half of all heights is then set to zero.
@@ -42,7 +42,7 @@ def place_in(region: Region, shape: tuple[int, int], row: float, column: float) 
     return left + column / (shape[1] - 1) * width, low + row / (shape[0] - 1) * height
 
 
-def peaks(heights: Floats, region: Region, *, least_m: float, apart_m: float) -> list[Peak]:
+def peaks(heights: Array, region: Region, *, least_m: float, apart_m: float) -> list[Peak]:
     """Return the local maxima above `least_m`, highest first, in a map of heights above the ground.
 
     A maximum is the highest pixel within about `apart_m` / 2, after a median filter of 3 x 3 pixels.
@@ -71,7 +71,7 @@ def near(found: Sequence[Peak], xy_m: XY, within_m: float) -> Peak | None:
     return best if best is not None and math.dist(best.xy_m, xy_m) <= within_m else None
 
 
-def flattest(heights: Floats, region: Region, size_m: float) -> tuple[XY, float]:
+def flattest(heights: Array, region: Region, size_m: float) -> tuple[XY, float]:
     """Return the centre of the square of a given size with the smallest range of heights, and this range."""
     pixel_m = region.size_m[0] / (heights.shape[1] - 1)
     size = math.ceil(size_m / pixel_m) + 2
@@ -96,14 +96,14 @@ def shift_m(first: Scan, second: Scan) -> XY:
     return float(dx) * width / (columns - 1), float(dy) * height / (rows - 1)
 
 
-def _windowed(values: Floats) -> Floats:
+def _windowed(values: Array) -> Array:
     low, high = np.nanpercentile(values, (1.0, 99.5))
     clipped = np.clip(np.nan_to_num(values, nan=float(np.nanmedian(values))), low, high)
     window = np.outer(np.hanning(len(values)), np.hanning(values.shape[1])) ** 0.5
     return np.asarray((clipped - clipped.mean()) * window)
 
 
-def _vertex(values: Floats, at: int) -> float:
+def _vertex(values: Array, at: int) -> float:
     # the maximum of the parabola through a value and its neighbours, relative to it
     if not 0 < at < len(values) - 1:
         return 0.0
@@ -140,7 +140,7 @@ def lattice_constant(scan: Scan) -> tuple[float, float]:
     return mean, max(float(constants.std(ddof=1)) / math.sqrt(3.0), 0.002 * mean)
 
 
-def _refined(values: Floats, step_x: float, step_y: float, x: float, y: float) -> XY:
+def _refined(values: Array, step_x: float, step_y: float, x: float, y: float) -> XY:
     rows, columns = values.shape
     reach = 0.5 / (columns * step_x)
     for _ in range(4):
@@ -175,7 +175,7 @@ def step_height(scan: Scan) -> tuple[float, float]:
     return fitted, max(float(np.std(parts, ddof=1)) / math.sqrt(len(parts)), 0.004 * fitted)
 
 
-def _first_high(power: Floats) -> int:
+def _first_high(power: Array) -> int:
     # the largest period whose power is near the highest
     high = np.flatnonzero(power > 0.9 * power.max())
     groups = np.split(high, np.flatnonzero(np.diff(high) > 1) + 1)

@@ -10,13 +10,12 @@ from datetime import UTC
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from afspm import read, suffixes
+from afspm import Array, read, suffixes
 from afspm.basics import NS_PER_S, AfspmError, FileError, InvalidValue, ProgressLine, counted, day_and_time
 from afspm.driver import FileContent
 from afspm.model import RegistrationOutcome
@@ -29,8 +28,6 @@ from afspm.plugins.drift.study.scan_series import Series, series
 from afspm.plugins.drift.study.workers import on_cores, processes
 from afspm.plugins.drift.trackers import tracker
 from afspm.record import JOURNAL_FILE, MEASURED_SUFFIX
-
-Array = NDArray[np.float64]
 
 NM = 1e9
 NM_PER_MIN = 60e9

@@ -7,10 +7,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from afspm import Array
 from afspm.emulation import World
 from afspm.model import Region, names
 from afspm_bench import analysis
-from afspm_bench.analysis import Floats, Peak
+from afspm_bench.analysis import Peak
 from afspm_bench.evidence import Evidence, true_heights
 from afspm_bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, nm, place_text
 
@@ -22,7 +23,7 @@ _ALONE_M, _TALL_M = 200e-9, 30e-9
 _HEIGHT, _SUPPORT = 0.05, 0.1  # relative: of a claimed height against the truth, and against the cited scan
 
 
-def fitting(seed: int, fits: Callable[[Floats], bool]) -> int:
+def fitting(seed: int, fits: Callable[[Array], bool]) -> int:
     """Return the first sample seed, in steps of 7919 from `seed`, whose heights satisfy `fits`."""
     for number in range(200):
         sample = (seed + 7919 * number) % 2**31
@@ -31,7 +32,7 @@ def fitting(seed: int, fits: Callable[[Floats], bool]) -> int:
     raise AssertionError(f"no sample of 200 from seed {seed} on fits the task")
 
 
-def true_peaks(heights: Floats) -> list[Peak]:
+def true_peaks(heights: Array) -> list[Peak]:
     """Return the true particles of the field, highest first."""
     return analysis.peaks(heights, FIELD, least_m=10e-9, apart_m=24e-9)
 
@@ -70,7 +71,7 @@ def _is_done(evidence: Evidence) -> bool:
 
 
 def highest(seed: int) -> BenchTask:
-    def fits(heights: Floats) -> bool:
+    def fits(heights: Array) -> bool:
         peaks = true_peaks(heights)[:6]
         return len(peaks) > 4 and all(_inside(one, 60e-9) for one in peaks) and _apart(peaks, 100e-9)
 
@@ -109,7 +110,7 @@ def _apart(peaks: Sequence[Peak], least_m: float) -> bool:
 
 
 def flat(seed: int) -> BenchTask:
-    def fits(heights: Floats) -> bool:
+    def fits(heights: Array) -> bool:
         return analysis.flattest(heights, FIELD, _FLAT_M + 60e-9)[1] < 0.7 * _FLAT_RANGE_M
 
     def judge(evidence: Evidence) -> Ruling:
@@ -153,7 +154,7 @@ def alone(peaks: Sequence[Peak]) -> list[Peak]:
 
 
 def isolated(seed: int) -> BenchTask:
-    def fits(heights: Floats) -> bool:
+    def fits(heights: Array) -> bool:
         peaks = true_peaks(heights)
         return any(
             all(other is one or math.dist(one.xy_m, other.xy_m) > _ALONE_M + 40e-9 for other in peaks)
@@ -191,7 +192,7 @@ def again(seed: int) -> BenchTask:
     random = drawn(seed, "again")
     shift = tuple(float(one) for one in random.uniform(-300e-9, 300e-9, 2))
 
-    def fits(heights: Floats) -> bool:
+    def fits(heights: Array) -> bool:
         return len(_known(heights)) == 6
 
     sample = fitting(seed, fits)
@@ -221,7 +222,7 @@ def again(seed: int) -> BenchTask:
     )
 
 
-def _known(heights: Floats) -> list[Peak]:
+def _known(heights: Array) -> list[Peak]:
     # the six highest of the middle, none close to another
     found: list[Peak] = []
     for peak in true_peaks(heights):
