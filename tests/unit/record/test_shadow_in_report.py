@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -171,9 +172,16 @@ def test_verdicts_that_components_publish_are_rows(night: Night, store: RecordSt
     (scan,) = open_run(tmp_path).scans
     assert scan.began_ns is not None
     bad = verdict_message(Scan(REGION, "Height", "m", np.zeros((6, 8)), scan.time_ns), BAD)
-    lines = line_verdict_message(LineVerdict(REGION, (6, 8), "Height", scan.began_ns, 4, 2, True, 0.9, True))
-    for verdict, envelope in ((bad, f"{VERDICT_MESSAGE}_judge"), (lines, f"{OF_LINES}_watch")):
+    lines = LineVerdict(REGION, (6, 8), "Height", scan.began_ns, 4, 2, True, 0.9, stops=False)
+    repeated, stop = replace(lines, row=5, reason="twice the threshold"), replace(lines, stops=True)
+    alarms = [(line_verdict_message(one), f"{OF_LINES}_watch") for one in (lines, repeated, stop)]
+    for verdict, envelope in ((bad, f"{VERDICT_MESSAGE}_judge"), *alarms):
         packet, _ = night.packet(verdict, envelope)
         store.take([(packet, "tcp://127.0.0.1:1")])  # from their own address, not from the scheduler
-    kinds = {row.kind for row in read(open_run(tmp_path)).rows if row.would}
-    assert {ShadowKind.SCAN, ShadowKind.LINES} <= kinds
+    rows = read(open_run(tmp_path)).rows
+    assert {ShadowKind.SCAN, ShadowKind.LINES} <= {row.kind for row in rows if row.would}
+    look, halt = (row.would for row in rows if row.kind is ShadowKind.LINES)
+    assert "look at row 4" in look
+    assert look.endswith("; again at row 5: twice the threshold")
+    assert "would have stopped the scan at row 4" in halt
+    assert "again" not in halt

@@ -203,12 +203,13 @@ def read(run: Run) -> ShadowNight:
         for scan in scans
         if not scan.interrupted
     ]
+    alarms: dict[tuple[int, ...], ShadowRow] = {}
     acts = [PersonAct(scan.time_ns, _ENDED_EARLY, answers=True) for scan in scans if scan.interrupted]
     for _, _, act in run.messages(("ActByHand",)):
         acts.append(PersonAct(act.time_ns, str(act), act.act in ANSWERS))
     for time_ns, verdict in judgements:
         if isinstance(verdict, TipVerdict):
-            decisions.append(_of_lines(time_ns, verdict, scans))
+            _add_alarm(alarms, time_ns, verdict, scans)
         elif (judged := read_verdict(verdict)) is not None and judged[1] == BAD:
             scan = run.scan_at(judged[0])
             which = "" if scan is None else f" of scan {scan.number}"
@@ -225,7 +226,7 @@ def read(run: Run) -> ShadowNight:
         for entry in run.journal
         if entry.event is ControlEvent.BY_HAND and entry.reason
     ]
-    decisions += _asked(run.journal)
+    decisions += [*alarms.values(), *_asked(run.journal)]
     return compare(decisions, sorted(acts, key=lambda act: act.time_ns), [*limits, *taken], run.notes)
 
 
@@ -364,6 +365,18 @@ def _judged(scan: ScanRow) -> str:
     if scan.tip_score is None:
         return "did not judge the tip"
     return "would have taken the tip for bad" if scan.tip_score == BAD else "would have gone on"
+
+
+def _add_alarm(
+    alarms: dict[tuple[int, ...], ShadowRow], time_ns: int, verdict: TipVerdict, scans: Sequence[ScanRow]
+) -> None:
+    # a detector repeats its alarm about one change as the evidence grows: that is one decision
+    of_scan = verdict.timestamp.ToNanoseconds() or time_ns
+    key = of_scan, verdict.since_row, int(verdict.stops)
+    if first := alarms.get(key):
+        alarms[key] = replace(first, would=f"{first.would}; again at row {verdict.row}: {verdict.reason}")
+    else:
+        alarms[key] = _of_lines(time_ns, verdict, scans)
 
 
 def _of_lines(time_ns: int, verdict: TipVerdict, scans: Sequence[ScanRow]) -> ShadowRow:
