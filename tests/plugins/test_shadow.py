@@ -8,15 +8,17 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any
+from typing import Any, cast
 
 import pytest
+from tests.plugins.nanosurf.test_nanosurf_at_panel import until
 from tests.plugins.panel_table import PANELS, Panel
 from tests.plugins.test_makers import MAKERS, Maker
 from tests.plugins.vendor_bench import PATIENT, SOON, Peer, VendorBench, scans, states
 from tests.plugins.wire_tap import lua_scripts, nanonis_names, tapped, zmtp_objects
 
 from afspm.model import ActByHand, ControlResponse, PanelAct, ScopeState, names
+from afspm.simulation.activities import ScanActivity
 
 FREE, SCANNING = ScopeState.FREE, ScopeState.SCANNING
 Sent = Callable[[], list[str]]
@@ -199,3 +201,45 @@ def test_shadow_process_has_no_method_that_sets_or_acts(watched: Watched) -> Non
     acting = [name for name in dir(driver) if hasattr(getattr(driver, name, None), "_afspm_action")]
     assert len(acting) > 3
     assert [name for name in (*acting, "set", "write", "command") if getattr(shadow, name) is not None] == []
+
+
+@pytest.mark.parametrize(
+    "watched", [WATCHED[name] for name in ("asylum", "nanosurf", "park")], ids=lambda one: one.name
+)
+def test_stop_is_published_though_the_next_scan_begins_before_a_file_is_missed(
+    watched: Watched, beside: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # no scan ends before `end`, however busy the computer is
+    monkeypatch.setattr(
+        ScanActivity, "end_s", property(lambda scan: scan.stopped_s or scan.start_s + 1e9 + scan.paused_s)
+    )
+    night, panel = beside(shadow_of(watched)), watched.panel
+    night.settings["result_timeout_s"] = 1e6
+    peer, made = night.start(), night.made
+    peer.until(FREE)
+
+    def begin(emulator: Any) -> None:
+        watched.maker.start(emulator, made.clock.now_s())
+
+    def end(emulator: Any) -> None:
+        emulator.rig.scan.paused_s = -1e9
+
+    def until_seen(value: float) -> list[Any]:
+        # values are read before the state, and published after it
+        made.at_panel(panel.turn(value))
+        return peer.until(lambda one: isinstance(one, ActByHand) and one.act is PanelAct.VALUES)
+
+    made.at_panel(begin)
+    peer.until(SCANNING)
+    received = until_seen(2.0)
+    first = made.emulator.rig.scan
+    made.at_panel(panel.acts["Stop"])
+    received += until_seen(3.0)
+    made.at_panel(begin)
+    received += until_seen(4.0)
+    assert states(received) == []
+    until(cast(Any, made), lambda: made.emulator.rig.scan is not first)  # some begin only after a ramp
+    made.at_panel(end)
+    received = peer.until(FREE) + peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE", "SCANNING", "FREE"]
+    assert {scan.filename for scan in scans(received)}

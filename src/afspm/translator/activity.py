@@ -56,6 +56,7 @@ class Activity(ABC):
         self._clock = clock
         self._log = log
         self._stopping = self._failed = False
+        self._why_last_ended = ""
         self.call: LongCall | None = None
         self.curve_awaited = ""
 
@@ -86,6 +87,7 @@ class Activity(ABC):
         if self._results.what not in ("", what):
             self.end()
         if what and not self._stopping and self._results.what != what:
+            self._why_last_ended = self.stopped_by_hand() if self._results.next_begins() else ""
             self.begin(what)
 
     def settle(self, what: str, is_seen: Callable[[], bool]) -> None:
@@ -110,7 +112,7 @@ class Activity(ABC):
         Raises:
             Refused: the measurement was not started. Also the errors of `do`.
         """
-        self._stopping = False
+        self._stopping, self._why_last_ended = False, ""
         self.begin(what)
         try:
             do()
@@ -134,6 +136,11 @@ class Activity(ABC):
         """
         missing = self._results.missing
         return f"{self.program} ended it without a request of the run, and {missing}" if missing else ""
+
+    def why_ended(self) -> str:
+        """Return `stopped_by_hand` of the measurement before the running one, once; else of the last one."""
+        found, self._why_last_ended = self._why_last_ended, ""
+        return found or self.stopped_by_hand()
 
     def at_rest(self, state: ScopeState = ScopeState.FREE) -> ScopeStatus:
         """Return the state while nothing is measured.

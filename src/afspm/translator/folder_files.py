@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import AfspmError, FileError
 from afspm.basics.plain_data import PlainMapping
 from afspm.model import Scan, Spectrum
@@ -29,6 +30,35 @@ class FolderFiles(ResultFiles):
     """
 
     pattern: str = "*"
+    _before: Entry | None = None
+    _outcome: bool | None = None
+    _is_given_up = False
+
+    def next_begins(self) -> bool:
+        ended = self._kept["ended"]
+        self._before, self._is_given_up = ended if ended is not None and ended["what"] == SCAN else None, False
+        return self._before is not None
+
+    def followed(self, now_ns: int, within_s: float) -> bool | None:
+        """Return once the outcome of a scan that another one followed before its file was there, else None.
+
+        Args:
+            within_s: longest wait for the file, experiment time.
+        """
+        before, running, outcome = self._before, self._kept["running"], self._outcome
+        self._outcome = None
+        if self._is_given_up:
+            self._before, self._is_given_up = None, False
+        # once the next scan is over, a new file is taken for its own
+        elif before is not None and (running is None or now_ns >= before["end_ns"] + within_s * NS_PER_S):
+            self._is_given_up, outcome = True, False
+            if running is not None:
+                self._has_none_yet(running)
+        return outcome
+
+    def forget(self) -> None:
+        self._before, self._is_given_up = None, False
+        super().forget()
 
     def begin(self, what: str, folder: Path, taken: PlainMapping) -> None:
         """Record the start of a measurement.
@@ -36,8 +66,9 @@ class FolderFiles(ResultFiles):
         Args:
             taken: the place of the measurement: "frame" of a scan, "position" of a spectrum.
         """
-        # only files newer than those of now can be its result
-        self._begins(what, {"folder": str(folder), "newest_ns": self.look(folder), **taken})
+        # only files newer than those of now can be its result, but the scan before it may have saved since its end
+        newest_ns = self.look(folder) if self._before is None else self._before["newest_ns"]
+        self._begins(what, {"folder": str(folder), "newest_ns": newest_ns, **taken})
 
     def look(self, folder: Path) -> int:
         """Register the files in a folder as no results; return the time of the newest file, in ns."""
@@ -56,7 +87,12 @@ class FolderFiles(ResultFiles):
         """Assign a complete new file to its measurement, and return the names of the last results, oldest first."""
         self.broken_off = False
         ended, running = self._kept["ended"], self._kept["running"]
-        if ended is not None and self._take(ended):
+        if self._before is not None:
+            # a file of the next scan waits until this one's outcome is published, which discards all results
+            if running is not None and not self._is_given_up and self._take(self._before):
+                self._outcome, self._before, self.broken_off = not self.broken_off, None, False
+                self._has_none_yet(running)
+        elif ended is not None and self._take(ended):
             self._kept["ended"] = None
         elif running is not None and running["what"] == SCAN and self._take({**running, "end_ns": now_ns}):
             self._goes_on(running)
@@ -81,6 +117,10 @@ class FolderFiles(ResultFiles):
 
     def check(self, path: Path, one: Scan | Spectrum, measured: Entry) -> None:
         """Check the first scan or spectrum of a new file; by default there is no check."""
+
+    def _has_none_yet(self, running: Entry) -> None:
+        # all files until now are of the scan before
+        running["newest_ns"] = self.look(Path(running["folder"]))
 
     def _goes_on(self, running: Entry) -> None:
         # the controller repeats scans: only a newer file belongs to the next image

@@ -69,6 +69,10 @@ class ResultFiles(ABC):
         running = self._kept["running"]
         return running["what"] if running else ""
 
+    def next_begins(self) -> bool:
+        """Register that a measurement begins at the panel; return True if a scan before it still awaits its file."""
+        return False
+
     @property
     def frame(self) -> list[float] | None:
         """The frame of the running scan (`as_list`); None without a scan."""

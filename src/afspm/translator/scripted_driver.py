@@ -76,8 +76,11 @@ class ScriptedDriver(Driver, Generic[S, A]):
     def results(self) -> Sequence[str]:
         return self._files.results(self.clock.now_ns())
 
+    def followed(self) -> bool | None:
+        return self._files.followed(self.clock.now_ns(), self.patience_s(self.common.result_timeout_s))
+
     def stopped_by_hand(self) -> str:
-        return self.activity.stopped_by_hand()
+        return self.activity.why_ended()
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         return self._files.load(result)

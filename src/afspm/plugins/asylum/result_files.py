@@ -69,6 +69,13 @@ class AsylumFiles(FolderFiles):
                 _frame_text(wanted),
             )
 
+    def _has_none_yet(self, running: Entry) -> None:
+        if modified_ns(_target(running).path) not in (0, running["there_ns"]):
+            # Asylum had not saved the scan before, and not counted on, when this scan began
+            running["suffix"] += 1
+            running["there_ns"] = modified_ns(_target(running).path)
+        super()._has_none_yet(running)
+
     def _goes_on(self, running: Entry) -> None:
         running["suffix"] += 1
         running["there_ns"] = modified_ns(_target(running).path)
