@@ -129,10 +129,12 @@ class JournalEntry:
     def refused(self) -> bool:
         """Return whether a request was refused.
 
-        A request that has to wait, for control or for a busy microscope, and a request without an answer are not.
+        A request that has to wait, for control or for a busy microscope, and a request without an answer are not. Nor
+        is control given back twice, as a component does at its end after it has lost it: nothing was asked for.
         """
         waits = self.request == ControlRequest.REQUEST_CTRL and self.response in WAIT_FOR_CONTROL
-        return not waits and self.response not in _NOT_REFUSED
+        had_none = self.request == ControlRequest.RELEASE_CTRL and self.response == ControlResponse.NOT_IN_CONTROL
+        return not (waits or had_none) and self.response not in _NOT_REFUSED
 
 
 @dataclass(frozen=True, slots=True)

@@ -155,7 +155,7 @@ class ParameterSpec:
         if self.type == "bool":
             return self._checked_word(value) if isinstance(value, str) else bool(self._finite(value))
         try:
-            number = float(value) * self.sign
+            number = float(value) * self.sign + 0.0  # no minus before a zero of a negative sign
         except (ValueError, TypeError):
             raise refuse_value(self.name, f"the controller returned {value!r}, which is not a number") from None
         number = units.convert(self._finite(number), self.unit, self.si_unit)

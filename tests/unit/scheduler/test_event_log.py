@@ -324,3 +324,9 @@ SQUARE = Region((0.0, 0.0), (5e-7, 5e-7))
 )
 def test_requests_in_words(kind: int, subject: Any, words: str) -> None:
     assert request_text(Request(int(kind), subject), ProblemNames()) == words
+
+
+@pytest.mark.parametrize(("request_", "refused"), [(R.RELEASE_CTRL, False), (R.ACTION, True)])
+def test_control_given_back_twice_is_no_refusal(request_: ControlRequest, refused: bool) -> None:
+    code = int(C.NOT_IN_CONTROL)
+    assert JournalEntry(0, "request", "series", "", code, request=int(request_)).refused is refused

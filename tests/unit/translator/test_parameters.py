@@ -69,6 +69,7 @@ def test_angles_default_to_degrees_and_may_have_the_opposite_sign() -> None:
     assert spec.parse("1.5", "rad") == 1.5
     assert spec.to_vendor(math.pi / 2) == pytest.approx(-90)
     assert spec.for_peer(math.pi / 2) == ("90", "deg")
+    assert str(TABLE["scan-angle"].from_vendor(0.0)) == "0.0"
 
 
 def test_an_experiment_file_changes_single_attributes_of_a_row() -> None:
