@@ -67,7 +67,8 @@ def watch(
         ended = running.run(experiment, running.RunOptions(runs=runs), terminal=sys.stdout)
     with open_run(ended.folder) as found:
         for line in watched.agreement_lines(watched.read(found)):
-            typer.echo("{}: {}, the person acted at {} of them ({} with 95 %)".format(*line))
+            if line[2]:  # an act answers this kind
+                typer.echo("{}: {}, the person acted at {} of them ({} with 95 %)".format(*line))
     raise typer.Exit(ended.outcome.exit_code)
 
 

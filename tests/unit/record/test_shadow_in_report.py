@@ -25,6 +25,7 @@ from afspm.record.report.shadow import (
     ShadowKind,
     ShadowNight,
     ShadowRow,
+    agreement_lines,
     compare,
     csv_text,
     html,
@@ -65,6 +66,14 @@ def test_late_act_answers_nothing(after_s: float, is_answered: bool) -> None:
     night = compare([decision(100.0)], [act(100.0 + after_s)])
     assert counted(night, ShadowKind.LINES) == (1, int(is_answered))
     assert counted(night, ShadowKind.PERSON) == (1, int(is_answered))
+
+
+def test_no_act_answers_drift() -> None:
+    row = decision(10.0, ShadowKind.DRIFT)
+    night = compare([row], [act(11.0)], notes=[note(row, "right")])
+    assert [(one.kind, one.did, one.after_s) for one in night.rows if one.would] == [(ShadowKind.DRIFT, "", None)]
+    (line,) = [line for line in agreement_lines(night) if line[0] == ShadowKind.DRIFT]
+    assert line[:5] == ("drift", "1", "", "", "1")
 
 
 def test_begun_scan_is_listed_and_answers_nothing() -> None:

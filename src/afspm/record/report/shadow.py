@@ -64,6 +64,8 @@ class ShadowKind(StrEnum):
     PERSON = "by hand"
 
 
+_UNANSWERED: Final = (ShadowKind.CONTROL, ShadowKind.DRIFT)
+"""Kinds without an answer: a component that waits all night is no decision, and no act answers drift."""
 COUNTED: Final = (ShadowKind.SCAN, ShadowKind.LINES, ShadowKind.PROBLEM)
 """Kinds with a counted agreement: a person answers them, if at all, by an act."""
 
@@ -249,7 +251,7 @@ def compare(
         soon = [act for act in answers if 0 <= act.time_ns - one.time_ns <= SOON_S * NS_PER_S]
         if one.kind in COUNTED:
             foreseen |= {act.time_ns for act in soon}
-        if soon and one.kind is not ShadowKind.CONTROL:  # a component that waits all night is no decision
+        if soon and one.kind not in _UNANSWERED:
             after_s = (soon[0].time_ns - one.time_ns) / NS_PER_S
             rows.append(replace(one, did=soon[0].text, after_s=after_s))
         else:
@@ -293,7 +295,7 @@ def html(night: ShadowNight, clock: PageTimes) -> str:
             clock.both(row.time_ns),
             escape(row.kind),
             escape(row.would),
-            escape(row.did) or ("went on" if row.would and row.kind is not ShadowKind.CONTROL else ""),
+            escape(row.did) or ("went on" if row.would and row.kind not in _UNANSWERED else ""),
             "" if row.after_s is None else escape(duration_text(row.after_s)),
             "" if row.mark is None else f"{_word(row.mark)}<small>{escape(row.mark.comment)}</small>",
         ]
@@ -329,7 +331,8 @@ def agreement_lines(night: ShadowNight) -> list[tuple[str, ...]]:
     """Return a line of each kind: number, number answered with interval, and number marked right, wrong, interval."""
     return [
         (
-            *(one.kind.value, str(one.count), str(one.agreed), _between(one.interval)),
+            *(one.kind.value, str(one.count)),
+            *((str(one.agreed), _between(one.interval)) if one.kind in (*COUNTED, ShadowKind.PERSON) else ("", "")),
             *(str(one.right), str(one.wrong), _between(one.interval_right)),
         )
         for one in night.agreement
