@@ -5,6 +5,7 @@ What one writes components and scripts with is here, loaded when it is first use
 
 from __future__ import annotations
 
+from importlib.machinery import PathFinder
 from typing import TYPE_CHECKING, Any
 
 from afspm.basics.lazy import lazily
@@ -113,11 +114,13 @@ _own = lazily(__name__)
 def __getattr__(name: str) -> Any:
     if name in __all__:
         return _own(name)
-    from afspm.basics import entry_points
+    # a function that a package adds, so that notebooks need no path of a guest; never under a name of Python's own, nor
+    # of a module here: `from afspm import wire` asks for the name first, and must not read all packages' metadata
+    if not name.startswith("_") and PathFinder.find_spec(f"{__name__}.{name}", __path__) is None:
+        from afspm.basics import entry_points
 
-    # a function that a package adds, so that notebooks need no path of a guest; never under a name of Python's own
-    if not name.startswith("_") and (found := entry_points.load(entry_points.FUNCTIONS, name)) is not None:
-        return found
+        if (found := entry_points.load(entry_points.FUNCTIONS, name)) is not None:
+            return found
     raise AttributeError(f"module 'afspm' has no attribute {name!r}")
 
 

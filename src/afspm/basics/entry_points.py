@@ -16,13 +16,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib import metadata
-from importlib.metadata import EntryPoint
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from afspm.basics.errors import ConfigError
+
+if TYPE_CHECKING:
+    from importlib.metadata import Distribution, EntryPoint
 
 DRIVERS = "afspm.drivers"  # class = "Name" of a translator
 EMULATORS = "afspm.emulators"  # class = "Name" of an emulated controller; `afspm emulate NAME`
@@ -166,6 +167,8 @@ def inventory(taken_commands: Collection[str] = ()) -> tuple[DeclaredName, ...]:
 
 @cache
 def _installed() -> Mapping[str, Sequence[EntryPoint]]:
+    from importlib import metadata  # imported late: it imports 40 modules, and most processes look up no name
+
     # metadata.entry_points() parses the entry points of all packages: 8 ms with 150 of them, this takes 2 ms
     found: dict[str, list[EntryPoint]] = {}
     for package in metadata.distributions():
@@ -178,9 +181,11 @@ def _installed() -> Mapping[str, Sequence[EntryPoint]]:
     return found
 
 
-def _is_first(package: metadata.Distribution, declared: str) -> bool:
+def _is_first(package: Distribution, declared: str) -> bool:
+    from importlib.metadata import distribution
+
     # a package may be installed twice in sys.path: Python imports the first
-    return metadata.distribution(package.name).read_text(_FILE) == declared
+    return distribution(package.name).read_text(_FILE) == declared
 
 
 def forget() -> None:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import metadata
 
 from afspm.basics.errors import ConfigError
 
@@ -55,7 +54,9 @@ def imports_of_extra(extra: str, what: str) -> Iterator[None]:
 
 def _missing(requirement: str) -> Iterator[str]:
     # packages of extras too: metadata lists them as requirements with a marker
-    from packaging.requirements import InvalidRequirement, Requirement  # imported late: few classes require anything
+    from importlib import metadata  # imported late, as is `packaging`: few classes require anything
+
+    from packaging.requirements import InvalidRequirement, Requirement
 
     try:
         wanted = Requirement(requirement)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections import deque
 from typing import IO
 
@@ -35,6 +34,8 @@ class PacketBacklog:
             self._memory_bytes += size
             return
         if self._file is None:
+            import tempfile  # imported late: few processes are ever so far behind
+
             self._file = tempfile.TemporaryFile(prefix="afspm-")  # noqa: SIM115 - open for as long as it is needed
         self._file.seek(0, 2)
         self._file.write(head_of(LoggedPacket(packet, None, 0)))

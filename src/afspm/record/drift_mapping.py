@@ -6,17 +6,17 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from afspm.model.arrays import Array
 from afspm.model.registration_outcome import RegistrationOutcome
 
 if TYPE_CHECKING:
+    from afspm.model.arrays import Array
     from afspm.wire.messages import DriftMapping
 
 
 def drift_at(matrix: Array, center_m: Sequence[float]) -> Array:
     """Return x_tip - x_sample in m, shape (2,): the displacement of the sample at `center_m` (tip coordinates, m)."""
+    import numpy as np
+
     at = np.asarray(center_m, dtype=np.float64)
     drift: Array = at - (matrix[:2, :2] @ at + matrix[:2, 2])
     return drift
@@ -27,5 +27,7 @@ def drift_knowledge(message: DriftMapping) -> tuple[RegistrationOutcome, float |
     outcome = RegistrationOutcome.of(message.outcome, matched=message.matched)
     if len(message.covariance) != 4:
         return outcome, None
+    import numpy as np
+
     largest = float(np.linalg.eigvalsh(np.array(message.covariance).reshape(2, 2))[-1])
     return outcome, math.sqrt(max(largest, 0.0))

@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 from statistics import median
 from typing import TYPE_CHECKING, TypeVar
 
-import numpy as np
-
 from afspm.basics.units import convert, same_kind
 from afspm.model import Frame, MeasurementConditions, Region, RegistrationOutcome, Scan, Spectrum
 from afspm.model.geometry import XY
@@ -230,6 +228,8 @@ class MeasurementHistory:
         """Add a displacement of the sample; a message without a mapping is ignored."""
         if len(message.matrix) != 6 or len(message.center) != 2:
             return
+        import numpy as np  # imported late: `afspm status` of most runs needs no arrays
+
         drift_x, drift_y = drift_at(np.array(message.matrix).reshape(2, 3), message.center)
         rate_x, rate_y = message.rate if len(message.rate) == 2 else (0.0, 0.0)
         at_ns = message.timestamp.ToNanoseconds()

@@ -15,7 +15,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -213,6 +212,8 @@ def run_translator(driver: DriverBase, context: ProcessContext, make: Callable[.
 
 
 def _begin_trace(driver: DriverBase, context: ProcessContext) -> None:
+    from importlib.metadata import version  # imported late: only a trace needs its 40 modules
+
     # a restarted process gets a file of its own, so that the first trace is not overwritten
     folder = Path(context.launch.run_dir or ".")
     file = next(one for i in itertools.count() if not (one := folder / (f"{i}-{FILE}" if i else FILE)).exists())

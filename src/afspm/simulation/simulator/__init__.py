@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Final, TypeVar
 
@@ -253,7 +252,8 @@ class Simulator(Driver):
         self._reached(refuses=False)
 
     def _switch_on(self) -> SimulatedController:
-        import_module("scipy.io")  # imported in advance: otherwise the first saved file would be late
+        # in advance: otherwise the first saved file would be late; beside the start, since it takes half of its time
+        in_background(_import_writer)
         kept = self.memory
         if "start_s" not in kept:
             values = {name: self.table[name].to_vendor(value) for name, value in self._initial.items()}
@@ -306,6 +306,8 @@ class Simulator(Driver):
 
     def get(self, vendor: str) -> Value:
         if vendor == names.CONTROLLER:
+            from importlib.metadata import version  # imported late, since the supervisor imports this class, too
+
             return f"simulated microscope of afspm {version('afspm')}"
         self._reached(refuses=False)
         if vendor not in self.memory["values"]:
@@ -363,6 +365,10 @@ _SETPOINTS: Final[Rows] = {
     "current": {"unit": "A", "range": ["1 pA", "100 nA"]},
     "frequency-shift": {"unit": "Hz", "range": ["-100 kHz", "-1 mHz"]},
 }
+
+
+def _import_writer() -> None:
+    import_module("scipy.io")
 
 
 def _rows_for(mode: str) -> Rows:
