@@ -26,6 +26,8 @@ FAR_BEHIND_BYTES = 64 << 20
 AT_ONCE_BYTES = 32 << 20
 LOOK_S = 0.1
 """Interval of reads of the log: delivery to other processes comes before recording."""
+LONGEST_LOOK_S = 0.25
+"""The interval of reads that find nothing: it doubles up to here, so that an idle run costs little."""
 AGAIN_S = 2.0
 # after a silence incomplete scans are written, too: their last channel may never come
 QUIET_S = 1.0
@@ -80,6 +82,7 @@ class RecordWriter:
         self._inbox = RecordInbox()
         self._error: BaseException | None = None
         self._told_full = self._told_behind = False
+        self._look_s = LOOK_S
         self._heard_s = self._committed_s = clock.monotonic_s()
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
 
@@ -181,14 +184,16 @@ class RecordWriter:
         return False
 
     def _next(self) -> tuple[list[SourcedPacket], bool | None]:
-        queued, ending = self._inbox.take(within_s=0.0 if self._told_behind else LOOK_S)
+        queued, ending = self._inbox.take(within_s=0.0 if self._told_behind else self._look_s)
         logged: list[SourcedPacket] = []
         try:
             logged = self._progress.read()
         except OSError as error:
             self._put_off(error)
         self._tell_behind()
-        return [*logged, *queued], ending
+        found = [*logged, *queued]
+        self._look_s = LOOK_S if found else min(2.0 * self._look_s, LONGEST_LOOK_S)
+        return found, ending
 
     def _tell_behind(self) -> None:
         behind = self._progress.behind_bytes()

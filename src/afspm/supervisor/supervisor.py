@@ -60,7 +60,9 @@ from afspm.transport.process import signals
 from afspm.transport.process.failure import take_fault
 
 REPORT_PERIOD_S = 0.1
-"""Real time between two updates of the reporter's process states."""
+"""Shortest real time between two updates of the reporter's process states."""
+QUIET_REPORT_S = 0.5
+"""Real time after which the states are updated without any event: a process may have become silent."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,7 @@ class Supervisor:
         )
         self._status = ProcessStatus(policy.liveness)
         self._reported_s = -math.inf
+        self._is_unreported = True  # whether an event came since then
         self._wakeup: WakeUp[ChildEvent | EndSignal | ReporterEvent] = WakeUp()
         self._beats = beats or HeartbeatListener()
         self._beats.end_polls_by(self._wakeup.fileno())
@@ -192,7 +195,8 @@ class Supervisor:
     def _timeout_s(self) -> float | None:
         deadlines = [self._core.deadline_s(), *(monitor.again_s for monitor in self._monitors.values())]
         if self._reporter is not None:
-            deadlines.append(self._reported_s + REPORT_PERIOD_S)
+            period_s = REPORT_PERIOD_S if self._is_unreported else QUIET_REPORT_S
+            deadlines.append(self._reported_s + period_s)
         soonest_s = min((s for s in deadlines if s is not None), default=None)
         return None if soonest_s is None else max(0.0, soonest_s - self._clock.monotonic_s())
 
@@ -222,13 +226,14 @@ class Supervisor:
         now_s = self._clock.monotonic_s()
         if self._reporter is None or now_s < self._reported_s + REPORT_PERIOD_S:
             return
-        self._reported_s = now_s
+        self._reported_s, self._is_unreported = now_s, False
         states, changed = self._status.states(self._core.children.values(), now_s, self._clock.now_ns())
         self._reporter.states(states, changed=changed)
 
     # --- effects ---
 
     def _step(self, event: SupervisorEvent) -> None:
+        self._is_unreported |= not isinstance(event, TimePassed)
         for effect in self._core.step(event, self._clock.monotonic_s()):
             match effect:
                 case WriteLog(name, level, text):

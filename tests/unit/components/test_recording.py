@@ -98,7 +98,7 @@ class Bench:
 
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    for name in ("AGAIN_S", "QUIET_S", "LOOK_S", "COMMIT_S"):
+    for name in ("AGAIN_S", "QUIET_S", "LOOK_S", "LONGEST_LOOK_S", "COMMIT_S"):
         monkeypatch.setattr(recording, name, 0.02)
     made = Bench(tmp_path)
     yield made
