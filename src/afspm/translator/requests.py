@@ -30,6 +30,7 @@ from afspm.translator.commands import Commands
 from afspm.translator.connection import Connection
 from afspm.translator.driver_base import LOST, DriverBase
 from afspm.translator.observer import Observer
+from afspm.translator.setting_groups import KeptSettings
 from afspm.translator.state import TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
 from afspm.translator.trace import TRACE
@@ -118,7 +119,7 @@ class RequestHandler:
     def _carry_out(self, request: Request) -> None:
         connection, observer = self._connection, self._observer
         # the last look may be old: the microscope must be free now
-        if connection.stands and not _is_read_only(request):
+        if connection.stands and not (_is_read_only(request) or self._is_kept(request)):
             starts = request.kind == ControlRequest.ACTION and request.subject in STARTS
             connection.guarded(observer.look_before_start if starts else partial(observer.observe, values=False))
         if request.subject != names.RETRACT:
@@ -137,6 +138,11 @@ class RequestHandler:
         observer.play(done.steps)
         if done.response.ok and (done.steps or done.announce):
             connection.guarded(partial(observer.observe, done.announce))
+
+    def _is_kept(self, request: Request) -> bool:
+        # it goes to the controller with the next action, before which the state is read
+        name = request.subject.name if isinstance(request.subject, Parameter) else ""
+        return any(type(group) is KeptSettings and name in group.names for group in self._driver.groups)
 
     def _record_begin(self, request: Request) -> None:
         self._driver.prove()

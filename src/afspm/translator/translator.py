@@ -10,6 +10,7 @@ import contextlib
 import itertools
 import logging
 import math
+import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -84,7 +85,8 @@ class Translator:
         self._log = log
         self._step = step
         self._clock = clock = port.clock
-        driver.clock, driver.log, driver.run_dir, driver.wake = clock, log, run.folder, port.wake_up
+        driver.clock, driver.log, driver.run_dir, driver.wake = clock, log, run.folder, self._wake
+        self._woken = threading.Event()
         driver.memory = memory.setdefault("microscope", {})
         self.state = state = TranslatorState(memory, clock, 2 * driver.patience_s(driver.common.result_timeout_s / 2))
         temporary = TemporarySettings(driver, state, log)
@@ -115,14 +117,17 @@ class Translator:
         Returns:
             ENDED after the scheduler's CLOSE; otherwise ORPHAN, after the safe exit.
         """
-        due = contextlib.ExitStack()
+        due, is_due = contextlib.ExitStack(), True
         try:
             while not self._ended:
-                with self._step():
-                    self.look()
-                due.close()  # after the look: on a busy computer the poll may return late
-                if self._connection.stands:
-                    due.enter_context(self.observer.late_at_change())
+                if is_due:
+                    self._woken.clear()
+                    with self._step():
+                        self.look()
+                with due:  # after the look: on a busy computer the poll may return late
+                    due = contextlib.ExitStack()
+                    if self._connection.stands:
+                        due.enter_context(self.observer.late_at_change())
                 arrived = self._port.poll(self.wait_s())
                 for one in arrived:
                     if not isinstance(one, ParentGone):
@@ -133,11 +138,17 @@ class Translator:
                     with self._step():
                         self._safe_exit.leave(self._wait_and_look)
                     return ExitCode.ORPHAN
+                # a request has looked by itself as far as it needs: another look would delay the next request
+                is_due = not arrived or self._woken.is_set() or not self._connection.stands or self.wait_s() <= 0.0
             return ExitCode.ENDED
         finally:
             due.close()
             self.driver.close()
             self._port.close()
+
+    def _wake(self) -> None:
+        self._woken.set()  # first: the poll that it ends may bring a request, too
+        self._port.wake_up()
 
     def leaves_danger(self) -> bool:
         """Return whether the tip must be retracted before this process ends. Thread-safe."""
