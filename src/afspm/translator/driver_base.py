@@ -363,6 +363,13 @@ class DriverBase(ABC):
         """
         return None
 
+    def reports_end(self) -> bool:
+        """Return whether the driver calls `wake` at the end of the measurement that runs now.
+
+        Override where the controller reports the end: then it is not polled more often towards the expected end.
+        """
+        return False
+
     def stopped_by_hand(self) -> str:
         """Return how the controller shows that a person ended the measurement just interrupted; "" if unknown.
 

@@ -125,7 +125,8 @@ class Observer:
     def wait_s(self) -> float:
         """Return the real seconds until the next reading is due."""
         real_now_s, now_s = self._clock.monotonic_s(), self._clock.now_s()
-        wait_s = min(self._polling.wait_s(real_now_s), self._all_at_s - real_now_s)
+        polling_s = self._polling.wait_s(real_now_s, end_is_reported=self._driver.reports_end())
+        wait_s = min(polling_s, self._all_at_s - real_now_s)
         sequence_s = self._state.sequence.deadline_s()
         for at_s in (self._driver.next_change_s(), sequence_s, self._live.due_s, self._temporary.until_s):
             if at_s is not None:

@@ -99,10 +99,14 @@ class AdaptivePolling:
                 self._ratio = lasted_s / guess_s
         self._measuring = self._expected = self._over_s = None
 
-    def wait_s(self, now_s: float) -> float:
-        """Return the time until the next poll."""
+    def wait_s(self, now_s: float, *, end_is_reported: bool = False) -> float:
+        """Return the time until the next poll.
+
+        Args:
+            end_is_reported: whether the controller itself reports the end of the running measurement.
+        """
         expected = self._expected
-        if expected is None:
+        if expected is None or (end_is_reported and self._measuring is not None and self._over_s is None):
             return self._idle_s
         if expected.end_s is None:
             return self._eager_s

@@ -29,6 +29,7 @@ from afspm.model import (
 )
 from afspm.plugins.nanonis.z_controller import unit_of
 from afspm.storage.formats import read
+from afspm.translator.trace import FILE, TracedExchange, read_trace
 
 Make = Callable[..., Bench]
 
@@ -324,6 +325,29 @@ def test_spectrum_has_its_position(bench: Make, kind: str, first: str, fetch: bo
     true = made.emulator.rig.spectrum
     assert true is not None
     np.testing.assert_allclose(spectrum.values, true.values, rtol=1e-4, atol=1e-18)
+
+
+@pytest.mark.parametrize(
+    ("action", "start", "most"), [(names.START_SPEC, "BiasSpectr.Start", 33), (names.START_SCAN, "Scan.Action", 40)]
+)
+def test_measurement_costs_few_questions(bench: Make, action: str, start: str, most: int) -> None:
+    # without polls at rest: all questions are of the requests, and of the reported end
+    made = bench(speed=20.0)
+    peer = made.start(poll_period_s=3600.0, trace=True)
+    ready(peer)
+    for _ in range(3):
+        assert peer.set(names.SPEC_KIND, "IV").ok
+        assert peer.act(action).ok
+        peer.until(FREE)
+    exchanges = [one for one in read_trace(made.folder / FILE) if isinstance(one, TracedExchange)]
+    begun = [one.at_s for one in exchanges if one.what == start]
+    asked = [
+        one.what
+        for one in exchanges
+        # the start of a spectrum is waited for
+        if one.connection == 0 and begun[1] <= one.at_s < begun[2] and one.what != "BiasSpectr.StatusGet"
+    ]
+    assert len(asked) <= most, asked
 
 
 def test_stopped_spectrum_is_not_published(bench: Make) -> None:

@@ -54,6 +54,14 @@ def test_first_scan_is_polled_eagerly_within_the_uncertainty_of_the_guess(lasts_
     assert looks(pace, 0.0, lasts_s)[1] <= EAGER_S + 1e-9
 
 
+def test_measurement_with_reported_end_is_polled_as_at_rest_until_its_file_is_awaited() -> None:
+    pace = AdaptivePolling(IDLE_S)
+    pace.began("a", 0.0)
+    assert {pace.wait_s(t_s, end_is_reported=True) for t_s in (0.0, 10.0)} == {IDLE_S}
+    pace.over(10.0)
+    assert pace.wait_s(10.0, end_is_reported=True) == EAGER_S
+
+
 def test_unknown_measurement_is_polled_eagerly() -> None:
     pace = AdaptivePolling(IDLE_S)
     pace.began("a", 0.0)

@@ -159,6 +159,9 @@ class Nanonis(Driver):
     def next_change_s(self) -> float | None:
         return self._activity.next_change_s()
 
+    def reports_end(self) -> bool:
+        return self._session is not None and self._activity.reports_end()
+
     def same(self, name: str, a: Value, b: Value, among: Mapping[str, Value]) -> bool:
         return geometry.same_float32(name, a, b, among)
 

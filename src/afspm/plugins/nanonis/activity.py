@@ -90,7 +90,8 @@ class NanonisActivity(Activity):
             self.begin_scan(frame(ScanFrame(self._ask).read())[0])
             return
         self.curve = None
-        self._files.begin(what, self._session_folder(), {"position": list(self._probe.xy_m())})
+        # a spectrum begins right after `status` has found no scan
+        self._files.begin(what, self._session_folder(), {"position": list(self._probe.xy_m(between_scans=True))})
 
     def end(self, path: str | None = None) -> None:
         """Register the end of the measurement.
@@ -163,6 +164,14 @@ class NanonisActivity(Activity):
         times = (self._occupied[1], self._probe.arrives_s, self._files.next_s() or 0.0)
         return min((at_s for at_s in times if at_s > now_s), default=None)
 
+    def reports_end(self) -> bool:
+        """Return whether the second connection will report the end of the running measurement.
+
+        The beginning of a late scan is not reported.
+        """
+        is_scan = self._files.what == SCAN
+        return self._listener.for_scan and self._files.was_seen if is_scan else self._listener.for_curve
+
     # --- state ---
 
     def status(self) -> ScopeStatus:
@@ -190,7 +199,7 @@ class NanonisActivity(Activity):
 
     def refuse_safe_tip(self) -> None:
         """Raise Refused after the safe tip has withdrawn the tip: no measurement is useful then."""
-        self._tip.look()
+        # `status` has just asked, as before each action: the microscope was free
         if self._tip.is_safe:
             raise Refused(ControlResponse.ACTION_ERROR, SAFE_TIP)
 

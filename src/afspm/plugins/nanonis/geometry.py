@@ -88,11 +88,15 @@ class Probe(Group):
         self._seen_m: tuple[float, float] | None = None
         self._range_m: tuple[float, ...] = (math.inf, math.inf)
 
-    def xy_m(self) -> tuple[float, float]:
-        """Return the position of the tip, (x, y) in m; for moves and scans, see the class."""
+    def xy_m(self, *, between_scans: bool = False) -> tuple[float, float]:
+        """Return the position of the tip, (x, y) in m; for moves and scans, see the class.
+
+        Args:
+            between_scans: whether no scan is known to run; otherwise Nanonis is asked.
+        """
         if self._goal_m is not None:
             return self._goal_m
-        if self._seen_m is not None and self._ask("Scan.StatusGet")[0]:
+        if self._seen_m is not None and not between_scans and self._ask("Scan.StatusGet")[0]:
             return self._seen_m
         # A difference below the converters' resolution does not count as a move.
         x, y = self._numbers("FolMe.XYPosGet", 0)

@@ -169,6 +169,10 @@ class Listener:
 
     Args:
         wake: called from that thread when `events` has new entries.
+
+    Attributes:
+        for_scan: whether the thread waits for the end of a scan, or is about to.
+        for_curve: whether it waits for the end of a spectrum, or is about to.
     """
 
     def __init__(self, link: Link, wake: Callable[[], None]) -> None:
@@ -176,18 +180,18 @@ class Listener:
         self._wake = wake
         self._jobs: SimpleQueue[Callable[[], ListenerEvent | None] | None] = SimpleQueue()
         self._events: SimpleQueue[ListenerEvent] = SimpleQueue()
-        self._for_scan = self._closed = False
+        self.for_scan = self.for_curve = self._closed = False
         Thread(target=self._work, name="Nanonis' second connection", daemon=True).start()
 
     def scan(self) -> None:
         """Let the thread wait for the end of a scan, unless it already waits."""
-        if not self._for_scan:
-            self._for_scan = True
+        if not self.for_scan:
+            self.for_scan = True
             self._jobs.put(self._next_end_of_scan)
 
     def curve(self, module: str, base_name: str) -> None:
         """Let the thread start a spectrum with a module, and wait for its data instead of the end of a scan."""
-        self._for_scan = False
+        self.for_scan, self.for_curve = False, True
         self._jobs.put(lambda: self._curve(module, base_name))
 
     def events(self) -> list[ListenerEvent]:
@@ -218,23 +222,26 @@ class Listener:
         try:
             return job()
         except AfspmError as error:
-            self._for_scan = False
+            self.for_scan = False
             return error
         except Exception as error:  # a malformed reply can raise any error: the thread must report it, not die
-            self._for_scan = False
+            self.for_scan = False
             return BadReply(f"Nanonis sent an unreadable message on a measurement: {error!r}")
 
     def _next_end_of_scan(self) -> ListenerEvent | None:
         # Short waits in a loop: a dead connection is noticed, and a spectrum gets its turn.
-        while self._for_scan and not self._closed:
+        while self.for_scan and not self._closed:
             timed_out, path = self._link.ask("Scan.WaitEndOfScan", _WAIT_MS, longer_s=_WAIT_MS / 1000)
             if not timed_out:
-                self._for_scan = False
+                self.for_scan = False
                 return ScanEnded(path)
         return None
 
     def _curve(self, module: str, base_name: str) -> ListenerEvent:
         with_data = 1
         # With data requested, Start replies at the end of the spectrum, and blocks this connection until then.
-        names, values, _ = self._link.ask(f"{module}.Start", with_data, base_name, longer_s=_LONGEST_CURVE_S)
+        try:
+            names, values, _ = self._link.ask(f"{module}.Start", with_data, base_name, longer_s=_LONGEST_CURVE_S)
+        finally:
+            self.for_curve = False
         return CurveEnded(tuple(names), values)
