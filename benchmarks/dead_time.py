@@ -3,6 +3,9 @@
 Both measure at an emulated Nanonis in real time, one after the other. The script does what a careful user would write:
 settings, start, wait, read all channels, save. afspm runs as a whole: supervisor, scheduler, translator, recorder and a
 ready-made component. A period is the time from the end of one measurement to the end of the next.
+
+On a real controller a question takes longer than at an emulated one, so the questions from the end of a measurement to
+the start of the next are counted, too. They do not depend on the speed of the computer.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ from typing import Any
 import numpy as np
 
 import afspm
+from afspm.translator.trace import FILE, TracedExchange, trace_lines
 from benchmarks.effort import effort
 from benchmarks.processes import roles
 from benchmarks.rows import Row, measurement
@@ -35,6 +39,12 @@ SHORT_FRAMES, SHORT_FRAME_S = effort(100, 3), 0.32
 LONG_FRAMES, LONG_FRAME_S = effort(4, 2), effort(10.0, 0.32)
 CURVES = effort(12, 3)
 MORE_THAN_THE_SCRIPT_MS = 20.0
+COUNTED = 4
+"""Measurements whose questions are counted."""
+AS_MANY = 2.0
+QUESTIONS_OF_A_CURVE = 18
+"""A script asks one: its start. Seven more look at the end, seven before the start, whether a person has withdrawn the
+tip, measures or approaches."""
 LONGEST_PART = 1.005
 """Of the time of a script, for scans that take as long as scans do."""
 DEADLINE_S = 300.0
@@ -51,6 +61,7 @@ seed = 7
 [microscope]
 component = true
 class = "Nanonis"
+trace = {trace}
 
 [scheduler]
 component = true
@@ -80,11 +91,12 @@ def speed_m_s(frame_s: float) -> float:
     return 2.0 * FRAME_M * ROWS / frame_s
 
 
-def afspm_periods_s(component: str, table: str) -> list[float]:
-    """Run an experiment to its end, and return its periods as the record has them."""
+@contextlib.contextmanager
+def ended_run(component: str, *, trace: bool = False) -> Iterator[Path]:
+    """Run an experiment to its end, and yield the folder with its run."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         file = Path(folder) / "experiment.toml"
-        file.write_text(EXPERIMENT.format(component=component), encoding="utf-8")
+        file.write_text(EXPERIMENT.format(component=component, trace=str(trace).lower()), encoding="utf-8")
         command = [sys.executable, "-c", "from afspm.cli import main; main()", "run", str(file)]
         run = subprocess.run(
             [*command, "--runs", folder, "--no-report"],
@@ -92,9 +104,32 @@ def afspm_periods_s(component: str, table: str) -> list[float]:
         )  # fmt: skip
         if run.returncode:
             raise RuntimeError(run.stdout + run.stderr)
-        with afspm.open_run(folder) as record:
-            ends_s = [row.time_ns * 1e-9 for row in getattr(record, table)]
+        yield Path(folder)
+
+
+def afspm_periods_s(component: str, table: str) -> list[float]:
+    """Run an experiment to its end, and return its periods as the record has them."""
+    with ended_run(component) as folder, afspm.open_run(folder) as record:
+        ends_s = [row.time_ns * 1e-9 for row in getattr(record, table)]
     return [after - before for before, after in itertools.pairwise(ends_s)]
+
+
+def afspm_questions(component: str, started_by: str, ended_by: str) -> float:
+    """Return the questions from the reported end of a measurement to the start of the next one, the start included.
+
+    Args:
+        started_by, ended_by: functions of Nanonis: one starts a measurement, one replies at its end.
+    """
+    with ended_run(component, trace=True) as folder:
+        lines = list(trace_lines(next(folder.glob(f"*/{FILE}"))))
+    asked = sorted((one for one in lines if isinstance(one, TracedExchange)), key=lambda one: one.at_s)
+    starts_s = [one.at_s for one in asked if one.what == started_by]
+    counts = []
+    for before_s, start_s in itertools.pairwise(starts_s):
+        ends_s = [one.at_s + one.took_s for one in asked if one.what == ended_by]
+        end_s = max((at_s for at_s in ends_s if before_s < at_s < start_s), default=start_s)
+        counts.append(sum(end_s <= one.at_s <= start_s for one in asked))
+    return statistics.median(counts)
 
 
 class Script:
@@ -102,8 +137,10 @@ class Script:
 
     def __init__(self, client: Any, folder: Path) -> None:
         self._client, self._folder = client, folder
+        self.questions = 0
 
     def ask(self, function: str, *arguments: Any) -> list[Any]:
+        self.questions += 1
         error, _, values = getattr(self._client, function)(*arguments)
         if error:
             raise RuntimeError(f"{function}: {error}")
@@ -173,6 +210,13 @@ def dead_time() -> Iterator[Row]:
     ours_s, bare_s = _scans(LONG_FRAMES, LONG_FRAME_S)
     medians_s = statistics.median(ours_s), statistics.median(bare_s)
     yield Row(f"a scan of {LONG_FRAME_S:g} s, from end to end", "s", *medians_s, LONGEST_PART)
+    scans = SCANS.format(rows=ROWS, count=COUNTED, speed=speed_m_s(SHORT_FRAME_S))
+    ours = afspm_questions(scans, "Scan.Action", "Scan.WaitEndOfScan")
+    with script() as plain:
+        plain.scans(COUNTED, SHORT_FRAME_S)
+        # of each scan all but the wait for its end; and the question for the channels
+        bare = (plain.questions - 1) / COUNTED - 1
+    yield Row("questions from the end of a scan to the next start", "", ours, bare, AS_MANY)
 
 
 @measurement
@@ -180,3 +224,5 @@ def dead_time_of_curves() -> Iterator[Row]:
     ours_s = afspm_periods_s(SPECTRA.format(count=CURVES), "spectra")
     with script() as plain:
         yield _period("curves", ours_s, plain.curves(CURVES))
+    ours = afspm_questions(SPECTRA.format(count=COUNTED), "BiasSpectr.Start", "BiasSpectr.Start")
+    yield Row("questions from the end of a curve to the next start", "", ours, None, QUESTIONS_OF_A_CURVE)
