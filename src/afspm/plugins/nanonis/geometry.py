@@ -108,7 +108,8 @@ class Probe(Group):
         return dict(zip(self.names, self.xy_m(), strict=True))
 
     def write(self, values: Mapping[str, Value]) -> None:
-        before_m = self.xy_m()
+        # the values are read right before they are set, by the translator
+        before_m = self._goal_m or self._seen_m or self.xy_m()
         x, y = (float(values.get(name, was)) for name, was in zip(self.names, before_m, strict=True))
         # Nanonis would clip the position to the range without an error.
         try:
