@@ -22,6 +22,8 @@ _VERSION: Final = "v2024.02"
 _OF_SAMPLE: Final = {"temperature": "temperature", "field": "magnetic_field", "pressure": "pressure"}
 """Fields of NXsample, by the last word in the name of an instrument parameter."""
 _TECHNIQUE, _BIAS_TECHNIQUE = "STM", "STS"
+_IN_HEADER: Final = 60_000
+"""Bytes of a field that HDF5 stores in its header, which has at most 64 kB."""
 
 
 def definition_of(spectrum: Spectrum, metadata: Mapping[str, str]) -> str:
@@ -33,8 +35,7 @@ def definition_of(spectrum: Spectrum, metadata: Mapping[str, str]) -> str:
 
 def describe(entry: h5py.Group, definition: str, about: PlainMapping, version: str) -> h5py.Group:
     """Write the facts about the whole file and return the instrument's group; unknown facts are left out."""
-    entry["definition"] = definition
-    entry["definition"].attrs["version"] = _VERSION
+    mark(put(entry, "definition", definition), version=_VERSION)
     metadata: Mapping[str, str] = about.get("metadata") or {}
     technique = _BIAS_TECHNIQUE if definition == BIAS_SPECTRUM else metadata.get("technique")
     texts = {
@@ -46,7 +47,7 @@ def describe(entry: h5py.Group, definition: str, about: PlainMapping, version: s
     }
     _write_texts(entry, texts)
     sample = group(entry, "sample", "NXsample")
-    sample["name"] = metadata.get("sample", "")
+    put(sample, "name", metadata.get("sample", ""))
     _write_surroundings(sample, about.get("instruments") or [])
     if "person" in metadata or "orcid" in metadata:
         user = group(entry, "user", "NXuser")
@@ -57,8 +58,7 @@ def describe(entry: h5py.Group, definition: str, about: PlainMapping, version: s
         _write_texts(hardware, {"vendor": vendor, "model": metadata.get("microscope")})
         software = group(instrument, "software", "NXfabrication")
         _write_texts(software, {"vendor": vendor, "name": metadata.get("software")})
-    program = entry.create_dataset("program_name", data="afspm")
-    program.attrs["version"] = version
+    mark(put(entry, "program_name", "afspm"), version=version)
     return instrument
 
 
@@ -75,11 +75,11 @@ def write_point(instrument: h5py.Group, spectrum: Spectrum) -> None:
 
 
 def write_bias_sweep(entry: h5py.Group, instrument: h5py.Group, spectrum: Spectrum) -> None:
-    entry["scan_mode"] = "constant height"  # the feedback is held while the bias is swept
+    put(entry, "scan_mode", "constant height")  # the feedback is held while the bias is swept
     environment = group(instrument, "bias_spectroscopy_environment", "NXenvironment")
     spectroscopy = group(environment, "bias_spectroscopy", "NXspm_bias_spectroscopy")
     sweep = group(spectroscopy, "bias_sweep", "NXspm_scan_control")
-    sweep["scan_type"] = "linear"
+    put(sweep, "scan_type", "linear")
     bias = spectrum.values[:, 0]
     far = np.abs(bias - bias[0])
     if far[-1] < 0.5 * far.max():  # there and back: the way there, since the ends of the whole sweep are equal
@@ -91,7 +91,7 @@ def write_bias_sweep(entry: h5py.Group, instrument: h5py.Group, spectrum: Spectr
     values(region, "scan_offset_bias", first, "V")
     values(region, "scan_range_bias", abs(last - first), "V")
     linear = group(sweep, "linear_sweep", "NXspm_scan_pattern")
-    linear["scan_points_bias"] = count
+    put(linear, "scan_points_bias", count)
     values(linear, "step_size_bias", (last - first) / max(1, count - 1), "V")
     if spectrum.position_m is not None:
         place = group(sweep, "spatial_location", "NXcoordinate_system")
@@ -111,7 +111,7 @@ def _write_pattern(
         values(area, f"scan_range_{axis}", size, "m")
         values(area, f"scan_start_{axis}", center - size / 2, "m")
         values(area, f"scan_end_{axis}", center + size / 2, "m")
-        mesh[f"scan_points_{axis}"] = count
+        put(mesh, f"scan_points_{axis}", count)
         if count > 1:
             values(mesh, f"step_size_{axis}", size / (count - 1), "m")
     values(area, "scan_angle_x", 0.0 if region is None else math.degrees(region.angle_rad), "deg")
@@ -125,7 +125,7 @@ def _write_surroundings(sample: h5py.Group, readings: Sequence[PlainMapping]) ->
     for one in readings:
         name = re.sub(r"\W", "_", str(one["name"]))
         sensor = group(environment, name, "NXsensor")
-        sensor["name"] = str(one["name"])
+        put(sensor, "name", str(one["name"]))
         for key in ("value", "target", "lowest", "highest"):
             if one.get(key) is not None:
                 values(sensor, key, float(one[key]), str(one["unit"]))
@@ -141,19 +141,57 @@ def _write_surroundings(sample: h5py.Group, readings: Sequence[PlainMapping]) ->
 
 def group(parent: h5py.Group, name: str, nexus_class: str) -> h5py.Group:
     made = parent.create_group(name)
-    made.attrs["NX_class"] = nexus_class
+    mark(made, NX_class=nexus_class)
     return made
+
+
+def mark(node: h5py.Group | h5py.Dataset, /, **attributes: str | Sequence[str] | float) -> None:
+    """Set attributes. Texts get a fixed length: the heap for texts of any length takes 4 kB in each file."""
+    for name, value in attributes.items():
+        if isinstance(value, int | float):
+            node.attrs[name] = value
+        else:
+            texts = _fixed(value)
+            node.attrs.create(name, texts, dtype=texts.dtype)
+
+
+def put(parent: h5py.Group, name: str, value: str | float) -> h5py.Dataset:
+    """Create a field of one text or number, in the header of the field if it fits."""
+    import h5py
+
+    data = _fixed(value) if isinstance(value, str) else np.asarray(value)
+    if data.nbytes > _IN_HEADER:
+        return parent.create_dataset(name, data=data)
+    layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    layout.set_layout(h5py.h5d.COMPACT)
+    kind, space = h5py.h5t.py_create(data.dtype, logical=True), h5py.h5s.create(h5py.h5s.SCALAR)
+    made = h5py.h5d.create(parent.id, name.encode(), kind, space, layout)
+    made.write(h5py.h5s.ALL, h5py.h5s.ALL, data)
+    return h5py.Dataset(made)
 
 
 def values(parent: h5py.Group, name: str, numbers: NDArray[np.float64] | float, unit: str, long_name: str = "") -> None:
     """Create a field of float64 with its unit."""
-    dataset = parent.create_dataset(name, data=numbers, dtype="<f8")
-    dataset.attrs["units"] = unit
+    if isinstance(numbers, int | float):
+        dataset = put(parent, name, float(numbers))
+    else:
+        dataset = parent.create_dataset(name, data=numbers, dtype="<f8")
+    mark(dataset, units=unit)
     if long_name:
-        dataset.attrs["long_name"] = long_name
+        mark(dataset, long_name=long_name)
+
+
+def _fixed(texts: str | Sequence[str]) -> NDArray[np.bytes_]:
+    import h5py
+
+    encoded = [text.encode() for text in ([texts] if isinstance(texts, str) else texts)]
+    if any(b"\0" in one for one in encoded):  # HDF5 would end the text there
+        raise ValueError(f"a text with a zero byte: {texts!r}")
+    array = np.array(encoded, dtype=h5py.string_dtype("utf-8", max(1, *map(len, encoded))))
+    return array.reshape(()) if isinstance(texts, str) else array
 
 
 def _write_texts(parent: h5py.Group, texts: Mapping[str, str | None]) -> None:
     for name, text in texts.items():
         if text:
-            parent[name] = str(text)
+            put(parent, name, str(text))

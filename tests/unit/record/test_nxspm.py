@@ -112,7 +112,7 @@ def test_readings_of_other_instruments_are_in_the_sample() -> None:
     ]  # fmt: skip
     entry = opened(encode_scan([SCAN], FileProvenance(0, None, {"instruments": readings})))
     sample = entry["sample"]
-    assert (sample["temperature"][()], sample["temperature"].attrs["units"]) == (4.2, "K")
+    assert (sample["temperature"][()], sample["temperature"].attrs["units"]) == (4.2, b"K")
     assert "magnetic_field" not in sample
     sensor = sample["environment/cryo_temperature"]
     assert said(sensor, "value", "target", "lowest", "highest", "value_age") == [4.2, 4.2, 4.1, 4.3, 0.5]

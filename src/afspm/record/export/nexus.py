@@ -13,7 +13,7 @@ from afspm.basics.clock import iso_utc
 from afspm.record.journal import measured_file
 from afspm.record.nexus_reader import ABOUT, GRID
 from afspm.record.nexus_writer import field_names
-from afspm.record.nxspm import group, values
+from afspm.record.nxspm import group, mark, put, values
 from afspm.record.run import Run
 from afspm.record.spectrum_stack import SpectrumStack, mean_over_repeats
 from afspm.record.tables import ScanRow, SpectrumRow
@@ -25,23 +25,23 @@ def grid_file(stack: SpectrumStack, metadata: Mapping[str, str]) -> bytes:
 
     content = io.BytesIO()
     with h5py.File(content, "w") as file:
-        file.attrs.update(NX_class="NXroot", default="entry", creator="afspm")
+        mark(file, NX_class="NXroot", default="entry", creator="afspm")
         entry = group(file, "entry", "NXentry")
-        entry.attrs["default"] = stack.directions[0]
-        entry["title"] = f"{stack.kind}, {len(stack.points.x_m)} x {len(stack.points.y_m)}"
-        group(entry, "sample", "NXsample")["name"] = metadata.get("sample", "")
+        mark(entry, default=stack.directions[0])
+        put(entry, "title", f"{stack.kind}, {len(stack.points.x_m)} x {len(stack.points.y_m)}")
+        put(group(entry, "sample", "NXsample"), "name", metadata.get("sample", ""))
         (swept, *fields) = field_names([stack.swept_name, *stack.curves], ("x", "y"))
         for number, direction in enumerate(stack.directions):
             data = group(entry, direction, "NXdata")
-            data.attrs.update(signal=fields[0], axes=["y", "x", swept], angle_deg=math.degrees(stack.points.angle_rad))
-            data.attrs["auxiliary_signals"] = fields[1:] or [fields[0]]
+            mark(data, signal=fields[0], axes=["y", "x", swept], angle_deg=math.degrees(stack.points.angle_rad))
+            mark(data, auxiliary_signals=fields[1:] or [fields[0]])
             values(data, "y", stack.points.y_m, "m", "y before the grid was turned")
             values(data, "x", stack.points.x_m, "m", "x before the grid was turned")
             values(data, swept, stack.swept, stack.swept_unit, stack.swept_name)
             for field, (name, curves) in zip(fields, stack.curves.items(), strict=True):
                 values(data, field, mean_over_repeats(curves)[:, :, number], stack.units[name], name)
         collection = group(entry, ABOUT, "NXcollection")
-        collection["about"] = json.dumps(_about_grid(stack, swept, dict(zip(stack.curves, fields, strict=True))))
+        put(collection, "about", json.dumps(_about_grid(stack, swept, dict(zip(stack.curves, fields, strict=True)))))
         collection["time_ns"] = stack.times[:, :, 0].astype(np.int64)
     return content.getvalue()
 
@@ -74,12 +74,11 @@ def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
     content = io.BytesIO(measured_file(run.folder, row.file).read_bytes())
     with h5py.File(content, "r+") as file:
         if row.key:
-            file["entry"]["afspm"].attrs["key"] = row.key
+            mark(file["entry"]["afspm"], key=row.key)
         for number, note in enumerate(run.notes_on(row), 1):
-            group = file["entry"].create_group(f"note_{number}")
-            group.attrs["NX_class"] = "NXnote"
-            group["author"], group["description"] = note.who, note.text
-            group["type"] = "text/plain"
+            made = group(file["entry"], f"note_{number}", "NXnote")
+            for name, text in (("author", note.who), ("description", note.text), ("type", "text/plain")):
+                put(made, name, text)
             if note.written_ns is not None:
-                group["date"] = iso_utc(note.written_ns)
+                put(made, "date", iso_utc(note.written_ns))
     yield ".h5", content.getvalue()
