@@ -1,7 +1,8 @@
 """Scans and spectra as HDF5 files that follow NeXus' NXspm (spectra over the bias: NXsts), without loss.
 
     /entry                  NXentry, definition "NXspm" or "NXsts"; technique, start_time, end_time, title
-      data                  NXdata: a field for each channel over y and x (unrotated, in m), with units
+      data                  NXdata: a field for each channel over y and x (unrotated, in m), with units;
+                            float32 if that is exact for each value, else float64
       experiment_instrument NXinstrument: hardware, software, position and number of points
       sample, user          NXsample, NXuser
       afspm                 NXcollection: `about`, all facts as JSON: holder, problems, drift …
@@ -83,7 +84,7 @@ def encode_scan(scans: Sequence[Scan], circumstances: FileProvenance) -> bytes:
         for name, axis in (("x", x), ("y", y)):
             values(data, name, axis, "m", f"{name} before the frame was turned")
         for scan, name in zip(scans, fields, strict=True):
-            values(data, name, scan.values, scan.unit, scan.channel)
+            values(data, name, _in_single_precision(scan.values), scan.unit, scan.channel)
         nxspm.write_frame(instrument, first)
 
     return _encoded(DEFINITION, about, circumstances, fill)
@@ -158,6 +159,16 @@ def _encoded(
         # HDF5 reserves 256 bytes for the header of each new field, and a copy has what the field needs: 4 kB less
         aside.copy(entry, file)
     return content.getvalue()
+
+
+def _in_single_precision(numbers: Array) -> NDArray[np.floating]:
+    # most controllers deliver float32; the first row alone tells most arrays of float64
+    for part in (numbers[:1], numbers):
+        with np.errstate(over="ignore", invalid="ignore"):
+            single = part.astype("<f4")
+        if single.astype("<f8").tobytes() != part.astype("<f8").tobytes():
+            return numbers
+    return single
 
 
 def _about(content: str, filename: str, circumstances: FileProvenance) -> dict[str, object]:

@@ -170,12 +170,15 @@ def put(parent: h5py.Group, name: str, value: str | float) -> h5py.Dataset:
     return h5py.Dataset(made)
 
 
-def values(parent: h5py.Group, name: str, numbers: NDArray[np.float64] | float, unit: str, long_name: str = "") -> None:
-    """Create a field of float64 with its unit."""
+def values(
+    parent: h5py.Group, name: str, numbers: NDArray[np.floating] | float, unit: str, long_name: str = ""
+) -> None:
+    """Create a field with its unit: of float32 if the numbers are, else of float64."""
     if isinstance(numbers, int | float):
         dataset = put(parent, name, float(numbers))
     else:
-        dataset = parent.create_dataset(name, data=numbers, dtype="<f8")
+        kind = "<f4" if numbers.dtype == np.float32 else "<f8"
+        dataset = parent.create_dataset(name, data=numbers, dtype=kind)
     mark(dataset, units=unit)
     if long_name:
         mark(dataset, long_name=long_name)

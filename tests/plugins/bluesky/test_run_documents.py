@@ -50,7 +50,8 @@ def test_no_channel_is_lost_to_a_number_of_the_event(tmp_path: Path) -> None:
         path = path if Path(path).exists() else path.removeprefix("/")
         stream = "scans" if one["data_key"] in arrays["scans"] else "spectra"
         with h5py.File(path) as file:
-            assert list(file[one["parameters"]["dataset"]].shape) == descriptors[stream][one["data_key"]]["shape"]
+            data, key = file[one["parameters"]["dataset"]], descriptors[stream][one["data_key"]]
+            assert (list(data.shape), data.dtype.str) == (key["shape"], key["dtype_numpy"])
     assert descriptors["scans"]["interrupted"]["dtype"] == "boolean"
     events = [one["data"] for name, one in found if name == "event"]
     assert events[0]["interrupted"] is False

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 
 from afspm.model import Region, Scan, Spectrum
 from afspm.record.nexus_writer import FileProvenance, encode_scan, encode_spectrum
+from afspm.storage.formats import read
 
 h5py = pytest.importorskip("h5py")
 METADATA = {
@@ -128,3 +131,45 @@ def test_sample_has_no_temperature_if_two_instruments_have_one(kelvin: float | N
     sample = opened(encode_scan([SCAN], FileProvenance(0, None, {"instruments": readings})))["sample"]
     assert "temperature" not in sample
     assert said(sample["environment/head_temperature"], "value") == [77.0]
+
+
+SINGLE = np.array([[0.1, -0.0, np.nan, 3e-30], [1e-9, 7.0, np.inf, -2.5]], np.float32).astype(np.float64)
+
+
+@pytest.mark.parametrize(
+    ("last", "kind"),
+    [(-2.5, "<f4"), (0.1, "<f8"), (1e300, "<f8"), (1e-60, "<f8")],
+    ids=["single precision", "double precision", "too large for it", "too small for it"],
+)
+def test_channel_is_in_single_precision_only_if_each_bit_is_read_again(tmp_path: Path, last: float, kind: str) -> None:
+    values = SINGLE.copy()
+    values[-1, -1] = last
+    file = tmp_path / "scan.h5"
+    file.write_bytes(encode_scan([replace(SCAN, values=values)], KNOWN))
+    assert opened(file.read_bytes())["data/height"].dtype.str == kind
+    (found,) = read(file).scans
+    assert found.values.dtype == np.float64
+    assert found.values.tobytes() == values.tobytes()
+
+
+def test_scan_recorded_in_double_precision_with_texts_of_any_length_is_read(tmp_path: Path) -> None:
+    # as versions before single precision wrote it, in the oldest format of HDF5
+    about = {
+        "content": "scan", "filename": "s.nc", "time_ns": 5, "began_ns": None, "center_m": [0.0, 0.0],
+        "size_m": [1e-6, 1e-6], "angle_rad": 0.0, "frame": "tip",
+        "channels": [{"name": "Height", "unit": "m", "field": "height", "time_ns": 5}],
+    }  # fmt: skip
+    file = tmp_path / "old.h5"
+    with h5py.File(file, "w", libver="earliest") as old:
+        old.attrs.update(NX_class="NXroot", default="entry", creator="afspm")
+        old["entry/afspm/about"], old["entry/vendor/header"] = json.dumps(about), json.dumps({"gain": 2})
+        data = old.create_dataset("entry/data/height", data=SINGLE, dtype="<f8")
+        data.attrs.update(units="m", long_name="Height")
+    content = read(file)
+    assert content.scans[0].values.tobytes() == SINGLE.tobytes()
+    assert (content.scans[0].filename, content.end_ns, content.header["gain"]) == ("s.nc", 5, 2)
+
+
+def test_structure_of_a_file_is_small() -> None:
+    image = encode_scan([SCAN], KNOWN)
+    assert len(image) - SCAN.values.nbytes // 2 < 12_000

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 from uuid import NAMESPACE_URL, uuid5
 
 from afspm import Run
-from afspm.basics import NS_PER_S
+from afspm.basics import NS_PER_S, FileError
+from afspm.driver import hdf5_reading
 from afspm.record import ScanRow, SpectrumRow, field_names, measured_file
 
 Document = tuple[str, dict[str, object]]
@@ -43,11 +44,12 @@ def documents(run: Run, scans: Iterable[ScanRow], spectra: Iterable[SpectrumRow]
     yield "start", _start(run, start, began_ns)
     streams: dict[tuple[object, ...], _Stream] = {}
     for row in rows:
-        stream = streams.get(_alike(row))
+        types = _types(run, row)
+        stream = streams.get((*_alike(row), types))
         if stream is None:
             count = sum(type(row) is type(one.first) for one in streams.values())
             name = ("scans" if isinstance(row, ScanRow) else "spectra") + (f"_{count + 1}" if count else "")
-            stream = streams[_alike(row)] = _Stream(run, start, name, row)
+            stream = streams[*_alike(row), types] = _Stream(run, start, name, row, types)
             yield "descriptor", stream.descriptor()
         yield from stream.event(row)
     counts = {stream.name: stream.count for stream in streams.values()}
@@ -79,10 +81,22 @@ def _stop(run: Run, start: str, counts: Mapping[str, int]) -> dict[str, object]:
 
 
 def _alike(row: ScanRow | SpectrumRow) -> tuple[object, ...]:
-    # the arrays of one stream must have the same shape
+    # the arrays of one stream must have the same shape, and the same type
     if isinstance(row, ScanRow):
         return "scan", row.channels, row.shape
     return "spectrum", row.kind, row.names, row.points
+
+
+def _types(run: Run, row: ScanRow | SpectrumRow) -> tuple[str, ...]:
+    # the record keeps the channels of a scan in single precision if that is exact
+    if not isinstance(row, ScanRow):
+        return ("<f8",) * len(row.names)
+    try:
+        with hdf5_reading.opened(measured_file(run.folder, row.file)) as file:
+            fields = field_names([name for name, _ in row.channels], ("x", "y"))
+            return tuple(file["entry"]["data"][one].dtype.str for one in fields)
+    except (FileError, OSError, KeyError):  # missing or damaged: the documents point to it all the same
+        return ("<f8",) * len(row.channels)
 
 
 @dataclass
@@ -93,6 +107,7 @@ class _Stream:
     start: str
     name: str
     first: ScanRow | SpectrumRow
+    types: tuple[str, ...]
     count: int = field(default=0)
 
     @property
@@ -116,10 +131,10 @@ class _Stream:
         source = f"afspm:{self.run.folder.name}"
         keys: dict[str, object] = {
             key: {
-                "source": f"{source}/{name}", "dtype": "array", "dtype_numpy": "<f8", "shape": shape, "units": unit,
+                "source": f"{source}/{name}", "dtype": "array", "dtype_numpy": kind, "shape": shape, "units": unit,
                 "external": "STREAM:",
             }
-            for key, _, name, unit, shape in self._arrays()
+            for kind, (key, _, name, unit, shape) in zip(self.types, self._arrays(), strict=True)
         }  # fmt: skip
         keys |= {
             one: {"source": source, "dtype": "number", "shape": [], "units": unit}

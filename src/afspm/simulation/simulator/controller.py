@@ -18,7 +18,7 @@ import numpy as np
 
 from afspm.basics.errors import AfspmError, FileError, InvalidValue, Refused
 from afspm.model import ControlResponse, ScanLines, ScopeState, Spectrum, names
-from afspm.simulation.activities import ScanActivity, SpectrumActivity
+from afspm.simulation.activities import Channels, ScanActivity, SpectrumActivity
 from afspm.simulation.faults import Faults
 from afspm.simulation.instrument import InstrumentBusy, SimulatedInstrument
 from afspm.storage.atomic import write_atomic
@@ -134,7 +134,7 @@ class SimulatedController:
             return []
         return [
             ScanLines(scan.region, scan.shape, channel, unit, int(rows[0]), values[rows])
-            for channel, (unit, values) in scan.channels().items()
+            for channel, (unit, values) in _in_single_precision(scan).items()
         ]
 
     def _advance(self, now_s: float) -> None:
@@ -271,7 +271,7 @@ class SimulatedController:
     # --- what comes of it ---
 
     def _save_scan(self, scan: ScanActivity) -> None:
-        content = encode_scan(scan.region, scan.channels(), self._facts(scan.end_s))
+        content = encode_scan(scan.region, _in_single_precision(scan), self._facts(scan.end_s))
         self._saved("scan", f"scan-{scan.number:04d}.nc", content, scan.end_s, {"scan": dict(scan.truth)})
 
     def _save_spectrum(self, curve: SpectrumActivity) -> None:
@@ -373,3 +373,10 @@ class SavedFiles:
 
 def _hidden(path: Path) -> Path:
     return path.with_name(f".{path.name}.whole")
+
+
+def _in_single_precision(scan: ScanActivity) -> Channels:
+    # as most controllers deliver their values
+    return {
+        name: (unit, values.astype(np.float32).astype(np.float64)) for name, (unit, values) in scan.channels().items()
+    }
