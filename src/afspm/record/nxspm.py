@@ -22,6 +22,8 @@ _VERSION: Final = "v2024.02"
 _OF_SAMPLE: Final = {"temperature": "temperature", "field": "magnetic_field", "pressure": "pressure"}
 """Fields of NXsample, by the last word in the name of an instrument parameter."""
 _TECHNIQUE, _BIAS_TECHNIQUE = "STM", "STS"
+_SHORT: Final = 200
+"""Characters of a text that is stored in the heap of the file, which has 4 kB for its first texts."""
 _IN_HEADER: Final = 60_000
 """Bytes of a field that HDF5 stores in its header, which has at most 64 kB."""
 
@@ -146,20 +148,21 @@ def group(parent: h5py.Group, name: str, nexus_class: str) -> h5py.Group:
 
 
 def mark(node: h5py.Group | h5py.Dataset, /, **attributes: str | Sequence[str] | float) -> None:
-    """Set attributes. Texts get a fixed length: the heap for texts of any length takes 4 kB in each file."""
-    for name, value in attributes.items():
-        if isinstance(value, int | float):
-            node.attrs[name] = value
-        else:
-            texts = _fixed(value)
-            node.attrs.create(name, texts, dtype=texts.dtype)
+    """Set attributes. Their texts have any length: NeXus' validator fails at classes in texts of fixed length."""
+    node.attrs.update(attributes)
 
 
 def put(parent: h5py.Group, name: str, value: str | float) -> h5py.Dataset:
     """Create a field of one text or number, in the header of the field if it fits."""
     import h5py
 
-    data = _fixed(value) if isinstance(value, str) else np.asarray(value)
+    if isinstance(value, float | int):
+        data = np.asarray(value)
+    elif len(value) <= _SHORT:  # NeXus' validator demands texts of any length for times
+        data = np.array(value, dtype=h5py.string_dtype())
+    else:
+        encoded = value.encode()
+        data = np.array(encoded, dtype=h5py.string_dtype("utf-8", len(encoded)))
     if data.nbytes > _IN_HEADER:
         return parent.create_dataset(name, data=data)
     layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
@@ -182,16 +185,6 @@ def values(
     mark(dataset, units=unit)
     if long_name:
         mark(dataset, long_name=long_name)
-
-
-def _fixed(texts: str | Sequence[str]) -> NDArray[np.bytes_]:
-    import h5py
-
-    encoded = [text.encode() for text in ([texts] if isinstance(texts, str) else texts)]
-    if any(b"\0" in one for one in encoded):  # HDF5 would end the text there
-        raise ValueError(f"a text with a zero byte: {texts!r}")
-    array = np.array(encoded, dtype=h5py.string_dtype("utf-8", max(1, *map(len, encoded))))
-    return array.reshape(()) if isinstance(texts, str) else array
 
 
 def _write_texts(parent: h5py.Group, texts: Mapping[str, str | None]) -> None:

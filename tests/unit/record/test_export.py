@@ -156,7 +156,7 @@ def test_spectra_of_a_grid_are_one_nexus_file(night: Night, store: RecordStore, 
     *_, name = export(spectra_of_a_grid(night, store, tmp_path), "h5", tmp_path / "out")
     with h5py.File(name) as file:
         data = file["entry"][file["entry"].attrs["default"]]
-        assert list(data.attrs["axes"]) == [b"y", b"x", b"bias"]
+        assert list(data.attrs["axes"]) == ["y", "x", "bias"]
         assert data[data.attrs["signal"]][:, :, 20] == pytest.approx(np.array([[1, 2, 3], [4, 5, 6]]))
         assert data["x"][:].tolist() == pytest.approx([0.0, 2e-9, 4e-9])
 

@@ -119,7 +119,7 @@ def test_export_has_the_key_of_a_scan(night: Night, store: RecordStore, tmp_path
         first, second = (path for path in export(run, "h5", tmp_path / "h5"))
         list(export(run, "csv", tmp_path / "csv"))
     with h5py.File(first) as file:
-        assert file["entry/afspm"].attrs["key"] == b"tile-1"
+        assert file["entry/afspm"].attrs["key"] == "tile-1"
     with h5py.File(second) as file:
         assert "key" not in file["entry/afspm"].attrs
     assert ",tile-1" in (tmp_path / "csv" / "scans.csv").read_text(encoding="utf-8")

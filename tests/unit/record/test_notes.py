@@ -61,7 +61,7 @@ def test_exports_have_the_notes(noted: Path, tmp_path: Path) -> None:
         assert not [name for name in file["entry"] if name.startswith("note")]
     with h5py.File(with_note) as file:
         note = file["entry/note_1"]
-        assert note.attrs["NX_class"] == b"NXnote"
+        assert note.attrs["NX_class"] == "NXnote"
         assert (note["author"][()], note["description"][()]) == (b"terminal:ada", HOSTILE.encode())
     assert afspm.read(with_note).scans
     for to in ("gwy", "nc"):

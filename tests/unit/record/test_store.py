@@ -100,16 +100,16 @@ def test_file_follows_nexus(night: Night, store: RecordStore, tmp_path: Path) ->
     h5py = pytest.importorskip("h5py")
     store.take(night.whole_scan(1))
     with h5py.File(tmp_path / afspm.open_run(tmp_path).scans[0].file) as file:
-        assert file.attrs["NX_class"] == b"NXroot"
+        assert file.attrs["NX_class"] == "NXroot"
         entry = file[file.attrs["default"]]
-        assert (entry.attrs["NX_class"], entry["definition"].asstr()[()]) == (b"NXentry", "NXspm")
+        assert (entry.attrs["NX_class"], entry["definition"].asstr()[()]) == ("NXentry", "NXspm")
         data = entry[entry.attrs["default"]]
-        assert data.attrs["NX_class"] == b"NXdata"
+        assert data.attrs["NX_class"] == "NXdata"
         signals = [data.attrs["signal"], *data.attrs["auxiliary_signals"]]
-        assert [data[name].attrs["long_name"] for name in signals] == [b"Height", b"Height Retrace"]
+        assert [data[name].attrs["long_name"] for name in signals] == ["Height", "Height Retrace"]
         rows, columns = (data[axis] for axis in data.attrs["axes"])
         assert data[signals[0]].shape == (len(rows), len(columns))
-        assert {data[name].attrs["units"] for name in (*signals, *data.attrs["axes"])} == {b"m"}
+        assert {data[name].attrs["units"] for name in (*signals, *data.attrs["axes"])} == {"m"}
         assert [rows[0], rows[-1]] == pytest.approx([-2.25e-6, -1.75e-6])
         region = entry["experiment_instrument/scan_environment/scan_control/scan_region"]
         assert region["scan_offset_value_x"][()] == pytest.approx(REGION.center_m[0])
