@@ -24,13 +24,14 @@ from afspm.model import (
     Note,
     Packet,
     ProbePosition,
+    Problem,
     ProblemNames,
     ProcessCondition,
     ScanSet,
     Spectrum,
 )
 from afspm.record import journal
-from afspm.record.bad_scans import LINE_VERDICT_MESSAGE, VERDICT_MESSAGE, read_verdict
+from afspm.record.bad_scans import LINE_VERDICT_MESSAGE, VERDICT_MESSAGE, bad_scans, read_verdict
 from afspm.record.instrument_values import RecordedReadings
 from afspm.record.journal import SCHEDULER
 from afspm.record.measured_tables import (
@@ -46,7 +47,7 @@ from afspm.record.measured_tables import (
 from afspm.record.packets import PacketLookup, packets, without_reading_files
 from afspm.record.run_json import EXPERIMENT_FILE, METADATA, REPLAY_OF, latest_run, run_json_or_empty
 from afspm.record.tables import ControlRow, NoteRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
-from afspm.record.treatment_ledger import KEEP_AWAY_M, TreatmentLedger, treatment_ledger
+from afspm.record.treatment_ledger import KEEP_AWAY_M, TreatmentLedger, treatment_ledger, treatment_times
 from afspm.wire.message_types import register_all
 from afspm.wire.messages import SpatialROIWithScoreList, TipVerdict, WatchCounts
 
@@ -292,6 +293,20 @@ class Run:
             verdict = self._decoded(message, payload)
             if isinstance(verdict, TipVerdict | SpatialROIWithScoreList):
                 yield time_ns, verdict
+
+    def tip_changes_ns(self) -> list[int]:
+        """Return the times at which the tip was seen to be changed, or was treated, oldest first.
+
+        A change that a verdict on a whole scan shows has the time of this scan's end: the verdict may follow another
+        scan. Flags of `tip-shape-changed` count in a run without verdicts, each from the end of the scan before it.
+        """
+        alarms = [
+            time_ns for time_ns, verdict in self.judgements() if isinstance(verdict, TipVerdict) and verdict.stops
+        ]
+        flags = [] if alarms else [one.flagged_ns for one in self.problems if one.number == Problem.TIP_SHAPE_CHANGED]
+        ends_ns = [row.time_ns for row in self.scans]
+        bad = bad_scans(ends_ns, self.verdicts(), {int(Problem.TIP_SHAPE_CHANGED): flags})
+        return sorted({*alarms, *bad, *treatment_times(self.journal)})
 
     def changed_rows(self) -> dict[int, int]:
         """Return the index of the first row after a tip change, by the end of the scan in ns.

@@ -114,6 +114,11 @@ def treatments_once(journal: Sequence[JournalEntry]) -> list[JournalEntry]:
     return found
 
 
+def treatment_times(journal: Sequence[JournalEntry]) -> list[int]:
+    """Return the time of each treatment that was carried out, or may have been, in ns."""
+    return [one.time_ns for one in treatments_once(journal) if _is_treatment(one) and one.response in _COUNTS]
+
+
 def _is_treatment(entry: JournalEntry) -> bool:
     return entry.request == ControlRequest.ACTION and entry.subject in names.TREATMENTS
 

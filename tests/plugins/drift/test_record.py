@@ -45,7 +45,7 @@ def test_an_unknown_rate_of_the_first_scan_is_the_rate_of_the_second() -> None:
 
 def test_a_written_record_is_read_back_unchanged(tmp_path: Path) -> None:
     written = record()
-    written.write(tmp_path / "drift.csv")
+    written.write(tmp_path / "drift.csv", ["no"] * len(written))
     read = DriftRecord.read(tmp_path / "drift.csv")
     assert read.keys == written.keys
     assert read.reasons == written.reasons

@@ -9,13 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.unit.record.record_lab import ABOUT, Night
 from typer.testing import CliRunner
 
+from afspm import read
 from afspm.basics.errors import InvalidValue
 from afspm.cli.app import app
-from afspm.model import Frame, Region, Scan
+from afspm.model import Frame, Problem, Region, Scan, ScopeState
+from afspm.plugins.drift.file_commands import tip_changed
 from afspm.plugins.drift.record import DriftRecord
 from afspm.plugins.drift.study.scan_series import series
+from afspm.record.store import RecordStore
 from afspm.simulation import World
 from afspm.storage.formats import FileContent
 from afspm.translator.own_files import FileFacts, encode_scan
@@ -105,6 +109,20 @@ def test_a_run_folder_is_followed_printed_and_drawn(run_folder: Path, tmp_path: 
     assert (output / "drift_errors.png").exists() == (find_spec("matplotlib") is not None)
     estimates = DriftRecord.read(output / "drift_estimates.csv")
     np.testing.assert_allclose(estimates.drift_m[1:], expected[1:], atol=1e-6 / PIXELS)
+
+
+def test_scans_after_a_tip_change_of_the_run_are_marked(run_folder: Path) -> None:
+    of_files = series([read(path) for path in sorted((run_folder / "scans").glob("scan-[0-5].nc"))]).scans
+    scans = [replace(scan, key=f"of the controller/scan-{number:04d}.nc") for number, scan in enumerate(of_files)]
+    assert tip_changed([run_folder], scans) == [""] * 6, "files alone do not show it"
+    night, store = Night(), RecordStore(run_folder, ABOUT)
+    for number in range(5):
+        store.take([night.state(ScopeState.SCANNING), *night.scans(number, ("Height",)), night.state(ScopeState.FREE)])
+        if number == 2:
+            store.take([night.control("judge", (Problem.TIP_SHAPE_CHANGED,)), night.control("corrector")])
+    store.close()
+    assert tip_changed([run_folder], scans) == ["no", "no", "yes", "yes", "yes", ""]
+    assert tip_changed([run_folder, run_folder], scans) == [""] * 6, "two runs have no common record"
 
 
 def test_only_unreadable_files_end_with_an_error(tmp_path: Path) -> None:

@@ -187,6 +187,7 @@ def test_verdicts_that_components_publish_are_rows(night: Night, store: RecordSt
     for verdict, envelope in ((bad, f"{VERDICT_MESSAGE}_judge"), *alarms):
         packet, _ = night.packet(verdict, envelope)
         store.take([(packet, "tcp://127.0.0.1:1")])  # from their own address, not from the scheduler
+    assert open_run(tmp_path).tip_changes_ns() == [scan.time_ns, packet.time_ns]
     rows = read(open_run(tmp_path)).rows
     assert {ShadowKind.SCAN, ShadowKind.LINES} <= {row.kind for row in rows if row.would}
     look, halt = (row.would for row in rows if row.kind is ShadowKind.LINES)

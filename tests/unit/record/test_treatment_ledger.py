@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from afspm.model import ControlRequest, ControlResponse, JournalEntry, Region, names
-from afspm.record.treatment_ledger import TreatmentLedger, TreatmentPlace, treatment_ledger
+from afspm.record.treatment_ledger import TreatmentLedger, TreatmentPlace, treatment_ledger, treatment_times
 
 S = 1_000_000_000
 
@@ -57,6 +57,7 @@ def test_refused_requests_count_nothing_and_unanswered_actions_count() -> None:
         acts(4, names.CRASH, int(ControlResponse.NO_RESPONSE), sent_s=3),
     )
     assert ledger.crashes == 1
+    assert treatment_times([acts(2, names.CRASH, int(ControlResponse.NOT_IN_CONTROL)), acts(3, names.PULSE)]) == [3 * S]
     assert ledger.crash_depth_m == pytest.approx(5e-9)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from afspm import Array, read, suffixes
+from afspm import Array, open_run, read, suffixes
 from afspm.basics import NS_PER_S, AfspmError, FileError, InvalidValue, ProgressLine, counted, day_and_time
 from afspm.driver import FileContent
 from afspm.model import RegistrationOutcome
@@ -74,8 +75,14 @@ def run(
     console.print(as_table(analysis.record))
     console.print(analysis.record.summary())
     truth_m = true_drift(paths[0], found.scans) if len(paths) == 1 else None  # only a single run has one truth
+    changed = tip_changed(paths, found.scans)
+    if "yes" in changed:
+        since = Path(found.scans[changed.index("yes")].key).name
+        console.print(
+            f"the tip changed before {since}: from there on its shift of the image is in the drift", markup=False
+        )
     with ProgressLine("drawing the figures", quiet=quiet):
-        files = list(written(found, analysis, truth_m, output, aside))
+        files = list(written(found, analysis, truth_m, changed, output, aside))
     for path in files:
         console.print(str(path), markup=False, soft_wrap=True)
 
@@ -164,7 +171,27 @@ def as_table(record: DriftRecord) -> Table:
     return table
 
 
-def written(found: Series, analysis: Analysis, truth: Array | None, folder: Path, console: Console) -> Iterator[Path]:
+def tip_changed(paths: Sequence[Path], scans: Sequence[DriftScan]) -> list[str]:
+    """Return for each scan whether the tip has changed since the first: "yes", "no", or "" if unknown.
+
+    Only the record of a run shows it: files of a controller do not show what happened between them.
+    """
+    if len(paths) != 1 or not (paths[0] / JOURNAL_FILE).exists():
+        return [""] * len(scans)
+    with open_run(paths[0]) as run:
+        changes_ns = run.tip_changes_ns()
+        # by the names of files: the clocks of controller and run may differ
+        ended_ns = {Path(file).name: row.time_ns for row in run.scans for file in (row.filename, row.file) if file}
+    first_ns, *_ = times_ns = [ended_ns.get(Path(scan.key).name) for scan in scans]
+    if first_ns is None:
+        return [""] * len(scans)
+    since_ns = next((at_ns for at_ns in changes_ns if at_ns > first_ns), math.inf)
+    return ["" if end_ns is None else "yes" if end_ns >= since_ns else "no" for end_ns in times_ns]
+
+
+def written(
+    found: Series, analysis: Analysis, truth: Array | None, changed: Sequence[str], folder: Path, console: Console
+) -> Iterator[Path]:
     """Write the results, and yield the path of each file; print the reason if there is no stack.
 
     Raises:
@@ -174,9 +201,9 @@ def written(found: Series, analysis: Analysis, truth: Array | None, folder: Path
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FileError(f"can't be made: {error.strerror or error}", where=str(folder)) from error
-    analysis.record.write(folder / "drift.csv")
+    analysis.record.write(folder / "drift.csv", changed)
     yield folder / "drift.csv"
-    analysis.estimates.write(folder / "drift_estimates.csv")
+    analysis.estimates.write(folder / "drift_estimates.csv", changed)
     yield folder / "drift_estimates.csv"
     try:
         _stack(found, analysis.record).write(folder / "drift_stack.nc", channel=found.channel, unit=found.unit)

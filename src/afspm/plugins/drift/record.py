@@ -109,8 +109,11 @@ class DriftRecord:
             failures=tuple(sum(bool(one.failure) for one in u.registrations.values()) for u in updates),
         )
 
-    def write(self, path: Path) -> None:
+    def write(self, path: Path, tip_changed: Sequence[str]) -> None:
         """Write the record as CSV, in SI units.
+
+        Args:
+            tip_changed: for each scan whether the tip has changed since the first: "yes", "no", or "" if unknown.
 
         Raises:
             FileError: the file can't be written.
@@ -118,8 +121,8 @@ class DriftRecord:
         try:
             with path.open("w", newline="", encoding="utf-8") as file:
                 table = csv.writer(file)
-                table.writerow(COLUMNS)
-                table.writerows(self._rows())
+                table.writerow((*COLUMNS, "tip_changed"))
+                table.writerows([*row, changed] for row, changed in zip(self._rows(), tip_changed, strict=True))
         except OSError as error:
             raise FileError(f"can't be written: {error}", where=str(path)) from error
 

@@ -199,7 +199,7 @@ def read(run: Run) -> ShadowNight:
         return ShadowNight()
     scans, names, solvers = run.scans, run.problem_names, _solvers(run)
     judgements = list(run.judgements())
-    decisions = [*of_drift(run.drift, scans, changes=_tip_changes(judgements, scans))]
+    decisions = [*of_drift(run.drift, scans, changes=run.tip_changes_ns())]
     taken = [
         ShadowRow(scan.time_ns, ShadowKind.TAKEN, _judged(scan), f"took scan {scan.number} to its last line")
         for scan in scans
@@ -406,12 +406,6 @@ def _asked(journal: Sequence[JournalEntry]) -> Iterator[ShadowRow]:
         times_ns = [entry.time_ns for entry in asked if entry.who == who]
         would = f"{who} would have asked for control, and waits ({counted(len(times_ns), 'request')})"
         yield ShadowRow(times_ns[0], ShadowKind.CONTROL, would)
-
-
-def _tip_changes(judgements: Sequence[tuple[int, object]], scans: Sequence[ScanRow]) -> list[int]:
-    # the verdict on a scan may come after the next scan: the change was there when the scan ended
-    bad = [scan.time_ns for scan in scans if scan.tip_score == BAD]
-    return bad + [time_ns for time_ns, verdict in judgements if isinstance(verdict, TipVerdict) and verdict.stops]
 
 
 def of_drift(
