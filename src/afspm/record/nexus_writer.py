@@ -23,10 +23,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from afspm.basics.clock import iso_utc
 from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.model import Scan, Spectrum
+from afspm.model.arrays import Array
 from afspm.record import nxspm
 from afspm.record.nexus_reader import ABOUT, BIAS_SPECTRUM, DEFINITION, VENDOR, about_of
 from afspm.record.nxspm import group, mark, put, values
