@@ -164,7 +164,7 @@ def _encoded(
 
 
 def _in_single_precision(numbers: Array) -> NDArray[np.floating]:
-    # most controllers deliver float32; the first row alone tells most arrays of float64
+    # most controllers deliver float32; the first row alone reveals most arrays of float64
     for part in (numbers[:1], numbers):
         with np.errstate(over="ignore", invalid="ignore"):
             single = part.astype("<f4")
