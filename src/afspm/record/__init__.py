@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # drift writes into a night: its mapping, its comparison, its
     from afspm.record.comparison_page import write as write_comparison
     from afspm.record.drift_mapping import drift_at, drift_knowledge
     from afspm.record.measured_files import SUFFIX as MEASURED_SUFFIX
-    from afspm.record.report.pictures import OFFSET, OWN_OFFSET, is_ours, topography
+    from afspm.record.report.pictures import OFFSET, is_ours, topography
 
 if TYPE_CHECKING:  # the page shows a night while it goes on
     from afspm.record.allowed_bands import AllowedBands, instrument_curves
@@ -74,7 +74,6 @@ __all__ = [
     "MEASURED_SUFFIX",
     "OFFSET",
     "OVER",
-    "OWN_OFFSET",
     "PALETTES",
     "PROBLEM",
     "REPLAY_OF",

@@ -54,7 +54,12 @@ def prepare() -> None:
 def draw(
     record: NightRecord, path: Path, problems: Mapping[int, str], *, title: str = "", simulated: bool = False
 ) -> None:
-    """Write the figure as an image file.
+    """Write the figure as an image file; the arguments are those of `figure_of`."""
+    figure_of(record, problems, title=title, simulated=simulated).savefig(path, dpi=200)
+
+
+def figure_of(record: NightRecord, problems: Mapping[int, str], *, title: str = "", simulated: bool = False) -> Figure:
+    """Return the figure.
 
     Args:
         problems: the names of problems, by number.
@@ -97,7 +102,7 @@ def draw(
             _bands(look, record, problems, colours, _around(span, record), names_too=i == 0)
             _times(look, *(round(edge) for edge in look.get_xlim()), about=4)
         _letter(figure, "c", 0.0, 1 - (top - 0.06) / height_in)
-    figure.savefig(path, dpi=200)
+    return figure
 
 
 def _figure(height_in: float) -> Figure:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
-from pathlib import Path
-from typing import Any, Final
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,9 @@ from afspm.record.report.pictures import topography
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SweptSetting
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 MOST: Final = 600
 _LARGEST_PX: Final = 160
 _PANEL_IN, _GAP_IN, _TEXT = 1.15, 0.06, 7.5
@@ -27,8 +29,8 @@ _log = logging.getLogger("afspm.report")
 Values = tuple[object, ...]
 
 
-def draw(run: Run, title: str) -> None:
-    """Draw `sweep.png` into the folder of a run with sweep scans; further sweeps have a number in the file name.
+def figures(run: Run, title: str, again: bool = False) -> Iterator[tuple[str, Figure]]:
+    """Yield the contact sheet of each sweep of a run, named "sweep", "sweep_2" …
 
     Interrupted scans, and sweeps of more than `MOST` scans, are left out.
     """
@@ -42,7 +44,7 @@ def draw(run: Run, title: str) -> None:
             continue
         scans = [(row.settings, scan) for row in rows if (scan := _scan(run, row)) is not None]
         if scans:
-            draw_sheet(scans, run.folder / (f"sweep_{number}.png" if number > 1 else "sweep.png"), title)
+            yield f"sweep_{number}" if number > 1 else "sweep", sheet(scans, title)
 
 
 def _scan(run: Run, row: ScanRow) -> Scan | None:
@@ -54,10 +56,11 @@ def _scan(run: Run, row: ScanRow) -> Scan | None:
     return scans[topography(scans)]
 
 
-def draw_sheet(scans: Sequence[tuple[tuple[SweptSetting, ...], Scan]], path: Path, title: str) -> None:
-    """Draw scans in rows and columns by their settings: the last parameter along a row, all others down the rows.
+def sheet(scans: Sequence[tuple[tuple[SweptSetting, ...], Scan]], title: str) -> Figure:
+    """Return a figure of scans in rows and columns by their settings.
 
-    All scans share one range of colours. Of two scans with the same settings the later scan is drawn.
+    The last parameter changes along a row, all others from row to row. All scans share one range of colours. Of two
+    scans with the same settings the later one is drawn.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -115,7 +118,7 @@ def draw_sheet(scans: Sequence[tuple[tuple[SweptSetting, ...], Scan]], path: Pat
     drawn.ax.yaxis.set_major_formatter(lambda value, _: f"{value * factor:.3g}".replace("-", "−"))
     drawn.ax.tick_params(labelsize=_TEXT)
     drawn.set_label(f"{scan.channel} / {unit}" if unit else scan.channel, fontsize=_TEXT)
-    figure.savefig(path, dpi=200)
+    return figure
 
 
 def _picture(scan: Scan) -> NDArray[np.float64]:

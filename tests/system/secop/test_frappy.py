@@ -163,6 +163,18 @@ def has_reported(scope: afspm.Scope) -> bool:
     return True
 
 
+def sets_field(scope: afspm.Scope) -> bool:
+    """Ramp the magnet to 60 mT; False if its reading is late, as on a busy computer: then nothing may be set."""
+    try:
+        found = scope.set("cryo.field", "60 mT", wait=True, timeout_s=DEADLINE_S)
+    except Refused as refused:
+        if "value is not known" in str(refused):
+            return False
+        raise
+    assert found == pytest.approx(60, abs=2)  # the magnet rounds to 10 mT, and ramps at 1 T/min
+    return True
+
+
 def test_cryostat_and_magnet_are_set_flagged_and_recorded(server: Server, folder: Path) -> None:
     wait_until(lambda: list(folder.glob(f"runs/*/{RUN_FILE}")))
     with afspm.connect(folder / "runs") as scope:
@@ -171,8 +183,7 @@ def test_cryostat_and_magnet_are_set_flagged_and_recorded(server: Server, folder
         wait_until(lambda: has_reported(scope))
         wait_until(lambda: not scope.control_state.problems)
         assert scope.get("cryo.temperature") == pytest.approx(4.2, abs=3.0)
-        # the magnet rounds to 10 mT, and ramps at 1 T/min
-        assert scope.set("cryo.field", "60 mT", wait=True, timeout_s=DEADLINE_S) == pytest.approx(60, abs=2)
+        wait_until(lambda: sets_field(scope))
         with pytest.raises(Refused, match="above the highest allowed, 300 K"):
             scope.set("cryo.temperature", "301 K")
         with pytest.raises(Refused, match="has no unit"):

@@ -165,13 +165,14 @@ def test_a_contact_sheet_shows_the_sweep(night: Night, store: RecordStore, tmp_p
 
     store.take([night.control(), *night.whole_scan(1)])
     with afspm.open_run(tmp_path) as run:
-        sweep_sheet.draw(run, "night")
-    assert not (tmp_path / "sweep.png").exists(), "there was no sweep"
+        assert list(sweep_sheet.figures(run, "night")) == [], "there was no sweep"
     for number, (gain, speed) in enumerate([("5", "1"), ("5", "2"), ("70", "2"), ("70", "1")], 2):
         store.take([settings(night, gain, speed=speed), *night.whole_scan(number)])
     with afspm.open_run(tmp_path) as run:
-        sweep_sheet.draw(run, "night")
+        (named,) = sweep_sheet.figures(run, "night")
         rows = [(row.settings, run.scan(row).first) for row in run.scans if row.settings]
+    assert named[0] == "sweep"
+    named[1].savefig(tmp_path / "sweep.png")
     assert (tmp_path / "sweep.png").stat().st_size > 10_000
     across, down = (sweep_sheet._sorted(one[part] for one, _ in rows) for part in (slice(-1, None), slice(None, -1)))
     assert [each[0].text for each in across] == ["1 µm/s", "2 µm/s"]

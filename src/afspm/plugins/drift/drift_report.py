@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,20 +10,24 @@ from numpy.typing import NDArray
 
 from afspm import Run, wire
 from afspm.plugins.drift.record import DriftRecord
-from afspm.record import OFFSET, OWN_OFFSET, drift_at, drift_knowledge, is_ours
+from afspm.record import OFFSET, drift_at, drift_knowledge, is_ours
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from afspm.wire.messages import DriftMapping
 
 
-def draw(run: Run, title: str) -> None:
-    """Draw the drift of at least two mapped scans into the run folder, unless a component has drawn a figure."""
-    if not is_ours(run.folder, OWN_OFFSET, OFFSET) or len(record := drift_of(run)) < 2:
+NAME = "report_drift"
+
+
+def figures(run: Run, title: str, again: bool = False) -> Iterator[tuple[str, Figure]]:
+    """Yield the drift of at least two mapped scans; unless `again`, only where no component has drawn it."""
+    if not (again or is_ours(run.folder, f"{NAME}.png", OFFSET)) or len(record := drift_of(run)) < 2:
         return
-    from afspm.plugins.drift.figures import style
     from afspm.plugins.drift.figures.drawings import draw_offsets
 
-    style.save(draw_offsets(record, title=title), run.folder / OWN_OFFSET)
+    yield NAME, draw_offsets(record, title=title)
 
 
 def drift_of(run: Run) -> DriftRecord:

@@ -25,16 +25,22 @@ _DPI = 150
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
     """Yield (suffix, content) of an image for each channel of a scan, or of a spectrum."""
+    for suffix, figure in figures(run, row):
+        yield f"{suffix}.png", content(figure, "png")
+
+
+def figures(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, Figure]]:
+    """Yield (suffix, figure) of each channel of a scan, or of a spectrum."""
     time = f"{iso_utc(row.time_ns)[:19].replace('T', ' ')} UTC"
     if isinstance(row, ScanRow):
         for channel, scan in run.scan(row).items():
             is_levelled = is_topography(channel)
             shown = replace(scan, values=flattened(scan.values)) if is_levelled else scan
             title = _title(run, f"{channel}{', lines levelled' if is_levelled else ''}, {time}", row.interrupted)
-            yield f"_{file_word(channel)}.png", _image(scan_figure(shown, title))
+            yield f"_{file_word(channel)}", scan_figure(shown, title)
     else:
         title = _title(run, f"{row.kind}, {time}", interrupted=False)
-        yield ".png", _image(spectrum_figure(run.spectrum(row), title))
+        yield "", spectrum_figure(run.spectrum(row), title)
 
 
 def scan_figure(scan: Scan, title: str) -> Figure:
@@ -64,10 +70,11 @@ def spectrum_figure(spectrum: Spectrum, title: str) -> Figure:
     return figure
 
 
-def _image(figure: Figure) -> bytes:
-    image = io.BytesIO()
-    figure.savefig(image, dpi=_DPI, format="png")
-    return image.getvalue()
+def content(figure: Figure, suffix: str) -> bytes:
+    """Return a figure as a file of a format that matplotlib knows by this suffix."""
+    file = io.BytesIO()
+    figure.savefig(file, dpi=_DPI, format=suffix)
+    return file.getvalue()
 
 
 def _title(run: Run, text: str, interrupted: bool) -> str:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 import logging
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +23,9 @@ from afspm.record.night_record import NightMark, NightRecord, Shot, Thumbnail, t
 from afspm.record.report.story import RunStory
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 from afspm.record.treatment_ledger import treatments_once
 
 MOST = 98
@@ -30,7 +34,8 @@ FIGURE_PX = 1400
 _QUALITY = 80
 NIGHT, OFFSET = "night.png", "drift_offset.png"
 """File names of figures drawn by components."""
-OWN_NIGHT, OWN_OFFSET = "report.png", "report_drift.png"
+OWN_NIGHT, _OWN_OFFSET = "report.png", "report_drift.png"
+_DPI = 200
 _TOPOGRAPHY = ("height", "topo", "z ", "z")
 _log = logging.getLogger("afspm.report")
 
@@ -139,15 +144,26 @@ def topography(scans: ScanSet) -> str:
 def draw(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -> None:
     """Draw the picture of the night unless a component has drawn it, and the figures that packages declare."""
     if is_ours(run.folder, OWN_NIGHT, NIGHT) and any(one.thumbnail is not None for one in pictures):
-        from afspm.record import night_figure
+        picture_of_night(run, story, pictures).savefig(run.folder / OWN_NIGHT, dpi=_DPI)
+    for name, figure in declared_figures(run, story):
+        figure.savefig(run.folder / f"{name}.png", dpi=_DPI)
 
-        record = night_of(run, story, pictures)
-        numbers = {number: story.overview.problems.name(number) for number in record.problems}
-        night_figure.draw(record, run.folder / OWN_NIGHT, numbers, title=story.name, simulated=story.simulated)
+
+def picture_of_night(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -> Figure:
+    """Return the picture of the night."""
+    from afspm.record.night_figure import figure_of
+
+    record = night_of(run, story, pictures)
+    numbers = {number: story.overview.problems.name(number) for number in record.problems}
+    return figure_of(record, numbers, title=story.name, simulated=story.simulated)
+
+
+def declared_figures(run: Run, story: RunStory, *, again: bool = False) -> Iterator[tuple[str, Figure]]:
+    """Yield (name, figure) of those that packages declare; `again`: also of those that a component has drawn."""
     title = f"{story.name}   SIMULATED" if story.simulated else story.name
     for name in entry_points.names(entry_points.FIGURES):
         try:
-            entry_points.load(entry_points.FIGURES, name)(run, title)
+            yield from entry_points.load(entry_points.FIGURES, name)(run, title, again)
         except Exception as error:  # a package's code may raise anything: the report does without its figure
             _log.warning("the figure %s is not drawn: %s: %s", name, type(error).__name__, error)
 
@@ -186,7 +202,7 @@ def night_of(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -
 def of_figures(folder: Path) -> list[FigurePicture]:
     """Return the figures in the run folder except the report's own night: the night first, then drift, then others."""
     found = [path for path in folder.glob("*.png") if path.name != OWN_NIGHT]  # the page itself shows the same
-    first = (NIGHT, OFFSET, OWN_OFFSET)
+    first = (NIGHT, OFFSET, _OWN_OFFSET)
     found.sort(key=lambda path: (first.index(path.name) if path.name in first else len(first), path.name))
     return [made for path in found if (made := _reduced(path)) is not None]
 

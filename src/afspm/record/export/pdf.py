@@ -1,0 +1,29 @@
+"""Figures for print (.pdf): of each measurement, of the night, and those that packages declare for the report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from afspm.record.export import png
+from afspm.record.report import pictures, story
+from afspm.record.run import Run
+from afspm.record.tables import ScanRow, SpectrumRow
+
+
+def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
+    """Yield (suffix, content) of a figure for each channel of a scan, or of a spectrum."""
+    for suffix, figure in png.figures(run, row):
+        yield f"{suffix}.pdf", png.content(figure, "pdf")
+
+
+def tables(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow]) -> Iterator[tuple[str, bytes]]:
+    """Yield (name, content) of the figures about the whole run, unless single scans are asked for."""
+    if len(scans) < sum(bool(row.file) for row in run.scans):
+        return
+    contents = story.read(run)
+    bad_ns = pictures.bad_ns(run, contents)
+    shown = pictures.of_scans(run, pictures.chosen(contents.scans, kept_ns=bad_ns), bad_ns)
+    if any(one.thumbnail is not None for one in shown):
+        yield "night.pdf", png.content(pictures.picture_of_night(run, contents, shown), "pdf")
+    for name, figure in pictures.declared_figures(run, contents, again=True):
+        yield f"{name}.pdf", png.content(figure, "pdf")
