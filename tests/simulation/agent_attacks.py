@@ -87,6 +87,31 @@ class Attack:
                     self._raw_request()
                 for _ in range(4):
                     await asyncio.sleep(0)  # runs go on
+        self._spend_again()
+
+    def _spend_again(self) -> None:
+        # a scan that is granted once: asked for again after a restart, as random calls seldom do
+        rig = self.rig
+        rig.later(4000.0)  # what a role allows within an hour is free again
+        for problem in (STOP, 1):
+            self._person(ControlRequest.RMV_EXP_PRBLM, problem)
+        self._person(ControlRequest.SET_CONTROL_MODE, int(ControlMode.AUTOMATED))
+        self._ask("series", ControlRequest.RELEASE_CTRL)
+        self._person(GRANT_REQUEST, Grant(AGENT))
+        once = Grant(
+            AGENT, region_m=(0.0, 0.0, 2 * UM, 2 * UM), counts=(GrantedCount(names.START_SCAN, 1),), lasts_s=600.0
+        )  # fmt: skip
+        self._person(GRANT_REQUEST, fresh(once, facts(rig)))
+        place = ScanParameters(Region((0.0, 0.0), (0.2 * UM, 0.2 * UM)), (16, 16))
+        for _ in range(2):
+            for kind, subject in (
+                (ControlRequest.REQUEST_CTRL, 0),
+                (ControlRequest.SET_SCAN_PARAMS, place),
+                (ControlRequest.ACTION, names.START_SCAN),
+            ):
+                self.calls += 1
+                rig.link(AGENT).request(int(kind), subject, request_id=f"{AGENT}/{rig.life}/again{self.calls}")
+            rig.restart()
 
     # --- everybody else ---
 
