@@ -1,4 +1,4 @@
-"""Figures for print (.pdf): of each measurement, of the night, and those that packages declare for the report."""
+"""Figures for print (.pdf): of each measurement, of the night, and the figures that packages declare for the report."""
 
 from __future__ import annotations
 

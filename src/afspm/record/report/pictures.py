@@ -159,7 +159,7 @@ def picture_of_night(run: Run, story: RunStory, pictures: Sequence[TopographyPic
 
 
 def declared_figures(run: Run, story: RunStory, *, again: bool = False) -> Iterator[tuple[str, Figure]]:
-    """Yield (name, figure) of those that packages declare; `again`: also of those that a component has drawn."""
+    """Yield (name, figure) as packages declare; `again`: also of figures that a component has drawn."""
     title = f"{story.name}   SIMULATED" if story.simulated else story.name
     for name in entry_points.names(entry_points.FIGURES):
         try:
