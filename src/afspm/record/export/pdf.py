@@ -9,11 +9,16 @@ from afspm.record.report import pictures, story
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 
+_DPI = 300
+
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
     """Yield (suffix, content) of a figure for each channel of a scan, or of a spectrum."""
     for suffix, figure in png.figures(run, row):
-        yield f"{suffix}.pdf", png.content(figure, "pdf")
+        for axes in figure.axes:
+            for mesh in axes.collections:
+                mesh.set_rasterized(True)  # of one square for each pixel a viewer shows the seams
+        yield f"{suffix}.pdf", png.content(figure, "pdf", _DPI)
 
 
 def tables(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow]) -> Iterator[tuple[str, bytes]]:

@@ -70,10 +70,10 @@ def spectrum_figure(spectrum: Spectrum, title: str) -> Figure:
     return figure
 
 
-def content(figure: Figure, suffix: str) -> bytes:
-    """Return a figure as a file of a format that matplotlib knows by this suffix."""
+def content(figure: Figure, suffix: str, dpi: int = _DPI) -> bytes:
+    """Return a figure as a file of a format that matplotlib knows by this suffix; `dpi`: of parts with pixels."""
     file = io.BytesIO()
-    figure.savefig(file, dpi=_DPI, format=suffix)
+    figure.savefig(file, dpi=dpi, format=suffix)
     return file.getvalue()
 
 
