@@ -42,7 +42,7 @@ PAST_THE_DOORS: Final = {
     "afspm.experiment.resolved_experiment": "published",
     "afspm.experiment.toml_lines": "published",
     "afspm.experiment.toml_writer": "published",
-    "afspm.experiment.wiring": "published",
+    "afspm.experiment.wiring_classes": "published",
     "afspm.model.fencing": "published",
     "afspm.model.sessions": "published web",
     "afspm.scheduler.events": "what_if",

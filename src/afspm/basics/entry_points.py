@@ -36,7 +36,7 @@ TRACKERS = "afspm.trackers"  # of drift, by name
 FIGURES = "afspm.figures"  # of the report: (run, title, again) yields names and figures of matplotlib
 DISPLAYS = "afspm.displays"  # of scans and spectra: what their `plot`, `to_sidpy` and notebook pictures call
 FUNCTIONS = "afspm.functions"  # of `afspm` itself, for scripts and notebooks: afspm.NAME
-FORMS = "afspm.forms"  # of experiment files: experiment.parts.FileForm
+FORMS = "afspm.forms"  # of experiment files: experiment.forms.FileForm
 COMMANDS = "afspm.commands"  # afspm NAME: a function, or a typer.Typer
 PAGES = "afspm.pages"  # `afspm run --dashboard`: a module with the functions of afspm.cli.run.RunPage
 

@@ -79,7 +79,7 @@ def _finding_as_json(finding: Finding) -> Plain:
 
 
 def _explain(experiment: Experiment, console: Console) -> None:
-    from afspm.experiment.parts import all_forms
+    from afspm.experiment.forms import all_forms
 
     for form in all_forms():
         for place, line, became in form.explained(experiment.resolved):

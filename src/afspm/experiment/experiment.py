@@ -13,8 +13,8 @@ from afspm.basics.errors import ConfigError
 from afspm.basics.formatting import quantity
 from afspm.basics.launch import Launch
 from afspm.experiment import document as documents
+from afspm.experiment import forms, process_starts
 from afspm.experiment import parts as sorting
-from afspm.experiment import process_starts
 from afspm.experiment.findings import Finding, Findings
 from afspm.experiment.implied_parts import RECORDS
 from afspm.experiment.process_starts import ProcessStart
@@ -33,7 +33,7 @@ class Experiment:
     def __init__(self, document: documents.Document) -> None:
         self._document = document
         self._unreadable = () if document.is_whole else tuple(document.findings.found)
-        self.parts = sorting.sort(document, sorting.all_forms())
+        self.parts = sorting.sort(document, forms.all_forms())
 
     @property
     def name(self) -> str:

@@ -5,17 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import cache
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
-from afspm.basics import entry_points
 from afspm.experiment.document import Document
 from afspm.experiment.findings import SourceLocation, closest, nearest
 from afspm.experiment.toml_lines import Path, Settings, Table
-from afspm.experiment.wiring import WIRE_KEYS, wire_of
-
-if TYPE_CHECKING:
-    from afspm.experiment.resolved_experiment import ResolvedExperiment
+from afspm.experiment.wiring_classes import WIRE_KEYS, wire_of
 
 KNOWN_VARIABLES: Final = frozenset({"name", "messages"})
 _INCLUDES = "no file includes another: lay files over each other, as in `afspm run first.toml second.toml`"
@@ -66,7 +61,7 @@ class ExperimentParts:
     intermediaries: dict[str, Settings] = field(default_factory=dict)
     components: list[ExperimentPart] = field(default_factory=list)
     became: dict[Path, str] = field(default_factory=dict)
-    """Equivalent of each line of a file of another form (`FileForm`)."""
+    """Equivalent of each line of a file of another form (`forms`)."""
     instead: dict[str, Settings] = field(default_factory=dict)
     """Tables of components without equivalent, by name, unchanged."""
     unused: list[str] = field(default_factory=list)
@@ -80,8 +75,8 @@ class ExperimentParts:
         return next(name for name in names if name not in taken)
 
 
-class FileForm(Protocol):
-    """Another form of experiment files, declared as an entry point of the group `afspm.forms`."""
+class Converter(Protocol):
+    """A converter of components from another form of files."""
 
     def convert(self, tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
         """Return the components in afspm's form, by name; components already in this form are returned unchanged.
@@ -94,20 +89,8 @@ class FileForm(Protocol):
                 added to `parts.became`, and tables without equivalent to `parts.instead`.
         """
 
-    def explained(self, resolved: ResolvedExperiment) -> list[tuple[SourceLocation, str, str]]:
-        """Return place, setting and afspm's equivalent of the setting, for each line of the file."""
 
-    def short(self, resolved: ResolvedExperiment) -> str:
-        """Return the experiment as a file in afspm's form."""
-
-
-@cache
-def all_forms() -> tuple[FileForm, ...]:
-    """Return all installed forms. Raises ConfigError if a form can't be loaded."""
-    return tuple(entry_points.load(entry_points.FORMS, name) for name in entry_points.names(entry_points.FORMS))
-
-
-def sort(document: Document, forms: Iterable[FileForm] = ()) -> ExperimentParts:
+def sort(document: Document, converters: Iterable[Converter] = ()) -> ExperimentParts:
     """Sort the tables of a file, and expand references; report tables that can't be part of an experiment."""
     parts = ExperimentParts()
     raw_components: dict[str, Settings] = {}
@@ -131,8 +114,8 @@ def sort(document: Document, forms: Iterable[FileForm] = ()) -> ExperimentParts:
     parts.sections = {k: references.expand(v, (k,)) for k, v in parts.sections.items()}
     parts.intermediaries = {k: references.expand(v, (k,)) for k, v in parts.intermediaries.items()}
     tables = {name: references.expand(table, (name,)) for name, table in raw_components.items()}
-    for form in forms:
-        tables = form.convert(tables, parts, document)
+    for converter in converters:
+        tables = converter.convert(tables, parts, document)
     for name, table in tables.items():
         if (part := _component(name, table, document)) is not None:
             parts.components.append(part)

@@ -15,7 +15,7 @@ from afspm.experiment.findings import Finding, Level, nearest
 from afspm.experiment.implied_parts import RECORDS, runnable
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.toml_writer import SECRETS
-from afspm.experiment.wiring import ProcessSockets
+from afspm.experiment.wiring_classes import ProcessSockets
 from afspm.model import Frame, Role
 from afspm.model.microscope_status import FEEDBACK_OFF
 from afspm.model.snapshot import to_plain

@@ -28,7 +28,7 @@ from afspm.experiment.parts import ExperimentPart, ExperimentParts
 from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
 from afspm.experiment.sections import parse, read_sections
 from afspm.experiment.toml_lines import Table
-from afspm.experiment.wiring import BoundSocket
+from afspm.experiment.wiring_classes import BoundSocket
 from afspm.model import STOPPED_BY_AGENT, ChannelRoles, PacketHeader, Parameter, ProblemNames, Role
 from afspm.model.problems import HIGHEST_PROBLEM
 from afspm.scheduler.publishing.envelopes import CacheSettings, Envelopes

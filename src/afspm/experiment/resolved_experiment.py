@@ -16,7 +16,7 @@ from afspm.experiment.parts import EMULATED, SIMULATED, ExperimentPart, Experime
 from afspm.experiment.planned_measurements import PlannedMeasurements
 from afspm.experiment.sections import ExperimentSections
 from afspm.experiment.toml_lines import Settings
-from afspm.experiment.wiring import BoundSocket, Wiring, WiringKeys
+from afspm.experiment.wiring_classes import BoundSocket, Wiring, WiringKeys
 from afspm.model import Frame, ProblemNames, Role
 from afspm.scheduler.instruments.conditions import InstrumentSettings
 from afspm.scheduler.publishing.envelopes import CacheSettings

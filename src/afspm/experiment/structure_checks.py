@@ -20,7 +20,7 @@ from afspm.experiment.findings import Finding, Level, closest, nearest
 from afspm.experiment.implied_parts import NO_PROGRAM, RECORDS, check_notify, is_program
 from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
 from afspm.experiment.toml_lines import Settings
-from afspm.experiment.wiring import WIRE_SETTINGS, BoundSocket, wire_of
+from afspm.experiment.wiring_classes import WIRE_SETTINGS, BoundSocket, wire_of
 from afspm.model import Role, component_of, is_of_instrument, names
 from afspm.model.events import LONGEST_PROCESS_NAME, PERSON, is_process_name
 from afspm.transport.network import is_local

@@ -8,7 +8,7 @@ import pytest
 
 from afspm.experiment import limits_section, sections
 from afspm.experiment.parts import DECLARED_KEYS, OWN_KEYS, SECTIONS
-from afspm.experiment.wiring import WIRE_KEYS, WIRE_SETTINGS, WiringClass
+from afspm.experiment.wiring_classes import WIRE_KEYS, WIRE_SETTINGS, WiringClass
 from afspm.scheduler.control.arbitration import RoleTable
 from afspm.scheduler.publishing.envelopes import CacheRule, CacheSettings
 from afspm.scheduler.settings import ControlSettings

@@ -11,7 +11,7 @@ from afspm.experiment.document import Document
 from afspm.experiment.parts import ExperimentParts
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.toml_writer import value as toml
-from afspm.experiment.wiring import WIRE_KEYS
+from afspm.experiment.wiring_classes import WIRE_KEYS
 from afspm.model import PacketHeader
 from afspm.scheduler.publishing.envelopes import default_envelope
 

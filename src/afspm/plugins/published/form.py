@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class PublishedForm:
-    """File form of the published implementation; see `experiment.parts.FileForm`."""
+    """File form of the published implementation; see `experiment.forms.FileForm`."""
 
     def convert(self, tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
         """Return the components of a file in afspm's form; see `files.convert`."""

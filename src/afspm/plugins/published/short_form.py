@@ -10,14 +10,14 @@ from afspm.experiment.findings import SourceLocation
 from afspm.experiment.parts import ExperimentPart
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.toml_writer import value as toml
-from afspm.experiment.wiring import WIRE_KEYS, WiringClass, wire_of
+from afspm.experiment.wiring_classes import WIRE_KEYS, WiringClass, wire_of
 from afspm.model import Role
 from afspm.plugins.published.files import INSTEAD, last
 from afspm.processes import is_local, toml_text
 
 if TYPE_CHECKING:
     from afspm.experiment.resolved_experiment import ResolvedExperiment
-    from afspm.experiment.wiring import WiringKeys
+    from afspm.experiment.wiring_classes import WiringKeys
 
 _VARIABLES: Final[tuple[str, ...]] = ("name", "messages")
 _FILLED_IN: Final = "filled in: processes on one computer find each other"
