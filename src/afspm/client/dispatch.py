@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 from afspm import wire
 from afspm.basics.errors import WireError
@@ -12,8 +13,34 @@ from afspm.model import ControlState, Packet
 from afspm.wire.messages import CONTROL_STATE
 
 if TYPE_CHECKING:
-    from afspm.client.component import Component
+    from afspm.basics.clock import Clock
     from afspm.client.experiment_link import PublishedState
+    from afspm.client.scope import Scope
+    from afspm.storage.memory import Memory
+
+
+class HostedComponent(Protocol):
+    """The interface of a component for its loop; see `Component` for each member."""
+
+    longest_step_s: ClassVar[float]
+    period_s: float | None
+    period_time: Literal["experiment", "real"]
+    scope: Scope
+    clock: Clock
+    log: logging.Logger
+    name: str
+    memory: Memory
+    run_dir: Path
+    simulated: bool
+    packet: Packet | None
+    _publish: Callable[[Any, str | None], None]
+
+    def run(self) -> None: ...
+    def on_start(self) -> None: ...
+    def on_problem(self, problem: str, flagged: bool) -> None: ...
+    def on_message(self, envelope: str, message: Any) -> None: ...
+    def on_tick(self) -> None: ...
+    def on_end(self) -> None: ...
 
 
 class MessageDispatcher:
@@ -24,7 +51,9 @@ class MessageDispatcher:
             since `Scope` needs them.
     """
 
-    def __init__(self, component: Component, base: type, prefixes: tuple[str, ...] | None, log: logging.Logger) -> None:
+    def __init__(
+        self, component: HostedComponent, base: type, prefixes: tuple[str, ...] | None, log: logging.Logger
+    ) -> None:
         self._component = component
         self._base = base
         self._prefixes = prefixes

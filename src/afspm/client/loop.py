@@ -7,7 +7,6 @@ import json
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from afspm import wire
 from afspm.basics.clock import NS_PER_S, Clock
@@ -15,7 +14,7 @@ from afspm.basics.errors import ConfigError, ExperimentEnded, MeasurementFailed,
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.own_fault import OwnFault
 from afspm.client.backlog import PacketBacklog
-from afspm.client.dispatch import MessageDispatcher, overrides
+from afspm.client.dispatch import HostedComponent, MessageDispatcher, overrides
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.keyed_results import kept_in
 from afspm.client.port_log import RecordedPort, recorded
@@ -26,9 +25,6 @@ from afspm.transport.process import failure
 from afspm.transport.process.context import ProcessContext
 from afspm.transport.process.failure import write_fault
 from afspm.transport.process.parent import StopRequested
-
-if TYPE_CHECKING:
-    from afspm.client.component import Component
 
 AFTER_THE_END_S = 30.0  # to handle packets from before the end
 AFTER_A_STOP_S = 0.5  # short: the parent kills a process soon after stopping it
@@ -42,7 +38,7 @@ class ComponentLoop:
         base: class with the empty handlers that the component overrides.
     """
 
-    def __init__(self, component: Component, base: type, context: ProcessContext) -> None:
+    def __init__(self, component: HostedComponent, base: type, context: ProcessContext) -> None:
         self._component = component
         self._context = context
         self._activity = context.activity
@@ -242,7 +238,7 @@ class _Ticker:
         self._next += (missed + 1) * self._period
 
 
-def _ticker(component: Component, clock: Clock) -> _Ticker | None:
+def _ticker(component: HostedComponent, clock: Clock) -> _Ticker | None:
     if component.period_s is None:
         return None
     if not component.period_s > 0.0:
