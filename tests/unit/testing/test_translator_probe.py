@@ -31,7 +31,7 @@ class Client:
 
     def come_to_rest(self) -> None: ...
 
-    def settled(self, _: int) -> list[Any]:
+    def settled(self, _: int, **_awaiting: object) -> list[Any]:
         return []
 
     def asked(self, kind: ControlRequest, subject: Any, _: str) -> None:

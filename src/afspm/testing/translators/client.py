@@ -91,9 +91,11 @@ class Observations:
         """Return the newest content of a type; None without one."""
         return next((one.thing for one in reversed(self.all) if isinstance(one.thing, kind)), None)
 
-    def has_state(self, state: ScopeState, mark: int) -> bool:
-        """Return whether a state was published after `mark`."""
-        return any(one.state is state for one in self.all[mark:])
+    def has(self, wanted: ScopeState | type, mark: int) -> bool:
+        """Return whether a state, or a content of a type, was published after `mark`."""
+        if isinstance(wanted, ScopeState):
+            return any(one.state is wanted for one in self.all[mark:])
+        return any(isinstance(one.thing, wanted) for one in self.all[mark:])
 
     def at_s(self, state: ScopeState, mark: int) -> float | None:
         """Return the first experiment time of a state after `mark`; None if it was not published."""
@@ -304,10 +306,23 @@ class CheckClient:
         mark = self.observations.mark()
         self._wait(done, within_s, expected, mark)
 
+    def awaited_newest(self, kind: type[T], expected: Callable[[T], bool]) -> T | None:
+        """Return the newest publication of a kind: the expected one, unless it has not come within `NOTICED_S`.
+
+        A pause in the publications is no sign that none follows: on a busy computer any process may pause.
+        """
+
+        def has_come() -> bool:
+            newest = self.observations.newest(kind)
+            return newest is not None and expected(newest)
+
+        self._awaited(has_come, NOTICED_S * self.patience)
+        return self.observations.newest(kind)
+
     def wait_state(self, state: ScopeState, mark: int, within_s: float | None = None) -> None:
         """Wait until a state is published after `mark`; None: as long as the effect of a request may take."""
         within_s = NOTICED_S * self.patience if within_s is None else within_s
-        self._wait(lambda: self.observations.has_state(state, mark), within_s, f"SS_{state.name}", mark)
+        self._wait(lambda: self.observations.has(state, mark), within_s, f"SS_{state.name}", mark)
 
     def _wait(self, done: Callable[[], bool], within_s: float, expected: str, mark: int) -> None:
         came = self._awaited(done, within_s)
@@ -321,9 +336,16 @@ class CheckClient:
         with self._alive():
             return self._link.wait(done_or_interrupted, self._link.until(within_s))
 
-    def settled(self, mark: int, experiment_s: float = MOVED_S) -> list[Observation]:
-        """Wait until the microscope is free and quiet; return all publications after `mark`."""
+    def settled(
+        self, mark: int, experiment_s: float = MOVED_S, *, awaiting: ScopeState | type | None = None
+    ) -> list[Observation]:
+        """Wait until the microscope is free and quiet; return all publications after `mark`.
 
+        Args:
+            awaiting: what is certainly published after `mark`, and waited for first.
+        """
+        if awaiting is not None:
+            self._awaited(lambda: self.observations.has(awaiting, mark), self.real_s(experiment_s))
         self.quiet()
         if self.state is not ScopeState.FREE:
             self.wait(lambda: self.state is ScopeState.FREE, self.real_s(experiment_s), "SS_FREE")

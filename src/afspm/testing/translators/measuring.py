@@ -292,13 +292,13 @@ class CheckMeasurements:
             raise Failed("a Spec1d between SS_SPEC and SS_FREE", describe_all(observed))
         return Taken(None, observed, None)
 
-    def move_probe(self, xy_m: tuple[float, float]) -> list[Observation]:
-        """Move the probe; return the resulting publications."""
+    def move_probe(self, xy_m: tuple[float, float], *, awaiting: ScopeState | None = None) -> list[Observation]:
+        """Move the probe; return the resulting publications, among them the state that is awaited."""
         self.client.come_to_rest()
         self._set_whole()
         mark = self.client.observations.mark()
         self.client.asked(ControlRequest.SET_PROBE_POS, ProbePosition(xy_m), "moving the probe")
-        return self.client.settled(mark)
+        return self.client.settled(mark, awaiting=awaiting)
 
     def _set_whole(self) -> None:
         # a failed scan may have left another frame; some controllers move the probe within the scan frame only

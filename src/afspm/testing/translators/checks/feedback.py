@@ -40,7 +40,7 @@ def set_and_require(kit: CheckMeasurements, wanted: Feedback) -> None:
     before, mark = in_force(kit), kit.client.observations.mark()
     given = {name: value for name, value in vars(wanted).items() if value is not None}
     response = kit.client.ask(ControlRequest.SET_ZCTRL_PARAMS, wanted)
-    observed = kit.client.settled(mark)
+    observed = kit.client.settled(mark, awaiting=Feedback if response.ok else None)
     if response.code in (ControlResponse.PARAM_ERROR, ControlResponse.PARAM_NOT_SUPPORTED):
         require_same(before, in_force(kit))
         raise Skipped(f"it can't be set here: {answer_in_words(response)}")

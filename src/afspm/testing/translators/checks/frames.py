@@ -59,24 +59,36 @@ def frame(kit: CheckMeasurements) -> None:
 _SIZES = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
 
 
-def ask_for(kit: CheckMeasurements, wanted: ScanParameters) -> list[Observation]:
-    """Set scan parameters; return the resulting publications."""
+def ask_for(kit: CheckMeasurements, wanted: ScanParameters, *, awaiting: ScopeState | None = None) -> list[Observation]:
+    """Set scan parameters; return the resulting publications, among them the state that is awaited."""
     kit.client.come_to_rest()
     mark = kit.client.observations.mark()
     kit.client.asked(ControlRequest.SET_SCAN_PARAMS, wanted, "setting a frame")
-    return kit.client.settled(mark)
+    return kit.client.settled(mark, awaiting=awaiting)
 
 
 def current_frame(kit: CheckMeasurements) -> FrameSetting:
     """Return the last published frame."""
     newest = kit.client.observations.newest(ScanParameters)
-    if newest is None or not isinstance(newest.region, Region) or not isinstance(newest.shape, tuple):
+    if (setting := _setting(newest)) is None:
         raise Failed("ScanParameters2d with region and shape", str(newest))
-    return FrameSetting(newest.region, newest.shape)
+    return setting
+
+
+def _setting(published: ScanParameters | None) -> FrameSetting | None:
+    if published is None or not isinstance(published.region, Region) or not isinstance(published.shape, tuple):
+        return None
+    return FrameSetting(published.region, published.shape)
 
 
 def require_in_force(kit: CheckMeasurements, frame: FrameSetting) -> None:
     """Raise Failed unless `frame` is the last published frame."""
+
+    def is_set(parameters: ScanParameters) -> bool:
+        setting = _setting(parameters)
+        return setting is not None and setting.shape == frame.shape and not difference(frame.region, setting.region)
+
+    kit.client.awaited_newest(ScanParameters, is_set)
     published = current_frame(kit)
     wrong = difference(frame.region, published.region)
     if wrong:
@@ -96,7 +108,8 @@ def require_published_once(observed: list[Observation], kind: type, named: str) 
 @check("frame/set", "a frame that is set: SS_MOVING, ScanParameters2d as set, once, SS_FREE", needs=_SIZES)
 def set_whole(kit: CheckMeasurements) -> None:
     ask_for(kit, kit.frames.plain.request(kit.support))
-    observed = ask_for(kit, kit.frames.other.request(kit.support))
+    require_in_force(kit, kit.frames.plain)
+    observed = ask_for(kit, kit.frames.other.request(kit.support), awaiting=ScopeState.FREE)
     require_published_once(observed, ScanParameters, "ScanParameters2d")
     require_in_force(kit, kit.frames.other)
 
