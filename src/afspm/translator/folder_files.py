@@ -31,12 +31,14 @@ class FolderFiles(ResultFiles):
 
     pattern: str = "*"
     _before: Entry | None = None
+    _of_before: Sequence[tuple[str, int]] = ()
     _outcome: bool | None = None
     _is_given_up = False
 
     def next_begins(self) -> bool:
         ended = self._kept["ended"]
         self._before, self._is_given_up = ended if ended is not None and ended["what"] == SCAN else None, False
+        self._of_before = ()
         return self._before is not None
 
     def followed(self, now_ns: int, within_s: float) -> bool | None:
@@ -89,9 +91,14 @@ class FolderFiles(ResultFiles):
         ended, running = self._kept["ended"], self._kept["running"]
         if self._before is not None:
             # a file of the next scan waits until this one's outcome is published, which discards all results
-            if running is not None and not self._is_given_up and self._take(self._before):
-                self._outcome, self._before, self.broken_off = not self.broken_off, None, False
-                self._has_none_yet(running)
+            if running is not None and not self._is_given_up:
+                # The state was read before the files: the next scan may have ended and saved in between. If it still
+                # runs at the next look, the file is not its own.
+                files, seen = self.files_of(self._before), self._of_before
+                self._of_before = files
+                if files and files == seen and self._take(self._before):
+                    self._outcome, self._before, self.broken_off = not self.broken_off, None, False
+                    self._has_none_yet(running)
         elif ended is not None and self._take(ended):
             self._kept["ended"] = None
         elif running is not None and running["what"] == SCAN and self._take({**running, "end_ns": now_ns}):

@@ -57,7 +57,8 @@ def test_late_file_belongs_to_the_scan_before_and_the_next_one_has_its_own(files
     files.begin(SCAN, tmp_path, TAKEN)
     assert look(files, 2.0) == ([], None)
     first = save(tmp_path, 1)
-    assert look(files, 3.0) == ([first], True)
+    assert look(files, 3.0) == ([], None), "it may be of the next scan, if that has just ended"
+    assert look(files, 3.5) == ([first], True)
     assert look(files, 4.0) == ([first], None)
     files.end(5 * 10**9)
     assert look(files, 6.0) == ([first], None)
@@ -69,7 +70,21 @@ def test_file_there_when_the_next_scan_begins_is_not_lost(files: OneRowFiles, tm
     first = save(tmp_path, 1)
     assert files.next_begins()
     files.begin(SCAN, tmp_path, TAKEN)
-    assert look(files, 2.0) == ([first], True)
+    assert look(files, 2.0) == ([], None)
+    assert look(files, 2.5) == ([first], True)
+
+
+def test_file_saved_between_the_state_and_the_files_of_a_look_belongs_to_the_scan_that_ended(
+    files: OneRowFiles, tmp_path: Path
+) -> None:
+    assert files.next_begins()
+    files.begin(SCAN, tmp_path, TAKEN)
+    second = save(tmp_path, 9)
+    assert look(files, 2.0) == ([], None), "the state was read before the end"
+    files.end(2 * 10**9)
+    assert look(files, 2.5) == ([], False), "the scan before has no file"
+    assert look(files, 3.0) == ([], None)
+    assert look(files, 3.5) == ([second], None)
 
 
 @pytest.mark.parametrize(("ends_next", "at_s"), [(True, 2.0), (False, 1.0 + WITHIN_S)])
