@@ -147,8 +147,17 @@ def unasked_for(watched: Watched, sent: Sequence[str]) -> list[str]:
     return [one for one in sent if not re.fullmatch(watched.allowed, one)]
 
 
+def endless(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no scan end until it is stopped, or its pause is set, however busy the computer is."""
+    monkeypatch.setattr(
+        ScanActivity, "end_s", property(lambda scan: scan.stopped_s or scan.start_s + 1e9 + scan.paused_s)
+    )
+
+
 @each
-def test_shadow_sends_questions_only_over_a_night_of_a_person(watched: Watched, beside: Make) -> None:
+def test_shadow_sends_questions_only_over_a_night_of_a_person(
+    watched: Watched, beside: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     night, panel = beside(shadow_of(watched)), watched.panel
     peer, made = night.start(), night.made
     peer.until(FREE)
@@ -156,20 +165,22 @@ def test_shadow_sends_questions_only_over_a_night_of_a_person(watched: Watched, 
     def press_start(emulator: Any) -> None:
         watched.maker.start(emulator, made.clock.now_s())
 
-    # a scan from the panel, with a knob turned meanwhile
-    made.at_panel(press_start)
-    peer.until(SCANNING)
-    # a request from anywhere is refused, whatever it asks for
-    for action in (names.RETRACT, names.START_SCAN, names.ENGAGE, names.PULSE):
-        assert peer.act(action).code == ControlResponse.ACTION_NOT_SUPPORTED
-    assert not peer.set(names.ZCTRL_SETPOINT, 1e-10).ok
-    # killed in the middle of the scan, it begins again
-    made.kill()
-    peer = night.start()
-    peer.until(SCANNING)
-    # the person stops the scan, moves the frame, scans to the end, and withdraws the tip
-    made.at_panel(panel.acts["Stop"])
-    peer.until(FREE)
+    with monkeypatch.context() as first_scan:
+        endless(first_scan)
+        # a scan from the panel, with a knob turned meanwhile
+        made.at_panel(press_start)
+        peer.until(SCANNING)
+        # a request from anywhere is refused, whatever it asks for
+        for action in (names.RETRACT, names.START_SCAN, names.ENGAGE, names.PULSE):
+            assert peer.act(action).code == ControlResponse.ACTION_NOT_SUPPORTED
+        assert not peer.set(names.ZCTRL_SETPOINT, 1e-10).ok
+        # killed in the middle of the scan, it begins again
+        made.kill()
+        peer = night.start()
+        peer.until(SCANNING)
+        # the person stops the scan, moves the frame, scans to the end, and withdraws the tip
+        made.at_panel(panel.acts["Stop"])
+        peer.until(FREE)
     made.at_panel(panel.acts["frame"])
     peer.until(lambda one: isinstance(one, ActByHand) and one.act is PanelAct.VALUES)
     made.strike(watched.fault)
@@ -209,10 +220,7 @@ def test_shadow_process_has_no_method_that_sets_or_acts(watched: Watched) -> Non
 def test_stop_is_published_though_the_next_scan_begins_before_a_file_is_missed(
     watched: Watched, beside: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # no scan ends before `end`, however busy the computer is
-    monkeypatch.setattr(
-        ScanActivity, "end_s", property(lambda scan: scan.stopped_s or scan.start_s + 1e9 + scan.paused_s)
-    )
+    endless(monkeypatch)
     night, panel = beside(shadow_of(watched)), watched.panel
     night.settings["result_timeout_s"] = 1e6
     peer, made = night.start(), night.made

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from deadlines import DEADLINE_S
-from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_to_line, until
+from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_to_line, scan_until_line, until
 from tests.plugins.gxsm.raw_clients import MemoryClient, SocketClient, client
 
 from afspm.plugins.gxsm.emulator.block import FAULT_KINDS, SharedMemoryBlock
@@ -177,7 +177,7 @@ def test_stopped_scan_is_saved_with_rows_of_the_previous_one(bench: Make) -> Non
     with calling(made) as gxsm:
         small(gxsm)
         assert gxsm.call("chfname", 0) == "EE: invalid channel"
-        made.at_panel(lambda emulator: hold_scan(emulator.program, 1, 3))
+        made.at_panel(lambda emulator: hold_scan(emulator.program, 1, 2, 3))
         gxsm.call("startscan")
         until(made, lambda: bool(bits(gxsm) & 2))
         made.at_panel(lambda emulator: scan_to_line(emulator.program, 4))
@@ -194,6 +194,7 @@ def test_stopped_scan_is_saved_with_rows_of_the_previous_one(bench: Make) -> Non
         assert gxsm.call("get_slice", 0, 0, 0, 7, 1).tolist() == [[0.0] * 16]
         gxsm.call("startscan")
         assert gxsm.call("y_current") == 7, "until the first line is in"
+        made.at_panel(lambda emulator: scan_until_line(emulator.program, 1))
         until(made, lambda: not bits(gxsm) & 2 and gxsm.call("rtquery", "s")[0] == 1.0)
         until(made, lambda: (made.data / "scan002-M-Xp-ZSmTopo.nc").exists())
         before = gxsm.call("get_slice", 0, 0, 0, 0, 8)
