@@ -342,7 +342,7 @@ class CheckClient:
         """Wait until the microscope is free and quiet; return all publications after `mark`.
 
         Args:
-            awaiting: what is certainly published after `mark`, and waited for first.
+            awaiting: a publication that certainly follows `mark`, and is waited for first.
         """
         if awaiting is not None:
             self._awaited(lambda: self.observations.has(awaiting, mark), self.real_s(experiment_s))
