@@ -81,7 +81,7 @@ def sample_scans() -> Iterator[Row]:
             source, _ = processes.scheduler(
                 str(translator.publish_address),
                 translator.serve_address,
-                class_="afspm.plugins.drift.scheduler.scheduler.DriftCompensatedScheduler",
+                class_="afspm.plugins.drift.frame.scheduler.DriftCompensatedScheduler",
                 drift=drift,
             )
             listener = ZmqPort(Network(), "Listener", CLOCK, subscribe=[source], envelopes=["Scan2d"])

@@ -17,7 +17,8 @@ from scipy import fft, ndimage
 from afspm import Array
 from afspm.model import Region
 from afspm.plugins.drift.estimators import estimator
-from afspm.plugins.drift.figures.style import (
+from afspm.plugins.drift.registration import DriftScan
+from afspm.plugins.drift.report.style import (
     BLUE,
     GREEN,
     GREY,
@@ -32,7 +33,6 @@ from afspm.plugins.drift.figures.style import (
     styled,
     time_axis,
 )  # fmt: skip
-from afspm.plugins.drift.registration import DriftScan
 from afspm.plugins.drift.study import NightSettings, night
 from afspm.simulation import World
 
@@ -144,7 +144,7 @@ def shear() -> Figure:
     at_m = np.zeros(2)
     down = taken(world, (0.0, 0.0), up.end_s + 2.0, 1e-6, direction="down")
     from afspm.model.drift_removal import undistorted
-    from afspm.plugins.drift.shear import velocity_from_up_down
+    from afspm.plugins.drift.track.shear import velocity_from_up_down
 
     told = velocity_from_up_down(up, down, estimator())
     v = (float(told.velocity_m_s[0]), float(told.velocity_m_s[1]))

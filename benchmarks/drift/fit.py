@@ -1,6 +1,6 @@
 """`python -m benchmarks.drift.fit`: fit the probabilities and the ellipses of the default estimator.
 
-Uses the fitted half of the families alone. Writes plugins/drift/estimators/coefficients.py (with `--doubt` the doubt in
+Uses the fitted half of the families alone. Writes plugins/drift/doubt/coefficients.py (with `--doubt` the doubt in
 it alone), or with `--figure` a reliability diagram of the present coefficients, on both halves. The outcomes of all
 pairs are kept in build/ as they come: an interrupted run continues, and a run with more rounds adds to them. After a
 change of the estimator delete this file.
@@ -25,9 +25,10 @@ from scipy.optimize import linprog, minimize
 from scipy.stats import beta
 
 from afspm import Array
-from afspm.plugins.drift.estimators import DEFAULT, acceptance
-from afspm.plugins.drift.estimators.acceptance import MatchEvidence
-from afspm.plugins.drift.estimators.coefficients import SPREAD
+from afspm.plugins.drift.doubt import acceptance
+from afspm.plugins.drift.doubt.acceptance import MatchEvidence
+from afspm.plugins.drift.doubt.coefficients import SPREAD
+from afspm.plugins.drift.estimators import DEFAULT
 from benchmarks.drift.families import HALVES, Half
 from benchmarks.drift.surfaces import SURFACES
 from benchmarks.drift.trials import ELLIPSE_95, Outcome, Trial

@@ -14,7 +14,7 @@ import numpy as np
 from rich.table import Table
 
 from afspm.plugins.drift.estimators import unguarded
-from afspm.plugins.drift.estimators.ransac import FORMS, Search
+from afspm.plugins.drift.registration.ransac import FORMS, Search
 from benchmarks.drift.pairs import PIXEL_M, Pair, Sampling, pair
 from benchmarks.drift.parts import Plan, Report
 from benchmarks.drift.surfaces import SURFACES

@@ -16,8 +16,8 @@ import numpy as np
 from afspm import Array
 from afspm.model import Region
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
-from afspm.plugins.drift.shear import row_delay_s
-from afspm.plugins.drift.tracking import Tracker, Update
+from afspm.plugins.drift.track.shear import row_delay_s
+from afspm.plugins.drift.track.tracking import Tracker, Update
 from benchmarks.drift.conditions import CONDITIONS, Condition, measured, wandered
 from benchmarks.drift.families import Half, drawn_condition, drawn_surface, source
 from benchmarks.drift.pairs import HEIGHT_M, PIXEL_M, ROW_S, View

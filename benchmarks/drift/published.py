@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from afspm import Array
-from afspm.plugins.drift.estimators.keypoints import Descriptors, matched
-from afspm.plugins.drift.estimators.ransac import FORMS, Search
-from afspm.plugins.drift.overlap import overlap_center_m
+from afspm.plugins.drift.pairs.overlap import overlap_center_m
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
+from afspm.plugins.drift.registration.keypoints import Descriptors, matched
+from afspm.plugins.drift.registration.ransac import FORMS, Search
 
 THRESHOLD = 0.05  # of the diagonal: of RANSAC, and of the score
 ITERATIONS = 100

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from afspm.plugins.drift.estimators import unguarded
-from afspm.plugins.drift.trackers import tracker
-from afspm.plugins.drift.tracking import Tracker
+from afspm.plugins.drift.track import tracker
+from afspm.plugins.drift.track.tracking import Tracker
 from benchmarks.drift.families import Half
 from benchmarks.drift.nights import Night, Oracle
 from benchmarks.drift.pairs import PIXEL_M

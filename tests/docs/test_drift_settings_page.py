@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from afspm.basics import entry_points
-from afspm.plugins.drift.trackers.references import Choice
-from afspm.plugins.drift.trackers.settings import BankSettings
+from afspm.plugins.drift.track.references import Choice
+from afspm.plugins.drift.track.settings import BankSettings
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "drift.md"
 ROW = re.compile(r"^\| ((?:`\w+`(?:, )?)+) \| `(\w+)` \| `([^`]+)` \|", re.MULTILINE)

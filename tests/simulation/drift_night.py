@@ -10,8 +10,7 @@ import numpy as np
 
 from afspm.model import Packet, Region, RegistrationOutcome, Scan, ScanParameters, ScopeState
 from afspm.model.geometry import XY
-from afspm.plugins.drift.mapping import Mapping
-from afspm.plugins.drift.scheduler.messages import (
+from afspm.plugins.drift.frame.messages import (
     Forecasted,
     Registered,
     RescanWanted,
@@ -20,9 +19,10 @@ from afspm.plugins.drift.scheduler.messages import (
     WorkerGone,
     WorkerReport,
 )
-from afspm.plugins.drift.scheduler.sample_frame import SampleFrame
-from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings, RescanRule
-from afspm.plugins.drift.trackers.paper import PaperForecast
+from afspm.plugins.drift.frame.sample_frame import SampleFrame
+from afspm.plugins.drift.frame.settings import DriftCompensationSettings, RescanRule
+from afspm.plugins.drift.track.mapping import Mapping
+from afspm.plugins.drift.track.paper import PaperForecast
 from afspm.scheduler.events import Effect, Publish
 from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.testing.components.scheduler_host import SchedulerHost

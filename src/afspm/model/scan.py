@@ -164,7 +164,7 @@ class Scan:
 
         Args:
             velocity_m_s: (x, y) of the sample under the tip, e.g. from an up frame followed by a down frame
-                (`afspm.plugins.drift.shear`); constant during the scan.
+                (`afspm.plugins.drift.track.shear`); constant during the scan.
             duration_s: from the first to the last row.
             upwards: whether small y was scanned first; None, from a file without the direction, is an error.
 

@@ -28,8 +28,7 @@ from afspm.model import (
 )
 from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, scan_values
 from afspm.model.snapshot import restored, snapshot
-from afspm.plugins.drift.mapping import Mapping
-from afspm.plugins.drift.scheduler.messages import (
+from afspm.plugins.drift.frame.messages import (
     Compensated,
     Forecasted,
     Registered,
@@ -37,12 +36,13 @@ from afspm.plugins.drift.scheduler.messages import (
     StartWorker,
     WorkerReport,
 )
-from afspm.plugins.drift.scheduler.sample_frame import SampleFrame
-from afspm.plugins.drift.scheduler.scheduler import DriftWireCodec
-from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings
-from afspm.plugins.drift.scheduler.state import DriftState
-from afspm.plugins.drift.trackers import forecast_from_dict
-from afspm.plugins.drift.trackers.paper import PaperForecast
+from afspm.plugins.drift.frame.sample_frame import SampleFrame
+from afspm.plugins.drift.frame.scheduler import DriftWireCodec
+from afspm.plugins.drift.frame.settings import DriftCompensationSettings
+from afspm.plugins.drift.frame.state import DriftState
+from afspm.plugins.drift.track import forecast_from_dict
+from afspm.plugins.drift.track.mapping import Mapping
+from afspm.plugins.drift.track.paper import PaperForecast
 from afspm.scheduler.events import (
     Connected,
     Delegate,

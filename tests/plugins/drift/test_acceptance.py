@@ -12,7 +12,7 @@ import pytest
 from benchmarks.drift import fit
 from benchmarks.drift.trials import Outcome
 
-from afspm.plugins.drift.estimators.acceptance import MatchEvidence
+from afspm.plugins.drift.doubt.acceptance import MatchEvidence
 
 GOOD = MatchEvidence(
     overlap=0.8, sd_px=0.02, gap=300.0, rival=0.05,

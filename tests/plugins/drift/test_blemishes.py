@@ -7,13 +7,13 @@ import pytest
 from benchmarks.drift.foreign_pairs import PIXEL_M, foreign_pair
 
 from afspm import Array
-from afspm.plugins.drift.estimators.alignment import Doubt
-from afspm.plugins.drift.estimators.coefficients import DOUBT, SPREAD
-from afspm.plugins.drift.estimators.images import Image, without_scars
+from afspm.plugins.drift.doubt.coefficients import DOUBT, SPREAD
+from afspm.plugins.drift.doubt.covariance import Doubt
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
-from afspm.plugins.drift.estimators.noise import CrossingLines
-from afspm.plugins.drift.estimators.spikes import without_scars_of_one, without_spikes
-from afspm.plugins.drift.estimators.warp import COUNT, OverlapBox, Scene, Spline, WarpedPair
+from afspm.plugins.drift.pairs.images import Image, without_scars
+from afspm.plugins.drift.pairs.noise import CrossingLines
+from afspm.plugins.drift.pairs.spikes import without_scars_of_one, without_spikes
+from afspm.plugins.drift.pairs.warp import COUNT, OverlapBox, Scene, Spline, WarpedPair
 
 SHIFT_PX = 3
 

@@ -27,10 +27,10 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
-from afspm.plugins.drift.scheduler.messages import NotRegistered, WorkerGone
-from afspm.plugins.drift.scheduler.sample_frame import SampleFrame
-from afspm.plugins.drift.scheduler.settings import Compensate, DriftCompensationSettings
-from afspm.plugins.drift.scheduler.state import SavedDrift
+from afspm.plugins.drift.frame.messages import NotRegistered, WorkerGone
+from afspm.plugins.drift.frame.sample_frame import SampleFrame
+from afspm.plugins.drift.frame.settings import Compensate, DriftCompensationSettings
+from afspm.plugins.drift.frame.state import SavedDrift
 from afspm.scheduler.events import Log, PacketIn, Publish, RequestIn, Tick, TranslatorCaughtUp
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit
 

@@ -22,7 +22,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
-from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings
+from afspm.plugins.drift.frame.settings import DriftCompensationSettings
 from afspm.scheduler.events import Publish
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit
 

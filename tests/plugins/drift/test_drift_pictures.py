@@ -17,10 +17,10 @@ from afspm.basics.errors import FileError
 from afspm.basics.exit_codes import ExitCode
 from afspm.components import line_file
 from afspm.model import Region
-from afspm.plugins.drift.drift_pictures import DriftPictures, TabledScan, parts
-from afspm.plugins.drift.record import DriftRecord
 from afspm.plugins.drift.registration import DriftScan
-from afspm.plugins.drift.simulated_truth import true_drift
+from afspm.plugins.drift.report.drift_pictures import DriftPictures, TabledScan, parts
+from afspm.plugins.drift.report.simulated_truth import true_drift
+from afspm.plugins.drift.track.record import DriftRecord
 from afspm.simulation import World
 from afspm.translator.own_files import FileFacts, encode_scan
 
@@ -32,8 +32,8 @@ PIXELS, EVERY_S, SWITCHED_ON = 48, 600.0, 4
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw coarsely: the look of a figure is not tested here."""
-    monkeypatch.setattr("afspm.plugins.drift.figures.style.DPI", 30)
-    monkeypatch.setattr("afspm.plugins.drift.figures.style.LAYOUT", None)
+    monkeypatch.setattr("afspm.plugins.drift.report.style.DPI", 30)
+    monkeypatch.setattr("afspm.plugins.drift.report.style.LAYOUT", None)
 
 
 def test_the_scan_during_which_correction_was_switched_on_belongs_to_no_part() -> None:
@@ -136,7 +136,7 @@ def test_comparisons_before_a_restart_are_repeated_before_the_end(
     component, left = DriftPictures(**quick), list[int]()
     pairs_at_end = DriftPictures.on_end
     monkeypatch.setattr(DriftPictures, "on_end", lambda self: left.append(6 - len(self._pairs)) or pairs_at_end(self))
-    monkeypatch.setattr("afspm.plugins.drift.figures.album.write", lambda *_, **__: [])
+    monkeypatch.setattr("afspm.plugins.drift.report.album.write", lambda *_, **__: [])
     lab.at(1500.0, lab.kill)
     run(component, lab, tmp_path / "state", run_dir=str(tmp_path))
     assert left == [0]
@@ -152,7 +152,7 @@ def test_figures_without_comparisons_are_drawn_when_time_is_short(
     for path in tmp_path.glob("*.png"):
         path.unlink()
     lab.restart_component()
-    monkeypatch.setattr("afspm.plugins.drift.drift_pictures._COMPARED_WITHIN_S", 0.0)
+    monkeypatch.setattr("afspm.plugins.drift.report.drift_pictures._COMPARED_WITHIN_S", 0.0)
     monkeypatch.setattr(DriftPictures, "on_tick", lambda self: None)
     lab.at(1500.0, lab.kill)
     run(DriftPictures(**quick), lab, tmp_path / "state", run_dir=str(tmp_path))
@@ -166,7 +166,7 @@ def test_figures_without_comparisons_are_drawn_when_time_is_short(
 def test_scans_of_a_night_are_never_all_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = night(tmp_path)
     drawn = []
-    monkeypatch.setattr("afspm.plugins.drift.figures.album.write", lambda run, *_, **__: drawn.append(run) or [])
+    monkeypatch.setattr("afspm.plugins.drift.report.album.write", lambda run, *_, **__: drawn.append(run) or [])
     lab.at(1500.0, lab.kill)
     run(DriftPictures(estimator="correlation"), lab, tmp_path / "state", run_dir=str(tmp_path))
     (album,) = drawn

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from afspm.model import RegistrationOutcome
-from afspm.plugins.drift.drift_pictures import COLUMNS, DriftTable, drift_row
-from afspm.plugins.drift.record import DriftRecord
+from afspm.plugins.drift.report.drift_pictures import COLUMNS, DriftTable, drift_row
+from afspm.plugins.drift.track.record import DriftRecord
 from afspm.wire.generated.drift_pb2 import DriftMapping
 
 

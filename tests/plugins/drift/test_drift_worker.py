@@ -21,10 +21,9 @@ from tests.plugins.drift.drift_parts import Brightest
 
 from afspm.basics.errors import ConfigError, FileError
 from afspm.model import Frame, Region, Scan
-from afspm.plugins.drift.registration import DriftScan
-from afspm.plugins.drift.scheduler import worker_process
-from afspm.plugins.drift.scheduler.estimation import Estimation
-from afspm.plugins.drift.scheduler.messages import (
+from afspm.plugins.drift.frame import worker_process
+from afspm.plugins.drift.frame.estimation import Estimation
+from afspm.plugins.drift.frame.messages import (
     Forecasted,
     NotRegistered,
     Registered,
@@ -33,10 +32,11 @@ from afspm.plugins.drift.scheduler.messages import (
     WorkerGone,
     WorkerReport,
 )
-from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings, RescanRule
-from afspm.plugins.drift.scheduler.worker_process import DriftWorkerProcess
-from afspm.plugins.drift.scheduler.worker_state import WorkerStateFile
-from afspm.plugins.drift.trackers import tracker
+from afspm.plugins.drift.frame.settings import DriftCompensationSettings, RescanRule
+from afspm.plugins.drift.frame.worker_process import DriftWorkerProcess
+from afspm.plugins.drift.frame.worker_state import WorkerStateFile
+from afspm.plugins.drift.registration import DriftScan
+from afspm.plugins.drift.track import tracker
 
 HERE = Region((0.0, 0.0), (63e-9, 63e-9))
 
@@ -283,11 +283,11 @@ def test_worker_ends_with_a_killed_scheduler_even_while_it_registers(tmp_path: P
     """Otherwise it would write the state that the worker of the next scheduler reads."""
     program = """
         import logging, sys, threading
-        from afspm.plugins.drift.scheduler.messages import StartWorker
-        from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings
-        from afspm.plugins.drift.scheduler.worker_process import DriftWorkerProcess
+        from afspm.plugins.drift.frame.messages import StartWorker
+        from afspm.plugins.drift.frame.settings import DriftCompensationSettings
+        from afspm.plugins.drift.frame.worker_process import DriftWorkerProcess
         from tests.plugins.drift.test_drift_worker import Heard, job
-        from afspm.plugins.drift.scheduler.messages import Registered
+        from afspm.plugins.drift.frame.messages import Registered
 
         worker = DriftWorkerProcess(
             DriftCompensationSettings(estimator="drift_parts.Hangs", tracker="paper"), None, logging.getLogger()

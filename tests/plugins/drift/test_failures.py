@@ -13,8 +13,8 @@ from tests.plugins.drift.trackers_lab import INTERVAL_S, World, follow, scan_at,
 from afspm.model import Region, RegistrationOutcome
 from afspm.plugins.drift.estimators import PairFailure, estimator, unguarded
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
-from afspm.plugins.drift.shear import velocity_from_up_down
-from afspm.plugins.drift.trackers import tracker
+from afspm.plugins.drift.track import tracker
+from afspm.plugins.drift.track.shear import velocity_from_up_down
 
 PIXEL_M = 10e-9
 SHIFT_PX = (3, -2)

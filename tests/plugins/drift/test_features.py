@@ -15,9 +15,9 @@ from tests.plugins.drift.registering import PIXEL_M, Waves, scanned
 
 from afspm.basics.errors import ConfigError
 from afspm.model import Region
-from afspm.plugins.drift.estimators import estimator, keypoints
-from afspm.plugins.drift.estimators.keypoints import matched
-from afspm.plugins.drift.registration import Prior, Registration
+from afspm.plugins.drift.estimators import estimator
+from afspm.plugins.drift.registration import Prior, Registration, keypoints
+from afspm.plugins.drift.registration.keypoints import matched
 
 pytest.importorskip("skimage")
 

@@ -17,8 +17,8 @@ from afspm.plugins.drift.registration import DriftScan, Matches
 pytest.importorskip("matplotlib")
 from matplotlib.figure import Figure
 
-from afspm.plugins.drift.figures import style
-from afspm.plugins.drift.figures.drawings import (
+from afspm.plugins.drift.report import style
+from afspm.plugins.drift.report.drawings import (
     ScanPair,
     _in_frame,
     draw_errors,
@@ -134,7 +134,8 @@ def test_the_package_of_figures_loads_without_matplotlib() -> None:
     import subprocess
     import sys
 
-    told = "import sys, afspm.plugins.drift.figures, afspm.plugins.drift.record; sys.exit('matplotlib' in sys.modules)"
+    modules = "afspm.plugins.drift.report, afspm.plugins.drift.track.record"
+    told = f"import sys, {modules}; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", told], check=False).returncode == 0
 
 

@@ -7,7 +7,7 @@ import pytest
 from benchmarks.drift.nights import FRAME_S, INTERVAL_S, Night, Oracle
 
 from afspm.plugins.drift.estimators import unguarded
-from afspm.plugins.drift.trackers import tracker
+from afspm.plugins.drift.track import tracker
 
 NM = 1e-9
 

@@ -9,14 +9,14 @@ import pytest
 from numpy.typing import NDArray
 
 from afspm.model import Region
-from afspm.plugins.drift.estimators.alignment import Believed, Fit
-from afspm.plugins.drift.estimators.images import without_scars
+from afspm.plugins.drift.doubt.nuisances import Shear, averaged
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
-from afspm.plugins.drift.estimators.noise import denoised
-from afspm.plugins.drift.estimators.nuisances import Shear, averaged
-from afspm.plugins.drift.estimators.search import shear_by_drift
-from afspm.plugins.drift.estimators.warp import COUNT, derivative
+from afspm.plugins.drift.pairs.images import without_scars
+from afspm.plugins.drift.pairs.noise import denoised
+from afspm.plugins.drift.pairs.warp import COUNT, derivative
 from afspm.plugins.drift.registration import DriftScan, Prior
+from afspm.plugins.drift.registration.alignment import Believed, Fit
+from afspm.plugins.drift.registration.search import shear_by_drift
 
 NM = 1e-9
 PIXEL_M = 10 * NM

@@ -10,8 +10,8 @@ import pytest
 from tests.plugins.drift.test_record import record
 
 from afspm.model import Region
-from afspm.plugins.drift.offline import against_first, spread_pairs
 from afspm.plugins.drift.registration import DriftScan, Registration
+from afspm.plugins.drift.track.offline import against_first, spread_pairs
 
 REGION = Region((1e-6, 0.0), (2e-6, 1e-6))
 
@@ -74,8 +74,8 @@ def test_drawn_pairs_have_the_given_time_apart_and_are_spread_over_the_run() -> 
 
 def test_an_album_contains_every_figure_with_material(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
-    from afspm.plugins.drift.figures import album, style
     from afspm.plugins.drift.registration import Matches
+    from afspm.plugins.drift.report import album, style
 
     monkeypatch.setattr(style, "DPI", 30)
     monkeypatch.setattr(style, "LAYOUT", None)

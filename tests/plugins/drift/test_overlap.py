@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from afspm.basics.errors import InvalidValue
 from afspm.model import Frame, Region
-from afspm.plugins.drift.overlap import (
+from afspm.plugins.drift.pairs.overlap import (
     intersection_area_m2,
     intersection_center_m,
     intersection_m,

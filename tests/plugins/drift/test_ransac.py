@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from afspm.plugins.drift.estimators.ransac import (
+from afspm.plugins.drift.registration.ransac import (
     FORMS,
     Search,
     fitted,

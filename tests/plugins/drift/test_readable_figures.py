@@ -21,7 +21,8 @@ from matplotlib.text import Text
 
 from afspm.components.surveying import SurveyRecord, Target
 from afspm.components.surveying.figure import draw_survey
-from afspm.plugins.drift.figures.drawings import (
+from afspm.plugins.drift.registration import DriftScan, Matches
+from afspm.plugins.drift.report.drawings import (
     ScanPair,
     draw_errors,
     draw_estimates,
@@ -30,7 +31,6 @@ from afspm.plugins.drift.figures.drawings import (
     draw_offsets,
     draw_pairs,
 )
-from afspm.plugins.drift.registration import DriftScan, Matches
 from afspm.record import night_figure
 
 SHOWN_PX = 800.0  # the width of a column of text in the report and the README

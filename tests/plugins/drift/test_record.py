@@ -10,7 +10,7 @@ import pytest
 
 from afspm.basics.errors import FileError
 from afspm.model import RegistrationOutcome
-from afspm.plugins.drift.record import DriftRecord
+from afspm.plugins.drift.track.record import DriftRecord
 from afspm.record.drift_mapping import drift_at
 
 

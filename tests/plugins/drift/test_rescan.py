@@ -8,7 +8,7 @@ import pytest
 
 from afspm.basics.errors import InvalidValue
 from afspm.model import Frame, Region
-from afspm.plugins.drift.overlap import too_far_off, too_little_shared
+from afspm.plugins.drift.pairs.overlap import too_far_off, too_little_shared
 
 NM = 1e-9
 ASKED = Region((0.0, 0.0), (2e-6, 2e-6), frame=Frame.SAMPLE)

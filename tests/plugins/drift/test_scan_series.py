@@ -16,9 +16,9 @@ from afspm import read
 from afspm.basics.errors import InvalidValue
 from afspm.cli.app import app
 from afspm.model import Frame, Problem, Region, Scan, ScopeState
-from afspm.plugins.drift.file_commands import tip_changed
-from afspm.plugins.drift.record import DriftRecord
-from afspm.plugins.drift.study.scan_series import series
+from afspm.plugins.drift.report.file_commands import tip_changed
+from afspm.plugins.drift.track.record import DriftRecord
+from afspm.plugins.drift.track.scan_series import series
 from afspm.record.store import RecordStore
 from afspm.simulation import World
 from afspm.storage.formats import FileContent

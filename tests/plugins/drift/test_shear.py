@@ -10,14 +10,14 @@ from tests.plugins.drift.trackers_lab import FRAME_S, SIZE_M, scan_at
 
 from afspm import Array
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
-from afspm.plugins.drift.shear import (
+from afspm.plugins.drift.track import BankTracker
+from afspm.plugins.drift.track.shear import (
     delay_per_length_s_m,
     row_delay_s,
     slow_axis,
     velocity_by_shear,
     velocity_from_up_down,
 )
-from afspm.plugins.drift.trackers import BankTracker
 
 NM = 1e-9
 VELOCITY = np.array([0.11, -0.07]) * NM

@@ -8,10 +8,10 @@ import numpy as np
 from benchmarks.drift.pairs import PIXEL_M, Pair, pair
 
 from afspm import Array
-from afspm.plugins.drift.estimators.images import Image, prepare
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
-from afspm.plugins.drift.estimators.spikes import without_spikes
-from afspm.plugins.drift.estimators.warp import COUNT, Scene
+from afspm.plugins.drift.pairs.images import Image, prepare
+from afspm.plugins.drift.pairs.spikes import without_spikes
+from afspm.plugins.drift.pairs.warp import COUNT, Scene
 from afspm.plugins.drift.registration import DriftScan, Registration
 
 PAIRS = [pair("stamper", "real", seed) for seed in range(40, 44)]

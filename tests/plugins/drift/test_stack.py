@@ -11,8 +11,8 @@ import pytest
 from afspm import Array
 from afspm.basics.errors import InvalidValue
 from afspm.model import Frame, Region
-from afspm.plugins.drift.offline import corrected
 from afspm.plugins.drift.registration import DriftScan
+from afspm.plugins.drift.track.offline import corrected
 
 PIXEL_M = 1e-6 / 63
 

@@ -23,8 +23,8 @@ from tests.plugins.drift.trackers_lab import (
 from afspm import Array
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
-from afspm.plugins.drift.trackers import BankTracker, PaperTracker, forecast_from_dict, tracker
-from afspm.plugins.drift.tracking import Prediction, Update
+from afspm.plugins.drift.track import BankTracker, PaperTracker, forecast_from_dict, tracker
+from afspm.plugins.drift.track.tracking import Prediction, Update
 
 NM = 1e-9
 STEADY = steady((0.05 * NM, -0.03 * NM))
@@ -646,7 +646,7 @@ def test_trackers_have_names() -> None:
     assert isinstance(tracker("bank", World()), BankTracker)
     assert isinstance(tracker("paper", World()), PaperTracker)
     assert isinstance(tracker({"compared": 2}, World()), BankTracker)
-    assert isinstance(tracker("afspm.plugins.drift.trackers.paper.PaperTracker", World()), PaperTracker)
+    assert isinstance(tracker("afspm.plugins.drift.track.paper.PaperTracker", World()), PaperTracker)
     with pytest.raises(ConfigError, match="did you mean 'paper'"):
         tracker("papper", World())
     with pytest.raises(ConfigError, match="not a tracker"):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from afspm.model.snapshot import from_plain, to_plain
-from afspm.plugins.drift.trackers.filters import Models
-from afspm.plugins.drift.trackers.forecast import Compensation
+from afspm.plugins.drift.track.filters import Models
+from afspm.plugins.drift.track.forecast import Compensation
 
 MODELS = Models(np.full(4, 2e-24), np.array([0.0, 1 / 10800.0, 1 / 2700.0, 1 / 30.0]), np.full(4, 5e-22))
 

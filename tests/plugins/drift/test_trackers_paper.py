@@ -12,9 +12,9 @@ import pytest
 from tests.plugins.drift.trackers_lab import INTERVAL_S, SIZE_M, World, follow, scan_at, steady
 
 from afspm.basics.errors import ConfigError, InvalidValue
-from afspm.plugins.drift.mapping import Mapping
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
-from afspm.plugins.drift.trackers import PaperTracker, forecast_from_dict, tracker
+from afspm.plugins.drift.track import PaperTracker, forecast_from_dict, tracker
+from afspm.plugins.drift.track.mapping import Mapping
 
 NM = 1e-9
 

@@ -17,11 +17,11 @@ from afspm import Array
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.model import Frame, Region
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
-from afspm.plugins.drift.mapping import Mapping
+from afspm.plugins.drift.frame.worker_state import WorkerStateFile
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
-from afspm.plugins.drift.scheduler.worker_state import WorkerStateFile
-from afspm.plugins.drift.trackers import BankTracker, forecast_from_dict
-from afspm.plugins.drift.tracking import Update
+from afspm.plugins.drift.track import BankTracker, forecast_from_dict
+from afspm.plugins.drift.track.mapping import Mapping
+from afspm.plugins.drift.track.tracking import Update
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ import pytest
 from systems import not_on_wine
 
 from afspm.basics.errors import InvalidValue
-from afspm.plugins.drift.study.workers import TaskOutcome, on_cores, processes
+from afspm.plugins.drift.workers import TaskOutcome, on_cores, processes
 
 
 def doubled(number: int) -> int:

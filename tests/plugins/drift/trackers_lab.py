@@ -10,10 +10,10 @@ import numpy as np
 
 from afspm import Array
 from afspm.model import Region
-from afspm.plugins.drift.overlap import intersection_ratio, overlap_center_m
+from afspm.plugins.drift.pairs.overlap import intersection_ratio, overlap_center_m
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
-from afspm.plugins.drift.shear import row_delay_s
-from afspm.plugins.drift.tracking import Tracker, Update
+from afspm.plugins.drift.track.shear import row_delay_s
+from afspm.plugins.drift.track.tracking import Tracker, Update
 
 Drift = Callable[[Any], Array]
 """Returns the displacement (x, y) at a time, or at an array of times: shape of the times + (2,)."""

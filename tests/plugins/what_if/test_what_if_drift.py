@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from afspm.plugins.drift.scheduler import scan_intake
-from afspm.plugins.drift.scheduler.worker import DriftWorkerInProcess
+from afspm.plugins.drift.frame import scan_intake
+from afspm.plugins.drift.frame.worker import DriftWorkerInProcess
 from afspm.plugins.what_if.scheduler_replay import replay_file
 from afspm.storage.line_log import read_lines
 from afspm.testing import Bench

@@ -14,12 +14,12 @@ from afspm.components.survey import Survey
 from afspm.experiment import load
 from afspm.model import Frame, Region, Scan
 from afspm.plugins.drift.estimators import PairFailure, unguarded
+from afspm.plugins.drift.frame.estimation import Estimation
+from afspm.plugins.drift.frame.messages import Registered
+from afspm.plugins.drift.frame.scheduler import DriftWireCodec
+from afspm.plugins.drift.frame.settings import RescanRule
 from afspm.plugins.drift.registration import DriftScan, Estimator
-from afspm.plugins.drift.scheduler.estimation import Estimation
-from afspm.plugins.drift.scheduler.messages import Registered
-from afspm.plugins.drift.scheduler.scheduler import DriftWireCodec
-from afspm.plugins.drift.scheduler.settings import RescanRule
-from afspm.plugins.drift.trackers import tracker
+from afspm.plugins.drift.track import tracker
 from afspm.simulation import World
 
 TUTORIAL = Path(__file__).parents[3] / "docs" / "tutorials" / "particle-survey.md"

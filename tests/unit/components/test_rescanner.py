@@ -22,7 +22,7 @@ from afspm.model import (
     ScanParameters,
     names,
 )
-from afspm.plugins.drift.rescanner import Rescanner
+from afspm.plugins.drift.frame.rescanner import Rescanner
 from afspm.wire.generated.drift_pb2 import DriftMapping, DriftRescan
 from afspm.wire.generated.scan_pb2 import ScanParameters2d
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from afspm.plugins.drift.scheduler.scheduler import DriftCompensatedScheduler
+from afspm.plugins.drift.frame.scheduler import DriftCompensatedScheduler
 
 from .conftest import Write, errors, only_error
 

@@ -63,7 +63,7 @@ def files(
     the current folder.
     """
     _one_thread_a_process()
-    from afspm.plugins.drift import file_commands as drift_files
+    from afspm.plugins.drift.report import file_commands as drift_files
     from afspm.processes import importing_from
 
     # only for a class of one's own: the current folder may be a download, with a module named like a library's
@@ -92,7 +92,7 @@ def study(
 ) -> None:
     """Simulate many nights over a grid of settings, rank the settings, and check whether the defaults hold."""
     _one_thread_a_process()
-    from afspm.plugins.drift import study_commands as drift_study
+    from afspm.plugins.drift.study import study_commands as drift_study
     from afspm.processes import importing_from
 
     with importing_from([Path.cwd()]):

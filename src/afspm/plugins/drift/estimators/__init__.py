@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 from afspm.basics import ConfigError, PlainMapping
 from afspm.plugins.drift.estimators.guarded import Guarded, PairFailure, Report, log_failure
-from afspm.plugins.drift.naming import named
+from afspm.plugins.drift.estimators.naming import named
 from afspm.plugins.drift.registration import Estimator
 
 __all__ = ["DEFAULT", "Guarded", "PairFailure", "estimator", "unguarded"]

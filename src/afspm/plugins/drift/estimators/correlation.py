@@ -8,10 +8,10 @@ import numpy as np
 
 from afspm import Array
 from afspm.basics import ConfigError
-from afspm.plugins.drift.estimators.images import CommonGrid, Image, Unusable, onto_common_grid, prepare
-from afspm.plugins.drift.estimators.search import MaskedCorrelation
-from afspm.plugins.drift.overlap import overlap_center_m
+from afspm.plugins.drift.pairs.images import CommonGrid, Image, Unusable, onto_common_grid, prepare
+from afspm.plugins.drift.pairs.overlap import overlap_center_m
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
+from afspm.plugins.drift.registration.search import MaskedCorrelation
 
 _SMOOTH_PX = 1.0
 _APART_PX = 4.0  # shifts nearer to the highest peak belong to this peak

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from afspm import Array
 from afspm.basics import ConfigError
-from afspm.plugins.drift.estimators.evidence import ConsensusEvidence, Standards, covariance_m2, weighed
-from afspm.plugins.drift.estimators.images import CommonGrid, Image, Unusable, onto_common_grid, prepare
-from afspm.plugins.drift.estimators.keypoints import KINDS, Keypoints, matched
-from afspm.plugins.drift.estimators.ransac import FORMS, Consensus, Form, Search, tightened
-from afspm.plugins.drift.overlap import overlap_center_m
+from afspm.plugins.drift.doubt.evidence import ConsensusEvidence, Standards, covariance_m2, weighed
+from afspm.plugins.drift.pairs.images import CommonGrid, Image, Unusable, onto_common_grid, prepare
+from afspm.plugins.drift.pairs.overlap import overlap_center_m
 from afspm.plugins.drift.registration import DriftScan, Matches, Prior, Registration
+from afspm.plugins.drift.registration.keypoints import KINDS, Keypoints, matched
+from afspm.plugins.drift.registration.ransac import FORMS, Consensus, Form, Search, tightened
 
 FINE_PX = 1.5  # largest usual distance of a right pair from the transform
 GATE = 25.0  # chi² from the expectation, the limit of the search

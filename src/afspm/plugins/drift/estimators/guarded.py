@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from afspm.plugins.drift.doubt.plausibility import unlike_drift
 from afspm.plugins.drift.estimators.correlation import Correlation
-from afspm.plugins.drift.mapping import unlike_drift
-from afspm.plugins.drift.overlap import overlap_ratio
+from afspm.plugins.drift.pairs.overlap import overlap_ratio
 from afspm.plugins.drift.registration import DriftScan, Estimator, LinearSeen, Prior, Registration
 
 COARSE_SD_PX = 0.5

@@ -15,24 +15,16 @@ import numpy as np
 
 from afspm import Array
 from afspm.basics import ConfigError
-from afspm.plugins.drift.estimators.acceptance import WRONG_AT_MOST, MatchEvidence, above_repeats, agreement
-from afspm.plugins.drift.estimators.alignment import (
-    COARSE,
-    SHIFT,
-    Believed,
-    Doubt,
-    covariance,
-    enlarged,
-    generalised_least_squares,
-    least_squares,
-)
-from afspm.plugins.drift.estimators.images import CommonGrid, Unusable, onto_common_grid, prepare
-from afspm.plugins.drift.estimators.noise import CrossingLines, FineFilter, without_lines
-from afspm.plugins.drift.estimators.nuisances import CREEP_SD_PX, Shear, averaged
-from afspm.plugins.drift.estimators.search import ExpectedShift, MaskedCorrelation, Scorer, candidates, shear_by_drift
-from afspm.plugins.drift.estimators.spikes import without_scars_of_one, without_spikes
-from afspm.plugins.drift.estimators.warp import COUNT, CREEP, LINEAR, SLOPES, OverlapBox, Scene, WarpedPair
+from afspm.plugins.drift.doubt.acceptance import WRONG_AT_MOST, MatchEvidence, above_repeats, agreement
+from afspm.plugins.drift.doubt.covariance import Doubt, covariance, enlarged
+from afspm.plugins.drift.doubt.nuisances import CREEP_SD_PX, Shear, averaged
+from afspm.plugins.drift.pairs.images import CommonGrid, Unusable, onto_common_grid, prepare
+from afspm.plugins.drift.pairs.noise import CrossingLines, FineFilter, without_lines
+from afspm.plugins.drift.pairs.spikes import without_scars_of_one, without_spikes
+from afspm.plugins.drift.pairs.warp import COUNT, CREEP, LINEAR, SLOPES, OverlapBox, Scene, WarpedPair
 from afspm.plugins.drift.registration import DriftScan, LinearSeen, Prior, Registration
+from afspm.plugins.drift.registration.alignment import COARSE, SHIFT, Believed, generalised_least_squares, least_squares
+from afspm.plugins.drift.registration.search import ExpectedShift, MaskedCorrelation, Scorer, candidates, shear_by_drift
 
 WIDEST = (0.01, 0.03)  # prior standard deviations of shear and rotation in the first stage, by x and by y
 GAIN_SD = 1.0  # prior standard deviation of the logarithm of the gain

@@ -10,7 +10,7 @@ from afspm.plugins.drift.study.grid import SettingsGrid
 from afspm.plugins.drift.study.night import SimulatedNight, night
 from afspm.plugins.drift.study.settings import NightSettings
 from afspm.plugins.drift.study.summary import Summary, summarised
-from afspm.plugins.drift.study.workers import TaskOutcome, on_cluster, on_cores
+from afspm.plugins.drift.workers import TaskOutcome, on_cluster, on_cores
 
 __all__ = [
     "NightSettings",

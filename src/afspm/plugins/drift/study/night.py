@@ -11,12 +11,12 @@ from afspm import Array
 from afspm.emulation import World
 from afspm.model import Frame, Region
 from afspm.plugins.drift.estimators import estimator
-from afspm.plugins.drift.overlap import too_far_off, too_little_shared
-from afspm.plugins.drift.record import DriftRecord
+from afspm.plugins.drift.pairs.overlap import too_far_off, too_little_shared
 from afspm.plugins.drift.registration import DriftScan
 from afspm.plugins.drift.study.settings import NightSettings
-from afspm.plugins.drift.trackers import tracker
-from afspm.plugins.drift.tracking import Tracker, Update
+from afspm.plugins.drift.track import tracker
+from afspm.plugins.drift.track.record import DriftRecord
+from afspm.plugins.drift.track.tracking import Tracker, Update
 
 SETTLED_S = 7200.0  # at the start the rate is unknown; the metrics judge tracking after that
 _95_PERCENT = -2.0 * math.log(0.05)  # of the square of a normal error of two components, in standard deviations

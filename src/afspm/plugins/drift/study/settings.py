@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, fields
 
 from afspm.basics import ConfigError, InvalidValue, Plain, PlainMapping
 from afspm.plugins.drift.estimators import DEFAULT as DEFAULT_ESTIMATOR
-from afspm.plugins.drift.overlap import F_RESCAN
-from afspm.plugins.drift.trackers import DEFAULT as DEFAULT_TRACKER
+from afspm.plugins.drift.pairs.overlap import F_RESCAN
+from afspm.plugins.drift.track import DEFAULT as DEFAULT_TRACKER
 
 Table = PlainMapping
 
@@ -25,7 +25,7 @@ class NightSettings:
         hours: duration of the night.
         drift_m: total displacement by the slow relaxation (time constant 3 h). A fast relaxation of a fifth, a daily
             cycle of a tenth and a random walk are added; the seed determines all directions.
-        rescan: rule for rescans, see `afspm.plugins.drift.overlap`: "tolerance", "paper" or "never".
+        rescan: rule for rescans, see `afspm.plugins.drift.pairs.overlap`: "tolerance", "paper" or "never".
         tolerance_m: tolerance of the rule "tolerance"; None: a tenth of the size.
         f_rescan: limit of the rule "paper".
         at_start: "up-down": the first scan is taken in both directions, as by the scheduler's default, if both scans

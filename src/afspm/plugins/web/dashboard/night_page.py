@@ -21,7 +21,7 @@ from nicegui import events, ui
 from afspm import Levelling, append_note, levelled
 from afspm.basics import AfspmError, ExperimentClock, InvalidValue, Plain, time_of_day, typeset_area, zone_offsets_s
 from afspm.model import PERSON
-from afspm.plugins.drift.scan_pair import onto_first
+from afspm.plugins.drift.report.scan_pair import onto_first
 from afspm.plugins.web.archive import Archive, allowed_region
 from afspm.plugins.web.dashboard import shadow_marks
 from afspm.plugins.web.dashboard.access import Access, Visitor
