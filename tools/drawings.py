@@ -106,6 +106,68 @@ def workflow() -> str:
     return sheet.document(720, 325, "The workflow of drift correction")
 
 
+def drift_stages() -> str:
+    """The stages of drift correction: what each takes and gives, with units and signs, and its folder."""
+    sheet = Sheet()
+    sheet.frame((110, 78), (270, 262), "estimators/: by name")
+    stages = (
+        (125, "pairs/", "one grid, levelled, mended"),
+        (210, "registration/", "search, then fit"),
+        (295, "doubt/", "how exact, how likely wrong"),
+        (390, "track/", "many pairs become one drift D(t)"),
+        (485, "frame/", "requests and packets, mapped"),
+    )
+    for number, (y, folder, does) in enumerate(stages):
+        kind = ("translator", "translator", "decision", "component", "scheduler")[number]
+        sheet.box((245, y), (230, 46), kind, folder, does)
+    flows = (
+        (
+            44,
+            100,
+            "two scans: values [y, x] · region in tip coordinates, m",
+            "start and end, s · a feature is at x_j, later at x_k",
+        ),
+        (150, 185, "two images in pixels, and the noise of their lines", ""),
+        (
+            235,
+            270,
+            "shift u in px: a feature at q is later at q + u",
+            "linear map A in px per px, and the normal equations",
+        ),
+        (
+            320,
+            365,
+            "displacement d = x_k − x_j, m, + to larger x · its covariance, m²",
+            "linear part, 1 · accepted, or the reason why not",
+        ),
+        (
+            415,
+            460,
+            "at any time t: M_tot, the translation by −D(t), m",
+            "covariance of D, m² · rate of D, m/s, with the sign of D",
+        ),
+        (
+            510,
+            550,
+            "to components: x_sample = M_tot x_tip = x_tip − D",
+            "to the microscope: x_tip = x_sample + D, and the rate, m/s",
+        ),
+    )
+    for top, bottom, *texts in flows:
+        sheet.arrow((245, top), (245, bottom), stroke=DATA)
+        for number, text in enumerate(filter(None, texts)):
+            sheet.note((395, (top + bottom) / 2 + number * 15), text, anchor="start", size=11)
+    sheet.arrow((129, 390), (95, 390), (95, 210), (128, 210), stroke=CONTROL)
+    for number, text in enumerate(("the prior:", "expected d, m", "covariance, m²")):
+        sheet.note((12, 285 + number * 15), text, anchor="start", fill=CONTROL, size=11)
+    sheet.note(
+        (20, 590),
+        "report/ draws and tabulates what track/ and frame/ know; study/ runs the stages in simulated nights.",
+        anchor="start",
+    )
+    return sheet.document(790, 605, "The stages of drift correction")
+
+
 def drift_designs() -> str:
     """The two designs of drift correction in the paper: components of their own, and a scheduler of its own."""
     sheet = Sheet()
@@ -217,6 +279,7 @@ DRAWINGS: dict[str, Callable[[], str]] = {
     "one-and-two-computers": computers,
     "reuse": reuse,
     "drift-workflow": workflow,
+    "drift-stages": drift_stages,
     "drift-designs": drift_designs,
     "drift-one-dimension": one_dimension,
     "two-paths": two_paths,
