@@ -12,7 +12,7 @@ from rich.table import Table
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
 from benchmarks.drift.foreign_pairs import CELLS, PIXEL_M, SURFACES, WANDERING, ZOOMS, foreign_pair
 from benchmarks.drift.parts import Plan, Report
-from benchmarks.drift.trials import Cell, Outcome, geometric_mean
+from benchmarks.drift.trials import ELLIPSE_95, Cell, Outcome, geometric_mean
 from benchmarks.rows import Row
 
 PAIRS = (
@@ -74,7 +74,7 @@ def report(plan: Plan, results: Sequence[Outcome]) -> Report:
         for cell in PAIRS
         for surface in SURFACES
     }
-    return Report([_table(cells)], list(_rows(cells)))
+    return Report([_table(cells), _ellipses(results)], list(_rows(cells)))
 
 
 Cells = dict[tuple[str, str], Cell]
@@ -90,6 +90,26 @@ def _table(cells: Cells) -> Table:
             cell, surface, str(c.count), f"{c.rms_px:.4f}", f"{c.ratio:.2f}", f"{c.failed:.0%}", f"{c.accepted:.0%}",
             f"{c.right_accepted:.0%}", f"{c.wrong:.1%}", f"{c.covered:.0%}", f"{c.ms:.0f}",
             end_section=surface == list(SURFACES)[-1],
+        )  # fmt: skip
+    return table
+
+
+def _ellipses(results: Sequence[Outcome]) -> Table:
+    # Of all surfaces together. "before": with the factor of the evidence, which was fitted to pairs without wander.
+    table = Table(title="ellipses of accepted pairs that are not wrong", title_justify="left", box=None, pad_edge=False)
+    for head in ("", "accepted", "chi2 before", "chi2", "95 % before", "95 %", "sd over before"):
+        table.add_column(head, justify="right" if head else "left", no_wrap=True)
+    for cell in PAIRS:
+        every = [o for o in results if o.cell == cell]
+        sure = [o for o in every if o.accepted and not o.failed]
+        if not sure:
+            continue
+        now = np.array([o.chi2 for o in sure])
+        wider = np.array([o.quality["spread"] / o.quality["spread_of_evidence"] for o in sure])
+        table.add_row(
+            cell, f"{len(sure)} of {len(every)}", f"{np.mean(now * wider) / 2:.2f}", f"{np.mean(now) / 2:.2f}",
+            f"{np.mean(now * wider <= ELLIPSE_95):.0%}", f"{np.mean(now <= ELLIPSE_95):.0%}",
+            f"{np.exp(np.mean(np.log(wider)) / 2):.2f}",
         )  # fmt: skip
     return table
 
