@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
@@ -183,11 +184,12 @@ def seen(
         return np.asarray(columns - (columns @ parabolas) @ parabolas.T, dtype=columns.dtype)
     found = np.empty_like(columns)
     metric_there = None if metric is None else metric.astype(columns.dtype)
-    few = max(1, CACHED // columns[0].size)
-    at_once = few if metric is None else few * max(1, ROWS_AT_ONCE // few)
+    few: int = max(1, CACHED // columns[0].size)
+    at_once: int = few if metric is None else few * max(1, ROWS_AT_ONCE // few)
     # the last rows stay apart: products of very few rows are summed in another order, and results would differ
-    whole = len(columns) - len(columns) % few
-    for some in (*(slice(k, min(k + at_once, whole)) for k in range(0, whole, at_once)), slice(whole, None)):
+    whole: int = len(columns) - len(columns) % few
+    for first, last in pairwise((*range(0, whole, at_once), whole, len(columns))):
+        some = slice(first, last)
         found[some] = _seen(columns[some], weight[some], metric_there)
     return found
 
