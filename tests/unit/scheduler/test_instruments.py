@@ -262,6 +262,7 @@ def test_band_around_the_target_and_its_time() -> None:
 def test_problem_is_flagged_while_the_condition_does_not_hold() -> None:
     cryo = Cryo(AllowedBand(4.15, 4.25, unit="K"), problem="cold")
     cryo.later(0.1)
+    cryo.later(4.2)
     assert cryo.is_flagged
     cryo.known()
     cryo.later(0.1)
@@ -277,6 +278,28 @@ def test_problem_is_flagged_while_the_condition_does_not_hold() -> None:
     cryo.later(4.2)  # no report at all
     assert cryo.is_flagged
     assert cryo.core.control.holder is None
+
+
+def test_first_reading_is_awaited_before_a_problem_is_flagged_but_not_for_ever() -> None:
+    cryo = Cryo(AllowedBand(4.15, 4.25, unit="K"), problem="cold")
+    cryo.in_control()
+    cryo.report(None, reason="not connected yet")
+    cryo.later(0.1)
+    cryo.later(3.8)
+    assert not cryo.is_flagged
+    assert "cold does not hold" in cryo.answer_to(ControlRequest.ACTION, START_SCAN)[1]
+    deadline_s = cryo.core.deadline_s()
+    assert deadline_s is not None
+    assert deadline_s <= cryo.now_s + 0.2
+    cryo.later(0.2)
+    assert cryo.is_flagged
+    again = Cryo(AllowedBand(4.15, 4.25, unit="K"), problem="cold", saved=cryo.core.snapshot())
+    again.later(0.1)
+    assert again.is_flagged, "a flag of before the restart stays until a reading"
+    first = Cryo(AllowedBand(4.15, 4.25, unit="K"), problem="cold")
+    first.known(4.3)
+    first.later(0.1)
+    assert first.is_flagged
 
 
 def test_flag_of_a_component_is_not_cleared_by_a_condition() -> None:

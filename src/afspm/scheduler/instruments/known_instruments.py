@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from afspm.basics.frozen import replace
 from afspm.model import ControlResponse, InstrumentOrder, InstrumentReading, InstrumentReadings, OrderOutcome, Parameter
 from afspm.model.instruments import GivenOrder, instrument_of
-from afspm.scheduler.instruments.conditions import OLDEST_S, ConditionState, InstrumentSettings
+from afspm.scheduler.instruments.conditions import OLDEST_S, ConditionState, InstrumentSettings, MeasuringCondition
 from afspm.scheduler.requests.forwarder import ForwardedRequest
 
 PUBLISH_S = 10.0
@@ -71,6 +71,7 @@ class Instruments:
         number: the number of the newest order or token.
         states: the states of the conditions, by name.
         given: the orders that may still be carried out, or whose value is on its way.
+        awaited_until_s: the real time until which a first reading is awaited; None: conditions were not evaluated yet.
     """
 
     settings: InstrumentSettings = field(default_factory=InstrumentSettings)
@@ -79,6 +80,7 @@ class Instruments:
     number: int = 0
     states: Mapping[str, ConditionState] = field(default_factory=dict)
     given: tuple[GivenOrder, ...] = ()
+    awaited_until_s: float | None = None
 
     # --- readings ---
 
@@ -154,7 +156,10 @@ class Instruments:
         for name, condition in self.settings.conditions.items():
             readings = {parameter: self.reading(parameter, now_s) for parameter in condition.bands}
             states[name] = self.states.get(name, ConditionState()).updated(condition, readings, now_ns)
-        return self if states == self.states else replace(self, states=states)
+        until_s = now_s + OLDEST_S if self.awaited_until_s is None else self.awaited_until_s
+        until_s = until_s if now_s <= until_s else _NEVER_S
+        is_same = states == self.states and until_s == self.awaited_until_s
+        return self if is_same else replace(self, states=states, awaited_until_s=until_s)
 
     def refusal(self, action: str, now_s: float, now_ns: int) -> str:
         """Return the reason why an action may not start now; empty if no condition forbids the start."""
@@ -168,14 +173,26 @@ class Instruments:
         ]
         return "; ".join(reasons)
 
-    def problems(self) -> dict[int, str]:
-        """Return the problems of the conditions that do not hold, each with one reason."""
+    def problems(self, flagged: Collection[int]) -> dict[int, str]:
+        """Return the problems of the conditions that do not hold, each with one reason.
+
+        An instrument connects after the start of the scheduler: until its first reading, or until `awaited_until_s`, a
+        problem that is not `flagged` is left out. Measurements are refused all the same.
+        """
         wanted = dict[int, str]()
         for name, condition in self.settings.conditions.items():
             reason = self.states.get(name, ConditionState()).reason
             if reason and condition.problem:
-                wanted.setdefault(self.settings.problems[condition.problem], f"{name}: {reason}")
+                number = self.settings.problems[condition.problem]
+                if number in flagged or not self._is_awaited(condition):
+                    wanted.setdefault(number, f"{name}: {reason}")
         return wanted
+
+    def _is_awaited(self, condition: MeasuringCondition) -> bool:
+        if self.awaited_until_s == _NEVER_S:
+            return False
+        known = (self._of(instrument_of(name)).readings.get(name) for name in condition.bands)
+        return any(one is None or one.measured_s == _NEVER_S for one in known)
 
     # --- orders ---
 
@@ -269,6 +286,8 @@ class Instruments:
     def due_s(self) -> float | None:
         """Return the next real time at which a condition or an order must be checked; None: no deadline."""
         dues = [one.job.deadline_s for known in self.known.values() for one in known.open]
+        if self.settings.problems and self.awaited_until_s is not None and self.awaited_until_s > _NEVER_S:
+            dues.append(self.awaited_until_s + _JUST_AFTER_S)
         for name, condition in self.settings.conditions.items():
             if self.states.get(name, ConditionState()).reason:
                 continue

@@ -266,7 +266,8 @@ def _next_flag(state: SchedulerState | StateDraft) -> tuple[ArbitrationEvent, in
     # not before the startup barrier opens: the state of before the restart is published first
     if state.control.ended or state.barrier.until_s is not None or not state.instruments.settings.problems:
         return None
-    wanted, flagged = state.instruments.problems(), state.control.problems
+    flagged = state.control.problems
+    wanted = state.instruments.problems(flagged)
     for problem, why in wanted.items():
         if problem not in flagged:
             return ArbitrationEvent.FLAG, problem, why
