@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from afspm.basics.errors import FileError
 from afspm.basics.formatting import scale, typeset
 from afspm.model import Scan
+from afspm.model.arrays import Array
 from afspm.model.line_levelling import flattened
-from afspm.record.drawing.raster import reduced, shared_range
+from afspm.record.drawing.raster import ValueRange, reduced, shared_range
 from afspm.record.report.pictures import topography
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SweptSetting
@@ -24,9 +24,13 @@ if TYPE_CHECKING:
 MOST: Final = 600
 _LARGEST_PX: Final = 160
 _PANEL_IN, _GAP_IN, _TEXT = 1.15, 0.06, 7.5
+_LEAST_CONTRAST: Final = 4.0
+"""Largest ratio of the shared range to the range of a row.
+
+A gain at which the feedback oscillates gives heights ten times those of a good scan, which is one colour then."""
 _TOP_IN, _BOTTOM_IN, _RIGHT_IN, _CHARACTER_IN = 0.85, 0.12, 0.85, 0.068
 _log = logging.getLogger("afspm.report")
-Values = tuple[object, ...]
+Setting = tuple[SweptSetting, ...]
 
 
 def figures(run: Run, title: str, again: bool = False) -> Iterator[tuple[str, Figure]]:
@@ -56,13 +60,16 @@ def _scan(run: Run, row: ScanRow) -> Scan | None:
     return scans[topography(scans)]
 
 
-def sheet(scans: Sequence[tuple[tuple[SweptSetting, ...], Scan]], title: str) -> Figure:
+def sheet(scans: Sequence[tuple[Setting, Scan]], title: str) -> Figure:
     """Return a figure of scans in rows and columns by their settings.
 
-    The last parameter changes along a row, all others from row to row. All scans share one range of colours. Of two
-    scans with the same settings the later one is drawn.
+    The last parameter changes along a row, all others from row to row. All scans share one range of colours, unless
+    that would leave a row without contrast: then each row has a range and a colour bar of its own. Of two scans with
+    the same settings the later one is drawn.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
     from afspm.record.plotting import draw_scale_bar, gold
@@ -88,7 +95,7 @@ def sheet(scans: Sequence[tuple[tuple[SweptSetting, ...], Scan]], title: str) ->
         y_in = _TOP_IN + row * pitch_in + _PANEL_IN / 2
         text(left_in - 0.1, y_in, _label(settings), va="center", ha="right")
     pictures = {one: (scan, _picture(scan)) for one, scan in scans}
-    span = shared_range([picture for _, picture in pictures.values()])
+    spans = _spans({one: picture for one, (_, picture) in pictures.items()})
     for settings, (scan, picture) in pictures.items():
         place = (across.index(settings[-1:]), down.index(settings[:-1]))
         x_in, y_in = left_in + place[0] * pitch_in, _TOP_IN + place[1] * pitch_in
@@ -96,6 +103,7 @@ def sheet(scans: Sequence[tuple[tuple[SweptSetting, ...], Scan]], title: str) ->
             (x_in / width_in, 1 - (y_in + _PANEL_IN) / height_in, _PANEL_IN / width_in, _PANEL_IN / height_in)
         )
         axes.set_facecolor("0.6")  # not measured
+        span = spans[settings[:-1]]
         width_m, height_m = scan.region.size_m
         axes.imshow(
             np.ma.masked_invalid(picture), cmap=gold(), vmin=span.low, vmax=span.high, origin="lower",
@@ -107,25 +115,42 @@ def sheet(scans: Sequence[tuple[tuple[SweptSetting, ...], Scan]], title: str) ->
         axes.set_yticks([])
         is_first = place == (0, len(down) - 1)
         draw_scale_bar(axes, scan.region.size_m, (0.0, 0.0), 1.0, font=_TEXT, named=is_first)
-    scan = scans[0][1]
-    factor, unit = scale(max(abs(span.low), abs(span.high)), scan.unit)
-    tall_in = min(2.0 * pitch_in, len(down) * pitch_in) - _GAP_IN
-    bar = figure.add_axes(
-        ((left_in + len(across) * pitch_in + 0.05) / width_in, 1 - (_TOP_IN + tall_in) / height_in,
-         0.1 / width_in, tall_in / height_in)
-    )  # fmt: skip
-    drawn = figure.colorbar(figure.axes[0].images[0], cax=bar)
-    drawn.ax.yaxis.set_major_formatter(lambda value, _: f"{value * factor:.3g}".replace("-", "−"))
-    drawn.ax.tick_params(labelsize=_TEXT)
-    drawn.set_label(f"{scan.channel} / {unit}" if unit else scan.channel, fontsize=_TEXT)
+    scan, bars_in = scans[0][1], left_in + len(across) * pitch_in + 0.05
+    is_shared = len(set(spans.values())) == 1
+    if not is_shared:
+        text(bars_in, 0.72, "row’s scale", va="center", style="italic")
+    tall_in = (min(2, len(down)) if is_shared else 1) * pitch_in - _GAP_IN
+    for row, settings in enumerate(down[:1] if is_shared else down):
+        span = spans[settings]
+        factor, unit = scale(max(abs(span.low), abs(span.high)), scan.unit)
+        low_in = _TOP_IN + row * pitch_in + tall_in
+        bar = figure.add_axes((bars_in / width_in, 1 - low_in / height_in, 0.1 / width_in, tall_in / height_in))
+        colours = ScalarMappable(Normalize(span.low * factor, span.high * factor), gold())
+        drawn = figure.colorbar(colours, cax=bar)
+        drawn.ax.yaxis.set_major_formatter(lambda value, _: f"{value:.3g}".replace("-", "−"))
+        drawn.ax.tick_params(labelsize=_TEXT)
+        drawn.set_label(f"{scan.channel} / {unit}" if unit else scan.channel, fontsize=_TEXT)
     return figure
 
 
-def _picture(scan: Scan) -> NDArray[np.float64]:
+def _spans(pictures: Mapping[Setting, Array]) -> dict[Setting, ValueRange]:
+    # the range of colours of each row; a picture of one value, or of none, has no range
+    rows: dict[Setting, list[Array]] = {}
+    for settings, picture in pictures.items():
+        rows.setdefault(settings[:-1], []).append(picture)
+    varied = {row: [one for one in found if np.nanmax(one, initial=-np.inf) > np.nanmin(one, initial=np.inf)]
+              for row, found in rows.items()}  # fmt: skip
+    spans = {row: shared_range(found) for row, found in varied.items() if found}
+    together = shared_range([one for found in varied.values() for one in found] or pictures.values())
+    is_flat = any(together.high - together.low > _LEAST_CONTRAST * (span.high - span.low) for span in spans.values())
+    return {row: spans.get(row, together) if is_flat else together for row in rows}
+
+
+def _picture(scan: Scan) -> Array:
     return reduced(flattened(scan.values), _LARGEST_PX)
 
 
-def _sorted(settings: Iterable[tuple[SweptSetting, ...]]) -> list[tuple[SweptSetting, ...]]:
+def _sorted(settings: Iterable[Setting]) -> list[Setting]:
     # numbers ascending, other values in the order of occurrence
     found = list(dict.fromkeys(settings))
     seen: list[object] = [one.value for each in found for one in each]
@@ -136,9 +161,9 @@ def _sorted(settings: Iterable[tuple[SweptSetting, ...]]) -> list[tuple[SweptSet
     return sorted(found, key=lambda each: tuple(map(rank, each)))
 
 
-def _names(settings: tuple[SweptSetting, ...]) -> str:
+def _names(settings: Setting) -> str:
     return "\n".join(one.name for one in settings)
 
 
-def _label(settings: tuple[SweptSetting, ...]) -> str:
+def _label(settings: Setting) -> str:
     return "\n".join(typeset(one.text) for one in settings)

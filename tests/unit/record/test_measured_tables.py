@@ -8,14 +8,15 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from tests.unit.record.record_lab import Given, Night
+from tests.unit.record.record_lab import REGION, Given, Night
 
 import afspm
 from afspm.basics.errors import ConfigError, InvalidValue
-from afspm.model import ControlResponse, JournalEntries, JournalEntry, Parameter, ScopeState, names
+from afspm.model import ControlResponse, JournalEntries, JournalEntry, Parameter, Scan, ScopeState, names
 from afspm.model.events import MeasurementSettings
 from afspm.record.export import export
 from afspm.record.store import RecordStore
+from afspm.record.tables import SweptSetting
 
 
 def start(night: Night, key: str, action: str = names.START_SCAN, response: int = ControlResponse.SUCCESS) -> Given:
@@ -177,3 +178,26 @@ def test_a_contact_sheet_shows_the_sweep(night: Night, store: RecordStore, tmp_p
     across, down = (sweep_sheet._sorted(one[part] for one, _ in rows) for part in (slice(-1, None), slice(None, -1)))
     assert [each[0].text for each in across] == ["1 µm/s", "2 µm/s"]
     assert [each[0].text for each in down] == ["5", "70"]
+    assert len(named[1].axes) == 4 + 1, "one colour bar"
+
+
+def test_row_without_contrast_has_a_scale_of_its_own() -> None:
+    pytest.importorskip("matplotlib")
+    from afspm.record import sweep_sheet
+
+    noise = np.random.default_rng(1).normal(size=(2, 2, 16, 16))
+    noise[1, 0, 3] = np.nan
+
+    def ranges(*, largest_m: float) -> list[tuple[float, float]]:
+        scans = [
+            ((SweptSetting("gain", gain, ""), SweptSetting("scan-speed", speed, "m/s")),
+             Scan(REGION, "Height", "m", height_m * noise[row, column], 0, ""))
+            for row, (gain, height_m) in enumerate([(5.0, 1e-9), (70.0, largest_m)])
+            for column, speed in enumerate([1e-6, 2e-6])
+        ]  # fmt: skip
+        return [axes.images[0].get_clim() for axes in sweep_sheet.sheet(scans, "night").axes if axes.images]
+
+    assert len(set(ranges(largest_m=2e-9))) == 1, "the same colours mean the same heights"
+    good, _, oscillating, _ = found = ranges(largest_m=20e-9)
+    assert len(set(found)) == 2
+    assert 10e-9 > good[1] - good[0] < 0.1 * (oscillating[1] - oscillating[0])
