@@ -179,7 +179,7 @@ def test_cryostat_and_magnet_are_set_flagged_and_recorded(server: Server, folder
     wait_until(lambda: list(folder.glob(f"runs/*/{RUN_FILE}")))
     with afspm.connect(folder / "runs") as scope:
         no_field = scope.problems["no-field"]
-        # flagged from the start until the instrument has reported, which may be over already
+        # flagged at the start if the first reading takes longer than 4 s, which may be over already
         wait_until(lambda: has_reported(scope))
         wait_until(lambda: not scope.control_state.problems)
         assert scope.get("cryo.temperature") == pytest.approx(4.2, abs=3.0)
