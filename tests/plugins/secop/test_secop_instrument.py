@@ -138,6 +138,27 @@ def test_trial_of_the_connection_names_what_answers_instead_of_a_server(
     assert error.value.where == address
 
 
+def test_server_of_ten_thousand_modules_is_described() -> None:
+    value = {"datainfo": {"type": "double", "unit": "K", "min": 0.0, "max": 300.0}}
+    target = {**value, "readonly": False, "description": "the target"}
+    modules = {f"m{number}": {"accessibles": {"value": value, "target": target}} for number in range(10_000)}
+    sent = f"ISSE,SECoP,V2021-02-22,v1.1\ndescribing . {json.dumps({'modules': modules})}\nactive\n".encode()
+    assert len(sent) > 1 << 20
+    with socket.create_server(("127.0.0.1", 0)) as server, ThreadPoolExecutor(1) as other:
+        host, port = server.getsockname()
+
+        def answer() -> None:
+            peer, _ = server.accept()
+            with peer:
+                peer.sendall(sent)
+                while peer.recv(1 << 10):
+                    pass
+
+        done = other.submit(answer)
+        Instrument(f"secop://{host}:{port}", {"cryo.t": "m9999"}).try_connection()
+        done.result(10.0)
+
+
 @pytest.mark.parametrize("levels", [200, 50_000])
 def test_nested_json_of_a_server_does_not_end_the_component(cryo: Cryo, levels: int) -> None:
     cryo.answers.append("update tt:value " + "[" * levels + "]" * levels)

@@ -9,8 +9,8 @@ from itertools import chain
 from afspm.basics import escaped, from_json
 
 IDENTIFY, DESCRIBE, ACTIVATE = "*IDN?", "describe", "activate"
-LONGEST = 1 << 20
-"""The greatest length of a line in bytes; a longer line is not SECoP."""
+LONGEST = 1 << 23
+"""The greatest length of a line in bytes; a longer line is not SECoP. 10,000 modules are described in some 2 MB."""
 _MOST_NESTED = 64
 # SECoP's own structures have a depth of about ten. Below Python's limit a value could be read, and not be printed.
 
