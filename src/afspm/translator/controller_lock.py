@@ -102,7 +102,8 @@ def _lock_file(address: str) -> Path:
 
 def _lock_folder() -> Path:
     # common to all users: each may add files, and delete only their own (sticky bit). A link in its place is refused:
-    # it may lead into a folder chosen by another user
+    # it may lead into a folder chosen by another user. The user who made the folder first, of several who measure here,
+    # could rename the files of others: the lock prevents mistakes, and each local user can open the controller's port
     in_common = {
         "win32": os.environ.get("PROGRAMDATA"),
         "darwin": "/tmp",
