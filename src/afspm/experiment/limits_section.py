@@ -211,7 +211,8 @@ class LimitsReader:
         elif isinstance(given, list):
             rules = [(i, str(rule), rule) for i, rule in enumerate(given)]
         else:
-            self.document.error("[limits] forbid is neither a list of rules nor a table of named rules", *_FORBID)
+            what = "[limits] forbid is neither a list of rules nor a table of named rules"
+            self.document.error(what, *_FORBID, hint=f'e.g. ["{_EXAMPLE}"]')
             return {}
         found = {name: self._rule(key, rule) for key, name, rule in rules}
         return {name: one for name, one in found.items() if one is not None}
@@ -224,18 +225,17 @@ class LimitsReader:
         try:
             units = self._units_of(rule_language.parse(rule))
         except RuleError as error:
-            at = f"column {self._column(rule, path, error.at)}"
+            at = self._place_in(rule, path, error.at)
             self.document.error(f"[limits] forbid, {at}: {error.what}", *path, hint=error.hint)
             return None
         return ForbiddenState(rule, units, str(self.document.place(*path)))
 
-    def _column(self, rule: str, path: tuple[str | int, ...], at: int) -> int:
-        # in the line of the file, from 1; of a rule with escapes or over several lines, in the rule
-        place = self.document.place(*path)
+    def _place_in(self, rule: str, path: tuple[str | int, ...], at: int) -> str:
+        place, column = self.document.place(*path), -1
         with contextlib.suppress(OSError, IndexError, UnicodeDecodeError):
-            line = Path(place.file).read_text(encoding="utf-8-sig").splitlines()[place.line - 1]
-            return max(0, line.find(rule)) + at + 1
-        return at + 1
+            column = Path(place.file).read_text(encoding="utf-8-sig").splitlines()[place.line - 1].find(rule)
+        # a rule with escapes, or over several lines, is not found in its line
+        return f"character {at + 1} of the rule" if column < 0 else f"column {column + at + 1}"
 
     def _units_of(self, tree: RuleTree) -> dict[str, str]:
         units = dict[str, str]()

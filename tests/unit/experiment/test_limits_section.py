@@ -84,6 +84,8 @@ def test_a_region_may_be_turned(write: Write) -> None:
         ("[limits]\nforbid = [3]\n", "3 is not a text"),
         ('[limits]\nforbid = ["scan-speed > 1 um/s and"]\n', "forbid, column 35: the rule ends where"),
         ('[limits]\nforbid = ["scan-sped > 1 um/s"]\n', "column 12: there is no parameter, instrument's"),
+        ('[limits]\nforbid = ["""\nscan-sped > 1 um/s"""]\n', "character 1 of the rule: there is no parameter"),
+        ('[limits]\nforbid = ["scan-speed > 1e999 um/s"]\n', "column 25: 1e999 is not a finite number"),
         ('[limits]\nforbid = ["scan-speed > 1 um"]\n', "scan-speed and 1 µm have different units: m/s and m"),
         ('[limits]\nforbid = ["scan-speed > 1"]\n', "scan-speed and 1 have different units: m/s and no unit"),
         ('[limits]\nforbid = ["scan-speed > scan-angle"]\n', "different units: m/s and rad"),

@@ -14,6 +14,7 @@ and `or`. Then a state in which no comparison is truer is not worse, which `Forb
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -273,9 +274,12 @@ class _Parser:
             unit = self._take().text
         try:
             si = si_unit(unit)
-            return RuleTerm(number=float(convert(float(token.text), unit, si)), unit=si, at=token.at)
+            number = float(convert(float(token.text), unit, si))
         except AfspmError as error:
             raise RuleError(error.what, token.at, error.hint) from error
+        if not math.isfinite(number):
+            raise RuleError(f"{token.text} is not a finite number", token.at)
+        return RuleTerm(number=number, unit=si, at=token.at)
 
     @property
     def _here(self) -> _Token:
@@ -293,5 +297,6 @@ class _Parser:
 
     def _unexpected(self, wanted: str, token: _Token | None = None) -> RuleError:
         token = token or self._here
-        found = repr(token.text) if token.text else "the rule ends"
-        return RuleError(f"{found} where {wanted} is expected", token.at)
+        found, word = repr(token.text) if token.text else "the rule ends", token.text.lower()
+        hint = f"write `{word}`" if word in _WORDS and token.text != word else ""
+        return RuleError(f"{found} where {wanted} is expected", token.at, hint)
