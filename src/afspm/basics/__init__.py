@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         position_text,
         quantity,
         scale,
+        shortest_single,
         typeset_position,
     )
     from afspm.basics.frozen import replace
@@ -134,6 +135,7 @@ __all__ = [
     "require_trusted",
     "same_kind",
     "scale",
+    "shortest_single",
     "si",
     "si_or_text",
     "time_of_day",

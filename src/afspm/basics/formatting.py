@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Sequence
 from datetime import UTC, datetime, tzinfo
 
@@ -16,6 +17,7 @@ PREFIXABLE = frozenset(
 )
 LONGEST_FOREIGN = 200
 """Greatest number of characters shown of a text from outside, such as a message of a controller."""
+_SINGLE = struct.Struct("<f")
 _DAY_NS = 86_400 * NS_PER_S
 _LENGTHS = ((1e-3, "mm"), (1e-6, "µm"), (1e-9, "nm"), (1e-12, "pm"))
 
@@ -158,6 +160,18 @@ def quantity(value: float | None, unit: str, digits: int = 4) -> str:
     factor, shown = scale(value, unit)
     rounded = float(f"{value * factor:.{digits}g}") + 0.0  # 20000, not 2e+04; 0, not -0
     return f"{rounded:.{max(digits, _PLAIN_DIGITS)}g} {shown}".strip()
+
+
+def shortest_single(number: float) -> float:
+    """Return the shortest decimal number of a single precision number: 0.1, not 0.10000000149011612.
+
+    A limit of 0.1 would refuse the latter.
+    """
+    for digits in range(6, 9):
+        decimal = float(f"{number:.{digits}g}")
+        if _SINGLE.unpack(_SINGLE.pack(decimal)) == (number,):
+            return decimal
+    return float(f"{number:.9g}")  # nine digits distinguish any two of them
 
 
 def typeset_position(xy_m: tuple[float, float]) -> str:

@@ -4,6 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Final
+
+from afspm.basics.formatting import quantity
+
+_DIGITS: Final = 7
+"""As many as single precision has: many controllers keep their settings in it."""
+_ALL_DIGITS: Final = 15
 
 
 class PanelAct(StrEnum):
@@ -45,8 +52,16 @@ class ChangedValue:
     unit: str = ""
 
     def __str__(self) -> str:
-        unit = f" {self.unit}" if self.unit else ""
-        return f"{self.parameter} = {self.after}{unit} (before: {self.before}{unit})"
+        before, after = (self._text(value, _DIGITS) for value in (self.before, self.after))
+        if before == after:
+            before, after = (self._text(value, _ALL_DIGITS) for value in (self.before, self.after))
+        return f"{self.parameter} = {after} (before: {before})"
+
+    def _text(self, value: str, digits: int) -> str:
+        try:
+            return quantity(float(value), self.unit, digits)
+        except ValueError:
+            return f"{value} {self.unit}".rstrip()
 
 
 @dataclass(frozen=True, slots=True)

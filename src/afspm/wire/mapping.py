@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable, Iterable
 from dataclasses import fields
 from enum import IntEnum
@@ -16,6 +15,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from afspm import model
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import InvalidValue
+from afspm.basics.formatting import shortest_single
 from afspm.model.events import LogLines, MeasurementSettings
 from afspm.model.instruments import InstrumentOrders
 from afspm.model.state import FeedbackUnits
@@ -36,7 +36,6 @@ E = TypeVar("E", bound=IntEnum)
 
 # the record and numpy keep times as ns in a signed 64-bit integer
 _TIMES = 2**63
-_FLOAT32 = struct.Struct("<f")
 
 
 def timestamp(time_ns: int) -> Timestamp:
@@ -58,15 +57,6 @@ def time_ns(stamp: Timestamp) -> int:
 def known(kind: type[E], number: int) -> E:
     """Return the enum member with this number; UNDEFINED (0) for an unknown number from a newer peer."""
     return kind(number) if number in kind._value2member_map_ else kind(0)
-
-
-def shortest(number: float) -> float:
-    """Return the shortest decimal number for a float32: 0.1, not 0.10000000149011612, which a limit of 0.1 refuses."""
-    for digits in range(6, 9):
-        decimal = float(f"{number:.{digits}g}")
-        if _FLOAT32.unpack(_FLOAT32.pack(decimal)) == (number,):
-            return decimal
-    return float(f"{number:.9g}")  # nine digits distinguish any two float32
 
 
 class FieldMapping(NamedTuple):
@@ -162,7 +152,7 @@ def _gain(name: str) -> FieldMapping:
     def finite(value: float) -> float:
         if not math.isfinite(value):
             raise InvalidValue(f"{name} is {value}")
-        return shortest(value)
+        return shortest_single(value)
 
     return FieldMapping(name, from_wire=finite)
 

@@ -142,11 +142,11 @@ def test_shadow_reports_a_persons_night_and_sends_no_command(run: AfspmRun, tmp_
     assert repair == "corrector would have been given control to solve tip-shape-changed"
     assert [row["afspm"].split(":")[0] for row in rows if row["kind"] == "limit"] == ["would have refused this"]
     slowed, *acts = [row["person"].split(",")[0] for row in rows if not row["afspm"]]
-    assert slowed.startswith("set at the microscope: scan-speed = 9.99")
+    assert slowed.startswith("set at the microscope: scan-speed = 10 nm/s")
     assert acts[-3:] == [
         "a scan was begun at the microscope",
-        "a scan ended before its last line",
-        "set at the microscope: tip-bias-voltage = 5 V (before: 0.100000001490116 V)",
+        "scan 1 ended before its last line",
+        "set at the microscope: tip-bias-voltage = 5 V (before: 100 mV)",
     ]
     assert "What afspm would have done" in (run.folder / "report.html").read_text(encoding="utf-8")
     (problem,) = [row["number"] for row in rows if row["kind"] == "problem"]

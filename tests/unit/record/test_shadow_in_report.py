@@ -14,7 +14,7 @@ from tests.unit.record.record_lab import REGION, Night
 from afspm.basics.errors import InvalidValue
 from afspm.basics.formatting import duration_text
 from afspm.components.tip_verdict import OF_LINES, LineVerdict, line_verdict_message, verdict_message
-from afspm.model import Region, Scan
+from afspm.model import Region, Scan, ScopeState
 from afspm.record.bad_scans import BAD, VERDICT_MESSAGE
 from afspm.record.measurement_history import DriftPoint
 from afspm.record.report.markup import PageTimes
@@ -195,3 +195,22 @@ def test_verdicts_that_components_publish_are_rows(night: Night, store: RecordSt
     assert look.endswith("; again at row 5: twice the threshold")
     assert "would have stopped the scan at row 4" in halt
     assert "again" not in halt
+
+
+@pytest.mark.parametrize(
+    ("after", "kind"),
+    [(ScopeState.FREE, ShadowKind.PERSON), (ScopeState.UNDEFINED, ShadowKind.CONTACT)],
+    ids=["stopped", "contact lost"],
+)
+def test_scan_that_a_lost_contact_ends_is_no_act_of_the_person(
+    night: Night, store: RecordStore, tmp_path: Path, after: ScopeState, kind: ShadowKind
+) -> None:
+    (tmp_path / "experiment.toml").write_text("[control]\nshadow = true\n", encoding="utf-8")
+    states = [ScopeState.FREE, ScopeState.SCANNING, ScopeState.INTERRUPTED, after]
+    if after is ScopeState.UNDEFINED:
+        states.append(ScopeState.FREE)  # again in contact
+    store.take([night.state(state) for state in states])
+    found = read(open_run(tmp_path))
+    (row,) = [row for row in found.rows if "scan 1" in row.would + row.did]
+    assert row.kind is kind
+    assert counted(found, ShadowKind.PERSON) == (int(kind is ShadowKind.PERSON), 0)

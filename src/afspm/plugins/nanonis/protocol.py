@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from afspm.basics import AfspmError, InvalidValue
+from afspm.basics import AfspmError, InvalidValue, shortest_single
 from afspm.driver import ControllerLost, text_of
 
 HEADER_BYTES: Final = 40
@@ -179,7 +179,9 @@ class _Reader:
 
     def number(self, code: str) -> Any:
         number = _NUMBERS[code]
-        return number.unpack(self.take(number.size))[0]
+        found = number.unpack(self.take(number.size))[0]
+        # a bias of 0.1 V is read as 0.1: otherwise pages and files have 0.10000000149011612
+        return shortest_single(found) if code == "f" else found
 
     def text(self) -> str:
         return text_of(self.take(self.number("i")))
@@ -197,7 +199,8 @@ class _Reader:
 
     def numbers(self, code: str) -> list[object]:
         raw = self.take(4 * self.count(4))
-        return list(struct.unpack(f">{len(raw) // 4}{code}", raw))
+        found = struct.unpack(f">{len(raw) // 4}{code}", raw)
+        return [shortest_single(one) if code == "f" else one for one in found]
 
     def shape(self) -> tuple[int, int]:
         rows, columns = self.number("i"), self.number("i")

@@ -110,10 +110,11 @@ def _cards(story: RunStory) -> str:
     interrupted = f"and {story.interrupted} interrupted" if story.interrupted else ""
     flags = len(story.problems)
     unsolved = sum(span.end_ns is None for span in story.problems)
+    flagged = ("problems flagged", flags, f"{unsolved} still flagged at the end" if unsolved else "")
     cards = [
         ("scans", len(story.scans) - story.interrupted, interrupted),
         ("spectra", story.spectra, ""),
-        ("problems flagged", flags, f"{unsolved} still flagged at the end" if unsolved else ""),
+        *(_decisions(story) or [flagged]),
         *_registered(story),
         ("refusals", sum(one.count for one in story.refusals), ""),
         ("restarts", len(story.restarts), f"given up: {', '.join(story.given_up)}" if story.given_up else ""),
@@ -123,6 +124,12 @@ def _cards(story: RunStory) -> str:
         for what, number, note in cards
     ]
     return f'<p class="lead">{escape(sentence(story))}</p><div class="cards">{"".join(made)}</div>'
+
+
+def _decisions(story: RunStory) -> list[tuple[str, int, str]]:
+    # a shadow flags no problem of the sample or the tip: it decides, and nothing follows
+    count, answered = story.shadow.answered
+    return [("decisions", count, f"{answered} answered by the person")] if story.shadow.agreement else []
 
 
 def _registered(story: RunStory) -> list[tuple[str, int, str]]:
@@ -207,10 +214,11 @@ def _problems(story: RunStory, clock: PageTimes) -> str:
         f"{counted(one.late_lines, 'line')} came after the end of their scan.</p>"
         for name, one in story.watched.items()
     )
+    nothing = "A shadow sets no problems: see its decisions above." if story.shadow.agreement else "None."
     return (
         (
             table(["problem", "flagged", "by", "in control meanwhile", "treatments", "for", "cleared"], rows)
-            or "<p>None.</p>"
+            or f"<p>{nothing}</p>"
         )
         + routine
         + watched

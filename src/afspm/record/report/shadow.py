@@ -23,6 +23,7 @@ from afspm.model import (
     PanelAct,
     Problem,
     RegistrationOutcome,
+    ScopeState,
 )
 from afspm.record.bad_scans import BAD, read_verdict
 from afspm.record.measurement_history import DriftPoint
@@ -36,7 +37,7 @@ SOON_S: Final = 300.0
 """Experiment time within which an act of the person answers a decision. Fixed before any night was seen."""
 ANSWERS: Final = frozenset({PanelAct.WITHDRAW, PanelAct.FEEDBACK_OFF, PanelAct.VALUES})
 """Acts that answer a decision, beside a scan that ended early: the person did not simply go on."""
-_ENDED_EARLY: Final = "a scan ended before its last line, and nothing but a person or the controller could end it"
+_OF_THE_SCAN: Final = (ScopeState.SCANNING, ScopeState.INTERRUPTED)
 _SIGMAS: Final = 1.959964
 FILE: Final = "shadow.csv"
 _HEADS: Final = ("number", "time_ns", "kind", "afspm", "person", "after_s", "left_s", "mark", "comment")
@@ -61,10 +62,11 @@ class ShadowKind(StrEnum):
     DRIFT = "drift"
     CONTROL = "control"
     LIMIT = "limit"
+    CONTACT = "contact lost"
     PERSON = "by hand"
 
 
-_UNANSWERED: Final = (ShadowKind.CONTROL, ShadowKind.DRIFT)
+_UNANSWERED: Final = (ShadowKind.CONTROL, ShadowKind.DRIFT, ShadowKind.CONTACT)
 """Kinds without an answer: a component that waits all night is no decision, and no act answers drift."""
 COUNTED: Final = (ShadowKind.SCAN, ShadowKind.LINES, ShadowKind.PROBLEM)
 """Kinds with a counted agreement: a person answers them, if at all, by an act."""
@@ -99,6 +101,11 @@ class ShadowRow:
     left_s: float | None = None
     number: int = 0
     mark: ShadowMark | None = None
+
+    @property
+    def answer(self) -> str:
+        """The act of the person, or "went on"; empty where nothing is answered."""
+        return self.did or ("went on" if self.would and self.kind not in _UNANSWERED else "")
 
 
 @dataclass(frozen=True)
@@ -163,6 +170,12 @@ class ShadowNight:
         hint = f"1 to {len(self.rows)}" if self.rows else "the run is no shadow, or nothing has happened yet"
         raise InvalidValue(f"the shadow's table has no row {number}", hint=hint)
 
+    @property
+    def answered(self) -> tuple[int, int]:
+        """The number of decisions with a counted agreement, and the number that the person answered."""
+        some = [one for one in self.agreement if one.kind in COUNTED]
+        return sum(one.count for one in some), sum(one.agreed for one in some)
+
     def left_s(self, *, right: bool) -> float:
         """Return the scan time left at all line alarms that a person marked right, or wrong."""
         marked = (row for row in self.rows if row.mark is not None and row.mark.right is right)
@@ -206,7 +219,17 @@ def read(run: Run) -> ShadowNight:
         if not scan.interrupted
     ]
     alarms: dict[tuple[int, ...], ShadowRow] = {}
-    acts = [PersonAct(scan.time_ns, _ENDED_EARLY, answers=True) for scan in scans if scan.interrupted]
+    early = [scan for scan in scans if scan.interrupted]
+    lost = _lost_in(run, early)
+    decisions += [
+        ShadowRow(scan.time_ns, ShadowKind.CONTACT, f"lost contact with the controller in scan {scan.number}")
+        for scan in lost
+    ]
+    acts = [
+        PersonAct(scan.time_ns, f"scan {scan.number} ended before its last line", answers=True)
+        for scan in early
+        if scan not in lost
+    ]
     for _, _, act in run.messages(("ActByHand",)):
         acts.append(PersonAct(act.time_ns, str(act), act.act in ANSWERS))
     for time_ns, verdict in judgements:
@@ -295,7 +318,7 @@ def html(night: ShadowNight, clock: PageTimes) -> str:
             clock.both(row.time_ns),
             escape(row.kind),
             escape(row.would),
-            escape(row.did) or ("went on" if row.would and row.kind not in _UNANSWERED else ""),
+            escape(row.answer),
             "" if row.after_s is None else escape(duration_text(row.after_s)),
             "" if row.mark is None else f"{_word(row.mark)}<small>{escape(row.mark.comment)}</small>",
         ]
@@ -314,7 +337,7 @@ def html(night: ShadowNight, clock: PageTimes) -> str:
     return (
         table(heads, shares)
         + f'<p class="note">{escape(marks_in_words(night))}</p>'
-        + table(("", "time", "", "afspm", "the person", "after", "marked"), cells)
+        + table(("row", "time", "kind", "afspm", "the person", "after", "marked"), cells)
     )
 
 
@@ -333,14 +356,14 @@ def agreement_lines(night: ShadowNight) -> list[tuple[str, ...]]:
         (
             *(one.kind.value, str(one.count)),
             *((str(one.agreed), _between(one.interval)) if one.kind in (*COUNTED, ShadowKind.PERSON) else ("", "")),
-            *(str(one.right), str(one.wrong), _between(one.interval_right)),
+            *(str(one.right), str(one.wrong), _between(one.interval_right) if one.right + one.wrong else ""),
         )
         for one in night.agreement
     ]
 
 
 def _between(share: tuple[float, float]) -> str:
-    return "{:.0%} to {:.0%}".format(*share)
+    return "{:.0f} % to {:.0f} %".format(*(100.0 * one for one in share))
 
 
 def _word(mark: ShadowMark) -> str:
@@ -362,6 +385,17 @@ def csv_text(night: ShadowNight) -> str:
 def _is_flag(entry: JournalEntry) -> bool:
     is_flag = entry.request == ControlRequest.ADD_EXP_PRBLM and entry.response == ControlResponse.SUCCESS
     return is_flag and entry.problem != Problem.DEVICE_MALFUNCTION
+
+
+def _lost_in(run: Run, scans: Sequence[ScanRow]) -> list[ScanRow]:
+    # a scan that a lost contact interrupts goes on at the controller: no person has ended it
+    states = [(packet.time_ns or 0, status.state) for packet, _, status in run.messages(("ScopeStateMsg",))]
+    found = []
+    for scan in scans:
+        later = (state for time_ns, state in states if time_ns >= scan.time_ns and state not in _OF_THE_SCAN)
+        if next(later, None) is ScopeState.UNDEFINED:
+            found.append(scan)
+    return found
 
 
 def _judged(scan: ScanRow) -> str:

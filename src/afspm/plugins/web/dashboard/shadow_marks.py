@@ -34,8 +34,8 @@ class ShadowMarks:
         self._show(night)
 
     def _row(self, row: shadow_report.ShadowRow) -> None:
-        did = row.did or ("went on" if row.would else "")
-        words = f"<b>{row.number} {escape(row.kind)}</b> {escape(row.would)} — <i>{escape(did)}</i>"
+        parts = (escape(row.would), row.answer and f"<i>{escape(row.answer)}</i>")
+        words = f"<b>{row.number} {escape(row.kind)}</b> {' — '.join(filter(None, parts))}"
         ui.html(f"<span><time>{time_of_day(row.time_ns)}</time> {words}</span>", sanitize=False)
         self._marks[row.number] = ui.html("", sanitize=False).classes("quiet")
         if self._visitor.person:
