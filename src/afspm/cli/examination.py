@@ -18,6 +18,7 @@ from afspm.basics import entry_points
 from afspm.basics.addresses import connectable
 from afspm.basics.clock import NS_PER_S, ExperimentClock
 from afspm.basics.errors import AfspmError
+from afspm.basics.formatting import duration_text
 from afspm.basics.launch import Launch, Sockets
 from afspm.basics.plain_data import Plain
 from afspm.client.component import Component
@@ -136,7 +137,10 @@ def _load(experiment: Experiment) -> Iterator[Diagnosis]:
     with suppress(AfspmError, OSError):
         folder = find_run(experiment.files[0])
         if goes_on(folder) and (load := load_of(newest_lines(folder / TRACE_FILE))) is not None:
-            yield diagnosis.fine("load", "controller", f"{load}, over the last {load.over_s:.0f} s")
+            what = f"{load}, over the last {duration_text(load.over_s)}"
+            severity = Severity.WARNING if load.lost else Severity.FINE
+            remedy = "raise `poll_period_s` of [microscope] if the controller is slow" if load.lost else ""
+            yield Diagnosis("load", severity, "controller", what, remedy)
 
 
 def _disk(runs: Path) -> Iterator[Diagnosis]:

@@ -11,14 +11,17 @@ import base64
 import json
 import threading
 import zlib
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from statistics import median
 from typing import IO, Final
 
 from afspm.basics.clock import NS_PER_S, Clock, ExperimentClock
 from afspm.basics.errors import FileError
+from afspm.basics.formatting import counted, quantity
 from afspm.basics.plain_data import Plain, from_json
 
 FILE: Final = "controller.trace.jsonl"
@@ -80,15 +83,27 @@ TraceLine = TraceHeader | TracedExchange | TracedFile
 
 @dataclass(frozen=True)
 class ControllerLoad:
-    """The load on a controller: connections, and questions in a real second."""
+    """The load on a controller in a part of a trace, in real time.
+
+    Attributes:
+        most_in_a_second: the number of questions in the fullest second.
+        answered_s: the median of the times to an answer; a question that waits for the end of a scan is one of many.
+        lost: the number of questions without a whole answer.
+    """
 
     connections: int
     questions_per_s: float
     over_s: float
+    most_in_a_second: int
+    answered_s: float
+    lost: int
 
     def __str__(self) -> str:
-        noun = "connection" if self.connections == 1 else "connections"
-        return f"{self.connections} {noun}, {self.questions_per_s:.3g} questions a second"
+        lost = f", {self.lost} without an answer" if self.lost else ""
+        return (
+            f"{counted(self.connections, 'connection')}, {self.questions_per_s:.3g} questions a second (at most"
+            f" {self.most_in_a_second}), half of them answered within {quantity(self.answered_s, 's', 2)}{lost}"
+        )
 
 
 def read_trace(file: Path) -> list[TraceLine]:
@@ -121,13 +136,19 @@ def trace_lines(file: Path) -> Iterator[TraceLine]:
 
 def load_of(lines: Iterable[TraceLine]) -> ControllerLoad | None:
     """Return the load on the controller in a part of a trace; None if the part is too short."""
-    connections, count, first_s, last_s = set[int](), 0, None, 0.0
-    for line in lines:
-        if isinstance(line, TracedExchange):
-            connections.add(line.connection)
-            first_s, last_s, count = line.at_s if first_s is None else first_s, line.at_s, count + 1
-    over_s = last_s - (first_s or 0.0)
-    return ControllerLoad(len(connections), (count - 1) / over_s, over_s) if over_s > 0.0 else None
+    # without the contents: the trace of a night may be larger than memory
+    asked = [replace(one, asked=None, answered=b"") for one in lines if isinstance(one, TracedExchange)]
+    over_s = asked[-1].at_s - asked[0].at_s if asked else 0.0
+    if over_s <= 0.0:
+        return None
+    return ControllerLoad(
+        connections=len({one.connection for one in asked}),
+        questions_per_s=(len(asked) - 1) / over_s,
+        over_s=over_s,
+        most_in_a_second=max(Counter(int(one.at_s) for one in asked).values()),
+        answered_s=median(one.took_s for one in asked),
+        lost=sum(bool(one.lost) for one in asked),
+    )
 
 
 def newest_lines(file: Path) -> Iterator[TraceLine]:
