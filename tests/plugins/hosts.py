@@ -16,7 +16,7 @@ from afspm.basics import entry_points
 
 HOST = "afspm.supervisor.host"
 IMPORTED = [
-    HOST,
+    *(HOST, "afspm.supervisor.hosting"),
     *("numpy", "h5py", "afspm.translator.translator", "afspm.transport.zmq_server"),
     *entry_points.modules(entry_points.DRIVERS),
 ]

@@ -13,7 +13,7 @@ import pytest
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.launch import Launch, Sockets
-from afspm.supervisor.host import MOST_FILES
+from afspm.supervisor.hosting import MOST_FILES
 from afspm.transport.heartbeat import Heartbeat, HeartbeatListener
 
 Host = Callable[[Launch], Any]
