@@ -21,6 +21,7 @@ from afspm.basics.plain_data import Plain
 from afspm.basics.type_aliases import unaliased
 
 T = TypeVar("T")
+_PLAIN_TYPES = frozenset({str, int, float, bool, type(None)})
 
 
 def snapshot(state: object, kind: str, version: int, *, lists: bool = False) -> Plain:
@@ -58,10 +59,13 @@ def _numpy() -> types.ModuleType | None:
 
 def to_plain(value: object, *, lists: bool = False) -> Any:
     """Return dataclasses, enums, collections and arrays as plain data."""
+    type_: Any = type(value)
+    if type_ in _PLAIN_TYPES:  # first, since most of a snapshot is plain: the scheduler waits for its own before a scan
+        return value
     if isinstance(value, Enum):
         return value.value
-    if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: to_plain(getattr(value, field.name), lists=lists) for field in fields(value) if field.init}
+    if (names := _field_names(type_)) is not None:
+        return {name: to_plain(getattr(value, name), lists=lists) for name in names}
     if (np := _numpy()) is not None:
         if isinstance(value, np.ndarray):
             return value.tolist() if lists else value
@@ -149,6 +153,12 @@ def _from_collection(origin: Any, arguments: Sequence[Any], plain: Any) -> objec
         return tuple(from_plain(one, value) for one, value in zip(arguments, plain, strict=True))
     made = [from_plain(arguments[0], value) for value in plain]
     return made if origin in (list, Sequence) else origin(made)
+
+
+@cache
+def _field_names(type_: type[object]) -> tuple[str, ...] | None:
+    # None: no dataclass
+    return tuple(field.name for field in fields(type_) if field.init) if is_dataclass(type_) else None
 
 
 @cache
