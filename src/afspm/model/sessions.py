@@ -21,6 +21,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum, auto
+from functools import lru_cache
 from typing import TypeVar
 
 from afspm.basics.frozen import replace
@@ -67,6 +68,7 @@ def token_of(name: str, request_id: str) -> str | None:
     return rest[0] if all(map(str.isdigit, rest[1:])) else None  # a number, and perhaps the number of an attempt
 
 
+@lru_cache(64)  # the steps of one request ask for the number of its id seven times
 def number_of(request_id: str) -> tuple[str, int] | None:
     """Return session and number of an id "<name>/<token>/<n>"; None for other forms.
 

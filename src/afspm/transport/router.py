@@ -170,7 +170,9 @@ class Router:
 
     def _former_lives(self, events: Sequence[RouterEvent]) -> list[int]:
         # a new sender under a known name may be a restarted process: look whether its former life is gone
-        names = {event.name for event in events if isinstance(event, PeerAsked) and len(events) > 1}
+        if len(events) < 2:
+            return []
+        names = {event.name for event in events if isinstance(event, PeerAsked)}
         return self._gone() if sum(sender.name in names for sender in self._senders.values()) > 1 else []
 
     def _gone(self) -> list[int]:
