@@ -45,8 +45,8 @@ def end(draft: StateDraft) -> None:
 
 def publish_changes(draft: StateDraft) -> None:
     """Publish the approvals if this step changed them."""
-    now = draft.grants.book.approvals()
-    if now != draft.before.grants.book.approvals():
+    book, before = draft.grants.book, draft.before.grants.book
+    if book is not before and (now := book.approvals()) != before.approvals():
         publish(draft, APPROVALS.name, draft.env.codec.encode(now))
 
 

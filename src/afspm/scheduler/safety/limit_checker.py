@@ -174,6 +174,8 @@ class LimitChecker:
         if len(SHAPE_CHANGES.keys() & given) == 1:
             needed += sorted(SHAPE_CHANGES)
         needed += forbidden_states.to_read(self._judging(request, is_mapped=is_mapped))
+        if not needed:
+            return needed
         for place, _ in _PLACES:
             if place.intersection(needed):  # a place of values read at different times would be a wrong one
                 needed += sorted(place)

@@ -41,5 +41,5 @@ def present_state(draft: StateDraft, read: Mapping[str, Parameter | None]) -> Pr
 
 def sending(draft: StateDraft, request: Request) -> None:
     """Forget values that were read for waiting orders of instruments, if a request may change them."""
-    if names := frozenset[str]().union(*(rule.names for rule in judging(draft.limits.limits, request))):
+    if names := {name for rule in judging(draft.limits.limits, request) for name in rule.names}:
         draft.instruments = draft.instruments.without_reads(names)
