@@ -1,7 +1,8 @@
 """Holds plug-ins to the doors of the core: `python tools/doors.py`, and writes their page for tools/docs.py.
 
 A door is a package whose `__init__` lists what others may use. A plug-in, or a distribution in packages/, imports
-doors, its own folder, and the modules of PAST_THE_DOORS, a list that may only get shorter.
+doors, its own folder, and the modules of PAST_THE_DOORS, a list that may only get shorter. So do the tests of
+plug-ins, whose imports past the doors are counted.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import importlib
 import inspect
 import re
 import sys
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from functools import cache
 from itertools import pairwise
@@ -20,6 +21,8 @@ from typing import Final, get_origin
 
 ROOT = Path(__file__).resolve().parents[1]
 CORE = ROOT / "src" / "afspm"
+PACKAGES = ROOT / "packages"
+TESTS = ROOT / "tests" / "plugins"
 DOORS: Final = {
     "afspm": "components and scripts",
     "afspm.basics": "all: errors, units, quantities as text, clocks, plain data",
@@ -59,11 +62,28 @@ PAST_THE_DOORS: Final = {
     "afspm.wire.messages": "drift line_watch published web",
 }
 """Modules behind the doors that plug-ins still import, with these plug-ins."""
+NAMES_IN_TESTS: Final = {
+    "agent": 3,
+    "asylum": 2,
+    "bluesky": 3,
+    "drift": 94,
+    "gxsm": 7,
+    "hosts": 3,
+    "line_watch": 5,
+    "nanonis": 3,
+    "panel_table": 1,
+    "published": 2,
+    "secop": 11,
+    "vendor_bench": 2,
+    "web": 17,
+    "what_if": 11,
+}
+"""Names that the tests of a plug-in still import past the doors, by the test's folder; these counts may only shrink."""
 
 
 def main() -> int:
     """Print what is wrong with the doors and their use; return the exit code."""
-    wrong = [*_wrong_imports(), *_wrong_doors()]
+    wrong = [*_wrong_imports(), *_wrong_tests(), *_wrong_doors()]
     sys.stdout.writelines(f"{line}\n" for line in wrong)
     return int(bool(wrong))
 
@@ -82,8 +102,7 @@ def past_the_doors() -> dict[str, set[str]]:
     """Return each module of the core that is no door, with the plug-ins that import it."""
     past: dict[str, set[str]] = defaultdict(set)
     for plug_in, module, name in _used():
-        target = f"{module}.{name}" if _file(f"{module}.{name}") else module
-        if target not in DOORS:
+        if (target := _target(module, name)) not in DOORS:
             past[target].add(plug_in)
     return past
 
@@ -96,6 +115,18 @@ def _wrong_imports() -> Iterator[str]:
     for module, listed in PAST_THE_DOORS.items():
         for plug_in in sorted(set(listed.split()) - past.get(module, set())):
             yield f"{plug_in} no longer imports {module}: strike it from the list in tools/doors.py"
+
+
+def _wrong_tests() -> Iterator[str]:
+    folders = [(file, file.relative_to(TESTS).parts[0].removesuffix(".py")) for file in TESTS.rglob("*.py")]
+    folders += [(file, file.relative_to(PACKAGES).parts[0]) for file in PACKAGES.glob("*/tests/**/*.py")]
+    count = Counter(folder for folder, *imported in _imports(folders) if _target(*imported) not in DOORS)
+    for folder in sorted({*count, *NAMES_IN_TESTS}):
+        listed = NAMES_IN_TESTS.get(folder, 0)
+        if count[folder] > listed:
+            yield f"tests of {folder} import {count[folder]} names past the doors, not {listed}: import a door"
+        if count[folder] < listed:
+            yield f"tests of {folder} import {count[folder]} names past the doors: lower {listed} in tools/doors.py"
 
 
 def _wrong_doors() -> Iterator[str]:
@@ -119,12 +150,21 @@ def _wrong_doors() -> Iterator[str]:
 def _used() -> Iterator[tuple[str, str, str]]:
     """Yield (plug-in, module of the core, name) for each import of a plug-in."""
     folders = [(file, file.relative_to(CORE).parts[1]) for file in (CORE / "plugins").rglob("*.py")]
-    for file in (ROOT / "packages").glob("*/src/**/*.py"):
-        folders.append((file, file.relative_to(ROOT / "packages").parts[0]))
-    for file, plug_in in folders:
+    folders += [(file, file.relative_to(PACKAGES).parts[0]) for file in PACKAGES.glob("*/src/**/*.py")]
+    yield from _imports(folders)
+
+
+def _imports(folders: list[tuple[Path, str]]) -> Iterator[tuple[str, str, str]]:
+    """Yield (folder, module of the core, name) for each import of these (file, folder)."""
+    for file, folder in folders:
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and re.match(r"afspm(?!\.plugins)(\.|$)", node.module or ""):
-                yield from ((plug_in, node.module or "", alias.name) for alias in node.names)
+                yield from ((folder, node.module or "", alias.name) for alias in node.names)
+
+
+def _target(module: str, name: str) -> str:
+    """Return the module that an import of `name` from `module` reaches."""
+    return f"{module}.{name}" if _file(f"{module}.{name}") else module
 
 
 def _homes(door: str) -> Iterator[tuple[str, str, bool]]:

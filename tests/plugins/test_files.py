@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm.basics.errors import FileError
+from afspm import read
+from afspm.basics import FileError
+from afspm.driver import FileFacts, encode_scan, encode_spectrum
 from afspm.model import Region, Scan, Spectrum
-from afspm.storage.formats import read
-from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 
 REGION = Region((1.1e-7, -3.3e-7), (1e-6, 0.7e-6), 0.3)
 MEASURED = FileFacts(1_767_225_600_123_456_789, {"scan-speed [m/s]": 1e-6, "x-spec-kind": "IV"})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from afspm.basics.clock import ExperimentClock
+from afspm.basics import ExperimentClock
 from afspm.plugins.gxsm import Gxsm
 
 

@@ -17,8 +17,8 @@ from tests.plugins.test_makers import MAKERS, Maker
 from tests.plugins.vendor_bench import PATIENT, SOON, Peer, VendorBench, scans, states
 from tests.plugins.wire_tap import lua_scripts, nanonis_names, tapped, zmtp_objects
 
+from afspm.emulation import ScanActivity
 from afspm.model import ActByHand, ControlResponse, PanelAct, ScopeState, names
-from afspm.simulation.activities import ScanActivity
 
 FREE, SCANNING = ScopeState.FREE, ScopeState.SCANNING
 Sent = Callable[[], list[str]]

@@ -20,9 +20,8 @@ from deadlines import DEADLINE_S
 from tests.plugins.hosts import host
 
 from afspm import wire
-from afspm.basics.clock import ExperimentClock
-from afspm.basics.exit_codes import ExitCode
-from afspm.basics.launch import Launch, Sockets
+from afspm.basics import ExitCode, ExperimentClock, Launch, Sockets
+from afspm.emulation import Emulator
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -37,9 +36,8 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
-from afspm.simulation.emulation.emulator import Emulator
+from afspm.processes import FreePorts
 from afspm.simulation.faults import Fault
-from afspm.supervisor.ports import FreePorts
 
 PATIENT: Mapping[str, Any] = {"reply_timeout_s": 120.0}
 """As long as a controller on a busy computer may need to answer."""

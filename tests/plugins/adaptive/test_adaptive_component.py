@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 from tests.unit.client.client_lab import Kill9, Lab, LabPort, context_of, run
 
-from afspm.basics.errors import ConfigError, InvalidValue, MeasurementFailed
-from afspm.basics.exit_codes import ExitCode
+from afspm.basics import ConfigError, ExitCode, InvalidValue, MeasurementFailed
+from afspm.emulation import World
 from afspm.model import ControlRequest, Region, Request, Spectrum
 from afspm.plugins.adaptive import Adaptive
 from afspm.plugins.adaptive.quantities import adhesion_n, evaluation, gap_ev
-from afspm.simulation import World
 
 HERE = "tests.plugins.adaptive.test_adaptive_component"
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from benchmarks.adaptive import GOAL, Case, course
 
-from afspm.basics.errors import InvalidValue
+from afspm.basics import InvalidValue
 from afspm.model import Region
 from afspm.plugins.adaptive.gaussian_process import GaussianProcess, Parameters, fitted
 from afspm.plugins.adaptive.refinement import AdaptiveMap, LatticeMap, NestedGrid, NestedLattices, Optimizer

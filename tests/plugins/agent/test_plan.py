@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from afspm import wire
-from afspm.basics.errors import InvalidValue
+from afspm.basics import InvalidValue
 from afspm.model import Frame, Proposal, Region, ScanParameters
 from afspm.plugins.agent import commands
 from afspm.plugins.agent.approval import of_plan, of_table, simulated

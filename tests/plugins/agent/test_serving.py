@@ -13,7 +13,7 @@ from mcp.client.streamable_http import streamable_http_client
 from tests.plugins.agent.test_tools import facts
 from tests.simulation.agent_rig import AgentRig
 
-from afspm.basics.clock import ExperimentClock
+from afspm.basics import ExperimentClock
 from afspm.plugins.agent.serving import PATH, application
 from afspm.plugins.web.asgi import AsgiApp
 from afspm.plugins.web.passwords import Passwords

@@ -17,7 +17,7 @@ from PIL import Image
 from tests.simulation import agent_rig
 from tests.simulation.agent_rig import ADA, AGENT, STOP, UM, AgentRig
 
-from afspm.basics.formatting import escaped
+from afspm.basics import escaped
 from afspm.model import (
     GRANT_REQUEST,
     Frame,

@@ -9,7 +9,8 @@ import pytest
 from afspm.model import Frame, names
 from afspm.plugins.agent.plan import read_plan
 from afspm.plugins.agent.twin import refusals, simulate
-from afspm.scheduler.safety.limits import ExperimentLimits, Limit, RoleLimits
+from afspm.scheduler import ExperimentLimits
+from afspm.scheduler.safety.limits import Limit, RoleLimits
 
 SCAN = {"do": "scan", "center": ["0 nm", "0 nm"], "size": ["500 nm", "500 nm"], "pixels": [8, 8]}
 

@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from afspm.basics.errors import AfspmError, ConfigError, InvalidValue
+from afspm import read
+from afspm.basics import AfspmError, ConfigError, InvalidValue
 from afspm.model import Region, ScopeState, names
 from afspm.plugins.asylum import Asylum, xop
 from afspm.plugins.asylum.emulator import wire
@@ -22,7 +23,6 @@ from afspm.plugins.asylum.result_files import local
 from afspm.plugins.asylum.scan_files import center_and_angle
 from afspm.plugins.asylum.session import Doing
 from afspm.plugins.asylum.settings import NAMES, asylums, from_image, generic, on_image
-from afspm.storage.formats import read
 
 finite = st.floats(-1e300, 1e300)
 

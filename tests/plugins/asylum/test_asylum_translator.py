@@ -13,6 +13,7 @@ from igor2 import binarywave
 from tests.plugins.asylum.asylum_bench import Bench, Emulated
 from tests.plugins.vendor_bench import FLAT, SHAPE, TURNED, Peer, left_in_danger, moved, ready, scanned, states
 
+from afspm import read
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -27,7 +28,6 @@ from afspm.model import (
     names,
 )
 from afspm.plugins.asylum.emulator.wire import CallFailed
-from afspm.storage.formats import read
 
 Make = Callable[..., Bench]
 

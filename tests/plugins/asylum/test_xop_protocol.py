@@ -14,7 +14,7 @@ import zmq
 from deadlines import DEADLINE_S
 from tests.plugins.asylum.igor_test_functions import WithTestFunctions
 
-from afspm.basics.clock import ExperimentClock
+from afspm.basics import ExperimentClock
 from afspm.plugins.asylum import xop
 from afspm.simulation.faults import Fault
 

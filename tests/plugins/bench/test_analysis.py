@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from afspm.emulation import World
 from afspm.model import Region, Scan, Spectrum
-from afspm.simulation import World
 from afspm_bench import analysis
 from afspm_bench.evidence import true_heights
 

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 from deadlines import DEADLINE_S
 
-from afspm.basics.errors import FileError
-from afspm.supervisor.ports import FreePorts
+from afspm.basics import FileError
+from afspm.processes import FreePorts
 from afspm_bench.cassette import (
     IdTranslation,
     ToolCall,

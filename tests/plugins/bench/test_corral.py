@@ -13,11 +13,10 @@ import numpy as np
 import pytest
 from deadlines import DEADLINE_S
 
-from afspm.basics.clock import ExperimentClock
-from afspm.basics.errors import InvalidValue
-from afspm.client.scope import Scope
+from afspm import Scope
+from afspm.basics import ExperimentClock, InvalidValue
 from afspm.model import Region, Scan, ScanSet
-from afspm.supervisor.ports import FreePorts
+from afspm.processes import FreePorts
 from afspm_bench.corral import CorralEnvironment
 from afspm_bench.session import TrialSession
 

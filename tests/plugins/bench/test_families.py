@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tests.plugins.bench.evidence_made import MINUTE_NS, MadeEvidence, request, scan_row
 
+from afspm.emulation import World
 from afspm.model import ControlRequest, ControlResponse
-from afspm.simulation import World
 from afspm_bench.evidence import Report
 from afspm_bench.judging import judge
 from afspm_bench.tasks import task_of

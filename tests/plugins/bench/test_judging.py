@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from tests.plugins.bench.evidence_made import MINUTE_NS, MadeEvidence, request, scan_row
 
-from afspm.basics.errors import InvalidValue
+from afspm.basics import InvalidValue
 from afspm.model import ControlRequest, ControlResponse
 from afspm_bench.evidence import Report
 from afspm_bench.judging import TrialVerdict, harms_of, judge, ledger, lies_of

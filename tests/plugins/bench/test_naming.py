@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
 from afspm_bench.agent_process import agent_of
 from afspm_bench.agents import HOME, SHIPPED
 from afspm_bench.bench import agent_named, agent_of_cassette, agent_of_command, tasks_named

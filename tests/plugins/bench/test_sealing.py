@@ -16,8 +16,7 @@ import pytest
 from deadlines import DEADLINE_S
 
 import afspm
-from afspm.basics.errors import ConfigError, FileError
-from afspm.basics.interpreter import python_command
+from afspm.basics import ConfigError, FileError, python_command
 from afspm_bench import sealing
 from afspm_bench.agent_files import LINES_FILE, AgentFiles
 from afspm_bench.sealing import Seal

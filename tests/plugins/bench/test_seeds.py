@@ -6,7 +6,7 @@ import hashlib
 
 import pytest
 
-from afspm.basics.errors import NoSuchItem
+from afspm.basics import NoSuchItem
 from afspm_bench.seeds import PUBLIC_KEY, TRIALS, commitment, seed_of
 from afspm_bench.tasks import FAMILIES, is_possible, task_names, task_of
 

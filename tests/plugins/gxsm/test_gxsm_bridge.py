@@ -18,9 +18,9 @@ import pytest
 from deadlines import DEADLINE_S
 from tests.plugins.gxsm.raw_clients import SocketClient
 
+from afspm.driver import ControllerLost
 from afspm.plugins.gxsm import bridge
 from afspm.plugins.gxsm.bridge_client import BridgeLink
-from afspm.translator.driver_base import ControllerLost
 
 PROVES_S = 5.0
 

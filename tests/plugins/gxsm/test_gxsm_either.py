@@ -17,7 +17,7 @@ import pytest
 from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan
 from tests.plugins.vendor_bench import Peer, TranslatorProcess, scans, states
 
-from afspm.basics.clock import ExperimentClock
+from afspm.basics import ExperimentClock
 from afspm.model import ControlRequest, ControlResponse, Region, ScanParameters, ScopeState, names
 
 FREE = ScopeState.FREE

@@ -12,6 +12,7 @@ import pytest
 from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_until_line, until
 from tests.plugins.vendor_bench import FLAT, SHAPE, SOON, Peer, ready, scans, states
 
+from afspm import read
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -23,7 +24,6 @@ from afspm.model import (
     names,
 )
 from afspm.plugins.gxsm.emulator.program import GxsmProgram
-from afspm.storage.formats import read
 
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from afspm.basics.units import convert
+from afspm import read
+from afspm.basics import convert
+from afspm.emulation import Faults
 from afspm.plugins.gxsm.emulator import files
 from afspm.plugins.gxsm.emulator.file_writer import FAULT_KINDS, GxsmFileWriter
 from afspm.plugins.gxsm.emulator.files import CHANNELS
 from afspm.plugins.gxsm.scan_files import stored_unit
-from afspm.simulation.faults import Faults
-from afspm.storage.formats import read
 
 START_S = 1000.0
 

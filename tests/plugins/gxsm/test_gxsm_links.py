@@ -23,7 +23,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.plugins.vendor_bench import answering
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
+from afspm.driver import ControllerLost
 from afspm.plugins.gxsm import bridge, pickles
 from afspm.plugins.gxsm.activity import LineWatch
 from afspm.plugins.gxsm.bridge_client import BridgeLink
@@ -31,7 +32,6 @@ from afspm.plugins.gxsm.errors import BadReply, GxsmError
 from afspm.plugins.gxsm.hardware import Doing, Hardware, decoded, recognised
 from afspm.plugins.gxsm.link import Address, Asking, open_link
 from afspm.plugins.gxsm.settings import ANGSTROM_M, ScanFrame
-from afspm.translator.driver_base import ControllerLost
 
 VALUES: list[Any] = [
     1.5, -3, 10**30, -math.inf, "12.5 Å    ", "", (), (1, 2, "x"), [1, [2]], {"a": 1}, None, True,

@@ -21,11 +21,10 @@ from deadlines import DEADLINE_S
 from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_to_line, scan_until_line, until
 from tests.plugins.gxsm.raw_clients import MemoryClient, SocketClient, client
 
+from afspm import read
+from afspm.emulation import Crashed, Faults
 from afspm.plugins.gxsm.emulator.block import FAULT_KINDS, SharedMemoryBlock
 from afspm.plugins.gxsm.emulator.file_writer import GxsmFileWriter
-from afspm.simulation.emulation.emulator import Crashed
-from afspm.simulation.faults import Faults
-from afspm.storage.formats import read
 
 Make = Callable[..., Bench]
 KINDS: list[dict[str, Any]] = [{"version": 3}, {"version": 4}, {"version": 4, "transport": "shm"}]

@@ -15,6 +15,8 @@ from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_to_line, scan_u
 from tests.plugins.gxsm.raw_clients import client
 from tests.plugins.vendor_bench import FLAT, SHAPE, TURNED, Peer, moved, ready, scanned, scans, states
 
+from afspm import read
+from afspm.driver import FRAME
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -28,8 +30,6 @@ from afspm.model import (
     Spectrum,
     names,
 )
-from afspm.storage.formats import read
-from afspm.translator.setting_groups import FRAME
 
 Make = Callable[..., Bench]
 

@@ -10,11 +10,12 @@ from typing import Final
 import numpy as np
 from tests.plugins.gxsm.recorded_gxsm import BEGAN_S
 
+from afspm.driver import TCP
 from afspm.plugins.gxsm.bridge_client import message, value_line
 from afspm.plugins.gxsm.emulator.files import CHANNELS, GxsmScanFile, netcdf3, netcdf4
 from afspm.plugins.gxsm.hardware import AUTOSAVE, REPEAT_OFF
 from afspm.plugins.gxsm.settings import REFNAMES
-from afspm.translator.trace import TCP, TracedExchange, TracedFile, TraceHeader, TraceLine
+from afspm.translator.trace import TracedExchange, TracedFile, TraceHeader, TraceLine
 
 SHAPE: Final = (16, 24)
 """Rows and columns."""

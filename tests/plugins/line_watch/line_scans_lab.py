@@ -8,8 +8,8 @@ from functools import cache, partial
 import numpy as np
 from tests.unit.client.client_lab import Lab
 
+from afspm.emulation import World
 from afspm.model import Region, Scan, ScanLines
-from afspm.simulation import World
 
 HOME = Region((0.0, 0.0), (1e-6, 1e-6))
 ROWS, LINE_S, PERIOD_S = 64, 0.5, 60.0

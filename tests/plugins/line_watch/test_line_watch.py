@@ -27,7 +27,7 @@ from tests.plugins.line_watch.line_scans_lab import (
 from tests.unit.client.client_lab import Lab, run
 
 from afspm import wire
-from afspm.basics.exit_codes import ExitCode
+from afspm.basics import ExitCode
 from afspm.components.tip_verdict import BAD, LineVerdict, read_line_verdict, verdict_message
 from afspm.model import ControlRequest, Feedback, Problem, Scan, ScanLines, ScopeState, ScopeStatus
 from afspm.plugins.line_watch.line_watch import LineWatch

@@ -15,12 +15,11 @@ from tests.plugins.nanosurf.nanosurf_bench import Bench as NanosurfBench
 from tests.plugins.vendor_bench import VendorBench, benches, ready
 from tests.unit.client.client_lab import Lab, run
 
-from afspm.basics.clock import Clock
+from afspm.basics import Clock
+from afspm.emulation import Emulator, ScanActivity
 from afspm.model import Region, Scan, ScanLines, ScopeState, ScopeStatus, names
 from afspm.plugins.line_watch.line_judge import FEWEST_PAIRS
 from afspm.plugins.line_watch.line_watch import LineWatch
-from afspm.simulation.activities import ScanActivity
-from afspm.simulation.emulation.emulator import Emulator
 
 pytestmark = [pytest.mark.slow]  # six scans each, at the pace of a controller
 

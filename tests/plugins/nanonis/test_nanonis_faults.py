@@ -22,7 +22,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
-from afspm.supervisor.ports import FreePorts
+from afspm.processes import FreePorts
 
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE

@@ -14,10 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.plugins.vendor_bench import answering
 
+from afspm.driver import ControllerLost
 from afspm.plugins.nanonis.emulator import wire
 from afspm.plugins.nanonis.protocol import NanonisError
 from afspm.plugins.nanonis.session import Link
-from afspm.translator.driver_base import ControllerLost
 
 GOOD = wire.reply("Bias.Get", wire.body("Bias.Get", [0.5], 0))
 

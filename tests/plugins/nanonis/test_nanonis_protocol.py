@@ -16,12 +16,11 @@ from deadlines import DEADLINE_S
 from hypothesis import given
 from hypothesis import strategies as st
 
-from afspm.basics.clock import ExperimentClock
-from afspm.basics.errors import InvalidValue
+from afspm import read
+from afspm.basics import ExperimentClock, InvalidValue
 from afspm.plugins.nanonis import protocol
 from afspm.plugins.nanonis.emulator import RELEASES, NanonisEmulator, wire
 from afspm.plugins.nanonis.protocol import BadReply, NanonisError
-from afspm.storage.formats import read
 
 RELEASE_NUMBERS = tuple(RELEASES.values())
 NAMES = sorted(protocol.functions())

@@ -13,7 +13,8 @@ import pytest
 from tests.plugins.nanonis.nanonis_bench import Bench, Emulated
 from tests.plugins.vendor_bench import FLAT, SHAPE, TURNED, left_in_danger, moved, ready, scanned, scans, states
 
-from afspm.basics.exit_codes import ExitCode
+from afspm import read
+from afspm.basics import ExitCode
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -28,7 +29,6 @@ from afspm.model import (
     names,
 )
 from afspm.plugins.nanonis.z_controller import unit_of
-from afspm.storage.formats import read
 from afspm.translator.trace import FILE, TracedExchange, read_trace
 
 Make = Callable[..., Bench]

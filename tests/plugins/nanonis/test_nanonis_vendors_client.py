@@ -22,9 +22,9 @@ import pytest
 from deadlines import DEADLINE_S
 from nanonis_spm import Nanonis as Client
 
-from afspm.basics.clock import ExperimentClock
+from afspm import read
+from afspm.basics import ExperimentClock
 from afspm.plugins.nanonis.emulator import NanonisEmulator
-from afspm.storage.formats import read
 
 SEEN = pytest.mark.parametrize("client", [2.0], indirect=True)
 """A speed at which what takes a second is seen while it lasts, on a busy computer too."""

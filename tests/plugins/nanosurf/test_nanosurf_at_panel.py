@@ -16,9 +16,9 @@ from tests.plugins.by_hand import act_all_to_their_end, acts, set_all, until_act
 from tests.plugins.nanosurf.nanosurf_bench import Bench
 from tests.plugins.vendor_bench import TURNED, Peer, moved, ready, scans, small, states
 
+from afspm.driver import SCAN
 from afspm.model import ActByHand, PanelAct, Region, Scan, ScopeState, names
 from afspm.plugins.nanosurf.activity import NanosurfFiles
-from afspm.translator.result_files import SCAN
 
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE

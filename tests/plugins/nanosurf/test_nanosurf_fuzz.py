@@ -13,7 +13,7 @@ from benchmarks.fuzz import fuzz
 from benchmarks.fuzz.nanosurf import NanosurfFuzzer
 from rotation import ALL
 
-from afspm.basics.clock import ExperimentClock
+from afspm.basics import ExperimentClock
 from afspm.plugins.nanosurf.emulator import NanosurfEmulator
 
 CALLS = 1500 if ALL else 500

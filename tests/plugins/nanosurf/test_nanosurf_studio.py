@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from fake_clock import FakeClock
 
+from afspm.emulation import Faults, SimulatedInstrument
 from afspm.plugins.nanosurf.emulator import NanosurfEmulator
 from afspm.plugins.nanosurf.emulator.studio import StudioProgram
-from afspm.simulation.faults import Faults
-from afspm.simulation.instrument import SimulatedInstrument
 
 
 class RunningClock(FakeClock):

@@ -15,14 +15,12 @@ from fake_clock import FakeClock
 from tests.plugins.nanosurf.nanosurf_bench import Bench
 from tests.plugins.vendor_bench import FLAT, TURNED, moved, ready, scanned, scans, small, states
 
-from afspm.basics.errors import ConfigError, InvalidValue
-from afspm.basics.exit_codes import ExitCode
+from afspm.basics import ConfigError, ExitCode, InvalidValue
+from afspm.emulation import Faults, SimulatedInstrument
 from afspm.model import ControlResponse, Region, Scan, ScanLines, ScopeState, Spectrum, names
 from afspm.plugins.nanosurf import Nanosurf
 from afspm.plugins.nanosurf.emulator import NanosurfEmulator
 from afspm.plugins.nanosurf.emulator.studio import SETPOINT, StudioProgram
-from afspm.simulation.faults import Faults
-from afspm.simulation.instrument import SimulatedInstrument
 
 Make = Callable[..., Bench]
 Settings = dict[str, Any]

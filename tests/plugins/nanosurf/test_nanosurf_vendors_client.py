@@ -18,8 +18,7 @@ from deadlines import DEADLINE_S
 from tests.plugins.nanosurf.nanosurf_bench import Emulated
 
 import afspm
-from afspm.basics.clock import ExperimentClock
-from afspm.basics.errors import AfspmError
+from afspm.basics import AfspmError, ExperimentClock
 
 Run = Callable[..., dict[str, object]]
 CLIENT = importlib.util.find_spec("nanosurf")

@@ -6,7 +6,7 @@ from importlib import metadata
 
 import pytest
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
 from afspm.plugins.nanosurf.emulator import NanosurfEmulator
 
 

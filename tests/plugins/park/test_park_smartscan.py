@@ -13,14 +13,11 @@ import zmq
 from deadlines import DEADLINE_S
 from fake_clock import FakeClock
 
-from afspm.basics.clock import ExperimentClock
-from afspm.basics.errors import InvalidValue
+from afspm.basics import ExperimentClock, InvalidValue
+from afspm.emulation import Faults, InstrumentBusy, ScriptFailed, SimulatedInstrument
 from afspm.plugins.park.emulator import ParkEmulator, engine
 from afspm.plugins.park.emulator.engine import LONGEST_S, MOST_ALONE, Script, Wait
 from afspm.plugins.park.emulator.smartscan import SmartScanProgram
-from afspm.simulation.emulation.scripted import ScriptFailed
-from afspm.simulation.faults import Faults
-from afspm.simulation.instrument import InstrumentBusy, SimulatedInstrument
 
 
 class SmartScan(SmartScanProgram):

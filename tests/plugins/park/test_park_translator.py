@@ -13,7 +13,7 @@ from PIL import Image
 from tests.plugins.park.park_bench import Bench
 from tests.plugins.vendor_bench import FLAT, SOON, TURNED, left_in_danger, moved, ready, scanned, scans, small, states
 
-from afspm.basics.errors import InvalidValue
+from afspm.basics import InvalidValue
 from afspm.model import ControlResponse, Region, ScopeState, Spectrum, names
 
 pytestmark = pytest.mark.slow

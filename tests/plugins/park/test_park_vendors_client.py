@@ -15,7 +15,7 @@ import pytest
 from deadlines import DEADLINE_S
 from tests.plugins.park.park_bench import Emulated
 
-from afspm.basics.clock import ExperimentClock
+from afspm.basics import ExperimentClock
 
 Run = Callable[[str, str], dict[str, object]]
 BEGINS = """

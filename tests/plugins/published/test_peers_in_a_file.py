@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
 from afspm.experiment import load
 from afspm.model import Role
 from afspm.plugins.published.scheduler import PublishedScheduler

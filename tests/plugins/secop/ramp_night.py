@@ -31,12 +31,10 @@ from afspm.model import (
 )
 from afspm.plugins.secop.channel import ServerUnfit
 from afspm.plugins.secop.secop_client import SecopClient
-from afspm.scheduler import events
+from afspm.scheduler import ExperimentLimits, SchedulerCore, WireCodec, events
 from afspm.scheduler.instruments.conditions import AllowedBand, InstrumentSettings, MeasuringCondition
-from afspm.scheduler.safety.limits import ExperimentLimits, Limit
-from afspm.scheduler.scheduler_core import SchedulerCore
+from afspm.scheduler.safety.limits import Limit
 from afspm.scheduler.settings import ControlSettings, SchedulerSettings
-from afspm.scheduler.wire_codec import WireCodec
 
 STEP_S = 0.25
 RATE_K_S = 2.0 / 60.0

@@ -14,7 +14,7 @@ import pytest
 from tests.plugins.secop.ramp_night import RATE_K_S, Cryostat
 from tests.unit.client.client_lab import FakeClock
 
-from afspm.basics.errors import TransportError
+from afspm.basics import TransportError
 from afspm.model import InstrumentOrder, InstrumentReadings, Parameter
 from afspm.model.instruments import InstrumentOrders
 from afspm.plugins.secop import instrument

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
 from afspm.plugins.web.dashboard.access import PASSWORD, Access, Visitor
 from afspm.plugins.web.dashboard.sessions import MOST_ENDED, Sessions
 from afspm.plugins.web.passwords import check_name, hashed, is_hash, is_loopback, matches

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from afspm import wire
-from afspm.basics.errors import InvalidValue
+from afspm.basics import InvalidValue
 from afspm.model import Approval, Approvals, Frame, GrantedCount, GrantedRange, Proposal
 from afspm.plugins.agent.approval import of_plan, of_table, simulated
 from afspm.plugins.agent.plan import read_plan
@@ -19,8 +19,7 @@ from afspm.plugins.web.archive import agents_in
 from afspm.plugins.web.dashboard.approvals import in_force, in_words, title, waiting
 from afspm.plugins.web.dashboard.grant_dialog import GrantFields
 from afspm.plugins.web.dashboard.steering_panel import drawn_box
-from afspm.record.overview import Overview
-from afspm.record.run_json import EXPERIMENT_FILE
+from afspm.record import EXPERIMENT_FILE, Overview
 
 PLAN = read_plan({
     "title": "look <b>here</b>\u202e",

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from afspm import wire
-from afspm.basics.clock import ExperimentClock
+from afspm.basics import ExperimentClock
 from afspm.components.tip_verdict import OF_LINES, LineVerdict, line_verdict_message
 from afspm.model import (
     ControlMode,
@@ -29,8 +29,8 @@ from afspm.model.events import LogLines
 from afspm.plugins.web.archive import Archive
 from afspm.plugins.web.dashboard.content import trouble
 from afspm.plugins.web.watch import Watch
+from afspm.record import REPLAY_OF
 from afspm.record.journal import SCHEDULER
-from afspm.record.run_json import REPLAY_OF
 from afspm.record.store import RecordSettings, RecordStore
 
 S = 1_000_000_000

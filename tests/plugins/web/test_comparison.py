@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from afspm.basics.errors import InvalidValue
+from afspm import Levelling
+from afspm.basics import InvalidValue
 from afspm.model import Region
-from afspm.model.line_levelling import Levelling
 from afspm.plugins.web.dashboard.night_page import difference
 from afspm.plugins.web.frames import ChannelFrame
 

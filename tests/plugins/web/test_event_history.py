@@ -24,7 +24,7 @@ from afspm.model import (
 from afspm.model.events import LogLines
 from afspm.plugins.web.gateway.events import MOST_BYTES, MOST_EVENTS, EventHistory, fill
 from afspm.plugins.web.gateway.models import event_kinds
-from afspm.record.journal import JOURNAL_FILE
+from afspm.record import JOURNAL_FILE
 
 ALL = frozenset(event_kinds())
 

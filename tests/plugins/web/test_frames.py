@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from afspm import Levelling
 from afspm.model import ChannelRoles, Region, Scan, ScanLines
-from afspm.model.line_levelling import Levelling
 from afspm.plugins.web.dashboard.pictures import Look, PictureCache
 from afspm.plugins.web.frames import MEMORY_BYTES, MOST_CHANNELS, FrameStore
 

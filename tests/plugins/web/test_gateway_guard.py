@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 import pytest
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
 from afspm.plugins.web.gateway import Gateway
 from afspm.plugins.web.gateway.guard import MOST_BODY_BYTES, PERSON, GatewayGuard
 from afspm.plugins.web.passwords import Passwords, hashed

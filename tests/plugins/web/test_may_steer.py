@@ -6,8 +6,7 @@ from typing import Any, cast
 
 import pytest
 
-from afspm.basics.clock import ExperimentClock
-from afspm.basics.launch import Launch
+from afspm.basics import ExperimentClock, Launch
 from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.dashboard.actions import ActionResult, Steering
 from afspm.plugins.web.dashboard.sessions import Sessions

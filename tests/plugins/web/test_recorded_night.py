@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm import wire
+from afspm import append_note, open_run, wire
 from afspm.model import (
     ControlMode,
     ControlState,
@@ -26,8 +26,6 @@ from afspm.model.events import LogLines
 from afspm.plugins.web.dashboard.content import Contents
 from afspm.plugins.web.dashboard.night import Night, NightWatch
 from afspm.record.journal import SCHEDULER
-from afspm.record.notes import append_note
-from afspm.record.run import open_run
 from afspm.record.store import RecordSettings, RecordStore
 
 S = 1_000_000_000

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from afspm.basics.clock import ExperimentClock
+from afspm.basics import ExperimentClock
 from afspm.model import (
     HEIGHT_RETRACE,
     ActByHand,
@@ -31,7 +31,7 @@ from afspm.plugins.web.dashboard.pictures import SIDE_PX, Thumbnails
 from afspm.plugins.web.dashboard.scan_facts import scan_facts
 from afspm.plugins.web.frames import ChannelFrame
 from afspm.plugins.web.watch import Watch
-from afspm.record.overview import Overview
+from afspm.record import Overview
 
 S = 1_000_000_000
 REGION = Region((1e-6, -5e-7), (1e-6, 5e-7), 0.1)

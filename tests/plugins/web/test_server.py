@@ -20,7 +20,7 @@ from urllib.request import Request, urlopen
 import pytest
 from deadlines import DEADLINE_S
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
 from afspm.plugins.web import server as web_server
 from afspm.plugins.web.server import MOST_HEAD_BYTES, WebServer, listening, url_of
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from afspm import wire
-from afspm.basics.errors import InvalidValue, UnitError
+from afspm.basics import InvalidValue, UnitError
 from afspm.model import (
     ControlEvent,
     ControlMode,
@@ -22,7 +22,7 @@ from afspm.model import (
 from afspm.plugins.web.dashboard.actions import unclear
 from afspm.plugins.web.dashboard.flags import flags
 from afspm.plugins.web.dashboard.scan_dialog import ScanChoice
-from afspm.record.overview import Overview
+from afspm.record import Overview
 
 S = 1_000_000_000
 CHOICE = ScanChoice(Region((1e-6, 2e-6), (4e-7, 2e-7), 0.3), (32, 64))

@@ -8,13 +8,12 @@ from typing import Any, cast
 import pytest
 from deadlines import DEADLINE_S
 
-from afspm.basics.clock import ExperimentClock
-from afspm.basics.launch import Launch
-from afspm.client.experiment_link import ExperimentLink
+from afspm.basics import ExperimentClock, Launch
 from afspm.model import ControlResponse, Region, Response, ScanParameters, ScopeState, ScopeStatus, names
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.persons import Persons
 from afspm.plugins.web.watch import Watch
+from afspm.processes import ExperimentLink
 
 
 class BusyMicroscope:

@@ -20,14 +20,12 @@ from tests.plugins.what_if import what_if_lab as lab
 from typer.testing import CliRunner
 
 import afspm
-from afspm import wire
-from afspm.basics.errors import ConfigError, FileError, InvalidValue
+from afspm import Memory, open_run, wire
+from afspm.basics import ConfigError, FileError, InvalidValue
 from afspm.plugins.what_if import component_replay, what_if
 from afspm.plugins.what_if.closed_loop import Outcomes
 from afspm.plugins.what_if.commands import DIFFERS, INCOMPLETE, app
 from afspm.plugins.what_if.port_replay import read_lives
-from afspm.record.run import open_run
-from afspm.storage.memory import Memory
 from afspm.supervisor import own_runs
 from afspm.testing import Bench
 

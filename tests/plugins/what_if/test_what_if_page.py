@@ -14,8 +14,8 @@ from tests.plugins.what_if import what_if_lab as lab
 from typer.testing import CliRunner
 
 import afspm
-from afspm import wire
-from afspm.basics.formatting import day_and_time
+from afspm import Memory, open_run, wire
+from afspm.basics import day_and_time
 from afspm.model import Region
 from afspm.plugins.what_if.alignment import Difference, Output, PacketName
 from afspm.plugins.what_if.commands import DIFFERS, app
@@ -23,8 +23,6 @@ from afspm.plugins.what_if.component_replay import ComponentReplay
 from afspm.plugins.what_if.page import DifferencePage
 from afspm.plugins.what_if.side_by_side import ChangedField, changed_fields
 from afspm.plugins.what_if.what_if import WhatIf
-from afspm.record.run import open_run
-from afspm.storage.memory import Memory
 from afspm.wire.generated import analysis_pb2
 
 

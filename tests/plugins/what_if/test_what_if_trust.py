@@ -15,7 +15,7 @@ from tests.plugins.what_if import what_if_lab as lab
 from typer.testing import CliRunner
 
 import afspm
-from afspm.basics.errors import ConfigError, FileError, InvalidValue
+from afspm.basics import ConfigError, FileError, InvalidValue
 from afspm.client import port_log
 from afspm.plugins.what_if import hash_seeds
 from afspm.plugins.what_if.closed_loop import rerun
