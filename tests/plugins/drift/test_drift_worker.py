@@ -19,7 +19,7 @@ import pytest
 from deadlines import DEADLINE_S
 from tests.plugins.drift.drift_parts import Brightest
 
-from afspm.basics.errors import ConfigError, FileError
+from afspm.basics import ConfigError, FileError
 from afspm.model import Frame, Region, Scan
 from afspm.plugins.drift.frame import worker_process
 from afspm.plugins.drift.frame.estimation import Estimation

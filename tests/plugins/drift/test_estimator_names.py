@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
 from afspm.model import Region
 from afspm.plugins.drift.estimators import Guarded, estimator
 from afspm.plugins.drift.registration import DriftScan, LinearSeen, Prior, Registration

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from tests.plugins.drift.registering import PIXEL_M, Waves, scanned
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
 from afspm.model import Region
 from afspm.plugins.drift.estimators import estimator
 from afspm.plugins.drift.registration import Prior, Registration, keypoints

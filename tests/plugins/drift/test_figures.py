@@ -10,7 +10,7 @@ import pytest
 from matplotlib.patches import Rectangle
 from tests.plugins.drift.test_record import record
 
-from afspm.basics.errors import InvalidValue
+from afspm.basics import InvalidValue
 from afspm.model import Region
 from afspm.plugins.drift.registration import DriftScan, Matches
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from afspm.basics.errors import ConfigError, FileError, InvalidValue
+from afspm.basics import ConfigError, FileError, InvalidValue
 from afspm.plugins.drift.study.grid import SettingsGrid
 from afspm.plugins.drift.study.settings import NightSettings
 

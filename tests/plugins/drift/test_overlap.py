@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from afspm.basics.errors import InvalidValue
+from afspm.basics import InvalidValue
 from afspm.model import Frame, Region
 from afspm.plugins.drift.pairs.overlap import (
     intersection_area_m2,

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from afspm.basics.errors import InvalidValue
+from afspm.basics import InvalidValue
 from afspm.model import Frame, Region
 from afspm.plugins.drift.pairs.overlap import too_far_off, too_little_shared
 

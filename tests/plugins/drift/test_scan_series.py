@@ -13,16 +13,15 @@ from tests.unit.record.record_lab import ABOUT, Night
 from typer.testing import CliRunner
 
 from afspm import read
-from afspm.basics.errors import InvalidValue
+from afspm.basics import InvalidValue
 from afspm.cli.app import app
+from afspm.driver import FileContent, FileFacts, encode_scan
+from afspm.emulation import World
 from afspm.model import Frame, Problem, Region, Scan, ScopeState
 from afspm.plugins.drift.report.file_commands import tip_changed
 from afspm.plugins.drift.track.record import DriftRecord
 from afspm.plugins.drift.track.scan_series import series
 from afspm.record.store import RecordStore
-from afspm.simulation import World
-from afspm.storage.formats import FileContent
-from afspm.translator.own_files import FileFacts, encode_scan
 
 REGION = Region((0.0, 0.0), (1e-6, 1e-6))
 PIXELS = 48

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from afspm import Array
-from afspm.basics.errors import InvalidValue
+from afspm.basics import InvalidValue
 from afspm.model import Frame, Region
 from afspm.plugins.drift.registration import DriftScan
 from afspm.plugins.drift.track.offline import corrected

@@ -21,7 +21,7 @@ from tests.plugins.drift.trackers_lab import (
 )
 
 from afspm import Array
-from afspm.basics.errors import ConfigError, InvalidValue
+from afspm.basics import ConfigError, InvalidValue
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 from afspm.plugins.drift.track import BankTracker, PaperTracker, forecast_from_dict, tracker
 from afspm.plugins.drift.track.tracking import Prediction, Update

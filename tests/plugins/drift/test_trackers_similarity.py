@@ -14,7 +14,7 @@ from tests.plugins.drift.registering import PIXEL_M, Waves
 from tests.plugins.drift.trackers_lab import World, follow
 
 from afspm import Array
-from afspm.basics.errors import ConfigError, InvalidValue
+from afspm.basics import ConfigError, InvalidValue
 from afspm.model import Frame, Region
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
 from afspm.plugins.drift.frame.worker_state import WorkerStateFile
