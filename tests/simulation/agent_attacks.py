@@ -150,7 +150,7 @@ class Attack:
 
     def _ask(self, name: str, kind: int, subject: Any = None) -> None:
         self._raw += 1
-        self.rig._ask(name, Request(int(kind), subject, b"", f"{name}/{self.rig.life}p/{self._raw}"))
+        self.rig.ask(name, Request(int(kind), subject, b"", f"{name}/{self.rig.life}p/{self._raw}"))
 
     def _person(self, kind: int, subject: Any = None) -> None:
         self._ask(ADA, kind, subject)

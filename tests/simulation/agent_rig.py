@@ -375,7 +375,7 @@ class AgentRig:
                 self.restart()
             if self.random.random() < self.loses:
                 continue
-            answer = self._ask(name, request)
+            answer = self.ask(name, request)
             if self.random.random() < self.kills / 2:
                 self.restart()
                 continue
@@ -385,7 +385,7 @@ class AgentRig:
         self.settle()
         return Response(int(ControlResponse.NO_RESPONSE), b"", "silence", request.id)
 
-    def _ask(self, name: str, request: Request) -> Response | None:
+    def ask(self, name: str, request: Request) -> Response | None:
         frames = wire.encode_request(request)
         try:
             read = wire.decode_request(frames)
@@ -571,7 +571,7 @@ class AgentRig:
 
 def facts(rig: AgentRig) -> Any:
     """Return the facts of an approval, as a person's program asks for them."""
-    return json.loads(rig._ask(ADA, Request(CLOCK_REQUEST, id=f"{ADA}/p/{rig.random.random()}")).payload)  # type: ignore[union-attr]
+    return json.loads(rig.ask(ADA, Request(CLOCK_REQUEST, id=f"{ADA}/p/{rig.random.random()}")).payload)  # type: ignore[union-attr]
 
 
 def run(coroutine: Any) -> Any:

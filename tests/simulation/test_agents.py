@@ -107,14 +107,14 @@ def test_stop_is_accepted_within_a_second_in_every_state(state: str) -> None:
             await asyncio.gather(*calls)
 
     if state == "another component scans":
-        rig._ask("series", Request(int(ControlRequest.REQUEST_CTRL), 0, b"", "series/a/1"))
+        rig.ask("series", Request(int(ControlRequest.REQUEST_CTRL), 0, b"", "series/a/1"))
         rig.publish(ScopeStatus(ScopeState.SCANNING))
     elif state == "in control":
-        rig._ask(ADA, Request(GRANT_REQUEST, fresh(Grant(AGENT, lasts_s=600.0), facts(rig)), b"", "dashboard:Ada/a/1"))
-        rig._ask(AGENT, Request(int(ControlRequest.REQUEST_CTRL), 0, b"", "agent:claude/a/1"))
+        rig.ask(ADA, Request(GRANT_REQUEST, fresh(Grant(AGENT, lasts_s=600.0), facts(rig)), b"", "dashboard:Ada/a/1"))
+        rig.ask(AGENT, Request(int(ControlRequest.REQUEST_CTRL), 0, b"", "agent:claude/a/1"))
         assert rig.core.control.holder == AGENT
     elif state == "manual":
-        rig._ask(ADA, Request(int(ControlRequest.SET_CONTROL_MODE), int(ControlMode.MANUAL), b"", "dashboard:Ada/a/1"))
+        rig.ask(ADA, Request(int(ControlRequest.SET_CONTROL_MODE), int(ControlMode.MANUAL), b"", "dashboard:Ada/a/1"))
     elif state == "restarting":
         rig.restart()
     asyncio.run(whole())

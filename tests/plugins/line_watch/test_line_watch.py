@@ -89,8 +89,8 @@ def test_cached_scans_are_not_missed_lines(caplog: pytest.LogCaptureFixture) -> 
     for number, picture in enumerate(night()[:4]):
         lab.publish(ScopeStatus(ScopeState.SCANNING))
         publish_scan(lab, picture, number, 0.0)
-        while lab._happenings:
-            heapq.heappop(lab._happenings)[2]()
+        while lab.happenings:
+            heapq.heappop(lab.happenings)[2]()
         lab.publish(ScopeStatus(ScopeState.FREE))
     lab.clock.passed_s = 800.0
     lab.at(100.0, lab.kill)

@@ -30,7 +30,7 @@ class Browser:
     def __init__(self, app: Guard, at: str) -> None:
         self._app = app
         self._at = httpx.URL(at)
-        self._cookies = httpx.Cookies()
+        self.cookies = httpx.Cookies()
 
     def get(self, path: str, **more: Any) -> httpx.Response:
         answer: httpx.Response = completed(self._ask("GET", path, **more))
@@ -42,14 +42,14 @@ class Browser:
 
     async def _ask(self, method: str, path: str, **more: Any) -> httpx.Response:
         transport = httpx.ASGITransport(self._app)
-        async with httpx.AsyncClient(transport=transport, base_url=self._at, cookies=self._cookies) as client:
+        async with httpx.AsyncClient(transport=transport, base_url=self._at, cookies=self.cookies) as client:
             answer = await client.request(method, path, **more)
-            self._cookies = client.cookies
+            self.cookies = client.cookies
         return answer
 
     def talk(self, origin: str) -> list[str]:
         """Connect a websocket; return the messages it receives, one word each."""
-        cookies = "; ".join(f"{cookie.name}={cookie.value}" for cookie in self._cookies.jar)
+        cookies = "; ".join(f"{cookie.name}={cookie.value}" for cookie in self.cookies.jar)
         headers = {"host": self._at.netloc.decode(), "origin": origin, "cookie": cookies}
         scope = {
             "type": "websocket", "path": "/talk", "raw_path": b"/talk", "query_string": b"", "root_path": "",
@@ -133,10 +133,10 @@ def test_the_password_opens_the_page(served: Served) -> None:
 def test_a_cookie_is_worth_nothing_after_signing_out(served: Served, everywhere: str) -> None:
     browser = served("0.0.0.0", KEPT, "https://lab:8080")
     browser.post("/login", data={"person": "Ada", "password": "analytical"})
-    (kept,) = [f"{cookie.name}={cookie.value}" for cookie in browser._cookies.jar]
+    (kept,) = [f"{cookie.name}={cookie.value}" for cookie in browser.cookies.jar]
     assert browser.get("/", headers={"cookie": kept}).status_code == 200
     browser.post("/logout", data={"everywhere": everywhere})
-    assert not browser._cookies.jar._cookies.get("lab", {})  # type: ignore[attr-defined]
+    assert not browser.cookies.jar._cookies.get("lab", {})  # type: ignore[attr-defined]
     assert browser.get("/", headers={"cookie": kept}).status_code == 401
 
 

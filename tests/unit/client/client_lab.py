@@ -108,9 +108,9 @@ class Lab:
         self.begun_scans = 0
         self.finished: list[Region] = []
         self.cached: dict[str, Packet] = {}
-        self._happenings: list[tuple[float, int, Callable[[], object]]] = []
+        self.happenings: list[tuple[float, int, Callable[[], object]]] = []
         self._numbers = itertools.count()
-        self._inbox: list[Incoming] = []
+        self.inbox: list[Incoming] = []
         self._newest_ns = 0
         self.most_at_once: int | None = None
         self.open = True
@@ -121,7 +121,7 @@ class Lab:
         self.publish(self.parameters)
         self.publish(self.position)
         self.publish(self.control.published())
-        self._inbox.append(CaughtUp(SOURCE))
+        self.inbox.append(CaughtUp(SOURCE))
 
     # --- the port ---
 
@@ -130,30 +130,30 @@ class Lab:
         self.requests.append(request)
         answer = self.intercept(request)
         if answer == "go on":
-            answer = self._answer_once(request)
+            answer = self.answer_once(request)
         if isinstance(answer, Response):
             answer.id = request.id
             if self.most_at_once is None:
-                self.at(0.01, lambda: self._inbox.append(ReplyReceived(answer)))
+                self.at(0.01, lambda: self.inbox.append(ReplyReceived(answer)))
             else:  # a socket of its own: the answer waits for no packet
-                self._inbox.insert(0, ReplyReceived(answer))
+                self.inbox.insert(0, ReplyReceived(answer))
 
     def poll(self, timeout_s: float | None) -> list[Incoming]:
         until_s = None if timeout_s is None else self.clock.passed_s + timeout_s
         self._is_woken = False
-        while not self._inbox and not self._is_woken:
-            if not self._happenings:
+        while not self.inbox and not self._is_woken:
+            if not self.happenings:
                 if until_s is None:
                     raise Nothing
                 self.clock.passed_s = max(until_s, self.clock.passed_s)
                 break
-            if until_s is not None and self._happenings[0][0] > until_s:
+            if until_s is not None and self.happenings[0][0] > until_s:
                 self.clock.passed_s = max(until_s, self.clock.passed_s)
                 break
-            at_s, _, happen = heapq.heappop(self._happenings)
+            at_s, _, happen = heapq.heappop(self.happenings)
             self.clock.passed_s = max(at_s, self.clock.passed_s)
             happen()
-        found, self._inbox = self._inbox[: self.most_at_once], self._inbox[len(self._inbox[: self.most_at_once]) :]
+        found, self.inbox = self.inbox[: self.most_at_once], self.inbox[len(self.inbox[: self.most_at_once]) :]
         return found
 
     def publish_out(self, envelope: str, payload: bytes) -> None:
@@ -165,22 +165,22 @@ class Lab:
     # --- what can be made to happen ---
 
     def at(self, in_s: float, happen: Callable[[], object]) -> None:
-        heapq.heappush(self._happenings, (self.clock.passed_s + in_s, next(self._numbers), happen))
+        heapq.heappush(self.happenings, (self.clock.passed_s + in_s, next(self._numbers), happen))
 
     def publish(self, thing: Any, envelope: str | None = None) -> Packet:
         message, payload = wire.encode(thing)
         self._newest_ns = max(self._newest_ns + 1, self.clock.now_ns())
         packet = Packet(envelope or message, payload, self._newest_ns)
         self.cached[f"{message}-{getattr(thing, 'channel', '')}"] = packet
-        self._inbox.append(PacketReceived(packet, SOURCE))
+        self.inbox.append(PacketReceived(packet, SOURCE))
         return packet
 
     def answer_now(self, response: Response) -> None:
         """Send an answer that `intercept` withheld."""
-        self._inbox.append(ReplyReceived(response))
+        self.inbox.append(ReplyReceived(response))
 
     def connect(self) -> None:
-        self._inbox.append(ControlConnected())
+        self.inbox.append(ControlConnected())
 
     def wake_up(self) -> None:
         """End the present `poll`."""
@@ -192,13 +192,13 @@ class Lab:
         signal.raise_signal(signal.SIGINT)
 
     def disconnect(self) -> None:
-        self._inbox.append(ControlDisconnected())
+        self.inbox.append(ControlDisconnected())
 
     def kill(self) -> None:
-        self._inbox.append(Killed())
+        self.inbox.append(Killed())
 
     def parent_goes(self) -> None:
-        self._inbox.append(ParentGone())
+        self.inbox.append(ParentGone())
 
     def does(self, event: a.ArbitrationEvent, who: str, number: int = 0) -> Response:
         """Send a request of another component to the scheduler."""
@@ -227,12 +227,12 @@ class Lab:
     def stop(self) -> None:
         """Stop what the microscope is doing."""
         if self.state in (ScopeState.SCANNING, ScopeState.SPEC):
-            self._go(ScopeState.INTERRUPTED)
-            self._go(ScopeState.FREE)
+            self.go(ScopeState.INTERRUPTED)
+            self.go(ScopeState.FREE)
 
     def restart_translator(self) -> None:
         """Drop the running measurement without a state."""
-        self._go(ScopeState.FREE)
+        self.go(ScopeState.FREE)
 
     def begin_unheard(self, region: Region, in_s: float, asked: str = "start-scan") -> None:
         """Kill the translator at the start of a scan of `region`, and restart it with the scan `in_s` later."""
@@ -247,9 +247,9 @@ class Lab:
             return Response(ControlResponse.NO_RESPONSE, reason="the translator is not connected")
 
         def back() -> None:
-            self._go(ScopeState.SCANNING)
+            self.go(ScopeState.SCANNING)
             self.publish_scan(region)
-            self._go(ScopeState.FREE)
+            self.go(ScopeState.FREE)
 
         self.intercept = dies
         self.at(in_s, back)
@@ -265,7 +265,7 @@ class Lab:
 
     def restart_component(self) -> None:
         """Kill the component: its unread packets are lost, and the cache is sent again."""
-        self._inbox = self.replay()
+        self.inbox = self.replay()
 
     def count(self, kind: int) -> int:
         return sum(request.kind == kind for request in self.requests)
@@ -277,13 +277,13 @@ class Lab:
 
     # --- scheduler and microscope ---
 
-    def _answer_once(self, request: Request) -> Response:
+    def answer_once(self, request: Request) -> Response:
         if request.id and request.id in self.answers:
             return self.answers[request.id]
-        response = self.answers[request.id] = self._answer(request)
+        response = self.answers[request.id] = self.answer(request)
         return response
 
-    def _answer(self, request: Request) -> Response:
+    def answer(self, request: Request) -> Response:
         asks: Mapping[int, a.ArbitrationEvent] = {
             ControlRequest.REQUEST_CTRL: a.ArbitrationEvent.REQUEST_CONTROL,
             ControlRequest.RELEASE_CTRL: a.ArbitrationEvent.RELEASE_CONTROL,
@@ -304,24 +304,24 @@ class Lab:
             return Response(ControlResponse.SUCCESS)
         if self.state is not ScopeState.FREE and not reads:
             return Response(ControlResponse.NOT_FREE)
-        return self._execute(request)
+        return self.execute(request)
 
-    def _execute(self, request: Request) -> Response:
+    def execute(self, request: Request) -> Response:
         match request.kind, request.subject:
             case ControlRequest.SET_SCAN_PARAMS, ScanParameters() as wanted:
                 self.parameters = ScanParameters(
                     wanted.region or self.parameters.region, wanted.shape or self.parameters.shape
                 )
-                self._move(self.parameters)
+                self.move(self.parameters)
             case ControlRequest.SET_PROBE_POS, ProbePosition() as position:
                 self.position = position
-                self._move(position)
+                self.move(position)
             case ControlRequest.SET_ZCTRL_PARAMS, Feedback() as feedback:
                 self.publish(feedback)
             case ControlRequest.ACTION, "start-scan":
-                self._start(ScopeState.SCANNING, self._finish_scan)
+                self._start(ScopeState.SCANNING, self.finish_scan)
             case ControlRequest.ACTION, "start-spec":
-                self._start(ScopeState.SPEC, self._finish_spectrum)
+                self._start(ScopeState.SPEC, self.finish_spectrum)
             case ((ControlRequest.ACTION | ControlRequest.ACTION_SUPPORT), "x-crash"):
                 return Response(ControlResponse.ACTION_NOT_SUPPORTED, reason="no such action")
             case ControlRequest.PARAM, Parameter(name, value, unit):
@@ -331,35 +331,35 @@ class Lab:
         self.executed.append(request.id)
         return Response(ControlResponse.SUCCESS)
 
-    def _move(self, thing: Any) -> None:
-        self._go(ScopeState.MOVING)
+    def move(self, thing: Any) -> None:
+        self.go(ScopeState.MOVING)
         self.publish(thing)
         self.state = ScopeState.MOVING
-        self.at(1.0, lambda: self._go(ScopeState.FREE))
+        self.at(1.0, lambda: self.go(ScopeState.FREE))
 
-    def _go(self, state: ScopeState) -> None:
+    def go(self, state: ScopeState) -> None:
         self.state = state
         self.publish(ScopeStatus(state))
 
     def _start(self, state: ScopeState, finish: Callable[[], None]) -> None:
         self.begun_scans += 1
         mine = self.begun_scans
-        self._go(state)
+        self.go(state)
 
         def end() -> None:
             if self.state is state and self.begun_scans == mine:
                 finish()
-                self._go(ScopeState.FREE)
+                self.go(ScopeState.FREE)
 
         self.at(SCAN_S, end)
 
-    def _finish_scan(self) -> None:
+    def finish_scan(self) -> None:
         assert isinstance(self.parameters.region, Region)
         assert isinstance(self.parameters.shape, tuple)
         self.finished.append(self.parameters.region)
         self.publish_scan(self.parameters.region, self.parameters.shape)
 
-    def _finish_spectrum(self) -> None:
+    def finish_spectrum(self) -> None:
         values, kind = np.zeros((3, 2)), self.values.get("x-spec-kind") or "IV"
         self.publish(Spectrum(self.position.xy_m, kind, ("U", "I"), ("V", "A"), values, self.clock.now_ns()))
 

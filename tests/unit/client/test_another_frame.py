@@ -15,8 +15,8 @@ from afspm.model import ControlRequest
 
 
 def test_another_frame_is_not_taken_for_a_rounded_own_one(lab: Lab, scope: Scope) -> None:
-    publish = lab._move
-    lab._move = lambda thing: publish(model.ScanParameters(OTHER_REGION, (8, 8)))  # type: ignore[method-assign]
+    publish = lab.move
+    lab.move = lambda thing: publish(model.ScanParameters(OTHER_REGION, (8, 8)))  # type: ignore[method-assign]
     scope.scan(REGION)
     scope.scan(REGION)
     assert lab.count(ControlRequest.SET_SCAN_PARAMS) == 2
@@ -47,7 +47,7 @@ def test_a_frame_that_is_never_scanned_is_given_up(lab: Lab, scope: Scope) -> No
     def elsewhere() -> None:
         lab.publish_scan(OTHER_REGION)
 
-    lab._finish_scan = elsewhere  # type: ignore[method-assign]
+    lab.finish_scan = elsewhere  # type: ignore[method-assign]
     with pytest.raises(NoResponse, match="failed 5 times: another measurement was taken"):
         scope.scan(REGION, shape=(8, 8))
 
@@ -60,7 +60,7 @@ def test_drift_corrected_scan_has_its_measured_position(lab: Lab, off: float, sc
     def first_elsewhere() -> None:
         lab.publish_scan(wrong if lab.begun_scans == 1 else REGION)
 
-    lab._finish_scan = first_elsewhere  # type: ignore[method-assign]
+    lab.finish_scan = first_elsewhere  # type: ignore[method-assign]
     scope.scan(REGION)
     assert lab.begun_scans == scans
 

@@ -184,7 +184,7 @@ def test_unreadable_packet_is_dropped_and_logged(caplog: pytest.LogCaptureFixtur
 
     def publish_rubbish() -> None:
         lab.publish(Scan(REGION, "A", "m", _zeros()))
-        packet = next(incoming.packet for incoming in lab._inbox)  # type: ignore[union-attr]
+        packet = next(incoming.packet for incoming in lab.inbox)  # type: ignore[union-attr]
         packet.payload = packet.payload[:-20]
         packet.envelope = "Scan2d"
         lab.publish(ScopeStatus(ScopeState.FREE), "NobodyKnows")
@@ -444,7 +444,7 @@ def test_packets_of_other_publishers_are_handled_but_do_not_set_the_state() -> N
     message, payload = wire.encode(ScopeStatus(ScopeState.SPEC))
 
     def publish() -> None:
-        lab._inbox.append(PacketReceived(model.Packet(message, payload, 1), "memory://another"))
+        lab.inbox.append(PacketReceived(model.Packet(message, payload, 1), "memory://another"))
 
     lab.at(1.0, publish)
     lab.at(2.0, lab.kill)

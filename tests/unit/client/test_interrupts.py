@@ -73,7 +73,7 @@ def test_scan_that_cannot_be_stopped_is_reported(lab: Lab, scope: Scope, caplog:
 def test_scan_with_an_unanswered_start_is_stopped(lab: Lab, scope: Scope) -> None:
     def unanswered(request: Request) -> Response | str:
         if request.subject == "start-scan":
-            lab._answer_once(request)
+            lab.answer_once(request)
             lab.at(0.0, lab.ctrl_c)
             return "no answer"
         return "go on"

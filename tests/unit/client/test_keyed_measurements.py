@@ -121,7 +121,7 @@ def test_a_scan_that_was_finished_during_the_death_is_found_in_the_cache(tmp_pat
     with pytest.raises(Kill9):
         survey(scope_of(lab, tmp_path, 0, port))
     lab.publish(lab.control.published())
-    while lab._happenings:  # nobody takes what arrives
+    while lab.happenings:  # nobody takes what arrives
         lab.poll(1000.0)
     lab.restart_component()
     scope_of(lab, tmp_path, 1).scan(TILES[0], shape=(8, 8), key="tile-0")
@@ -139,7 +139,7 @@ def test_scan_without_a_key_does_not_forget_the_keyed_one(tmp_path: Path) -> Non
     kill_in(lab, 155.0, port)  # the spectrum took 100 s
     with pytest.raises(Kill9):
         measure(scope_of(lab, tmp_path, 0, port))
-    while lab._happenings:  # it ends while nobody is there
+    while lab.happenings:  # it ends while nobody is there
         lab.poll(1000.0)
     assert len(lab.finished) == 1
     lab.restart_component()
@@ -231,14 +231,14 @@ def test_refused_key_is_requested_again_with_another_id(tmp_path: Path) -> None:
 
 def retracted(lab: Lab) -> Callable[[], None]:
     """Retract the tip: scans are refused, and the refusals cached. Return the function that engages it again."""
-    execute, is_retracted = lab._execute, [True]
+    execute, is_retracted = lab.execute, [True]
 
     def carry_out(request: Request) -> Response:
         if is_retracted and request.subject == "start-scan":
             return Response(ControlResponse.ACTION_ERROR, reason="the tip is retracted")
         return execute(request)
 
-    lab._execute = carry_out  # type: ignore[method-assign]
+    lab.execute = carry_out  # type: ignore[method-assign]
     return is_retracted.clear
 
 
@@ -383,8 +383,8 @@ def lose_start(lab: Lab, back_s: float) -> list[tuple[str, float]]:
         if request.subject != "start-scan":
             return "go on"
         if not asked:
-            lab._go(ScopeState.UNDEFINED)
-            lab.at(back_s, lambda: lab._go(ScopeState.FREE))
+            lab.go(ScopeState.UNDEFINED)
+            lab.at(back_s, lambda: lab.go(ScopeState.FREE))
         asked.append((request.id, lab.clock.passed_s))
         if request.id != asked[0][0]:
             return "go on"
@@ -412,9 +412,9 @@ def test_scan_that_begins_late_after_its_controller_is_back_is_not_started_again
     asked = lose_start(lab, back_s=2.0)
 
     def begins() -> None:
-        lab._go(ScopeState.SCANNING)
+        lab.go(ScopeState.SCANNING)
         lab.publish_scan(REGION)
-        lab._go(ScopeState.FREE)
+        lab.go(ScopeState.FREE)
 
     lab.at(2.0 + LOST_AFTER_S - 2 * RETRY_S, begins)
     scans = scope_of(lab, tmp_path, 0).scan(REGION, shape=(8, 8), key="tile")

@@ -90,8 +90,8 @@ def test_a_region_in_sample_coordinates_is_set_each_time(lab: Lab, scope: Scope)
 
 def test_a_controller_that_rounds_is_not_set_again_and_again(lab: Lab, scope: Scope) -> None:
     coarse = model.Region((1e-9, 0.0), (1e-6, 1e-6))
-    publish = lab._move
-    lab._move = lambda thing: publish(model.ScanParameters(coarse, (8, 8)))  # type: ignore[method-assign]
+    publish = lab.move
+    lab.move = lambda thing: publish(model.ScanParameters(coarse, (8, 8)))  # type: ignore[method-assign]
     scope.scan(REGION)
     scope.scan(REGION)
     assert lab.count(ControlRequest.SET_SCAN_PARAMS) == 1
@@ -291,7 +291,7 @@ def test_earlier_packets_are_not_taken_for_the_scan(lab: Lab, scope: Scope) -> N
 
 
 def test_a_scan_whose_beginning_was_lost_with_the_connection_is_recognised(lab: Lab, scope: Scope) -> None:
-    lose = lab._go
+    lose = lab.go
 
     def without_busy(state: ScopeState) -> None:
         if state is ScopeState.SCANNING:
@@ -299,7 +299,7 @@ def test_a_scan_whose_beginning_was_lost_with_the_connection_is_recognised(lab: 
         else:
             lose(state)
 
-    lab._go = without_busy  # type: ignore[method-assign]
+    lab.go = without_busy  # type: ignore[method-assign]
     lab.at(2.0, lambda: lab.publish_scan(REGION))
     lab.at(2.1, lambda: lose(ScopeState.FREE))
     scope.scan(REGION)
@@ -310,9 +310,9 @@ def test_scan_is_not_taken_twice_if_the_connection_is_cut_at_its_start(lab: Lab,
     publish = lab.publish
 
     def withhold(thing: object, envelope: str | None = None) -> Packet:
-        heard = list(lab._inbox)
+        heard = list(lab.inbox)
         packet = publish(thing, envelope)
-        lab._inbox[:] = heard
+        lab.inbox[:] = heard
         return packet
 
     def cut(request: model.Request) -> str:
@@ -324,7 +324,7 @@ def test_scan_is_not_taken_twice_if_the_connection_is_cut_at_its_start(lab: Lab,
 
     def connect() -> None:
         lab.publish = publish  # type: ignore[method-assign]
-        lab._inbox += lab.replay()
+        lab.inbox += lab.replay()
 
     lab.intercept = cut
     assert scope.scan(REGION).region == REGION
@@ -355,7 +355,7 @@ def test_a_refusal_is_raised_with_its_reason(lab: Lab, scope: Scope) -> None:
 
 def test_request_waits_for_a_busy_microscope(lab: Lab, scope: Scope) -> None:
     lab.state = ScopeState.BUSY_PARAM
-    lab.at(12.0, lambda: lab._go(ScopeState.FREE))
+    lab.at(12.0, lambda: lab.go(ScopeState.FREE))
     scope.scan(REGION)
     assert lab.begun_scans == 1
     assert lab.clock.passed_s > 12.0 + SCAN_S
@@ -383,7 +383,7 @@ def test_a_lost_answer_repeats_the_request_with_its_id_and_executes_it_once(lab:
     def lose_first(request: model.Request) -> Response | str | None:
         if request.subject == "start-scan" and not lost:
             lost.append(request.id)
-            lab._answer_once(request)
+            lab.answer_once(request)
             return None
         return "go on"
 
@@ -513,20 +513,20 @@ def test_the_answer_to_an_earlier_request_is_not_taken_for_this_ones(lab: Lab, s
     from afspm.transport.port import ReplyReceived
 
     late = Response(ControlResponse.FAILURE, reason="of another", id="experiment/0/other")
-    lab.intercept = lambda request: (lab._inbox.append(ReplyReceived(late)), "go on")[1]
+    lab.intercept = lambda request: (lab.inbox.append(ReplyReceived(late)), "go on")[1]
     scope.flag(TIP)
 
 
 def test_nothing_is_measured_before_the_schedulers_packets_arrive(lab: Lab, scope: Scope) -> None:
     """The cache may show that the measurement is already done."""
-    lab._inbox.remove(CaughtUp(SOURCE))
-    lab.at(100.0, lambda: lab._inbox.append(CaughtUp(SOURCE)))
+    lab.inbox.remove(CaughtUp(SOURCE))
+    lab.at(100.0, lambda: lab.inbox.append(CaughtUp(SOURCE)))
     scope.scan(REGION)
     assert lab.clock.passed_s == pytest.approx(100.0 + SCAN_S, abs=5.0)
 
 
 def test_measurement_without_packets_ends_at_its_timeout(lab: Lab, scope: Scope) -> None:
-    lab._inbox.remove(CaughtUp(SOURCE))
+    lab.inbox.remove(CaughtUp(SOURCE))
     with pytest.raises(NoResponse, match="its packets do not arrive"):
         scope.scan(REGION, timeout_s=10.0)
     assert lab.begun_scans == 0
@@ -541,7 +541,7 @@ def test_problem_that_may_be_flagged_unseen_is_cleared(lab: Lab, scope: Scope) -
 def test_missing_state_of_the_microscope_is_logged_once(
     lab: Lab, scope: Scope, caplog: pytest.LogCaptureFixture
 ) -> None:
-    lab._inbox = [one for one in lab._inbox if getattr(getattr(one, "packet", None), "envelope", "") != "ScopeStateMsg"]
+    lab.inbox = [one for one in lab.inbox if getattr(getattr(one, "packet", None), "envelope", "") != "ScopeStateMsg"]
     lab.at(20.0, lambda: lab.publish(ScopeStatus(ScopeState.FREE)))
     scope.set("tip-bias-voltage", "1 V")
     assert [record.message for record in caplog.records if "has published no state yet" in record.message]
@@ -607,7 +607,7 @@ def test_an_old_control_state_is_not_taken_for_a_loss(lab: Lab, scope: Scope) ->
         lab.at(0.5, lambda: lab.publish(model.ControlState(ControlMode.AUTOMATED, None, ())))
         lab.at(0.6, lambda: lab.publish(lab.control.published()))
         publish, lab.publish = lab.publish, lambda thing, envelope=None: None  # type: ignore[assignment,return-value]
-        response = lab._answer(request)
+        response = lab.answer(request)
         lab.publish = publish  # type: ignore[method-assign]
         return response
 
@@ -862,7 +862,7 @@ def test_an_action_whose_answer_and_control_were_lost_is_not_done_twice(lab: Lab
         if request.subject != "x-pulse":
             return "go on"
         if not done:
-            lab._answer_once(request)
+            lab.answer_once(request)
             lab.flag(TIP)
             lab.at(30.0, lambda: lab.clear(TIP))
         done.append(request.id)
@@ -878,7 +878,7 @@ def test_a_scan_that_is_seen_to_begin_needs_no_answer(lab: Lab, scope: Scope) ->
     def lost(request: model.Request) -> Response | str:
         if request.subject != "start-scan":
             return "go on"
-        lab._answer_once(request)
+        lab.answer_once(request)
         return Response(ControlResponse.NO_RESPONSE, reason="outcome unknown")
 
     lab.intercept = lost

@@ -37,13 +37,13 @@ class SweepLab(Lab):
     def in_force(self) -> tuple[str, str]:
         return self.values["tip-bias-voltage"], self.values["zctrl-igain"]
 
-    def _finish_scan(self) -> None:
+    def finish_scan(self) -> None:
         self.measured.append(self.in_force)
-        super()._finish_scan()
+        super().finish_scan()
 
-    def _finish_spectrum(self) -> None:
+    def finish_spectrum(self) -> None:
         self.measured.append(self.in_force)
-        super()._finish_spectrum()
+        super().finish_spectrum()
 
 
 def scope_of(lab: Lab, folder: Path | None = None, life: int = 0, port: LabPort | None = None) -> Scope:
@@ -211,7 +211,7 @@ class SourceLab(SweepLab):
         self.at_volt: list[str] = []
         self.targets: list[str | None] = []
 
-    def _execute(self, request: Request) -> Response:
+    def execute(self, request: Request) -> Response:
         subject = request.subject
         if isinstance(subject, Parameter) and subject.name.startswith("source.bias"):
             if subject.value is not None:
@@ -222,11 +222,11 @@ class SourceLab(SweepLab):
                 self.readings_left -= 1
                 if self.readings_left == 0:
                     self.values |= {"source.bias": self.values["source.bias.target"], "source.bias.busy": "false"}
-        return super()._execute(request)
+        return super().execute(request)
 
-    def _finish_scan(self) -> None:
+    def finish_scan(self) -> None:
         self.at_volt.append(self.values["source.bias"])
-        super()._finish_scan()
+        super().finish_scan()
 
 
 BIASES: dict[str, SweptValues] = {"source.bias": ["4.2 V", "10 V"], "zctrl-igain": [1, 2]}

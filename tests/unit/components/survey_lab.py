@@ -49,9 +49,9 @@ class ParticleLab(Lab):
             name = f"scan-{len(self.finished)}.nc"
             self.publish(Scan(region, channel, "m", values, self.clock.now_ns(), name))
 
-    def _finish_spectrum(self) -> None:
+    def finish_spectrum(self) -> None:
         self.spots.append(self.position.xy_m)
-        super()._finish_spectrum()
+        super().finish_spectrum()
 
 
 __all__ = ["PARTICLES", "ParticleLab"]

@@ -150,11 +150,11 @@ def test_original_gain_is_restored_after_a_kill(tmp_path: Path) -> None:
 class Unscannable(Rig):
     """A laboratory whose scans break off while the integral gain is above 3."""
 
-    def _finish_scan(self) -> None:
+    def finish_scan(self) -> None:
         if self.gains[-1] > 3.0:
-            self._go(ScopeState.INTERRUPTED)
+            self.go(ScopeState.INTERRUPTED)
         else:
-            super()._finish_scan()
+            super().finish_scan()
 
 
 def test_gain_is_set_back_when_the_scans_fail_with_it(tmp_path: Path) -> None:

@@ -42,9 +42,9 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 def scanned(lab: Lab, at_s: float) -> None:
     """Let another client take a scan of 100 s."""
-    lab.at(at_s, lambda: lab._go(ScopeState.SCANNING))
+    lab.at(at_s, lambda: lab.go(ScopeState.SCANNING))
     lab.at(at_s + 100.0, lambda: lab.publish_scan(REGION))
-    lab.at(at_s + 100.0, lambda: lab._go(ScopeState.FREE))
+    lab.at(at_s + 100.0, lambda: lab.go(ScopeState.FREE))
 
 
 def held_by(lab: Lab, name: str, at_s: float) -> None:
@@ -341,7 +341,7 @@ def test_bias_survives_a_restart_unless_a_part_of_the_journal_is_missing(
     assert Metadata().run_process(first_life) == ExitCode.ORPHAN
     lab.restart_component()
     if missed:  # the cache keeps the newest entries only
-        lab._inbox.clear()
+        lab.inbox.clear()
         lab.connect()
     measured_with(lab, 100.0)
     lab.at(500.0, lab.kill)

@@ -189,7 +189,7 @@ def _lab() -> Lab:
     lab.channels = ("Height",)
     for number in range(3):
         at_s = 100.0 * (number + 1)
-        lab.at(at_s, lambda: lab._go(ScopeState.SCANNING))
+        lab.at(at_s, lambda: lab.go(ScopeState.SCANNING))
         lab.at(at_s + 50, lambda: lab.publish_scan(REGION, (64, 64)))
     told = verdict_message(scan(4), BAD)
     lab.at(320.0, lambda: lab.publish(told, f"{MESSAGE}_tip_classifier"))

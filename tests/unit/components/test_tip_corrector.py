@@ -60,13 +60,13 @@ class Repairs(Lab):
             self.at(0.5, lambda: self.clear(TIP))
         self.at(0.6, lambda: self.publish(verdict_message(scan, score), f"{MESSAGE}_tip_classifier"))
 
-    def _execute(self, request: Request) -> Response:
+    def execute(self, request: Request) -> Response:
         if request.subject in ("x-pulse", "x-crash"):
             if request.kind == ControlRequest.ACTION:
                 self.actions.append((request.subject, self.position.xy_m))
                 self.executed.append(request.id)
             return Response(ControlResponse.SUCCESS)
-        return super()._execute(request)
+        return super().execute(request)
 
     def stand_at(self, xy_m: tuple[float, float]) -> None:
         """Let a person move the probe."""
@@ -122,13 +122,13 @@ def test_treatments_are_made_at_fresh_places_away_from_scans_and_published() -> 
 class MovesInItsFrame(Repairs):
     """A microscope that, like GXSM, moves its tip only within the scan frame."""
 
-    def _execute(self, request: Request) -> Response:
+    def execute(self, request: Request) -> Response:
         if request.kind == ControlRequest.SET_PROBE_POS:
             (x, y), region = request.subject.xy_m, self.parameters.region
             assert isinstance(region, Region)
             if not region.contains((x, y)):
                 return Response(ControlResponse.PARAM_ERROR, reason="not in the frame")
-        return super()._execute(request)
+        return super().execute(request)
 
 
 def test_frame_moves_along_if_the_tip_moves_only_within_it() -> None:
@@ -445,7 +445,7 @@ def test_treatment_without_an_answer_is_not_requested_again(is_done: bool) -> No
             return "go on"
         lab.intercept = lambda request: "go on"
         if is_done:
-            lab._answer_once(request)
+            lab.answer_once(request)
         a_person_takes_over(lab)
         return Response(ControlResponse.NO_RESPONSE, reason="the translator is not connected")
 
