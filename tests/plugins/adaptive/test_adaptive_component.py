@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.unit.client.client_lab import Kill9, Lab, LabPort, context_of, run
+from client_lab import Kill9, Lab, LabPort, context_of, run
 
 from afspm.basics import ConfigError, ExitCode, InvalidValue, MeasurementFailed
 from afspm.emulation import World

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.unit.client.client_lab import Lab, context_of, run
+from client_lab import Lab, context_of, run
 
 from afspm import wire
 from afspm.basics.errors import FileError

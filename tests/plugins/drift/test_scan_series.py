@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.unit.record.record_lab import ABOUT, Night
+from record_lab import ABOUT, Night
 from typer.testing import CliRunner
 
 from afspm import read

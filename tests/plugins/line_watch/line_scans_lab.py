@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from functools import cache, partial
 
 import numpy as np
-from tests.unit.client.client_lab import Lab
+from client_lab import Lab
 
 from afspm.emulation import World
 from afspm.model import Region, Scan, ScanLines

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from client_lab import Lab, run
 from tests.plugins.line_watch.line_scans_lab import (
     CHANGED_ROW,
     CHANNELS,
@@ -24,7 +25,6 @@ from tests.plugins.line_watch.line_scans_lab import (
     scan_at,
     world_with,
 )
-from tests.unit.client.client_lab import Lab, run
 
 from afspm import wire
 from afspm.basics import ExitCode

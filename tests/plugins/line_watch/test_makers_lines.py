@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from client_lab import Lab, run
 from tests.plugins.gxsm.gxsm_bench import Bench as GxsmBench
 from tests.plugins.line_watch.test_line_watch import flags, verdicts
 from tests.plugins.nanonis.nanonis_bench import Bench as NanonisBench
 from tests.plugins.nanosurf.nanosurf_bench import Bench as NanosurfBench
 from tests.plugins.vendor_bench import VendorBench, benches, ready
-from tests.unit.client.client_lab import Lab, run
 
 from afspm.basics import Clock
 from afspm.emulation import Emulator, ScanActivity

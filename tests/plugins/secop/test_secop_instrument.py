@@ -11,8 +11,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from client_lab import FakeClock
 from tests.plugins.secop.ramp_night import RATE_K_S, Cryostat
-from tests.unit.client.client_lab import FakeClock
 
 from afspm.basics import TransportError
 from afspm.model import InstrumentOrder, InstrumentReadings, Parameter

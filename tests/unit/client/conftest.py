@@ -7,7 +7,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from tests.unit.client.client_lab import SOURCE, Lab, LabPort
+from client_lab import SOURCE, Lab, LabPort
 
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope

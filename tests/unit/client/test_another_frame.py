@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
-from tests.unit.client.client_lab import OTHER_REGION, REGION, SOURCE, Lab, LabPort
+from client_lab import OTHER_REGION, REGION, SOURCE, Lab, LabPort
 
 from afspm import model
 from afspm.basics.errors import NoResponse

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.unit.client.client_lab import EPOCH_S, OTHER_REGION, REGION, Lab, Nothing, context_of, run
+from client_lab import EPOCH_S, OTHER_REGION, REGION, Lab, Nothing, context_of, run
 
 from afspm import model, wire
 from afspm.basics.errors import ConfigError, ExperimentEnded, NoResponse, Refused

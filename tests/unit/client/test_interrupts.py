@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from tests.unit.client.client_lab import REGION, SCAN_S, Lab
+from client_lab import REGION, SCAN_S, Lab
 
 from afspm.client.scope import Scope
 from afspm.model import ControlMode, Request, Response, ScopeState

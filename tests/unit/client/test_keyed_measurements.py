@@ -8,9 +8,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
+from client_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, LabPort
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.unit.client.client_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, LabPort
 
 from afspm import wire
 from afspm.basics.errors import ControlLost, InvalidValue, NoResponse, Refused

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.unit.client.client_lab import OTHER_REGION, REGION, SCAN_S, SOURCE, Lab, LabPort
+from client_lab import OTHER_REGION, REGION, SCAN_S, SOURCE, Lab, LabPort
 
 from afspm import model, wire
 from afspm.basics.errors import (

@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from tests.unit.client.client_lab import SCAN_S, SOURCE, Kill9, Lab, LabPort
+from client_lab import SCAN_S, SOURCE, Kill9, Lab, LabPort
 
 from afspm import wire
 from afspm.basics.errors import InvalidValue, Refused

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from tests.unit.client.client_lab import REGION, Lab
+from client_lab import REGION, Lab
 
 from afspm import model
 from afspm.basics.errors import ControlLost, NoResponse

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tests.unit.client.client_lab import Lab
+from client_lab import Lab
 
 from afspm import wire
 from afspm.components.survey import Survey

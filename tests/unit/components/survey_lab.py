@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from tests.unit.client.client_lab import Lab
+from client_lab import Lab
 
 from afspm.model import ControlRequest, ControlResponse, Region, Request, Response, Scan, ScanParameters
 

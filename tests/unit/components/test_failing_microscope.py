@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.unit.client.client_lab import OTHER_REGION, Lab, run
+from client_lab import OTHER_REGION, Lab, run
 
 from afspm.basics.errors import MeasurementFailed
 from afspm.basics.exit_codes import ExitCode

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from tests.unit.client.client_lab import Lab, run
+from client_lab import Lab, run
 
 from afspm import wire
 from afspm.basics.exit_codes import ExitCode

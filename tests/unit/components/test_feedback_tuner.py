@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.unit.client.client_lab import Lab, run
+from client_lab import Lab, run
 
 from afspm.basics.errors import MeasurementFailed, Refused
 from afspm.basics.exit_codes import ExitCode

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.unit.client.client_lab import Lab, run
+from client_lab import Lab, run
 
 from afspm.components.log_collector import LogCollector, formatted
 from afspm.model import LogLine

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.unit.client.client_lab import REGION, Lab, Nothing, context_of, run
+from client_lab import REGION, Lab, Nothing, context_of, run
 
 from afspm.basics.clock import iso_utc
 from afspm.basics.exit_codes import ExitCode

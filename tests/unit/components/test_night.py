@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from client_lab import REGION, Lab, context_of, run
 from deadlines import DEADLINE_S
 from numpy.typing import NDArray
-from tests.unit.client.client_lab import REGION, Lab, context_of, run
 
 from afspm import wire
 from afspm.basics.exit_codes import ExitCode

@@ -11,7 +11,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
-from tests.unit.client.client_lab import FakeClock
+from client_lab import FakeClock
 from typer.testing import CliRunner
 
 from afspm import model

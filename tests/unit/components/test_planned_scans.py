@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.unit.client.client_lab import EPOCH_S, SCAN_S, Kill9, Lab, LabPort, context_of, run
+from client_lab import EPOCH_S, SCAN_S, Kill9, Lab, LabPort, context_of, run
 
 from afspm import wire
 from afspm.basics.errors import ConfigError, Refused

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from tests.unit.client.client_lab import REGION, Lab, run
+from client_lab import REGION, Lab, run
 
 from afspm import wire
 from afspm.basics.errors import ConfigError

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.unit.client.client_lab import Kill9, LabPort, context_of, run
+from client_lab import Kill9, LabPort, context_of, run
 from tests.unit.components.survey_lab import PARTICLES, ParticleLab
 
 from afspm.basics.errors import ConfigError

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from client_lab import run
 from rotation import rotated
-from tests.unit.client.client_lab import run
 from tests.unit.components.drifting_survey_lab import DriftingLab
 
 from afspm.basics.exit_codes import ExitCode

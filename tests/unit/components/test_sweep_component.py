@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.unit.client.client_lab import Kill9, Lab, LabPort, context_of, run
+from client_lab import Kill9, Lab, LabPort, context_of, run
 
 from afspm.basics.errors import ConfigError
 from afspm.basics.exit_codes import ExitCode

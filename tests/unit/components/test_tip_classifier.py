@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from tests.unit.client.client_lab import Lab, run
+from client_lab import Lab, run
 from tests.unit.components.tip_scans_lab import channels
 
 from afspm import wire

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.unit.client.client_lab import REGION, SCAN_S, Kill9, Lab, LabPort, context_of, run
+from client_lab import REGION, SCAN_S, Kill9, Lab, LabPort, context_of, run
 from tests.unit.components.tip_scans_lab import ELSEWHERE, HOME, channels
 
 from afspm import wire

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.unit.record.record_lab import ABOUT, Night
+from record_lab import ABOUT, Night
 
 from afspm.record.store import RecordStore
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.unit.record.record_lab import ABOUT, Night
+from record_lab import ABOUT, Night
 from typer.testing import CliRunner
 
 from afspm.basics.errors import FileError, InvalidValue

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.unit.record.record_lab import REGION, Night
+from record_lab import REGION, Night
 
 import afspm
 from afspm.basics.errors import FileError, InvalidValue

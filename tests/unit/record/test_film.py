@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from tests.unit.record.record_lab import ABOUT, Given, Night
+from record_lab import ABOUT, Given, Night
 
 import afspm
 from afspm import wire

@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from tests.unit.record.record_lab import REGION, Given, Night
+from record_lab import REGION, Given, Night
 
 import afspm
 from afspm.basics.errors import ConfigError, InvalidValue

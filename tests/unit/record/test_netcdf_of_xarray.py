@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.unit.record.record_lab import Night
+from record_lab import Night
 
 import afspm
 from afspm.model import Region, Scan, ScanSet, Spectrum

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import h5py
 import pytest
-from tests.unit.record.record_lab import Night
+from record_lab import Night
 
 import afspm
 from afspm.basics.errors import FileError, InvalidValue

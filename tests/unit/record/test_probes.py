@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from tests.unit.record.record_lab import ABOUT, REGION, Night
+from record_lab import ABOUT, REGION, Night
 from typer.testing import CliRunner
 
 from afspm.cli.app import app

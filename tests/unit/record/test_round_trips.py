@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from tests.unit.record.record_lab import ABOUT, Night
+from record_lab import ABOUT, Night
 
 import afspm
 from afspm.model import ChannelRoles, Frame, Region, Scan, ScanSet, ScopeState, Spectrum

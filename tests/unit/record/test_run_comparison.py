@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.unit.record.record_lab import ABOUT, REGION, Night
+from record_lab import ABOUT, REGION, Night
 
 from afspm.basics.errors import InvalidValue
 from afspm.model import ControlRequest, ControlResponse, JournalEntries, JournalEntry, Region, Scan, ScopeState

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.unit.record.record_lab import REGION, Night
+from record_lab import REGION, Night
 
 from afspm.basics.errors import InvalidValue
 from afspm.basics.formatting import duration_text

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.unit.record.record_lab import ABOUT, REGION, START_NS, Given, Night, same
+from record_lab import ABOUT, REGION, START_NS, Given, Night, same
 
 import afspm
 from afspm import wire
