@@ -75,9 +75,9 @@ class SupervisorRegistry:
     def saved(self) -> dict[str, SavedSupervisor]:
         return {
             name: SavedSupervisor(
-                one.processes, one.orders, {process: starts for process, (starts, _) in one.over.items()}
+                report.processes, report.orders, {process: starts for process, (starts, _) in report.over.items()}
             )
-            for name, one in self.supervisors.items()
+            for name, report in self.supervisors.items()
         }
 
     @classmethod
@@ -86,12 +86,12 @@ class SupervisorRegistry:
         return cls(
             {
                 name: KnownSupervisor(
-                    one.processes,
+                    report.processes,
                     None,
-                    one.orders,
-                    {process: (starts, -math.inf) for process, starts in one.over.items()},
+                    report.orders,
+                    {process: (starts, -math.inf) for process, starts in report.over.items()},
                 )
-                for name, one in saved.items()
+                for name, report in saved.items()
             }
         )
 
@@ -112,12 +112,16 @@ class SupervisorRegistry:
             -inf if it ended before a restart of the scheduler. None if it has not ended, or if another supervisor
             recently reported a process of this name that has not ended.
         """
-        having = [one for one in self.supervisors.values() if process in one.processes]
-        since_s = max((one.over[process][1] for one in having if process in one.over), default=None)
+        having = [supervisor for supervisor in self.supervisors.values() if process in supervisor.processes]
+        since_s = max(
+            (supervisor.over[process][1] for supervisor in having if process in supervisor.over), default=None
+        )
         if since_s is None:
             return None
-        others = [one for one in having if process not in one.over]
-        goes_on = any(one.reported_s is None or one.reported_s > since_s - SILENT_S for one in others)
+        others = [supervisor for supervisor in having if process not in supervisor.over]
+        goes_on = any(
+            supervisor.reported_s is None or supervisor.reported_s > since_s - SILENT_S for supervisor in others
+        )
         return None if goes_on else since_s
 
     def orders_for(self, supervisor: str) -> tuple[SupervisorRegistry, tuple[str, ...]]:
@@ -133,9 +137,9 @@ class SupervisorRegistry:
 
         The order goes to the supervisor that reported the process last.
         """
-        having = {name: one for name, one in self.supervisors.items() if process in one.processes}
+        having = {name: supervisor for name, supervisor in self.supervisors.items() if process in supervisor.processes}
         if not having:
-            known = sorted({process for one in self.supervisors.values() for process in one.processes})
+            known = sorted({process for supervisor in self.supervisors.values() for process in supervisor.processes})
             return self, f"there is no process {process!r}; known: {', '.join(known) or 'none'}"
         # after a restart of the scheduler the next report is still to come: the supervisor counts as alive
         name, newest = max(having.items(), key=lambda item: now_s if item[1].reported_s is None else item[1].reported_s)
@@ -160,7 +164,7 @@ class SupervisorRegistry:
                 over[state.name] = (state.starts, since_s if starts == state.starts else now_s)
         processes = tuple(state.name for state in states)
         newest = replace(known, processes=processes, reported_s=now_s, over=over, states=states)
-        others = [(other, one) for other, one in self.supervisors.items() if other != name]
+        others = [(other, supervisor) for other, supervisor in self.supervisors.items() if other != name]
         return replace(self, supervisors=dict([*others, (name, newest)][-_MOST:]))
 
     def clock_compared(self, name: str, time_ns: int, now_ns: int, speed: float) -> tuple[SupervisorRegistry, str]:
@@ -237,7 +241,7 @@ def announcement(event: RequestIn, codec: Codec) -> Announcement:
     if event.user not in (None, SUPERVISOR):
         return Announcement("", f"only the key of {SUPERVISOR!r} may report processes, not the key of {event.user}")
     spoken_of = thing.lines if isinstance(thing, LogLines) else thing.processes
-    if wrong := [one.name for one in spoken_of if not is_process_name(one.name)]:
+    if wrong := [process.name for process in spoken_of if not is_process_name(process.name)]:
         return Announcement("", f"{wrong[0][:LONGEST_PROCESS_NAME]!r} can't be the name of a process")
     if isinstance(thing, LogLines):
         return Announcement(subject.message)

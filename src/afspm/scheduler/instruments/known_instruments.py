@@ -109,9 +109,9 @@ class Instruments:
             return reading.reason or "it has no value"
         unit = reading.unit or "1"  # a parameter without a unit would be taken in the unit of the rule
         numbers = (reading.value,) if reading.target is None else (reading.value, reading.target)
-        found = [Parameter(parameter, repr(number), unit) for number in numbers]
-        orders = [one.order.parameter for one in self.given if one.parameter == parameter]
-        return tuple(dict.fromkeys((*found, *orders)))
+        values = [Parameter(parameter, repr(number), unit) for number in numbers]
+        orders = [order.order.parameter for order in self.given if order.parameter == parameter]
+        return tuple(dict.fromkeys((*values, *orders)))
 
     def reported(self, report: InstrumentReadings, now_s: float, now_ns: int) -> Instruments:
         """Store a report; the caller settles the outcomes in it."""
@@ -130,7 +130,7 @@ class Instruments:
             readings[reading.name] = KnownReading(reading, made_s - age_s)
         changed = self._with(report.instrument, replace(before, readings=readings))
         arrived = {reading.name for reading in report.readings if reading.value is not None and not reading.busy}
-        given = tuple(one for one in self.given if not (one.is_done and one.parameter in arrived))
+        given = tuple(order for order in self.given if not (order.is_done and order.parameter in arrived))
         return replace(changed, units=units, given=given).evaluated(now_s, now_ns)
 
     def to_publish(self, report: InstrumentReadings, now_s: float) -> Instruments | None:
@@ -138,8 +138,10 @@ class Instruments:
         known = self._of(report.instrument)
         passed_s = now_s - known.published_s
         new = tuple(self.reading(name, now_s) for name in known.readings)
-        if [_state(one) for one in new] == [_state(one) for one in known.published] and passed_s < PUBLISH_S:
-            values = [one.value for one in new], [one.value for one in known.published]
+        if [_state(reading) for reading in new] == [
+            _state(reading) for reading in known.published
+        ] and passed_s < PUBLISH_S:
+            values = [reading.value for reading in new], [reading.value for reading in known.published]
             if values[0] == values[1] or passed_s < PUBLISH_CHANGED_S:
                 return None
         return self._with(report.instrument, replace(known, published=new, published_s=now_s))
@@ -220,13 +222,17 @@ class Instruments:
 
     def reported_outcome(self, outcome: OrderOutcome) -> Instruments:
         """Store the outcome of an order: a success replaces earlier targets, a refusal leaves them."""
-        found = next((one for one in self.given if one.order.number == outcome.number), None)
-        if found is None or outcome.response == ControlResponse.NO_RESPONSE:
+        answered = next((order for order in self.given if order.order.number == outcome.number), None)
+        if answered is None or outcome.response == ControlResponse.NO_RESPONSE:
             return self
         if outcome.response != ControlResponse.SUCCESS:
-            return replace(self, given=tuple(one for one in self.given if one is not found))
-        newer = (one for one in self.given if one.parameter != found.parameter or one.order.number > outcome.number)
-        return replace(self, given=(replace(found, is_done=True), *newer))
+            return replace(self, given=tuple(order for order in self.given if order is not answered))
+        newer = (
+            order
+            for order in self.given
+            if order.parameter != answered.parameter or order.order.number > outcome.number
+        )
+        return replace(self, given=(replace(answered, is_done=True), *newer))
 
     def asked_to_read(self, instrument: str, now_s: float) -> Instruments:
         """Store that the values for the first order of an instrument are being read."""
@@ -238,10 +244,10 @@ class Instruments:
         """Store a value of the microscope that was read for an order."""
         changed = self
         for owner, known in self.known.items():
-            for one in known.open:
-                if one.job.number == number and one.read_s is not None:
-                    filled = replace(one, read={**one.read, name: value})
-                    orders = tuple(filled if other is one else other for other in known.open)
+            for order in known.open:
+                if order.job.number == number and order.read_s is not None:
+                    filled = replace(order, read={**order.read, name: value})
+                    orders = tuple(filled if other is order else other for other in known.open)
                     changed = changed._with(owner, replace(known, open=orders))
         return changed
 
@@ -249,27 +255,31 @@ class Instruments:
         """Forget the values read for waiting orders that are judged with one of these names."""
         changed = self
         for owner, known in self.known.items():
-            if any(one.read_s is not None and one.order is None and one.read.keys() & names for one in known.open):
-                orders = tuple(one if one.order else replace(one, read={}, read_s=None) for one in known.open)
+            if any(
+                order.read_s is not None and order.order is None and order.read.keys() & names for order in known.open
+            ):
+                orders = tuple(order if order.order else replace(order, read={}, read_s=None) for order in known.open)
                 changed = changed._with(owner, replace(known, open=orders))
         return changed
 
     def settled(self, instrument: str, number: int) -> Instruments:
         """Remove the order with this number."""
         known = self._of(instrument)
-        rest = tuple(one for one in known.open if one.job.number != number)
+        rest = tuple(order for order in known.open if order.job.number != number)
         return self._with(instrument, replace(known, open=rest))
 
     def found(self, instrument: str, outcome: OrderOutcome) -> OpenOrder | None:
         """Return the open order that an outcome belongs to; None if the order was settled before."""
-        for one in self._of(instrument).open:
-            if one.order is not None and one.order.number == outcome.number:
-                return one
+        for order in self._of(instrument).open:
+            if order.order is not None and order.order.number == outcome.number:
+                return order
         return None
 
     def overdue(self, now_s: float) -> list[tuple[str, OpenOrder]]:
         """Return the orders whose deadline has passed, each with its instrument."""
-        return [(name, one) for name, known in self.known.items() for one in known.open if now_s >= one.job.deadline_s]
+        return [
+            (name, order) for name, known in self.known.items() for order in known.open if now_s >= order.job.deadline_s
+        ]
 
     def answered(self, instrument: str, now_s: float) -> Instruments:
         """Store that a report is being answered, under a new token."""
@@ -285,7 +295,7 @@ class Instruments:
 
     def due_s(self) -> float | None:
         """Return the next real time at which a condition or an order must be checked; None: no deadline."""
-        dues = [one.job.deadline_s for known in self.known.values() for one in known.open]
+        dues = [order.job.deadline_s for known in self.known.values() for order in known.open]
         if self.settings.problems and self.awaited_until_s is not None and self.awaited_until_s > _NEVER_S:
             dues.append(self.awaited_until_s + _JUST_AFTER_S)
         for name, condition in self.settings.conditions.items():

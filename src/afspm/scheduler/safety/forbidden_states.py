@@ -55,7 +55,7 @@ class PresentState:
 def in_states(states: Collection[ScopeState]) -> dict[str, tuple[Parameter, ...]]:
     """Return the candidates of each state's name for a microscope in one of several states."""
     return {
-        name: tuple({Parameter(name, "true" if one.name == name else "false"): None for one in states})
+        name: tuple({Parameter(name, "true" if state.name == name else "false"): None for state in states})
         for name in STATES
     }
 
@@ -77,16 +77,16 @@ def values_in(subject: object) -> dict[str, Parameter]:
     """Return the parameters in a request or message, by name; none if it is malformed or reads a parameter."""
     if isinstance(subject, Parameter):
         return {} if subject.value is None else {subject.name: subject}
-    found = dict[str, Parameter]()
+    values = dict[str, Parameter]()
     if isinstance(subject, Feedback) and subject.on is not None:
-        found[names.FEEDBACK_ON] = Parameter(names.FEEDBACK_ON, "true" if subject.on else "false")
+        values[names.FEEDBACK_ON] = Parameter(names.FEEDBACK_ON, "true" if subject.on else "false")
     try:
         for name, number in values_of(subject, {}):
             if number is not None:
-                found[name] = Parameter(name, repr(number), BASE_PARAMETERS.get(name) or None)
+                values[name] = Parameter(name, repr(number), BASE_PARAMETERS.get(name) or None)
     except ParameterValueError:  # `LimitChecker.check` refuses it
         return {}
-    return found
+    return values
 
 
 def judging(limits: ExperimentLimits, request: Request) -> list[ForbiddenState]:
@@ -100,8 +100,8 @@ def judging(limits: ExperimentLimits, request: Request) -> list[ForbiddenState]:
 
 def to_read(rules: Collection[ForbiddenState]) -> list[str]:
     """Return the parameters of the microscope in rules; instruments report theirs, and states are published."""
-    found = {name for rule in rules for name in rule.names if name not in STATES}
-    return sorted(name for name in found if not instrument_of(name) or name.startswith("x-"))
+    known = {name for rule in rules for name in rule.names if name not in STATES}
+    return sorted(name for name in known if not instrument_of(name) or name.startswith("x-"))
 
 
 def refusal(limits: ExperimentLimits, request: Request, present: PresentState, *, certain: bool = False) -> str:
@@ -136,7 +136,7 @@ class PlanRehearsal:
 
 def now_forbidden(rule: ForbiddenState, present: PresentState) -> str:
     """Return the sentence that a state is forbidden; empty if it may be allowed."""
-    known = {name: _value(rule, one) for name, (one, *_) in present.values.items() if name in rule.names}
+    known = {name: _value(rule, parameter) for name, (parameter, *_) in present.values.items() if name in rule.names}
     if not rule_language.holds(rule.tree, known):
         return ""
     return f"{' and '.join(_texts(rule, known, rule.names))} is a forbidden state: {rule.rule} ({rule.source})"
@@ -167,12 +167,12 @@ class _Decision:
 
     def refusal(self, *, certain: bool) -> str:
         after = [{**known, **self.settings} for known in self.before]
-        found = [rule_language.holds(self.rule.tree, known) for known in after]
-        if True in found:
-            return "" if self._moves_away() else self._sentence(after[found.index(True)])
-        if certain or None not in found or self._moves_away():
+        holds = [rule_language.holds(self.rule.tree, known) for known in after]
+        if True in holds:
+            return "" if self._moves_away() else self._sentence(after[holds.index(True)])
+        if certain or None not in holds or self._moves_away():
             return ""
-        return self._sentence_of_unknown(after[found.index(None)])
+        return self._sentence_of_unknown(after[holds.index(None)])
 
     def _moves_away(self) -> bool:
         is_less = False
@@ -223,7 +223,8 @@ class _Decision:
 
 def _combinations(rule: ForbiddenState, present: PresentState) -> Iterator[Known]:
     candidates = {
-        name: tuple(_value(rule, one) for one in present.values.get(name, ())) or (None,) for name in sorted(rule.names)
+        name: tuple(_value(rule, parameter) for parameter in present.values.get(name, ())) or (None,)
+        for name in sorted(rule.names)
     }
     if math.prod(map(len, candidates.values())) > _MOST_COMBINATIONS:
         yield {}
@@ -236,10 +237,10 @@ def _value(rule: ForbiddenState, given: Parameter) -> Value | None:
     if given.name not in rule.units:
         return _WORDS.get((given.value or "").strip().lower())
     try:
-        found = values_of(given, {given.name: Limit(unit=rule.units[given.name])})
+        quantities = values_of(given, {given.name: Limit(unit=rule.units[given.name])})
     except ParameterValueError:
         return None
-    return next((one.number for one in found), None)
+    return next((quantity.number for quantity in quantities), None)
 
 
 def _texts(rule: ForbiddenState, known: Known, wanted: Collection[str]) -> list[str]:

@@ -128,7 +128,9 @@ class HeldGrant:
         )
 
     def left(self) -> tuple[GrantedCount, ...]:
-        return tuple(GrantedCount(one.action, one.count - self.used.get(one.action, 0)) for one in self.grant.counts)
+        return tuple(
+            GrantedCount(count.action, count.count - self.used.get(count.action, 0)) for count in self.grant.counts
+        )
 
 
 @dataclass(frozen=True)
@@ -182,7 +184,7 @@ class GrantBook:
     def approvals(self) -> Approvals:
         """Return the approvals in their published form."""
         return Approvals(
-            tuple(one.published() for held in (self.plans, self.grants) for _, one in sorted(held.items()))
+            tuple(approval.published() for held in (self.plans, self.grants) for _, approval in sorted(held.items()))
         )
 
 
@@ -230,7 +232,7 @@ class GrantChecker:
 
     def ends_ns(self, agent: str | None) -> int | None:
         """Return the experiment time at which the last approval of an agent runs out; None: it has none."""
-        return None if agent is None else max((one.until_ns for one in self._held(agent)), default=None)
+        return None if agent is None else max((approval.until_ns for approval in self._held(agent)), default=None)
 
     def control_changed(
         self, before: ArbitrationState, after: ArbitrationState, by_hand: frozenset[int], now_ns: int
@@ -366,9 +368,9 @@ class GrantChecker:
         elif action and action not in _STOPS and (grant := book.grants.get(who)) is not None:
             used = {**grant.used, action: grant.used.get(action, 0) + 1}
             book = replace(book, grants={**book.grants, who: replace(grant, used=used)})
-        kept = tuple(one for one in book.spent.get(who, ()) if now_ns - one.at_ns < _HOUR_NS)
+        lately = tuple(use for use in book.spent.get(who, ()) if now_ns - use.at_ns < _HOUR_NS)
         spent = SpentRequest(request.id, request.kind, request.payload, now_ns, approved, action)
-        return replace(self, book=replace(book, spent={**book.spent, who: (*kept, spent)}))
+        return replace(self, book=replace(book, spent={**book.spent, who: (*lately, spent)}))
 
     def not_done(self, who: str, request: Request) -> GrantChecker:
         """Undo the use of a request that was certainly not carried out."""
@@ -382,7 +384,7 @@ class GrantChecker:
         elif spent.action and grant is not None and grant.used.get(spent.action):
             used = {**grant.used, spent.action: grant.used[spent.action] - 1}
             book = replace(book, grants={**book.grants, who: replace(grant, used=used)})
-        rest = tuple(one for one in book.spent[who] if one is not spent)
+        rest = tuple(use for use in book.spent[who] if use is not spent)
         return replace(self, book=replace(book, spent={**book.spent, who: rest}))
 
     def done(self, who: str, request: Request) -> GrantChecker:
@@ -403,19 +405,21 @@ class GrantChecker:
         return [held[agent] for held in (self.book.plans, self.book.grants) if agent in held]
 
     def _spent(self, who: str, request_id: str) -> SpentRequest | None:
-        return next((one for one in self.book.spent.get(who, ()) if one.request_id == request_id), None)
+        return next((use for use in self.book.spent.get(who, ()) if use.request_id == request_id), None)
 
     def _role(self, who: str) -> RoleLimits | None:
         return self.limits.roles.get(who) or self.limits.roles.get(component_of(who))
 
     def _sets_of_limits(self, who: str) -> list[ExperimentLimits]:
         role, placed = self._role(who), self.book.placed
-        found = [] if role is None else [role.limits]
+        limits = [] if role is None else [role.limits]
         if who in self.book.grants:
-            found.append(ExperimentLimits(_limits_of(self.book.grants[who].grant).parameters))
+            limits.append(ExperimentLimits(_limits_of(self.book.grants[who].grant).parameters))
         # with any region, so that the microscope is asked where it stands before an action
         places = (placed.region, None if placed.probe_m is None else Region(placed.probe_m, (_PROBE_M, _PROBE_M)))
-        return found + [ExperimentLimits(region=one) for one in places if one is not None and placed.who == who]
+        return limits + [
+            ExperimentLimits(region=region) for region in places if region is not None and placed.who == who
+        ]
 
     def _refused_by_role(self, who: str, request: Request, now_ns: int, offset_m: XY | None, state: LimitState) -> str:
         role = self._role(who)
@@ -427,7 +431,7 @@ class GrantChecker:
             return why
         action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
         most = role.per_hour.get(action)
-        lately = [one for one in self.book.spent.get(who, ()) if one.action == action and now_ns - one.at_ns < _HOUR_NS]
+        lately = [use for use in self.book.spent.get(who, ()) if use.action == action and now_ns - use.at_ns < _HOUR_NS]
         is_repeated = bool(request.id) and self._spent(who, request.id) is not None
         if most is not None and len(lately) >= most and not is_repeated:
             return f"{who} has used {action} {len(lately)} times within an hour, {most} are allowed ({role.source})"
@@ -465,7 +469,7 @@ class GrantChecker:
             return "the grant has run out"
         if request.kind == ControlRequest.ACTION:
             action = str(request.subject)
-            left = next((one.count for one in held.left() if one.action == action), None)
+            left = next((granted.count for granted in held.left() if granted.action == action), None)
             if left is None:
                 return f"the grant does not include the action {action}"
             if left <= 0:
@@ -473,10 +477,10 @@ class GrantChecker:
             if grant.region is None:
                 return "the grant has no region"
             placed = self.book.placed
-            asked = Request(_SET_REGION, ScanParameters(placed.region))  # all corners, also if the scan is turned
+            placing = Request(_SET_REGION, ScanParameters(placed.region))  # all corners, also if the scan is turned
             if action in names.AT_PROBE and placed.probe_m is not None:
-                asked = Request(_SET_PROBE, ProbePosition(placed.probe_m))
-            refusal = LimitChecker(limits).check(who, asked, now_ns)
+                placing = Request(_SET_PROBE, ProbePosition(placed.probe_m))
+            refusal = LimitChecker(limits).check(who, placing, now_ns)
             refusal = refusal or LimitChecker(limits, state).check_treatment(request)
             return "" if refusal is None else refusal.reason
         if others := _others(request, limits):
@@ -521,13 +525,13 @@ def _limits_of(grant: Grant) -> ExperimentLimits:
     # a range is in SI, and the scheduler knows the units of base parameters alone: another value with a unit is outside
     return ExperimentLimits(
         parameters={
-            one.parameter: Limit(
-                one.low,
-                one.high,
-                unit=BASE_PARAMETERS.get(one.parameter) or "",
+            granted.parameter: Limit(
+                granted.low,
+                granted.high,
+                unit=BASE_PARAMETERS.get(granted.parameter) or "",
                 source="the grant",
             )
-            for one in grant.ranges
+            for granted in grant.ranges
         },
         region=grant.region,
         region_source="the grant",

@@ -61,7 +61,7 @@ _TREATMENTS = {
     names.CRASH: (names.CRASH_DEPTH, names.CRASH_SPEED),
 }
 """The parameters that a treatment of the tip uses as they are in force."""
-_OF_TREATMENTS = frozenset(name for given in _TREATMENTS.values() for name in given)
+_OF_TREATMENTS = frozenset(name for parameters in _TREATMENTS.values() for name in parameters)
 
 
 class _Breach(Exception):
@@ -147,9 +147,11 @@ class LimitChecker:
                 self._check_range(changed.name, value, limit, _TOLD_REACH)
             except _Breach as breach:
                 return breach.reason
-        seen = PresentState({name: (one,) for name, one in {**self.state.last_seen, changed.name: changed}.items()})
+        present = PresentState(
+            {name: (value,) for name, value in {**self.state.last_seen, changed.name: changed}.items()}
+        )
         rules = (rule for rule in self.limits.forbid.values() if changed.name in rule.names)
-        return next(filter(None, (forbidden_states.now_forbidden(rule, seen) for rule in rules)), "")
+        return next(filter(None, (forbidden_states.now_forbidden(rule, present) for rule in rules)), "")
 
     def depends_on(self, request: Request, *, is_mapped: bool = False) -> list[str]:
         """Return the parameters to read before a request is checked.
@@ -160,8 +162,8 @@ class LimitChecker:
         Args:
             is_mapped: a mapped place is sent as a whole, even if the client set only a part of it.
         """
-        given = self.names_set_by(request)
-        needed = [name for name in given if name in self.limits.bounded]
+        parameters = self.names_set_by(request)
+        needed = [name for name in parameters if name in self.limits.bounded]
         if request.kind == ControlRequest.ACTION:
             limited = self.limits.parameters
             of_action = _TREATMENTS.get(str(request.subject), ())
@@ -169,9 +171,9 @@ class LimitChecker:
         if self.limits.region is not None or is_mapped:
             action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
             for place, actions in _PLACES:
-                if action in actions or 0 < len(place.intersection(given)) < len(place):
+                if action in actions or 0 < len(place.intersection(parameters)) < len(place):
                     needed += sorted(place)
-        if len(SHAPE_CHANGES.keys() & given) == 1:
+        if len(SHAPE_CHANGES.keys() & parameters) == 1:
             needed += sorted(SHAPE_CHANGES)
         needed += forbidden_states.to_read(self._judging(request, is_mapped=is_mapped))
         if not needed:
@@ -184,9 +186,9 @@ class LimitChecker:
     def _judging(self, request: Request, *, is_mapped: bool) -> list[ForbiddenState]:
         rules = forbidden_states.judging(self.limits, request)
         if is_mapped:
-            given = set(self.names_set_by(request))
-            moved_ones = frozenset[str]().union(*(place for place, _ in _PLACES if place & given))
-            rules += [one for one in self.limits.forbid.values() if one not in rules and one.names & moved_ones]
+            parameters = set(self.names_set_by(request))
+            moved_ones = frozenset[str]().union(*(place for place, _ in _PLACES if place & parameters))
+            rules += [rule for rule in self.limits.forbid.values() if rule not in rules and rule.names & moved_ones]
         return rules
 
     def to_be_known(self) -> list[str]:
@@ -196,7 +198,7 @@ class LimitChecker:
     def seen(self, values: Iterable[Parameter]) -> LimitChecker:
         """Store the last known values of quantities in forbidden states."""
         wanted = frozenset[str]().union(*(rule.names for rule in self.limits.forbid.values()))
-        new = {one.name: one for one in values if one.name in wanted}
+        new = {value.name: value for value in values if value.name in wanted}
         if not new:
             return self
         return replace(self, state=replace(self.state, last_seen={**self.state.last_seen, **new}))
@@ -214,16 +216,16 @@ class LimitChecker:
                 usage = usage.forget(name)
             elif name in self.limits.bounded or name in _OF_TREATMENTS:
                 usage = usage.learn(name, value, now_ns, was_read=True)
-        read = self.seen(one for one in values.values() if one is not None)
+        read = self.seen(value for value in values.values() if value is not None)
         return read._with_state(usage, self.state.position.was_read(numbers_read))
 
     def unknown(self, request: Request) -> LimitChecker:
         """Forget the values that a request of unknown outcome may have changed."""
-        given = self.names_set_by(request)
+        parameters = self.names_set_by(request)
         usage = self.state.usage
-        for name in given:
+        for name in parameters:
             usage = usage.forget(name)
-        return self._with_state(usage, self.state.position.without(given))
+        return self._with_state(usage, self.state.position.without(parameters))
 
     def forget(self, name: str) -> LimitChecker:
         """Forget the value of a parameter that could not be read."""
@@ -306,8 +308,8 @@ class LimitChecker:
         return self._with_seen(subject, usage, position)
 
     def _with_seen(self, subject: object, usage: Usage, position: KnownPosition) -> LimitChecker:
-        seen = self.seen(forbidden_states.values_in(subject).values()) if self.limits.forbid else self
-        return seen._with_state(usage, position.learn(subject))
+        checker = self.seen(forbidden_states.values_in(subject).values()) if self.limits.forbid else self
+        return checker._with_state(usage, position.learn(subject))
 
     def _with_state(self, usage: Usage, position: KnownPosition) -> LimitChecker:
         if usage is self.state.usage and position is self.state.position:
