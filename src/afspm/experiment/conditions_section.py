@@ -48,13 +48,13 @@ class ConditionsReader:
     def read(self, table: Table) -> InstrumentSettings:
         """Return the settings; after errors, which are reported, entries may be missing."""
         for instrument, parameters in self.instruments.items():
-            for one in parameters:
-                if instrument_of(one) != instrument:
-                    what = f"[{instrument}] parameters: {one!r} does not begin with {instrument!r} and a dot"
-                    hint = f'"{instrument}.{one.rpartition(".")[2]}"'
-                    self.document.error(what, instrument, "parameters", one, hint=hint)
-        conditions = {name: found for name, one in table.items() if (found := self._condition(name, one)) is not None}
-        flagged = {one.problem for one in conditions.values() if one.problem}
+            for parameter in parameters:
+                if instrument_of(parameter) != instrument:
+                    what = f"[{instrument}] parameters: {parameter!r} does not begin with {instrument!r} and a dot"
+                    hint = f'"{instrument}.{parameter.rpartition(".")[2]}"'
+                    self.document.error(what, instrument, "parameters", parameter, hint=hint)
+        conditions = {name: condition for name, bands in table.items() if (condition := self._condition(name, bands))}
+        flagged = {condition.problem for condition in conditions.values() if condition.problem}
         numbers = {name: self.problems.number(name) for name in sorted(flagged)}
         return InstrumentSettings(tuple(self.instruments), conditions, numbers)
 
@@ -77,7 +77,7 @@ class ConditionsReader:
 
     def _band(self, name: str, parameter: str, table: object) -> AllowedBand | None:
         path = ("conditions", name, parameter)
-        known = [one for parameters in self.instruments.values() for one in parameters]
+        known = [name for parameters in self.instruments.values() for name in parameters]
         if parameter not in known:
             what = f"[conditions.{name}] no instrument has the parameter {parameter!r}"
             self.document.error(what, *path, hint=nearest(parameter, known) or "see `parameters` of the instrument")
@@ -123,24 +123,24 @@ class ConditionsReader:
         return AllowedBand(low, high, read.get("within"), read.get("for", 0.0), unit)
 
     def _actions(self, name: str, table: Table) -> tuple[str, ...] | None:
-        path, given = ("conditions", name, _WHILE), table.get(_WHILE, list(MeasuringCondition().actions))
-        if not isinstance(given, list) or not given or not all(isinstance(one, str) for one in given):
+        path, actions = ("conditions", name, _WHILE), table.get(_WHILE, list(MeasuringCondition().actions))
+        if not isinstance(actions, list) or not actions or not all(isinstance(action, str) for action in actions):
             self.document.error(f"[conditions.{name}] while is not a list of actions", *path)
             return None
         known = BASE_ACTIONS if self.actions is None else self.actions
-        for i, one in enumerate(given):
-            if one not in known and (self.actions is not None or not one.startswith("x-")):
-                what = f"[conditions.{name}] while: there is no action {one!r}"
-                self.document.error(what, *path, i, hint=nearest(one, known))
+        for i, action in enumerate(actions):
+            if action not in known and (self.actions is not None or not action.startswith("x-")):
+                what = f"[conditions.{name}] while: there is no action {action!r}"
+                self.document.error(what, *path, i, hint=nearest(action, known))
                 return None
-        return tuple(given)
+        return tuple(actions)
 
     def _problem(self, name: str, table: Table) -> str | None:
-        given = table.get(_PROBLEM, "")
-        if given == "" or (isinstance(given, str) and given in self.problems):
-            return str(given)
-        what = f"[conditions.{name}] the experiment knows no problem {given!r}"
-        hint = f"name it, with a number of its own: [problems] {given} = 100"
+        problem = table.get(_PROBLEM, "")
+        if problem == "" or (isinstance(problem, str) and problem in self.problems):
+            return str(problem)
+        what = f"[conditions.{name}] the experiment knows no problem {problem!r}"
+        hint = f"name it, with a number of its own: [problems] {problem} = 100"
         self.document.error(what, "conditions", name, _PROBLEM, hint=hint)
         return None
 

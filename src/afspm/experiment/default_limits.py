@@ -35,13 +35,13 @@ class DefaultLimits:
     def sources(self) -> dict[str, str]:
         """Return the place of each default, by the name that loosens it."""
         limits = self.limits
-        found = {name: one.source for name, one in (*limits.parameters.items(), *limits.actions.items())}
-        found |= {name: one.source for name, one in limits.forbid.items()}
+        places = {name: limit.source for name, limit in (*limits.parameters.items(), *limits.actions.items())}
+        places |= {name: rule.source for name, rule in limits.forbid.items()}
         if limits.region is not None:
-            found["region"] = limits.region_source
+            places["region"] = limits.region_source
         if limits.most_pixels != ExperimentLimits.most_pixels:
-            found["most_pixels"] = limits.region_source.rpartition(":")[0] or "limits.toml"
-        return found
+            places["most_pixels"] = limits.region_source.rpartition(":")[0] or "limits.toml"
+        return places
 
     def lines(self) -> Iterator[str]:
         """Yield a line about each default, for people."""
@@ -57,9 +57,9 @@ def read(file: Path, reader: LimitsReader, table: Table) -> DefaultLimits:
     """
     own = documents.read([file])
     limits = replace(reader, document=own, components=()).read(own.data.get("limits", {}))
-    for one in own.findings.found:
-        (reader.document.findings.error if one.is_error else reader.document.findings.warning)(
-            one.what, one.place, one.hint
+    for finding in own.findings.found:
+        (reader.document.findings.error if finding.is_error else reader.document.findings.warning)(
+            finding.what, finding.place, finding.hint
         )
     loosen = table.get("loosen", ())
     return DefaultLimits(limits, tuple(map(str, loosen)) if isinstance(loosen, list) else ())

@@ -131,12 +131,12 @@ class LimitsReader:
             self.document.error("[limits] actions is not a table", "limits", "actions")
             actions = {}
         limits = ExperimentLimits(
-            parameters={name: limit for name, one in parameters.items() if (limit := self._parameter(name, one))},
-            actions={name: limit for name, one in actions.items() if (limit := self._action(name, one))},
+            parameters={name: limit for name, keys in parameters.items() if (limit := self._parameter(name, keys))},
+            actions={name: limit for name, keys in actions.items() if (limit := self._action(name, keys))},
             region=None if whole.region is None else self._region(whole.region),
             region_source=str(self.document.place("limits", "region")),
             most_pixels=whole.most_pixels,
-            sets={name: one for name, one in self.sets.items() if one},
+            sets={action: parameters for action, parameters in self.sets.items() if parameters},
             roles=self._roles(table.get("roles", {})),
             forbid=self._forbid(table.get("forbid", [])),
         )
@@ -145,7 +145,7 @@ class LimitsReader:
 
     @property
     def _known_parameters(self) -> list[str]:
-        return [*self.parameters, *(one for parameters in self.instruments.values() for one in parameters)]
+        return [*self.parameters, *(parameter for parameters in self.instruments.values() for parameter in parameters)]
 
     def _parameter(self, name: str, table: object) -> Limit | None:
         known = self._known_parameters
@@ -156,17 +156,17 @@ class LimitsReader:
             self.document.error(f"[limits] there is no parameter {name!r}", "limits", name, hint=hint)
             return None
         path = ("limits", name)
-        given = self._table(table, path, _OF_PARAMETER)
-        if given is None:
+        fields = self._table(table, path, _OF_PARAMETER)
+        if fields is None:
             return None
-        unit = self._unit(name, given, path)
-        read = self._limit(given, path, unit)
+        unit = self._unit(name, fields, path)
+        read = self._limit(fields, path, unit)
         for key, value in (("step", read.step), ("rate", read.rate_per_s)):
             if value is not None and value <= 0:
                 self.document.error(f"[limits.{name}] {key} is not above zero", *path, key)
         if read.low is not None and read.high is not None:
             if read.low > read.high:
-                what = f"[limits.{name}] min = {given['min']!r} is above max = {given['max']!r}"
+                what = f"[limits.{name}] min = {fields['min']!r} is above max = {fields['max']!r}"
                 self.document.error(what, *path, "min", hint="nothing would be allowed")
             elif read.step is not None and read.step > read.high - read.low:
                 self.document.warning(f"[limits.{name}] step is larger than the whole range", *path, "step")
@@ -214,8 +214,8 @@ class LimitsReader:
             what = "[limits] forbid is neither a list of rules nor a table of named rules"
             self.document.error(what, *_FORBID, hint=f'e.g. ["{_EXAMPLE}"]')
             return {}
-        found = {name: self._rule(key, rule) for key, name, rule in rules}
-        return {name: one for name, one in found.items() if one is not None}
+        states = {name: self._rule(key, rule) for key, name, rule in rules}
+        return {name: state for name, state in states.items() if state is not None}
 
     def _rule(self, key: str | int, rule: object) -> ForbiddenState | None:
         path = (*_FORBID, key)
@@ -259,13 +259,15 @@ class LimitsReader:
                 hint = f"write {term.name} or not {term.name} alone"
                 raise RuleError(f"{term.name} is on or off, and can't be compared", term.at, hint)
         known = {term.name: self.parameters.get(term.name) for term in terms if term.name}
-        given = [term.unit for term in terms if not term.name] + [one for one in known.values() if one is not None]
-        given += [units[name] for name in known if name in units]
-        if not given:
+        known_units = [term.unit for term in terms if not term.name] + [
+            unit for unit in known.values() if unit is not None
+        ]
+        known_units += [units[name] for name in known if name in units]
+        if not known_units:
             what = f"the units of {' and '.join(known)} are known only in the run"
             raise RuleError(what, atom.left.at, "compare each with a number and its unit")
         left, right = (known.get(term.name, term.unit) if term.name else term.unit for term in terms)
-        left, right = (given[0] if unit is None else unit for unit in (left, right))
+        left, right = (known_units[0] if unit is None else unit for unit in (left, right))
         if left != right:
             what = f"{atom.left} and {atom.right} have different units: {left or 'no unit'} and {right or 'no unit'}"
             raise RuleError(what, atom.left.at if atom.right.name else atom.right.at)
@@ -285,7 +287,7 @@ class LimitsReader:
         if not isinstance(table, Mapping):
             self.document.error("[limits] roles is not a table", "limits", "roles")
             return {}
-        return {name: self._role(name, one) for name, one in table.items()}
+        return {name: self._role(name, role) for name, role in table.items()}
 
     def _role(self, name: str, table: object) -> RoleLimits:
         path = ("limits", "roles", name)
@@ -294,7 +296,7 @@ class LimitsReader:
             self.document.error(what, *path, hint=nearest(near, self.components))
         plain = dict(table) if isinstance(table, Mapping) else {}
         given = parse(RoleSection, ".".join(path), plain, self.document, path)
-        ranges = {one: self._range(one, pair, path) for one, pair in (given.parameters or {}).items()}
+        ranges = {name: self._range(name, pair, path) for name, pair in (given.parameters or {}).items()}
         places: list[tuple[str, tuple[str | int, ...]]] = [
             *((action, ("actions", number)) for number, action in enumerate(given.actions or ())),
             *((action, ("per_hour", action)) for action in given.per_hour or ()),
@@ -306,7 +308,7 @@ class LimitsReader:
         source = str(self.document.place(*path))
         return RoleLimits(
             ExperimentLimits(
-                parameters={one: limit for one, limit in ranges.items() if limit is not None},
+                parameters={parameter: limit for parameter, limit in ranges.items() if limit is not None},
                 region=None if given.region is None else self._region(given.region, path),
                 region_source=source,
             ),
@@ -322,12 +324,12 @@ class LimitsReader:
             what = f"[{'.'.join(path)}] there is no parameter {name!r}"
             self.document.error(what, *place, hint=nearest(name, known))
             return None
-        given = dict(zip(("min", "max"), pair, strict=True))
+        bounds = dict(zip(("min", "max"), pair, strict=True))
         if name in self.parameters:
-            unit = self.parameters[name] or _unit_given(given, si_unit) or ""
+            unit = self.parameters[name] or _unit_given(bounds, si_unit) or ""
         else:
-            unit = self._unit_of_instrument(given, place)
-        low, high = (self._in(value, key, unit, place) for key, value in given.items())
+            unit = self._unit_of_instrument(bounds, place)
+        low, high = (self._in(value, key, unit, place) for key, value in bounds.items())
         if low is not None and high is not None and low > high:
             self.document.error(f"{name_of(place)}: the first value is above the second", *place)
         return Limit(low, high, unit=unit, source=str(self.document.place(*place)))

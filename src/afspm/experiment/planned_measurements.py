@@ -60,7 +60,7 @@ class PlannedMeasurements:
 
     def sets(self, name: str) -> bool:
         """Return whether the plan sets this parameter."""
-        return any(one.name == name for parameters in self.parameters.values() for one in parameters)
+        return any(parameter.name == name for parameters in self.parameters.values() for parameter in parameters)
 
     def frame(self) -> Iterator[Parameter]:
         """Yield the parameters that the plan sets: regions and pixels, outermost probe positions, kind of spectra."""
@@ -70,12 +70,12 @@ class PlannedMeasurements:
             sides = zip((names.SCAN_SIZE_X, names.SCAN_SIZE_Y), region.size_m, strict=True)
             corner = zip((names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y), region.top_left_m, strict=True)
             yield from (Parameter(name, repr(float(value_m)), "m") for name, value_m in (*sides, *corner))
-        for shape in (self.shape, *(one.shape for one in self.placed_later.values())):
+        for shape in (self.shape, *(scan.shape for scan in self.placed_later.values())):
             if isinstance(shape, tuple):
                 rows, columns = shape
                 yield Parameter(names.SCAN_RESOLUTION_X, str(columns))
                 yield Parameter(names.SCAN_RESOLUTION_Y, str(rows))
-        for region in (one.region for one in self.placed_later.values() if isinstance(one.region, Region)):
+        for region in (scan.region for scan in self.placed_later.values() if isinstance(scan.region, Region)):
             sides = zip((names.SCAN_SIZE_X, names.SCAN_SIZE_Y), region.size_m, strict=True)
             yield from (Parameter(name, repr(float(value_m)), "m") for name, value_m in sides)
         for name, places_m in zip(
@@ -114,8 +114,10 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
     plan = getattr(made, "plan", None)
     regions = tuple(r for r in getattr(plan, "regions", ()) if isinstance(r, Region))
     positions = tuple(getattr(made, "positions", ()))
-    given = {name: getattr(made, name, None) for name in _PARAMETERS}
-    set_by_setting = {name: _as_parameters(values) for name, values in given.items() if isinstance(values, Mapping)}
+    by_setting = {name: getattr(made, name, None) for name in _PARAMETERS}
+    set_by_setting = {
+        name: _as_parameters(values) for name, values in by_setting.items() if isinstance(values, Mapping)
+    }
     return PlannedMeasurements(
         regions,
         positions,
@@ -150,13 +152,13 @@ def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) 
 
     The limits of the component's role count, too.
     """
-    found = _refusals_by(name, planned, limits)
+    refusals = _refusals_by(name, planned, limits)
     if limits.forbid:
-        found += _forbidden(planned, limits)
+        refusals += _forbidden(planned, limits)
     if (role := limits.roles.get(name)) is not None:
-        known = {one.reason for one in found}
-        found += [one for one in _refusals_by_role(name, planned, role) if one.reason not in known]
-    return found
+        known = {refusal.reason for refusal in refusals}
+        refusals += [refusal for refusal in _refusals_by_role(name, planned, role) if refusal.reason not in known]
+    return refusals
 
 
 def _refusals_by_role(name: str, planned: PlannedMeasurements, role: RoleLimits) -> Iterator[Refusal]:
@@ -165,45 +167,47 @@ def _refusals_by_role(name: str, planned: PlannedMeasurements, role: RoleLimits)
         if action not in (role.actions or ()):
             yield Refusal(f"{action} is not among the actions of {name} ({role.source})")
     for setting, parameters in planned.parameters.items() if role.parameters_only else ():
-        for one in parameters:
-            if one.name not in role.limits.parameters:
-                reason = f"{one.name} is not among the parameters of {name} ({role.source})"
-                yield Refusal(reason, (setting, one.name))
+        for parameter in parameters:
+            if parameter.name not in role.limits.parameters:
+                reason = f"{parameter.name} is not among the parameters of {name} ({role.source})"
+                yield Refusal(reason, (setting, parameter.name))
 
 
 def _forbidden(planned: PlannedMeasurements, limits: ExperimentLimits) -> list[Refusal]:
     # judged by what the plan itself sets: other values are unknown before the run
-    rehearsal, found = PlanRehearsal(limits), dict[str, Refusal]()
+    rehearsal, refusals = PlanRehearsal(limits), dict[str, Refusal]()
     for where, request in _requests(planned):
         if why := rehearsal.refusal(request):
-            found.setdefault(where[-1] if where else str(request.subject), Refusal(why, where))
-    return list(found.values())
+            refusals.setdefault(where[-1] if where else str(request.subject), Refusal(why, where))
+    return list(refusals.values())
 
 
 def _requests(planned: PlannedMeasurements) -> Iterator[tuple[tuple[str, ...], Request]]:
     # in the order of a run, each with the setting that it is made of
-    scans = [Request(ControlRequest.SET_SCAN_PARAMS, ScanParameters(one, planned.shape)) for one in planned.regions]
-    scans += [Request(ControlRequest.SET_PROBE_POS, ProbePosition(one)) for one in planned.positions]
-    scans += [Request(ControlRequest.ACTION, one) for one in planned.needs_actions]
-    settings = {setting: given for setting, given in planned.parameters.items() if setting != "initial"}
+    scans = [
+        Request(ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, planned.shape)) for region in planned.regions
+    ]
+    scans += [Request(ControlRequest.SET_PROBE_POS, ProbePosition(xy_m)) for xy_m in planned.positions]
+    scans += [Request(ControlRequest.ACTION, action) for action in planned.needs_actions]
+    settings = {setting: parameters for setting, parameters in planned.parameters.items() if setting != "initial"}
     if planned.sweep is not None:
         sweep = planned.sweep
-        settings["parameters"] = tuple(one for place in sweep.places() for one in sweep.settings(place))
-    for setting, given in (settings or {"": ()}).items():
-        for one in given:
-            yield (setting, one.name), Request(ControlRequest.PARAM, one)
+        settings["parameters"] = tuple(parameter for place in sweep.places() for parameter in sweep.settings(place))
+    for setting, parameters in (settings or {"": ()}).items():
+        for parameter in parameters:
+            yield (setting, parameter.name), Request(ControlRequest.PARAM, parameter)
         yield from (((), request) for request in scans)
 
 
 def _refusals_by(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[Refusal]:
     # steps and rates depend on the value before, which is unknown here
     guard = LimitChecker(limits.fixed)
-    found: dict[str, Refusal] = {}
+    refusals: dict[str, Refusal] = {}
 
     def check(kind: ControlRequest, subject: object, where: tuple[str | int, ...] = (), hint: str = "") -> None:
         refused = guard.check(name, Request(kind, subject, b""), 0)
         if refused is not None:
-            found.setdefault(refused.reason, Refusal(refused.reason, where, hint))
+            refusals.setdefault(refused.reason, Refusal(refused.reason, where, hint))
 
     for setting, parameters in planned.parameters.items():
         if setting == "initial":  # values of the microscope itself; its frame is checked in parts
@@ -215,18 +219,18 @@ def _refusals_by(name: str, planned: PlannedMeasurements, limits: ExperimentLimi
         hint = 'list values between them, or leave `order` at "snake"'
         check(ControlRequest.PARAM, after, ("parameters", after.name), hint)
     guard = LimitChecker(limits.fixed)
-    cure, of_parameters = _remedy(planned, limits.region), len(found)
+    cure, of_parameters = _remedy(planned, limits.region), len(refusals)
     for number, region in enumerate(planned.regions):
         wanted, where = ScanParameters(region, planned.shape), ("regions", number)
         if planned.is_listed:
             check(ControlRequest.SET_SCAN_PARAMS, wanted, where, _nearest_text(region, limits.region))
-        elif len(found) == of_parameters:  # of a grid outside, one reason is enough
+        elif len(refusals) == of_parameters:  # of a grid outside, one reason is enough
             check(ControlRequest.SET_SCAN_PARAMS, wanted, hint=cure)
     for setting, scan in planned.placed_later.items():
         check(ControlRequest.SET_SCAN_PARAMS, scan, (setting,))
     for xy in planned.positions:
         check(ControlRequest.SET_PROBE_POS, ProbePosition(xy), hint=cure)
-    return list(found.values())
+    return list(refusals.values())
 
 
 def _remedy(planned: PlannedMeasurements, allowed: Region | None) -> str:
@@ -308,7 +312,8 @@ def too_slow(planned: PlannedMeasurements, usual_m_s: float | None) -> str:
     Args:
         usual_m_s: scan speed if the plan sets no speed.
     """
-    speeds = [one for one in planned.parameters.get("parameters", ()) if one.name == names.SCAN_SPEED]
+    parameters = planned.parameters.get("parameters", ())
+    speeds = [parameter for parameter in parameters if parameter.name == names.SCAN_SPEED]
     speed_m_s = si(f"{speeds[0].value} {speeds[0].unit or 'm/s'}", "m/s") if speeds else usual_m_s
     if not speed_m_s or planned.shape is None or not planned.period_s:
         return ""
@@ -327,12 +332,12 @@ def refused_actions(limits: ExperimentLimits) -> list[tuple[str, str]]:
     """Return the actions whose settings the limits would always refuse, with the reasons."""
     # the tip's position is unknown before the start
     guard = LimitChecker(replace(_for_all(limits.fixed), actions={}, region=None))
-    found = []
+    refusals = []
     for action in limits.sets:
         refused = guard.check("", Request(ControlRequest.ACTION, action, b""), 0)
         if refused is not None:
-            found.append((action, refused.reason))
-    return found
+            refusals.append((action, refused.reason))
+    return refusals
 
 
 def _sweep_steps(sweep: SweepPlan, limits: ExperimentLimits) -> Iterator[tuple[Parameter, Parameter]]:

@@ -57,8 +57,8 @@ def report(
         location: path of the value in the document; None: `path`.
     """
     by_place: dict[SettingPath, list[ErrorDetails]] = {}
-    for one in error.errors(include_url=False):
-        by_place.setdefault(_place(one, given), []).append(one)
+    for detail in error.errors(include_url=False):
+        by_place.setdefault(_place(detail, given), []).append(detail)
     for place, errors in by_place.items():
         if any(other[: len(place)] == place != other for other in by_place):
             continue  # another member of the union fits better: its error lies deeper
@@ -76,44 +76,44 @@ def name_of(path: SettingPath) -> str:
     return f"[{path[0]}] {text}".rstrip()
 
 
-def _place(one: ErrorDetails, given: Any) -> SettingPath:
+def _place(detail: ErrorDetails, given: Any) -> SettingPath:
     # pydantic's location also holds names of union members and validators, which the file does not.
     place: list[str | int] = []
-    for number, part in enumerate(one["loc"], 1):
+    for number, part in enumerate(detail["loc"], 1):
         if part in (given if isinstance(given, Mapping) else range(len(given)) if isinstance(given, list) else ()):
             given = given[part]
-        elif not (one["type"] == "missing" and number == len(one["loc"]) and isinstance(part, str)):
+        elif not (detail["type"] == "missing" and number == len(detail["loc"]) and isinstance(part, str)):
             continue
         place.append(part)
     return tuple(place)
 
 
 def _sentence(errors: Sequence[ErrorDetails], shown: str, known: Iterable[str]) -> tuple[str, str]:
-    given = errors[0].get("input")
-    if len(errors) > 1 and isinstance(given, list | Mapping):  # a union: the value is not meant as a quantity
-        errors = [one for one in errors if _cause(one) is None] or errors
+    value = errors[0].get("input")
+    if len(errors) > 1 and isinstance(value, list | Mapping):  # a union: the value is not meant as a quantity
+        errors = [detail for detail in errors if _cause(detail) is None] or errors
     last = errors[-1]
     kind, context = last["type"], last.get("ctx", {})
     if kind in _UNKNOWN:
         return f"{shown} is not a setting", nearest(str(last["loc"][-1]), known)
     if kind == "missing" and isinstance(index := last["loc"][-1], int):
-        return f"{shown} needs {index + 1} values, and has {len(given)}", ""
+        return f"{shown} needs {index + 1} values, and has {len(value)}", ""
     if kind == "missing":
         return f"{shown} is missing", ""
     if kind == "too_long":
         return f"{shown} has {context['actual_length']} values, and takes {context['max_length']} at most", ""
-    for one in errors:
-        if (cause := _cause(one)) is not None:
-            return f"{shown} = {given!r}: {cause.what}", cause.hint
-    wanted = [_WANTED[one["type"]].format(**one.get("ctx", {})) for one in errors if one["type"] in _WANTED]
+    for detail in errors:
+        if (cause := _cause(detail)) is not None:
+            return f"{shown} = {value!r}: {cause.what}", cause.hint
+    wanted = [_WANTED[detail["type"]].format(**detail.get("ctx", {})) for detail in errors if detail["type"] in _WANTED]
     if wanted:
-        near = closest(str(given), re.findall(r"'(.*?)'", " ".join(wanted)))
+        near = closest(str(value), re.findall(r"'(.*?)'", " ".join(wanted)))
         hint = f"did you mean {near!r}?" if near else ""
-        return f"{shown} is {' or '.join(dict.fromkeys(wanted))}, not {given!r}", hint
+        return f"{shown} is {' or '.join(dict.fromkeys(wanted))}, not {value!r}", hint
     message = last["msg"].removeprefix("Value error, ").replace("Input should be", "it should be")
-    return f"{shown}: {message[:1].lower()}{message[1:]}, not {given!r}", ""
+    return f"{shown}: {message[:1].lower()}{message[1:]}, not {value!r}", ""
 
 
-def _cause(one: ErrorDetails) -> AfspmError | None:
-    cause = one.get("ctx", {}).get("error")
+def _cause(detail: ErrorDetails) -> AfspmError | None:
+    cause = detail.get("ctx", {}).get("error")
     return cause if isinstance(cause, AfspmError) else None
