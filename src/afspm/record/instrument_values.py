@@ -78,21 +78,21 @@ def value_at_end(
         speed: experiment seconds per real second.
         bands: the bands of all parameters; a band that does not guard `action` is left out.
     """
-    stop = bisect_right(readings, end_ns, key=lambda one: one[0])
+    stop = bisect_right(readings, end_ns, key=lambda reading: reading[0])
     if not stop or readings[stop - 1][0] <= earliest_ns(end_ns, speed):
         return None
     at_ns, last = readings[stop - 1]
-    start = stop if since_ns is None else bisect_right(readings, since_ns - 1, hi=stop, key=lambda one: one[0])
-    during = [one for _, one in readings[start:stop]]
-    seen = [one.value for one in during if one.value is not None and one.is_number]
+    start = stop if since_ns is None else bisect_right(readings, since_ns - 1, hi=stop, key=lambda reading: reading[0])
+    during = [reading for _, reading in readings[start:stop]]
+    values = [reading.value for reading in during if reading.value is not None and reading.is_number]
     outside = tuple(
         dict.fromkeys(
             band.condition
             for band in bands.get(last.name, ())
             if action in band.actions
             # without a reading meanwhile the last one is still true
-            for one in during or [last]
-            if not band.contains(one.value if one.is_number else None, one.target, one.unit)
+            for reading in during or [last]
+            if not band.contains(reading.value if reading.is_number else None, reading.target, reading.unit)
         )
     )
     return InstrumentValue(
@@ -102,8 +102,8 @@ def value_at_end(
         last.target,
         None if last.age_s is None else last.age_s + (end_ns - at_ns) * 1e-9 / speed,
         last.reason,
-        min(seen, default=None),
-        max(seen, default=None),
+        min(values, default=None),
+        max(values, default=None),
         outside,
     )
 
@@ -139,12 +139,14 @@ class RecordedReadings:
         """Add the readings of a packet; a packet of another version is left out."""
         with suppress(WireError):
             report = wire.decode("InstrumentReadings", payload)
-            for one in report.readings if isinstance(report, InstrumentReadings) else ():
-                self.of[one.name].append((time_ns, one))
+            for reading in report.readings if isinstance(report, InstrumentReadings) else ():
+                self.of[reading.name].append((time_ns, reading))
 
     def values(
         self, end_ns: int, since_ns: int | None, bands: AllowedBands | None = None, action: str = ""
     ) -> tuple[InstrumentValue, ...]:
         """Return the values of all parameters at the end of a measurement, as `value_at_end`."""
-        found = (value_at_end(one, end_ns, since_ns, self.speed, bands or {}, action) for one in self.of.values())
-        return tuple(one for one in found if one is not None)
+        values = (
+            value_at_end(readings, end_ns, since_ns, self.speed, bands or {}, action) for readings in self.of.values()
+        )
+        return tuple(value for value in values if value is not None)

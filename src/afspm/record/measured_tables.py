@@ -56,11 +56,11 @@ class KeyedTable(Table[R]):
 
     def _last_with_key(self, key: str) -> R:
         # the last one: earlier attempts of this key were interrupted
-        found = [row for row in self._rows if row.key == key]
-        if not found:
+        attempts = [row for row in self._rows if row.key == key]
+        if not attempts:
             known = dict.fromkeys(row.key for row in self._rows if row.key)
             raise NoSuchItem(f"no key {key!r}; {_describe_keys(list(known))}")
-        return found[-1]
+        return attempts[-1]
 
     def _with(self, rows: Iterable[R]) -> KeyedTable[R]:
         return KeyedTable(rows, self._kind)
@@ -143,10 +143,10 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
 def read_scans(
     query: Query, verdicts: Iterable[tuple[int, float]], readings: RecordedReadings, bands: AllowedBands
 ) -> KeyedTable[ScanRow]:
-    found = query("SELECT * FROM scans ORDER BY number")
-    keys = _keys(query, "scans", found)
+    rows_of_scans = query("SELECT * FROM scans ORDER BY number")
+    keys = _keys(query, "scans", rows_of_scans)
     positions = _positions(query)
-    rows = [scan_row(row, keys.get(row[0], ""), *positions.get(row[0], (None, None))) for row in found]
+    rows = [scan_row(row, keys.get(row[0], ""), *positions.get(row[0], (None, None))) for row in rows_of_scans]
     scores = last_scores((row.time_ns for row in rows), verdicts)
     rows = [replace(row, tip_score=scores.get(row.time_ns)) for row in rows]
     rows = _with_instruments(query, "scans", rows, readings, bands)
@@ -156,9 +156,9 @@ def read_scans(
 def read_spectra(
     query: Query, read: Callable[[SpectrumRow], Spectrum], readings: RecordedReadings, bands: AllowedBands
 ) -> SpectrumTable:
-    found = query("SELECT * FROM spectra ORDER BY number")
-    keys = _keys(query, "spectra", found)
-    rows = [spectrum_row(row, keys.get(row[0], "")) for row in found]
+    rows_of_spectra = query("SELECT * FROM spectra ORDER BY number")
+    keys = _keys(query, "spectra", rows_of_spectra)
+    rows = [spectrum_row(row, keys.get(row[0], "")) for row in rows_of_spectra]
     rows = _with_instruments(query, "spectra", rows, readings, bands)
     return SpectrumTable(_with_settings(query, "spectra", rows), read)
 
@@ -183,7 +183,7 @@ def _positions(query: Query) -> dict[int, tuple[RegistrationOutcome, float | Non
     mappings = query("SELECT time_ns, payload FROM packets WHERE message = 'DriftMapping' ORDER BY time_ns DESC")
     if not mappings:
         return {}
-    found, after_ns = {}, -1
+    knowledge, after_ns = {}, -1
     from afspm.record.drift_mapping import drift_knowledge  # imports numpy, which the supervisor avoids
 
     for number, published_ns in sorted(query(_PUBLISHED["scans"]), key=itemgetter(1)):
@@ -194,8 +194,8 @@ def _positions(query: Query) -> dict[int, tuple[RegistrationOutcome, float | Non
         after_ns = published_ns
         if number is not None and payload is not None:
             with suppress(WireError):  # another implementation may encode the mapping differently
-                found[number] = drift_knowledge(wire.decode("DriftMapping", payload))
-    return found
+                knowledge[number] = drift_knowledge(wire.decode("DriftMapping", payload))
+    return knowledge
 
 
 def _with_settings(query: Query, table: str, rows: list[R]) -> list[R]:
@@ -213,8 +213,8 @@ def _with_settings(query: Query, table: str, rows: list[R]) -> list[R]:
             with suppress(WireError):  # of a newer version
                 settings = wire.decode("MeasurementSettings", published.pop()[1])
                 newest[settings.who] = settings
-        if (found := newest.get(component_of(row.holder or ""))) is not None and found.key in ("", row.key):
-            made[row.number] = tuple(map(_swept, found.parameters))
+        if (conditions := newest.get(component_of(row.holder or ""))) is not None and conditions.key in ("", row.key):
+            made[row.number] = tuple(map(_swept, conditions.parameters))
     return [replace(row, settings=made.get(row.number, ())) for row in rows]
 
 

@@ -129,7 +129,7 @@ class Run:
         """Return the facts beside the values: drift, feedback, the controller's header, notes … Raises as `scan`."""
         header: dict[str, Any] = dict(self._content(row.file, f"number {row.number}").header)
         notes = [f"{note.text} ({note.who})" for note in self.notes_on(row)]
-        settings = {one.column: one.value for one in row.settings}
+        settings = {setting.column: setting.value for setting in row.settings}
         return (
             header
             | ({"notes": notes} if notes else {})
@@ -179,15 +179,15 @@ class Run:
 
     def notes_on(self, row: ScanRow | SpectrumRow) -> Table[NoteRow]:
         """Return the notes on a scan; empty for a spectrum."""
-        near = (one for one in self._notes() if one.scan_ns and abs(one.scan_ns - row.time_ns) <= _SAME_SCAN_NS)
+        near = (note for note in self._notes() if note.scan_ns and abs(note.scan_ns - row.time_ns) <= _SAME_SCAN_NS)
         return Table(map(self._note_row, near), NoteRow).where(
             lambda note: isinstance(row, ScanRow) and note.scan == row.number
         )
 
     def _notes(self) -> list[Note]:
         payloads = self._query("SELECT payload FROM packets WHERE message = 'Note' ORDER BY time_ns")
-        found = [note for (payload,) in payloads if isinstance(note := self._decoded("Note", payload), Note)]
-        return sorted(found, key=lambda note: note.time_ns)
+        notes = [note for (payload,) in payloads if isinstance(note := self._decoded("Note", payload), Note)]
+        return sorted(notes, key=lambda note: note.time_ns)
 
     def _note_row(self, note: Note) -> NoteRow:
         scan = None if note.scan_ns is None else self.scan_at(note.scan_ns)
@@ -198,7 +198,7 @@ class Run:
         """Requests with their answers, changes of control, orders and notes; oldest first."""
         rows = self._query("SELECT payload FROM packets WHERE message = 'JournalEntries' ORDER BY time_ns, rowid")
         published = (self._decoded("JournalEntries", payload) for (payload,) in rows)
-        entries = [entry for one in published if isinstance(one, JournalEntries) for entry in one.entries]
+        entries = [entry for message in published if isinstance(message, JournalEntries) for entry in message.entries]
         notes = (JournalEntry(*row) for row in self._query("SELECT * FROM entries WHERE kind = 'note' ORDER BY rowid"))
         return Table(sorted((*entries, *notes), key=lambda entry: entry.time_ns), JournalEntry)
 
@@ -243,12 +243,12 @@ class Run:
     @property
     def restarts(self) -> Table[ProcessRow]:
         """Each restart of a process: the first row with that number of starts."""
-        seen: dict[str, int] = {}
+        starts: dict[str, int] = {}
         rows = []
         for row in self.processes:
-            if row.starts > seen.get(row.name, 1):
+            if row.starts > starts.get(row.name, 1):
                 rows.append(row)
-            seen[row.name] = row.starts
+            starts[row.name] = row.starts
         return Table(rows, ProcessRow)
 
     @property
@@ -282,8 +282,8 @@ class Run:
     def verdicts(self) -> list[tuple[int, float]]:
         """Return (time of the scan, score) of each verdict on a scan, in the order of arrival."""
         sql = "SELECT payload FROM packets WHERE message = ? ORDER BY time_ns, rowid"
-        found = (self._decoded(VERDICT_MESSAGE, payload) for (payload,) in self._query(sql, (VERDICT_MESSAGE,)))
-        verdicts = (read_verdict(message) for message in found if isinstance(message, SpatialROIWithScoreList))
+        messages = (self._decoded(VERDICT_MESSAGE, payload) for (payload,) in self._query(sql, (VERDICT_MESSAGE,)))
+        verdicts = (read_verdict(message) for message in messages if isinstance(message, SpatialROIWithScoreList))
         return [verdict for verdict in verdicts if verdict is not None]
 
     def judgements(self) -> Iterator[tuple[int, TipVerdict | SpatialROIWithScoreList]]:
@@ -303,7 +303,7 @@ class Run:
         alarms = [
             time_ns for time_ns, verdict in self.judgements() if isinstance(verdict, TipVerdict) and verdict.stops
         ]
-        flags = [] if alarms else [one.flagged_ns for one in self.problems if one.number == Problem.TIP_SHAPE_CHANGED]
+        flags = [] if alarms else [row.flagged_ns for row in self.problems if row.number == Problem.TIP_SHAPE_CHANGED]
         ends_ns = [row.time_ns for row in self.scans]
         bad = bad_scans(ends_ns, self.verdicts(), {int(Problem.TIP_SHAPE_CHANGED): flags})
         return sorted({*alarms, *bad, *treatment_times(self.journal)})
@@ -314,7 +314,7 @@ class Run:
         Only changes are included that were found while the scan ran; the last verdict on a scan counts.
         """
         sql = "SELECT payload FROM packets WHERE message = ? ORDER BY time_ns, rowid"
-        found: dict[int, int] = {}
+        rows: dict[int, int] = {}
         ends_ns = [row.time_ns for row in self.scans]
         for (payload,) in self._query(sql, (LINE_VERDICT_MESSAGE,)):
             verdict = self._decoded(LINE_VERDICT_MESSAGE, payload)
@@ -323,18 +323,18 @@ class Run:
             began_ns = verdict.timestamp.ToNanoseconds()
             ended_ns = next((end_ns for end_ns in ends_ns if end_ns > began_ns), None)
             if ended_ns is not None:
-                found[ended_ns] = verdict.since_row
-        return found
+                rows[ended_ns] = verdict.since_row
+        return rows
 
     def watch_counts(self) -> dict[str, WatchCounts]:
         """Return what each watch on running scans has counted, by the name of the component."""
-        name, found = WatchCounts.DESCRIPTOR.name, {}
+        name, counts_of = WatchCounts.DESCRIPTOR.name, {}
         sql = "SELECT envelope, payload FROM packets WHERE message = ? ORDER BY time_ns, rowid"
         for envelope, payload in self._query(sql, (name,)):
             counts = self._decoded(name, payload)
             if isinstance(counts, WatchCounts):
-                found[envelope.removeprefix(f"{name}_")] = counts
-        return found
+                counts_of[envelope.removeprefix(f"{name}_")] = counts
+        return counts_of
 
     # --- everything ---
 
@@ -485,15 +485,15 @@ class Run:
             raise journal.damaged(self.folder / journal.JOURNAL_FILE, error) from error
 
     def _note(self, name: str) -> Any:
-        found = self._query("SELECT value FROM about WHERE name = ?", (name,))
-        return from_json(found[0][0]) if found else None
+        rows = self._query("SELECT value FROM about WHERE name = ?", (name,))
+        return from_json(rows[0][0]) if rows else None
 
     def _row(self, table: str, index: int, made: Callable[[Row], R]) -> R:
         order, offset = ("ASC", index) if index >= 0 else ("DESC", -index - 1)
-        found = self._query(f"SELECT * FROM {table} ORDER BY number {order} LIMIT 1 OFFSET ?", (offset,))
-        if not found:
+        rows = self._query(f"SELECT * FROM {table} ORDER BY number {order} LIMIT 1 OFFSET ?", (offset,))
+        if not rows:
             raise NoSuchItem(f"there is no number {index} among the {table} of {self.folder.name}")
-        return made(found[0])
+        return made(rows[0])
 
     def _content(self, file: str, what: str) -> FileContent:
         from afspm.storage.formats import read

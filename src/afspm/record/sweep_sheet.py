@@ -41,7 +41,7 @@ def figures(run: Run, title: str, again: bool = False) -> Iterator[tuple[str, Fi
     swept: dict[tuple[str, ...], list[ScanRow]] = {}
     for row in run.scans:
         if row.settings and row.file and not row.interrupted:
-            swept.setdefault(tuple(one.column for one in row.settings), []).append(row)
+            swept.setdefault(tuple(setting.column for setting in row.settings), []).append(row)
     for number, rows in enumerate(swept.values(), 1):
         if len(rows) > MOST:
             _log.warning("a sweep of %d scans has no contact sheet: at most %d fit", len(rows), MOST)
@@ -74,7 +74,7 @@ def sheet(scans: Sequence[tuple[Setting, Scan]], title: str) -> Figure:
 
     from afspm.record.plotting import draw_scale_bar, gold
 
-    across, down = _sorted(one[-1:] for one, _ in scans), _sorted(one[:-1] for one, _ in scans)
+    across, down = _sorted(settings[-1:] for settings, _ in scans), _sorted(settings[:-1] for settings, _ in scans)
     last, others = scans[0][0][-1], scans[0][0][:-1]
     left_in = 0.2 + _CHARACTER_IN * max([0, *map(len, "\n".join((*map(_label, down), _names(others))).split("\n"))])
     pitch_in = _PANEL_IN + _GAP_IN
@@ -94,8 +94,8 @@ def sheet(scans: Sequence[tuple[Setting, Scan]], title: str) -> Figure:
     for row, settings in enumerate(down):
         y_in = _TOP_IN + row * pitch_in + _PANEL_IN / 2
         text(left_in - 0.1, y_in, _label(settings), va="center", ha="right")
-    pictures = {one: (scan, _picture(scan)) for one, scan in scans}
-    spans = _spans({one: picture for one, (_, picture) in pictures.items()})
+    pictures = {settings: (scan, _picture(scan)) for settings, scan in scans}
+    spans = _spans({settings: picture for settings, (_, picture) in pictures.items()})
     for settings, (scan, picture) in pictures.items():
         place = (across.index(settings[-1:]), down.index(settings[:-1]))
         x_in, y_in = left_in + place[0] * pitch_in, _TOP_IN + place[1] * pitch_in
@@ -153,17 +153,17 @@ def _picture(scan: Scan) -> Array:
 def _sorted(settings: Iterable[Setting]) -> list[Setting]:
     # numbers ascending, other values in the order of occurrence
     found = list(dict.fromkeys(settings))
-    seen: list[object] = [one.value for each in found for one in each]
+    seen: list[object] = [setting.value for each in found for setting in each]
 
-    def rank(one: SweptSetting) -> float:
-        return float(one.value) if isinstance(one.value, int | float) else float(seen.index(one.value))
+    def rank(setting: SweptSetting) -> float:
+        return float(setting.value) if isinstance(setting.value, int | float) else float(seen.index(setting.value))
 
     return sorted(found, key=lambda each: tuple(map(rank, each)))
 
 
 def _names(settings: Setting) -> str:
-    return "\n".join(one.name for one in settings)
+    return "\n".join(setting.name for setting in settings)
 
 
 def _label(settings: Setting) -> str:
-    return "\n".join(typeset(one.text) for one in settings)
+    return "\n".join(typeset(setting.text) for setting in settings)

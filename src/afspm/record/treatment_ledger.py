@@ -100,23 +100,23 @@ def treatments_once(journal: Sequence[JournalEntry]) -> list[JournalEntry]:
     A long treatment has an entry for each repetition of its request, and another for a late answer. Unsent treatments
     with an unknown outcome are left out.
     """
-    treatments = {i for i, one in enumerate(journal) if _is_treatment(one)}
+    treatments = {i for i, entry in enumerate(journal) if _is_treatment(entry)}
     last = {_sending(journal[i]): i for i in sorted(treatments)}
     first = {_sending(journal[i]): i for i in sorted(treatments, reverse=True)}
-    found = []
+    sent = []
     for i, entry in enumerate(journal):
         if i not in treatments:
-            found.append(entry)
+            sent.append(entry)
         elif entry.sent_ns is None:
-            found += [entry] if entry.response != ControlResponse.NO_RESPONSE else []
+            sent += [entry] if entry.response != ControlResponse.NO_RESPONSE else []
         elif first[_sending(entry)] == i:
-            found.append(replace(entry, response=journal[last[_sending(entry)]].response))
-    return found
+            sent.append(replace(entry, response=journal[last[_sending(entry)]].response))
+    return sent
 
 
 def treatment_times(journal: Sequence[JournalEntry]) -> list[int]:
     """Return the time of each treatment that was carried out, or may have been, in ns."""
-    return [one.time_ns for one in treatments_once(journal) if _is_treatment(one) and one.response in _COUNTS]
+    return [entry.time_ns for entry in treatments_once(journal) if _is_treatment(entry) and entry.response in _COUNTS]
 
 
 def _is_treatment(entry: JournalEntry) -> bool:

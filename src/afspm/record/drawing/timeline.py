@@ -95,7 +95,7 @@ class TimelineCurve:
         """Return the times in which the value is outside a band: (from, to) in ns, interpolated between values."""
         low = max((band.low for band in self.bands), default=-math.inf)
         high = min((band.high for band in self.bands), default=math.inf)
-        found: list[tuple[int, int]] = []
+        parts: list[tuple[int, int]] = []
         points = list(zip(self.times_ns, self.values, strict=True))
         for (t0, v0), (t1, v1) in zip(points, [*points[1:], points[-1]] if points else [], strict=True):
             if not math.isfinite(v0):
@@ -103,11 +103,11 @@ class TimelineCurve:
             if not math.isfinite(v1):
                 t1, v1 = t0, v0  # how the value went on is unknown
             for part in _outside(t0, v0, t1, v1, low, high):
-                if found and found[-1][1] == part[0]:
-                    found[-1] = (found[-1][0], part[1])
+                if parts and parts[-1][1] == part[0]:
+                    parts[-1] = (parts[-1][0], part[1])
                 else:
-                    found.append(part)
-        return found
+                    parts.append(part)
+        return parts
 
 
 @dataclass
@@ -150,7 +150,7 @@ def timeline_html(
     axes = _axis(begin_ns, end_ns, zone, "UTC" if local_too else "")
     axes += _axis(begin_ns, end_ns, None, "local") if local_too else ""
     strip = _pictures(pictures, begin_ns, end_ns)
-    drawn = "".join(_curve(one, begin_ns, end_ns) for one in curves)
+    drawn = "".join(_curve(curve, begin_ns, end_ns) for curve in curves)
     longest = max(len(row.name) for row, _ in read)
     return f'<div class="lanes" style="--names:min(max(9ch, {longest}ch), 40%)">{strip}{body}{drawn}{axes}</div>'
 
@@ -185,13 +185,13 @@ def time_ticks(begin_s: float, end_s: float, about: int = 7) -> list[float]:
 def stretches(spans: Sequence[Interval], begin_ns: int, end_ns: int) -> list[Stretch]:
     """Return the drawn stretch of each interval; short intervals in one column are merged and counted."""
     width_ns = (end_ns - begin_ns) / COLUMNS
-    found: list[Stretch] = []
+    stretches: list[Stretch] = []
     for span in spans:
         until_ns = end_ns if span.end_ns is None else min(span.end_ns, end_ns)
         begin = min(COLUMNS - 1, max(0, int((span.start_ns - begin_ns) / width_ns)))
         end = max(begin + 1, min(COLUMNS, round((until_ns - begin_ns) / width_ns)))
-        _add(found, Stretch(begin, end, span.label, span.by, max(0, until_ns - span.start_ns)))
-    return found
+        _add(stretches, Stretch(begin, end, span.label, span.by, max(0, until_ns - span.start_ns)))
+    return stretches
 
 
 def _pictures(pictures: Iterable[tuple[int, str]], begin_ns: int, end_ns: int) -> str:
@@ -206,26 +206,26 @@ def _pictures(pictures: Iterable[tuple[int, str]], begin_ns: int, end_ns: int) -
     return f'<div class="lane strip"><b>scans</b><div>{cells}</div></div>' if cells else ""
 
 
-def _add(found: list[Stretch], one: Stretch) -> None:
-    if not found:
-        found.append(one)
+def _add(stretches: list[Stretch], added: Stretch) -> None:
+    if not stretches:
+        stretches.append(added)
         return
-    before = found[-1]
-    if one.begin < before.end:
-        if one.end <= before.end:
-            _merge(before, one)
+    before = stretches[-1]
+    if added.begin < before.end:
+        if added.end <= before.end:
+            _merge(before, added)
             return
-        one.begin = before.end
-    if before.end == one.begin and before.label == one.label and one.end - one.begin <= 1:
-        before.end, before.lasted_ns, before.count = one.end, before.lasted_ns + one.lasted_ns, before.count + 1
+        added.begin = before.end
+    if before.end == added.begin and before.label == added.label and added.end - added.begin <= 1:
+        before.end, before.lasted_ns, before.count = added.end, before.lasted_ns + added.lasted_ns, before.count + 1
         return
-    found.append(one)
+    stretches.append(added)
 
 
-def _merge(into: Stretch, one: Stretch) -> None:
-    if one.lasted_ns > into.lasted_ns and into.end - into.begin <= 1:
-        into.label, into.by = one.label, one.by
-    into.lasted_ns = max(into.lasted_ns, one.lasted_ns)
+def _merge(into: Stretch, stretch: Stretch) -> None:
+    if stretch.lasted_ns > into.lasted_ns and into.end - into.begin <= 1:
+        into.label, into.by = stretch.label, stretch.by
+    into.lasted_ns = max(into.lasted_ns, stretch.lasted_ns)
     into.count += 1
 
 
@@ -318,17 +318,17 @@ def _curve_texts(curve: TimelineCurve, low: float, high: float, gone_ns: int, ti
 
 def _row(row: TimelineRow, shown: Sequence[Stretch], begin_ns: int, end_ns: int, zone: tzinfo | None) -> str:
     cells = []
-    for one in shown:
-        label = one.label.replace("_", " ")
-        start_ns = begin_ns + one.begin * (end_ns - begin_ns) // COLUMNS
-        by = f", by {one.by}" if one.by else ""
-        lasted = f" for {duration_text(one.lasted_ns / NS_PER_S)}" if one.lasted_ns else ""
-        often = f", {one.count} times about here" if one.count > 1 else lasted
-        title = f"{label}{by} {'from' if one.lasted_ns else 'at'} {time_of_day(start_ns, zone)}{often}"
-        left, width = 100 * one.begin / COLUMNS, 100 * (one.end - one.begin) / COLUMNS
+    for stretch in shown:
+        label = stretch.label.replace("_", " ")
+        start_ns = begin_ns + stretch.begin * (end_ns - begin_ns) // COLUMNS
+        by = f", by {stretch.by}" if stretch.by else ""
+        lasted = f" for {duration_text(stretch.lasted_ns / NS_PER_S)}" if stretch.lasted_ns else ""
+        often = f", {stretch.count} times about here" if stretch.count > 1 else lasted
+        title = f"{label}{by} {'from' if stretch.lasted_ns else 'at'} {time_of_day(start_ns, zone)}{often}"
+        left, width = 100 * stretch.begin / COLUMNS, 100 * (stretch.end - stretch.begin) / COLUMNS
         word = f"<i>{escape(label)}</i>" if width > 7 else ""
         cells.append(
-            f'<span class="{row.style(one.label)}" style="left:{left:.2f}%;width:{width:.2f}%" '
+            f'<span class="{row.style(stretch.label)}" style="left:{left:.2f}%;width:{width:.2f}%" '
             f'title="{escape(title)}">{word}</span>'
         )
     return f'<div class="lane"><b>{escape(row.name)}</b><div>{"".join(cells)}</div></div>'

@@ -67,19 +67,21 @@ class SpectrumGroup:
 
     @property
     def positions(self) -> list[XY]:
-        return [one.spectrum.position_m for one in self.measured if one.spectrum.position_m is not None]
+        return [spectrum.spectrum.position_m for spectrum in self.measured if spectrum.spectrum.position_m is not None]
 
     @property
     def axes(self) -> tuple[Axis, dict[str, Axis]]:
         """The axis of the sweep and an axis for each variable, over the range of all curves."""
         first = self.first
         units = dict(zip(first.names, first.units, strict=True))
-        swept = np.concatenate([one.swept for one in self.measured])
-        found = {
-            name: Axis.over(name, units.get(name, ""), np.concatenate([one.values(name) for one in self.measured]))
+        swept = np.concatenate([spectrum.swept for spectrum in self.measured])
+        others = {
+            name: Axis.over(
+                name, units.get(name, ""), np.concatenate([spectrum.values(name) for spectrum in self.measured])
+            )
             for name in self.measured[0].curves
         }
-        return Axis.over(first.names[0], first.units[0], swept), found
+        return Axis.over(first.names[0], first.units[0], swept), others
 
 
 def read(run: Run) -> list[SpectrumGroup]:
@@ -122,39 +124,39 @@ def _group(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
 def _all(group: SpectrumGroup, x: Axis, y: Axis, name: str) -> str:
     measured = group.measured
     if len(measured) < _LEAST_AVERAGED:
-        return chart(x, y, [curve for one in measured for curve in _both_ways(one, name)])
+        return chart(x, y, [curve for spectrum in measured for curve in _both_ways(spectrum, name)])
     step = -(-len(measured) // MOST_SMALL)
     thin = max(0.15, min(0.6, 6.0 / len(measured)))
-    curves = [Curve(one.swept, one.curves[name], "", thin) for one in measured[::step]]
+    curves = [Curve(spectrum.swept, spectrum.curves[name], "", thin) for spectrum in measured[::step]]
     if (common := _common(measured)) is None:
         return chart(x, y, curves)
-    if back := [at(common, one.swept, one.back[name]) for one in measured if name in one.back]:
+    if back := [at(common, spectrum.swept, spectrum.back[name]) for spectrum in measured if name in spectrum.back]:
         curves.append(Curve(common, np.mean(back, axis=0), BACKWARD))
-    values = np.stack([at(common, one.swept, one.curves[name]) for one in measured])
+    values = np.stack([at(common, spectrum.swept, spectrum.curves[name]) for spectrum in measured])
     mean, spread = values.mean(axis=0), values.std(axis=0, ddof=1)
     return chart(x, y, [*curves, Curve(common, mean)], Band(common, mean - spread, mean + spread))
 
 
-def _both_ways(one: SpectrumCurves, name: str) -> Iterator[Curve]:
-    if name in one.back:
-        yield Curve(one.swept, one.back[name], BACKWARD)
-    yield Curve(one.swept, one.curves[name])
+def _both_ways(spectrum: SpectrumCurves, name: str) -> Iterator[Curve]:
+    if name in spectrum.back:
+        yield Curve(spectrum.swept, spectrum.back[name], BACKWARD)
+    yield Curve(spectrum.swept, spectrum.curves[name])
 
 
 def _common(measured: Sequence[SpectrumCurves]) -> Array | None:
     # None where the common range is less than half of the widest sweep
     try:
-        common = common_sweep([one.swept for one in measured])
+        common = common_sweep([spectrum.swept for spectrum in measured])
     except InvalidValue:
         return None
-    return common if np.ptp(common) > 0.5 * max(np.ptp(one.swept) for one in measured) else None
+    return common if np.ptp(common) > 0.5 * max(np.ptp(spectrum.swept) for spectrum in measured) else None
 
 
 def _legend(group: SpectrumGroup) -> str:
     sentences = []
     if len(group.measured) >= _LEAST_AVERAGED:
         sentences.append("Thin: single curves. Thick: their mean; the band is one standard deviation.")
-    if any(one.back for one in group.measured):
+    if any(spectrum.back for spectrum in group.measured):
         sentences.append("Orange: on the way there; blue: on the way back.")
     if left_out := group.count - len(group.measured):
         sentences.append(f"{left_out} more are not read.")
@@ -166,10 +168,11 @@ def _small(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
     if len(shown) < 2:
         return ""
     places, columns = _places(shown)
-    names = ["", *(f"spectrum-{number}-{one.row.number}" for one in shown), ""]
+    names = ["", *(f"spectrum-{number}-{spectrum.row.number}" for spectrum in shown), ""]
     axes = group.axes
     figures = "".join(
-        _figure(one, axes, clock, names[k : k + 3], places[k] if places else "") for k, one in enumerate(shown)
+        _figure(spectrum, axes, clock, names[k : k + 3], places[k] if places else "")
+        for k, spectrum in enumerate(shown)
     )
     style = f' style="grid-template-columns:repeat({columns},minmax(0,1fr));gap:.3rem"' if places else ""
     position = "Each lies where it was measured on the grid, y upwards. " if places else ""
@@ -179,7 +182,7 @@ def _small(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
 
 
 def _places(shown: Sequence[SpectrumCurves]) -> tuple[list[str], int]:
-    positions = [one.spectrum.position_m for one in shown]
+    positions = [spectrum.spectrum.position_m for spectrum in shown]
     try:
         points = grid([position for position in positions if position is not None])
     except InvalidValue:
@@ -191,11 +194,11 @@ def _places(shown: Sequence[SpectrumCurves]) -> tuple[list[str], int]:
 
 
 def _figure(
-    one: SpectrumCurves, axes: tuple[Axis, dict[str, Axis]], clock: PageTimes, names: Sequence[str], place: str
+    spectrum: SpectrumCurves, axes: tuple[Axis, dict[str, Axis]], clock: PageTimes, names: Sequence[str], place: str
 ) -> str:
     x, others = axes
-    charts = [chart(x, axis, list(_both_ways(one, name))) for name, axis in others.items()]
-    row = one.row
+    charts = [chart(x, axis, list(_both_ways(spectrum, name))) for name, axis in others.items()]
+    row = spectrum.row
     where = "" if row.position_m is None else typeset_position(row.position_m)
     facts = {
         "spectrum": f"{row.number}{f', {escape(row.key)}' if row.key else ''}",

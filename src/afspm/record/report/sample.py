@@ -47,15 +47,17 @@ def sheet(story: RunStory, shown: Sequence[TopographyPicture], clock: PageTimes)
     if not shown:
         return "" if story.spectra else "<p>None.</p>"
     styles = colours(story)
-    names = ["", *(name_of(one.row) for one in shown), ""]
-    figures = [_figure(one, story, styles, clock, (names[index], names[index + 2])) for index, one in enumerate(shown)]
+    names = ["", *(name_of(picture.row) for picture in shown), ""]
+    figures = [
+        _figure(picture, story, styles, clock, (names[index], names[index + 2])) for index, picture in enumerate(shown)
+    ]
     left_out = len(story.scans) - len(shown)
     note = f'<p class="note">{left_out} more are not shown.</p>' if left_out else ""
     return f'<div class="sheet">{"".join(figures)}</div>{note}<p class="note">{_LEGEND}{_estimated(shown)}</p>'
 
 
 def _estimated(shown: Sequence[TopographyPicture]) -> str:
-    marks = {one.row.registration for one in shown}
+    marks = {picture.row.registration for picture in shown}
     meanings = [f"<b>{outcome.label}</b>: {reason}" for outcome, reason in _OUTCOMES.items() if outcome in marks]
     text = f" The place on the sample is only estimated, from earlier drift: {'; '.join(meanings)}." if meanings else ""
     if RegistrationOutcome.COARSE in marks:
@@ -71,38 +73,40 @@ def sample_map(
     Treatments of the tip are marked, or listed below the map if they are too far away.
     """
     pictures = _topmost(shown)
-    corners = [one.row.region.corners_m() for one in pictures if one.row.region is not None]
+    corners = [picture.row.region.corners_m() for picture in pictures if picture.row.region is not None]
     corners += [np.array([position]) for position in spectra_m]
     if not corners:
         return ""
     measured_m = np.concatenate(corners)
     view = _View(measured_m)
     if treated:
-        wider = _View(np.concatenate([measured_m, np.array([one.xy_m for one in treated])]))
+        wider = _View(np.concatenate([measured_m, np.array([treatment.xy_m for treatment in treated])]))
         view = wider if max(wider.width, wider.height) <= _WIDENED * max(view.width, view.height) else view
-    marked = [one for one in treated if view.contains(one.xy_m)]
-    images = "".join(view.image(one) for one in pictures)
+    marked = [treatment for treatment in treated if view.contains(treatment.xy_m)]
+    images = "".join(view.image(picture) for picture in pictures)
     points = "".join(view.point(position) for position in spectra_m)
-    points += "".join(view.mark(one) for one in marked)
+    points += "".join(view.mark(treatment) for treatment in marked)
     places = "sample coordinates" if frame is Frame.SAMPLE else "coordinates of the scanner"
     points_told = "; the points are spectra" if spectra_m else ""
     scans_told = ", the newest scan on top; click one to see it" if pictures else ""
     legend = f"{places.capitalize()}{scans_told}{points_told}{_marks_text(marked)}."
-    far = _far_text([one for one in treated if one not in marked])
+    far = _far_text([treatment for treatment in treated if treatment not in marked])
     return f'{view.frame(images + points)}<p class="note">{legend}{far}</p>'
 
 
 def _marks_text(marked: Sequence[TreatmentPlace]) -> str:
-    made = {one.action for one in marked}
-    return "".join(f"; {sign} {one}" for action, (sign, one, _) in _MARKS.items() if action in made)
+    made = {treatment.action for treatment in marked}
+    return "".join(f"; {sign} {singular}" for action, (sign, singular, _) in _MARKS.items() if action in made)
 
 
 def _far_text(far: Sequence[TreatmentPlace]) -> str:
     if not far:
         return ""
-    counts = Counter(one.action for one in far)
+    counts = Counter(treatment.action for treatment in far)
     what = " and ".join(counted(counts[action], *words[1:]) for action, words in _MARKS.items() if counts[action])
-    (left, low), (right, high) = (edge(np.array([one.xy_m for one in far]), axis=0) for edge in (np.min, np.max))
+    (left, low), (right, high) = (
+        edge(np.array([treatment.xy_m for treatment in far]), axis=0) for edge in (np.min, np.max)
+    )
     if (left, low) == (right, high):
         return f" Outside the map: {what} at {typeset_position((left, low))}."
     return f" Outside the map: {what} between {typeset_position((left, low))} and {typeset_position((right, high))}."
@@ -132,20 +136,20 @@ class _View:
         look = f"aspect-ratio:{ratio:.5g};max-width:{min(560.0, 480.0 * ratio):.0f}px"
         return f'<div class="map" style="{look}">{content}{bar}{"".join(ticks)}</div>'
 
-    def image(self, one: TopographyPicture) -> str:
-        region = one.row.region
+    def image(self, picture: TopographyPicture) -> str:
+        row, region = picture.row, picture.row.region
         assert region is not None
-        assert one.image is not None
+        assert picture.image is not None
         (width, height), (x, y) = region.size_m, region.center_m
         place = (
             f"left:{self._x(x - width / 2):.3f}%;top:{self._y(y + height / 2):.3f}%;"
             f"width:{100 * width / self.width:.3f}%;height:{100 * height / self.height:.3f}%"
         )
         turned = f";transform:rotate({-math.degrees(region.angle_rad):.3f}deg)" if region.angle_rad else ""
-        bad = "bad" if one.is_bad else ""
+        bad = "bad" if picture.is_bad else ""
         return (
-            f'<a class="{bad}" href="#{name_of(one.row)}" title="scan {one.row.number}, {typeset_area(region.size_m)}" '
-            f'style="{place}{turned}"><img src="{data_url(one.image.image)}" alt=""></a>'
+            f'<a class="{bad}" href="#{name_of(row)}" title="scan {row.number}, {typeset_area(region.size_m)}" '
+            f'style="{place}{turned}"><img src="{data_url(picture.image.image)}" alt=""></a>'
         )
 
     def point(self, position_m: XY) -> str:
@@ -171,21 +175,24 @@ class _View:
 
 
 def _topmost(shown: Sequence[TopographyPicture]) -> list[TopographyPicture]:
-    newest = {one.row.region: one for one in shown if one.image is not None and one.row.region is not None}
-    return sorted(newest.values(), key=lambda one: one.row.number)[-_HIDDEN_BEHIND:]
+    newest = {
+        picture.row.region: picture for picture in shown if picture.image is not None and picture.row.region is not None
+    }
+    return sorted(newest.values(), key=lambda picture: picture.row.number)[-_HIDDEN_BEHIND:]
 
 
 def _figure(
-    one: TopographyPicture, story: RunStory, styles: dict[str, str], clock: PageTimes, beside: tuple[str, str]
+    picture: TopographyPicture, story: RunStory, styles: dict[str, str], clock: PageTimes, beside: tuple[str, str]
 ) -> str:
-    row, region = one.row, one.row.region
+    row, region = picture.row, picture.row.region
     width, height = region.size_m if region else (1.0, 1.0)
-    if one.image is None:
+    if picture.image is None:
         shown = '<div class="none">no values</div>'
     else:
         shown = (
-            f'<img src="{data_url(one.image.image)}" alt="scan {row.number}" style="aspect-ratio:{width / height:.4g}">'
-            f"{scale_bar((width, height))}{_change(one)}"
+            f'<img src="{data_url(picture.image.image)}" alt="scan {row.number}" '
+            f'style="aspect-ratio:{width / height:.4g}">'
+            f"{scale_bar((width, height))}{_change(picture)}"
         )
     mark = " <b>interrupted</b>" if row.interrupted else ""
     if row.registration is not None and row.registration is not RegistrationOutcome.REGISTERED:
@@ -198,23 +205,23 @@ def _figure(
         f'<i class="{styles.get(row.holder or "", "state")}"></i>'
         f"{row.number} · {clock.utc(row.time_ns)}{noted}{mark}{size}"
     )
-    facts = dict(_facts(one, story, clock))
+    facts = dict(_facts(picture, story, clock))
     return markup.figure(
-        name_of(row), shown, caption, facts, beside=beside, style="scan bad" if one.is_bad else "scan",
+        name_of(row), shown, caption, facts, beside=beside, style="scan bad" if picture.is_bad else "scan",
         ratio=width / height,
     )  # fmt: skip
 
 
-def _change(one: TopographyPicture) -> str:
-    if one.changed_row is None or not one.row.shape:
+def _change(picture: TopographyPicture) -> str:
+    if picture.changed_row is None or not picture.row.shape:
         return ""
     # the first row is at the bottom
-    up = 100.0 * one.changed_row / one.row.shape[0]
-    return f'<hr class="change" style="bottom:{up:.3f}%" title="tip changed, row {one.changed_row}">'
+    up = 100.0 * picture.changed_row / picture.row.shape[0]
+    return f'<hr class="change" style="bottom:{up:.3f}%" title="tip changed, row {picture.changed_row}">'
 
 
-def _facts(one: TopographyPicture, story: RunStory, clock: PageTimes) -> Iterator[tuple[str, str]]:
-    row, region = one.row, one.row.region
+def _facts(picture: TopographyPicture, story: RunStory, clock: PageTimes) -> Iterator[tuple[str, str]]:
+    row, region = picture.row, picture.row.region
     yield "scan", f"{row.number}{f', {escape(row.key)}' if row.key else ''}"
     yield "finished", clock.whole(row.time_ns)
     if row.began_ns is not None:
@@ -232,16 +239,22 @@ def _facts(one: TopographyPicture, story: RunStory, clock: PageTimes) -> Iterato
         )
     if row.shape is not None:
         yield "pixels", f"{row.shape[1]} × {row.shape[0]}"
-    if one.image is not None:
-        span = one.image.span
-        yield "shown", f"{escape(one.channel)}, {quantity(span.high - span.low, one.unit, 3)} from dark to light"
+    if picture.image is not None:
+        span = picture.image.span
+        yield (
+            "shown",
+            f"{escape(picture.channel)}, {quantity(span.high - span.low, picture.unit, 3)} from dark to light",
+        )
     for value in row.instruments:
         outside = f", outside: {', '.join(value.outside)}" if value.outside else ""
         yield escape(value.name), escape(f"{value.text}{outside}")
     yield "in control", escape(row.holder or "none")
     yield "problems", escape(", ".join(row.problems))
     yield "interrupted", "yes" if row.interrupted else ""
-    yield "tip changed", "" if one.changed_row is None else f"row {one.changed_row}, by the lines of the running scan"
+    yield (
+        "tip changed",
+        "" if picture.changed_row is None else f"row {picture.changed_row}, by the lines of the running scan",
+    )
     notes = [note for note in story.notes if note.scan == row.number]
     yield "notes", "<br>".join(f"{escape(note.text)} ({escape(note.who)})" for note in notes)
     yield "file", escape(row.file)
