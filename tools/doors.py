@@ -66,7 +66,7 @@ NAMES_IN_TESTS: Final = {
     "agent": 3,
     "asylum": 2,
     "bluesky": 3,
-    "drift": 33,
+    "drift": 36,
     "gxsm": 7,
     "hosts": 3,
     "line_watch": 5,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from afspm import wire
+from afspm import restored, snapshot, wire
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -26,8 +26,6 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
-from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, scan_values
-from afspm.model.snapshot import restored, snapshot
 from afspm.plugins.drift.frame.messages import (
     Compensated,
     Forecasted,
@@ -43,27 +41,25 @@ from afspm.plugins.drift.frame.state import DriftState
 from afspm.plugins.drift.track import forecast_from_dict
 from afspm.plugins.drift.track.mapping import Mapping
 from afspm.plugins.drift.track.paper import PaperForecast
-from afspm.scheduler.events import (
-    Connected,
+from afspm.scheduler import (
+    PROBE_CHANGES,
+    REGION_CHANGES,
     Delegate,
-    Effect,
-    Forward,
+    ExperimentLimits,
     FrameReported,
     Input,
     PacketIn,
-    Publish,
-    Reply,
     RequestIn,
-    SaveState,
+    SavedState,
+    SchedulerCore,
     Tick,
     TranslatorCaughtUp,
-    TranslatorReply,
     TranslatorUp,
+    scan_values,
 )
+from afspm.scheduler.events import Connected, Effect, Forward, Publish, Reply, SaveState, TranslatorReply
 from afspm.scheduler.safety.limit_checker import is_get
-from afspm.scheduler.safety.limits import ExperimentLimits
-from afspm.scheduler.saved_state import KIND, VERSION, SavedState
-from afspm.scheduler.scheduler_core import SchedulerCore
+from afspm.scheduler.saved_state import KIND, VERSION
 from afspm.scheduler.settings import SchedulerSettings
 from afspm.wire.generated.spectroscopy_pb2 import ProbePosition as ProbePositionMessage
 

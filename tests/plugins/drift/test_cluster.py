@@ -10,7 +10,7 @@ import pytest
 from tests.plugins.drift.test_study_command import SMALL, told
 from tests.plugins.drift.test_workers import by_index, doubled, doubled_by_the_next
 
-from afspm.basics.errors import ConfigError
+from afspm.basics import ConfigError
 from afspm.plugins.drift.workers import TaskOutcome, on_cluster
 
 pytestmark = pytest.mark.slow  # each worker imports Dask; `test_workers.py` has those without

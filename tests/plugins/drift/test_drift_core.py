@@ -31,8 +31,9 @@ from afspm.plugins.drift.frame.messages import NotRegistered, WorkerGone
 from afspm.plugins.drift.frame.sample_frame import SampleFrame
 from afspm.plugins.drift.frame.settings import Compensate, DriftCompensationSettings
 from afspm.plugins.drift.frame.state import SavedDrift
-from afspm.scheduler.events import Log, PacketIn, Publish, RequestIn, Tick, TranslatorCaughtUp
-from afspm.scheduler.safety.limits import ExperimentLimits, Limit
+from afspm.scheduler import ExperimentLimits, Log, PacketIn, RequestIn, Tick, TranslatorCaughtUp
+from afspm.scheduler.events import Publish
+from afspm.scheduler.safety.limits import Limit
 
 DRIFT = (100e-9, -50e-9)
 BACK = (-100e-9, 50e-9)

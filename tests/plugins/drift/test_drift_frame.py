@@ -23,8 +23,9 @@ from afspm.model import (
     names,
 )
 from afspm.plugins.drift.frame.settings import DriftCompensationSettings
+from afspm.scheduler import ExperimentLimits
 from afspm.scheduler.events import Publish
-from afspm.scheduler.safety.limits import ExperimentLimits, Limit
+from afspm.scheduler.safety.limits import Limit
 
 DRIFT = (100e-9, -50e-9)
 TURN = math.radians(10.0)

@@ -13,16 +13,15 @@ import pytest
 from client_lab import Lab, context_of, run
 
 from afspm import wire
-from afspm.basics.errors import FileError
-from afspm.basics.exit_codes import ExitCode
+from afspm.basics import ExitCode, FileError
 from afspm.components import line_file
+from afspm.driver import FileFacts, encode_scan
+from afspm.emulation import World
 from afspm.model import Region
 from afspm.plugins.drift.registration import DriftScan
 from afspm.plugins.drift.report.drift_pictures import DriftPictures, TabledScan, parts
 from afspm.plugins.drift.report.simulated_truth import true_drift
 from afspm.plugins.drift.track.record import DriftRecord
-from afspm.simulation import World
-from afspm.translator.own_files import FileFacts, encode_scan
 
 pytest.importorskip("matplotlib")
 SETTINGS: dict[str, Any] = {"surface": {"kind": "particles"}, "drift": {"velocity_m_per_s": (60e-12, -30e-12, 0.0)}}

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from afspm.basics.errors import FileError
+from afspm.basics import FileError
 from afspm.model import RegistrationOutcome
 from afspm.plugins.drift.track.record import DriftRecord
-from afspm.record.drift_mapping import drift_at
+from afspm.record import drift_at
 
 
 def record(n: int = 20, seed: int = 1) -> DriftRecord:

@@ -13,11 +13,11 @@ from record_lab import ABOUT, Night
 from tests.unit.record.test_measured_tables import start
 from typer.testing import CliRunner
 
-from afspm.basics.errors import InvalidValue
+from afspm import open_run
+from afspm.basics import InvalidValue
 from afspm.cli.app import app
 from afspm.model import Region, Scan, ScopeState
 from afspm.plugins.drift.frame.remount import Remount, find, overview_of
-from afspm.record.run import open_run
 from afspm.record.store import RecordStore
 from afspm.simulation.surfaces import surface_from
 

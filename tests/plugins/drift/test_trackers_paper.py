@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tests.plugins.drift.trackers_lab import INTERVAL_S, SIZE_M, World, follow, scan_at, steady
 
-from afspm.basics.errors import ConfigError, InvalidValue
+from afspm.basics import ConfigError, InvalidValue
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 from afspm.plugins.drift.track import PaperTracker, forecast_from_dict, tracker
 from afspm.plugins.drift.track.mapping import Mapping

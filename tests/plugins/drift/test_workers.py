@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from systems import not_on_wine
 
-from afspm.basics.errors import InvalidValue
+from afspm.basics import InvalidValue
 from afspm.plugins.drift.workers import TaskOutcome, on_cores, processes
 
 
