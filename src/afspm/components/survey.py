@@ -52,9 +52,9 @@ class Survey(Component):
     """A wide scan, a search for targets in it, and a zoom and curves at each target.
 
     The component writes a table into the run folder (number, position, height, outcome, files of zoom and curves) and a
-    picture: the survey with its numbered targets, their zooms and curves. If the zoom or a curve of a target is
-    refused, for instance by a limit, the table has the reason, and the survey goes on with the next target. With a
-    Drift Compensated Scheduler, positions are positions on the sample.
+    picture (`.png`, and `.pdf` for print): the survey with its numbered targets, their zooms and curves. If the zoom or
+    a curve of a target is refused, for instance by a limit, the table has the reason, and the survey goes on with the
+    next target. With a Drift Compensated Scheduler, positions are positions on the sample.
 
     Each scan and each curve is taken once, even if processes are killed. If the experiment ends early, table and
     picture show the measurements up to then. Their keys are `survey`, `zoom-3`, `curve-top-3` and so on:
@@ -81,7 +81,7 @@ class Survey(Component):
         parameters: parameters to set before the survey, e.g. {scan-speed = "10 um/s"}.
         zoom_parameters: parameters to set before the zooms.
         end_when_done: whether to end the whole experiment after the last target.
-        file: name of the table and of the picture in the run folder, without `.csv` and `.png`.
+        file: name of the table and of the picture in the run folder, without suffix.
     """
 
     drift_doubts: tuple[ConfigError, ...]
@@ -195,10 +195,12 @@ class Survey(Component):
             self.log.warning("no survey was taken: there is no table and no picture")
             return
         self._keep(self._record)
-        from afspm.components.surveying.figure import draw_survey  # matplotlib: needed at the end alone
+        from afspm.components.surveying import figure  # matplotlib: needed at the end alone
 
+        drawn = figure.survey_figure(self._record, title=self.name, simulated=self.simulated)
         path = Path(self.run_dir) / f"{self.file}.png"
-        draw_survey(self._record, path, title=self.name, simulated=self.simulated)
+        for suffix in (".png", ".pdf"):  # the second for `afspm export --to pdf`: the record does not have all of it
+            drawn.savefig(path.with_suffix(suffix), dpi=figure.DPI)
         self.log.info("the survey is drawn: %s", path)
 
     def _set(self, parameters: Mapping[str, str | float]) -> None:

@@ -72,6 +72,7 @@ def test_a_map_is_measured_to_its_end_and_written(tmp_path: Path) -> None:
         x, y = float(row["x [m]"]), float(row["y [m]"])
         assert float(row["height"]) == pytest.approx(math.exp(-((x - 1e-7) ** 2 + y**2) / 100e-9**2))
     assert (tmp_path / "map.png").stat().st_size > 10_000
+    assert (tmp_path / "map.pdf").read_bytes().startswith(b"%PDF")
 
 
 @pytest.mark.parametrize("call", [40, 83, 150, 151, 202])

@@ -61,6 +61,7 @@ def test_survey_leaves_a_picture(ran: Any, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     ran(ParticleLab())
     assert (tmp_path / "targets.png").stat().st_size > 50_000
+    assert (tmp_path / "targets.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_target_outside_limits_is_refused_in_the_table_and_the_next_follows(ran: Any) -> None:

@@ -272,10 +272,11 @@ def test_pictures_are_there_for_every_channel(run: Run, tmp_path: Path) -> None:
 
 def test_figures_for_print_are_those_of_each_measurement_and_of_the_night(run: Run, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
+    (tmp_path / "targets.pdf").write_bytes(b"%PDF of a survey")
     names = [file.name for file in export(run, "pdf", tmp_path / "out")]
-    assert names[:3] == ["night.pdf", "0001_Height.pdf", "0001_Height_Retrace.pdf"]
+    assert names[:4] == ["night.pdf", "targets.pdf", "0001_Height.pdf", "0001_Height_Retrace.pdf"]
     assert all((tmp_path / "out" / name).read_bytes().startswith(b"%PDF") for name in names)
-    assert [file.name for file in export(run, "pdf", tmp_path / "one", "1")] == names[1:3]
+    assert [file.name for file in export(run, "pdf", tmp_path / "one", "1")] == names[2:4]
 
 
 def test_pictures_of_heights_have_levelled_lines_and_say_so(

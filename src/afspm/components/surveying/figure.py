@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MOST_ZOOMS: Final = 15
+DPI: Final = 200
 _COLUMNS: Final = 5
 _SURVEY_IN, _ZOOM_IN, _CURVE_IN = 4.6, 1.28, 0.8
 _LEFT_IN, _TOP_IN, _BOTTOM_IN, _RIGHT_IN = 0.15, 0.42, 0.55, 0.15
@@ -47,7 +48,12 @@ def draw_survey(record: SurveyRecord, path: str | Path, *, title: str = "", simu
         path: the path of the picture; its suffix gives the format.
         simulated: whether to mark the picture, so that it is not taken for a measurement.
     """
-    _Picture(record).save(Path(path), title, simulated=simulated)
+    survey_figure(record, title=title, simulated=simulated).savefig(path, dpi=DPI)
+
+
+def survey_figure(record: SurveyRecord, *, title: str = "", simulated: bool = False) -> Figure:
+    """Return the figure that `draw_survey` writes."""
+    return _Picture(record).drawn(title, simulated=simulated)
 
 
 class _Picture:
@@ -69,14 +75,14 @@ class _Picture:
         FigureCanvasAgg(self._figure)
         self._map = gold()
 
-    def save(self, path: Path, title: str, *, simulated: bool) -> None:
+    def drawn(self, title: str, *, simulated: bool) -> Figure:
         self._head(title, simulated=simulated)
         # one range for the survey and its zooms: the targets are the highest of the survey, and compared with it
         zooms = [flattened(visit.zoom, 1) for visit in self._shown if visit.zoom]
         colours = self._survey(zooms)
         if zooms:
             self._zooms(*colours)
-        self._figure.savefig(path, dpi=200)
+        return self._figure
 
     def _axes(self, left_in: float, top_in: float, width_in: float, height_in: float) -> Axes:
         low_in = self._height_in - _TOP_IN - top_in - height_in

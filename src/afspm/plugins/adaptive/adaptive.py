@@ -35,8 +35,8 @@ class Adaptive(Component):
     With drift and slow moves the expected error may be half of the true error: then the drift is fitted wrongly, and a
     map with a limit on `error` ends too early. Measured on one of four simulated maps.
 
-    The table `map.csv` and the picture `map.png` are written into the run folder at the end, from at least
-    three spectra.
+    The table `map.csv` and the picture `map.png`, also as `map.pdf`, are written into the run folder at the end, from
+    at least three spectra.
 
     Args:
         size: (width, height) of the region.
@@ -137,10 +137,13 @@ class Adaptive(Component):
         folder = Path(self.run_dir)
         with self._outage.trying():  # on a full disk the error is logged, and the picture is tried
             write_atomic(folder / f"{self.file}.csv", [self._table(found).encode()])
-        from afspm.plugins.adaptive.map_picture import draw_map  # matplotlib: needed at the end alone
+        from afspm.plugins.adaptive.map_picture import DPI, draw_map  # matplotlib: needed at the end alone
 
-        draw_map(found, self._region, folder / f"{self.file}.png", title=self.name, simulated=self.simulated)
-        self.log.info("the map is drawn: %s", folder / f"{self.file}.png")
+        drawn = draw_map(found, self._region, title=self.name, simulated=self.simulated)
+        path = folder / f"{self.file}.png"
+        for suffix in (".png", ".pdf"):  # the second for `afspm export --to pdf`: the fit is not in the record
+            drawn.savefig(path.with_suffix(suffix), dpi=DPI)
+        self.log.info("the map is drawn: %s", path)
 
     def _table(self, found: MapProgress) -> str:
         text = io.StringIO()

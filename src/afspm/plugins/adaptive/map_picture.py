@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -17,16 +16,16 @@ from afspm.model import Region
 from afspm.plugins.adaptive.mapping import MapProgress
 from afspm.record import CATEGORICAL, PROBLEM, Contrast, draw_scale_bar, gold, value_range
 
+DPI: Final = 160
 _LONGER: Final = 120  # pixels along the longer side
 _WIDTH_IN, _TEXT = 9.6, 9.0
 
 
-def draw_map(found: MapProgress, region: Region, path: Path, *, title: str = "", simulated: bool = False) -> None:
-    """Draw a map and its expected error, with the measured positions.
+def draw_map(found: MapProgress, region: Region, *, title: str = "", simulated: bool = False) -> Figure:
+    """Return a figure of a map and its expected error, with the measured positions.
 
     Args:
         region: region that was mapped.
-        path: file of the picture; its suffix determines the format.
         simulated: whether to mark the picture as SIMULATED.
     """
     values, errors = _pictures(found, region)
@@ -51,7 +50,7 @@ def draw_map(found: MapProgress, region: Region, path: Path, *, title: str = "",
     if simulated:
         figure.text(0.985, 1.0 - 0.2 / height_in, "SIMULATED", size=10, weight="bold", color=PROBLEM, ha="right",
                     va="center")  # fmt: skip
-    figure.savefig(path, dpi=160)
+    return figure
 
 
 def _panel(

@@ -1,4 +1,4 @@
-"""Figures for print (.pdf): of each measurement, of the night, and the figures that packages declare for the report."""
+"""Figures for print (.pdf): of each measurement, of the night, as packages declare, and as components wrote them."""
 
 from __future__ import annotations
 
@@ -32,3 +32,5 @@ def tables(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow]) -> Iterat
         yield "night.pdf", png.content(pictures.picture_of_night(run, contents, shown), "pdf")
     for name, figure in pictures.declared_figures(run, contents, again=True):
         yield f"{name}.pdf", png.content(figure, "pdf")
+    for path in sorted(run.folder.glob("*.pdf")):  # of a survey or a map: only its component has all data of it
+        yield path.name, path.read_bytes()
