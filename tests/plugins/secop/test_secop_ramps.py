@@ -239,7 +239,7 @@ def _believe_old_readings(patch: pytest.MonkeyPatch) -> None:
 
 def _ignore_conditions(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Instruments, "refusal", lambda *_: "")
-    patch.setattr(Instruments, "problems", lambda _: {})
+    patch.setattr(Instruments, "problems", lambda *_: {})
 
 
 def _ignore_rates(patch: pytest.MonkeyPatch) -> None:
