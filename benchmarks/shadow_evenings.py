@@ -31,7 +31,9 @@ from afspm.plugins.asylum.emulator import AsylumEmulator
 from afspm.plugins.gxsm.emulator import GxsmEmulator
 from afspm.plugins.nanonis.emulator import NanonisEmulator
 from afspm.plugins.nanosurf.emulator import NanosurfEmulator
+from afspm.plugins.nanosurf.emulator.studio import StudioProgram
 from afspm.plugins.park.emulator import ParkEmulator
+from afspm.plugins.park.emulator.smartscan import SmartScanProgram
 from afspm.record.report.shadow import FILE, ShadowKind
 from afspm.simulation.emulation.emulator import Emulator
 from afspm.translator.trace import FILE as TRACE
@@ -219,6 +221,8 @@ class AtGxsm(AtTheController, GxsmEmulator):
 class AtNanosurf(AtTheController, NanosurfEmulator):
     """A person at an emulated Nanosurf Studio."""
 
+    program: StudioProgram
+
     def set_up(self, line_s: float) -> None:
         for name, value in (("points_per_line", LINES), ("lines_per_frame", LINES), ("line_rate", 1 / line_s)):
             self.program.put(f"imaging.{name}", value)
@@ -235,6 +239,8 @@ class AtNanosurf(AtTheController, NanosurfEmulator):
 
 class AtPark(AtTheController, ParkEmulator):
     """A person at an emulated SmartScan."""
+
+    program: SmartScanProgram
 
     def set_up(self, line_s: float) -> None:
         self.program.ask("call", "scan.setScanGeometry", [{"pixelWidth": LINES, "pixelHeight": LINES}])
