@@ -14,10 +14,10 @@ from afspm.client.experiment_link import ExperimentLink
 from afspm.model import Packet, ProblemNames
 from afspm.record.overview import Overview
 from afspm.record.run_lock import cut_off_message
-from afspm.supervisor.own_runs import own_messages
+from afspm.supervisor.own_runs import register_own_messages
 from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import open_port
-from afspm.wire.message_types import register_all
+from afspm.wire.messages import SCAN_LINES
 
 HEARD_WITHIN_S = 5.0
 
@@ -30,6 +30,7 @@ class Follower:
         name: name (and owner of the key) of the follower.
         envelopes: prefixes of the envelopes to subscribe to; None: all messages of translator and scheduler except
             scans, spectra and lines of running scans.
+        lines: whether to subscribe to the lines of running scans, too.
 
     Attributes:
         ended: whether the experiment has ended.
@@ -40,12 +41,15 @@ class Follower:
         ConfigError: the run has no scheduler to connect to.
     """
 
-    def __init__(self, folder: Path, name: str = "terminal", envelopes: tuple[str, ...] | None = None) -> None:
+    def __init__(
+        self, folder: Path, name: str = "terminal", envelopes: tuple[str, ...] | None = None, *, lines: bool = False
+    ) -> None:
         guest = guest_of(folder, name)
-        register_all(own_messages(folder, guest.messages))
+        register_own_messages(folder, guest.messages)
         # no socket for requests: a follower sends none, and the scheduler need not know it
         sockets = dataclasses.replace(guest.sockets, control=None)
-        envelopes = envelopes or wire.messages_without_values()
+        # chosen after the registration, so that relayed messages of the experiment are followed, too
+        envelopes = (*(envelopes or wire.messages_without_values()), *([SCAN_LINES.name] if lines else ()))
         self.launch: Launch = dataclasses.replace(guest, sockets=sockets, envelopes=envelopes)
         self.folder = folder
         self.clock: Clock = ExperimentClock.from_dict(guest.clock)

@@ -45,13 +45,10 @@ def looking(where: Path, *, lines: bool = False, as_json: bool = False) -> Itera
         lines: whether to follow lines of unfinished scans, too.
         as_json: whether a program reads the output, also that no run goes on.
     """
-    from afspm import wire
     from afspm.cli.follower import Follower
-    from afspm.wire.messages import SCAN_LINES
 
     folder = _running(where, as_json=as_json)
-    envelopes = (*wire.messages_without_values(), *([SCAN_LINES.name] if lines else []))
-    with Follower(folder, TERMINAL, envelopes) as follower:
+    with Follower(folder, TERMINAL, lines=lines) as follower:
         with _only_if_running(folder, as_json=as_json):
             follower.catch_up()
         if follower.ended:

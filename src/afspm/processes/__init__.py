@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from afspm.transport.rate_limited_log import RateLimitedLog
     from afspm.transport.router import PeerAsked, Router
     from afspm.transport.zmq_port import open_port
-    from afspm.wire.message_types import register_all as register_messages
 
 if TYPE_CHECKING:  # a page offers an ended run for resuming, reads its log, and has a name of its own
     from afspm.experiment.process_starts import DASHBOARD
@@ -53,7 +52,7 @@ if TYPE_CHECKING:  # one command, page or bridge has it, and another may
     from afspm.cli.arguments import RecordedRun
     from afspm.cli.joining import acting
     from afspm.experiment.experiment import load as load_experiment
-    from afspm.supervisor.own_runs import own_homes, own_messages
+    from afspm.supervisor.own_runs import own_homes, register_own_messages
     from afspm.supervisor.run import dry_run
     from afspm.supervisor.run import now as run_time
     from afspm.transport.port import Port
@@ -62,6 +61,7 @@ if TYPE_CHECKING:  # one command, page or bridge has it, and another may
     from afspm.transport.process.loading import load as load_class
     from afspm.transport.process.parent import leave_interrupts_to_parent
     from afspm.transport.zmq_port import ZmqPort
+    from afspm.wire.message_types import register_all as register_messages
 
 __all__ = [
     "ACCEPTED",
@@ -133,11 +133,11 @@ __all__ = [
     "open_port",
     "opt",
     "own_homes",
-    "own_messages",
     "plain_console",
     "plain_table",
     "receive_frames",
     "register_messages",
+    "register_own_messages",
     "run_experiment",
     "run_time",
     "send_frames",

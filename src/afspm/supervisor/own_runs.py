@@ -54,15 +54,25 @@ def own_homes(folder: Path) -> list[Path] | None:
     return [*map(Path, homes)] if hmac.compare_digest(expected.encode(), signature.encode()) else None
 
 
-def own_messages(folder: Path, messages: Sequence[str]) -> tuple[str, ...]:
-    """Return the modules of messages that run.json names, if this user has made the run; else nothing, with a warning.
+def register_own_messages(folder: Path, messages: Sequence[str]) -> None:
+    """Register the messages that run.json names, if this user has made the run; else warn.
 
     Importing them would run modules of another person's choice.
+
+    Raises:
+        ConfigError: as for `register_all`.
     """
-    if not messages or own_homes(folder) is not None:
-        return tuple(messages)
-    _log.warning("messages of %s are not read: %s is not known as a run of yours", ", ".join(messages), folder)
-    return ()
+    if not messages:
+        return
+    if (homes := own_homes(folder)) is None:
+        _log.warning("messages of %s are not read: %s is not known as a run of yours", ", ".join(messages), folder)
+        return
+    # imported late: few experiments have messages of their own
+    from afspm.experiment.class_loader import importing_from
+    from afspm.wire.message_types import register_all
+
+    with importing_from(homes):  # the modules may lie beside the experiment file, as for the run itself
+        register_all(messages)
 
 
 def state_folder() -> Path:

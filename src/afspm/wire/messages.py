@@ -428,9 +428,10 @@ def followed_messages() -> tuple[str, ...]:
 
 
 def messages_without_values() -> tuple[str, ...]:
-    """Return the names of messages from translator and scheduler without the values of scans and spectra."""
+    """Return the names of messages from translator and scheduler, and of relayed ones, without those with values."""
     published = (Role.TRANSLATOR, Role.SCHEDULER)
-    return tuple(name for name, one in _declared.items() if one.source in published and not one.has_values)
+    from_them = (one for one in _declared.values() if one.source in published or one.relayed)
+    return tuple(one.name for one in from_them if not one.has_values)
 
 
 def message_of(envelope: str) -> str:

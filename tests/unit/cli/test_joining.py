@@ -37,7 +37,7 @@ def test_message_on_a_run_that_was_cut_off_names_resume_and_on_a_running_one_the
         f'{{"name": "night", "guest": {{"keys": {keys}}}}}', encoding="utf-8"
     )
     monkeypatch.setattr("afspm.client.connect.join", nobody)
-    monkeypatch.setattr("afspm.cli.follower.Follower.__init__", lambda *_: None)
+    monkeypatch.setattr("afspm.cli.follower.Follower.__init__", lambda *_, **_more: None)
     monkeypatch.setattr("afspm.cli.follower.Follower.close", lambda *_: None)
     monkeypatch.setattr("afspm.cli.follower.Follower.catch_up", nobody)
     with lock_run(tmp_path / "night-1"):

@@ -202,11 +202,11 @@ def _run_as_guest(folder: Path, dashboard: Dashboard, name: str) -> int:
 
     from afspm import guest_of
     from afspm.basics import ExperimentClock
-    from afspm.processes import ProcessActivity, ProcessContext, new_session, open_port, own_messages, register_messages
+    from afspm.processes import ProcessActivity, ProcessContext, new_session, open_port, register_own_messages
     from afspm.record import STATE_DIR
 
     launch = guest_of(folder, name)
-    register_messages(own_messages(folder, launch.messages))
+    register_own_messages(folder, launch.messages)
     launch = dataclasses.replace(launch, run_dir=str(folder), state_dir=str(folder / STATE_DIR))
     clock = ExperimentClock.from_dict(launch.clock)
     port = open_port(launch, clock)
