@@ -88,7 +88,7 @@ class ControllerLoad:
     Attributes:
         most_in_a_second: the number of questions in the fullest second.
         answered_s: the median of the times to an answer; a question that waits for the end of a scan is one of many.
-        lost: the number of questions without a whole answer.
+        lost: the number of questions without an answer.
     """
 
     connections: int
@@ -137,7 +137,12 @@ def trace_lines(file: Path) -> Iterator[TraceLine]:
 def load_of(lines: Iterable[TraceLine]) -> ControllerLoad | None:
     """Return the load on the controller in a part of a trace; None if the part is too short."""
     # without the contents: the trace of a night may be larger than memory
-    asked = [replace(one, asked=None, answered=b"") for one in lines if isinstance(one, TracedExchange)]
+    asked, lost = list[TracedExchange](), 0
+    for line in lines:
+        if isinstance(line, TracedExchange):
+            # a refusal by the controller is an answer
+            lost += bool(line.lost) and not line.answered
+            asked.append(replace(line, asked=None, answered=b""))
     over_s = asked[-1].at_s - asked[0].at_s if asked else 0.0
     if over_s <= 0.0:
         return None
@@ -147,7 +152,7 @@ def load_of(lines: Iterable[TraceLine]) -> ControllerLoad | None:
         over_s=over_s,
         most_in_a_second=max(Counter(int(one.at_s) for one in asked).values()),
         answered_s=median(one.took_s for one in asked),
-        lost=sum(bool(one.lost) for one in asked),
+        lost=lost,
     )
 
 

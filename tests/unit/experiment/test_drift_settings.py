@@ -99,7 +99,7 @@ def test_published_names_of_drift_classes_are_known(write: Write) -> None:
             rescanner="afspm.components.drift.rescanner.DriftRescanner",
         ),
     )
-    assert names["scheduler"].class_.endswith("drift.scheduler.scheduler.DriftCompensatedScheduler")
+    assert names["scheduler"].class_.endswith("drift.frame.scheduler.DriftCompensatedScheduler")
     assert names["rescanner"].class_.endswith("rescanner.Rescanner")
 
 

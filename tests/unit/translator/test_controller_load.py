@@ -6,7 +6,7 @@ from afspm.translator.trace import TCP, TracedExchange, load_of
 
 
 def asked(at_s: float, *, connection: int = 0, lost: str = "", took_s: float = 0.002) -> TracedExchange:
-    return TracedExchange(connection, TCP, "Bias.Get", b"?", b"!", 0, lost, at_s=at_s, took_s=took_s)
+    return TracedExchange(connection, TCP, "Bias.Get", b"?", b"" if lost else b"!", 0, lost, at_s=at_s, took_s=took_s)
 
 
 def test_load_has_rate_fullest_second_and_time_of_answers() -> None:
