@@ -136,22 +136,25 @@ def trace_lines(file: Path) -> Iterator[TraceLine]:
 
 def load_of(lines: Iterable[TraceLine]) -> ControllerLoad | None:
     """Return the load on the controller in a part of a trace; None if the part is too short."""
-    # without the contents: the trace of a night may be larger than memory
-    asked, lost = list[TracedExchange](), 0
+    # line by line: the trace of a night may be larger than memory
+    connections, in_second, took_s, lost = set[int](), Counter[int](), list[float](), 0
+    first_s, last_s = None, 0.0
     for line in lines:
         if isinstance(line, TracedExchange):
-            # a refusal by the controller is an answer
-            lost += bool(line.lost) and not line.answered
-            asked.append(replace(line, asked=None, answered=b""))
-    over_s = asked[-1].at_s - asked[0].at_s if asked else 0.0
-    if over_s <= 0.0:
+            first_s, last_s = line.at_s if first_s is None else first_s, line.at_s
+            connections.add(line.connection)
+            in_second[int(line.at_s)] += 1
+            took_s.append(line.took_s)
+            lost += bool(line.lost) and not line.answered  # a refusal by the controller is an answer
+    if first_s is None or last_s <= first_s:
         return None
+    over_s = last_s - first_s
     return ControllerLoad(
-        connections=len({one.connection for one in asked}),
-        questions_per_s=(len(asked) - 1) / over_s,
+        connections=len(connections),
+        questions_per_s=(len(took_s) - 1) / over_s,
         over_s=over_s,
-        most_in_a_second=max(Counter(int(one.at_s) for one in asked).values()),
-        answered_s=median(one.took_s for one in asked),
+        most_in_a_second=max(in_second.values()),
+        answered_s=median(took_s),
         lost=lost,
     )
 
