@@ -67,7 +67,7 @@ class SpectrumGroup:
 
     @property
     def positions(self) -> list[XY]:
-        return [spectrum.spectrum.position_m for spectrum in self.measured if spectrum.spectrum.position_m is not None]
+        return [measured.spectrum.position_m for measured in self.measured if measured.spectrum.position_m is not None]
 
     @property
     def axes(self) -> tuple[Axis, dict[str, Axis]]:
@@ -182,7 +182,7 @@ def _small(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
 
 
 def _places(shown: Sequence[SpectrumCurves]) -> tuple[list[str], int]:
-    positions = [spectrum.spectrum.position_m for spectrum in shown]
+    positions = [measured.spectrum.position_m for measured in shown]
     try:
         points = grid([position for position in positions if position is not None])
     except InvalidValue:

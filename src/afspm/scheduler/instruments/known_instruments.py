@@ -138,9 +138,8 @@ class Instruments:
         known = self._of(report.instrument)
         passed_s = now_s - known.published_s
         new = tuple(self.reading(name, now_s) for name in known.readings)
-        if [_state(reading) for reading in new] == [
-            _state(reading) for reading in known.published
-        ] and passed_s < PUBLISH_S:
+        is_same = [*map(_state, new)] == [*map(_state, known.published)]
+        if is_same and passed_s < PUBLISH_S:
             values = [reading.value for reading in new], [reading.value for reading in known.published]
             if values[0] == values[1] or passed_s < PUBLISH_CHANGED_S:
                 return None
