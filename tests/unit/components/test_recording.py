@@ -100,6 +100,8 @@ class Bench:
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
     for name in ("AGAIN_S", "QUIET_S", "LOOK_S", "LONGEST_LOOK_S", "COMMIT_S"):
         monkeypatch.setattr(recording, name, 0.02)
+    # after a second `finish` leaves a busy writer to itself, which would write into what a test has changed meanwhile
+    monkeypatch.setattr(recording, "STOPPING_S", DEADLINE_S)
     made = Bench(tmp_path)
     yield made
     made.log.close()
