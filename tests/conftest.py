@@ -10,6 +10,7 @@ import signal
 import tempfile
 import zlib
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -58,14 +59,26 @@ QUICK = ("tests/system/scheduler/", "tests/system/supervisor/", "tests/system/pr
 """Of these, what `make test` runs all the same: the processes that everything else stands on."""
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Import only modules with a slow test for `-m slow`: one of six, and each process that runs tests imports them."""
+    if config.option.markexpr != "slow" or collection_path.suffix != ".py":
+        return None
+    module = collection_path.relative_to(config.rootpath).as_posix()
+    return True if not (_is_slow(module) or "mark.slow" in collection_path.read_text(encoding="utf-8")) else None
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark by folder what `make test` leaves to `make test-all`."""
     for item in items:
-        module = item.nodeid.partition("::")[0]
-        is_slow = module.startswith(SLOW) and not module.startswith(QUICK)
-        if is_slow or (module.startswith("tests/plugins/") and module.endswith(SLOW_MODULES)):
+        if _is_slow(item.nodeid.partition("::")[0]):
             item.add_marker(pytest.mark.slow)
+
+
+def _is_slow(module: str) -> bool:
+    if module.startswith(SLOW):
+        return not module.startswith(QUICK)
+    return module.startswith("tests/plugins/") and module.endswith(SLOW_MODULES)
 
 
 def pytest_collection_finish() -> None:
