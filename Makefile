@@ -61,14 +61,15 @@ test: $(COLLECTED)
 test-times: TABLE := --processor-times
 test-times: test
 
-## the rest: whole experiments, samples, snippets of the docs, faults of controllers, mutants. What is APART, or needs more
-## (root, compilers, an hour), has a target of its own, below
+## the rest: whole experiments, samples, snippets of the docs, faults of controllers, mutants; of the largest sets a part,
+## another at each commit (tests/support/rotation.py), and all with AFSPM_CASES=all. What is APART, or needs more (root,
+## compilers, an hour), has a target of its own, below
 # Fewer at a time than of the quick ones: each starts some ten processes, and more wait longer for each other than they gain
 SLOW_AT_A_TIME ?= 5
 test-all: test-slow test-power-cut
 
 test-slow: $(COLLECTED)
-	@$(PYTEST) -n $(SLOW_AT_A_TIME) --dist worksteal -m slow $(addprefix --ignore ,$(APART) tests/system/hosts $(POWER_CUT))
+	@$(PYTEST) -n $(SLOW_AT_A_TIME) --dist worksteal -m slow --in-turn $(addprefix --ignore ,$(APART) tests/system/hosts $(POWER_CUT))
 
 # A power cut is tried alone: the scheduler publishes what a disk has not taken within 0.2 s, which may be lost
 test-power-cut: $(COLLECTED)

@@ -18,7 +18,7 @@ import zmq
 from deadlines import DEADLINE_S
 from hypothesis import HealthCheck, settings
 
-pytest_plugins = ["must_run", "time_per_test"]
+pytest_plugins = ["must_run", "rotation", "time_per_test"]
 
 # how long one example takes says more about how busy the computer is than about us
 any_pace: dict[str, Any] = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}

@@ -73,7 +73,7 @@ def run(folder: Path, command: str, *files: Path) -> tuple[subprocess.CompletedP
 VENDORS = tuple(f"{name}{way}" for name in MAKERS for way in ("", *(f"-{one}" for one in MAKERS[name].transports)))
 
 
-@pytest.fixture(scope="module", params=rotated(VENDORS, 3))
+@pytest.fixture(scope="module", params=rotated(VENDORS, len(VENDORS)))
 def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path, Path]:
     """The vendor, a trace, and the file of an experiment that plays it back."""
     vendor, _, transport = str(request.param).partition("-")

@@ -46,7 +46,7 @@ def test_check_refuses_what_the_record_calls_impossible(tmp_path: Path, job: str
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("job", "instrument"), rotated(CELLS, len(CELLS) // 12) if not WRITTEN else CELLS)
+@pytest.mark.parametrize(("job", "instrument"), rotated(CELLS, len(CELLS) // 6) if not WRITTEN else CELLS)
 def test_job_is_done(afspm_run: Run, tmp_path: Path, job: str, instrument: str) -> None:
     pytest.importorskip("matplotlib")
     of_cell = files(tmp_path / "jobs", job, instrument)
