@@ -37,3 +37,11 @@ def test_packages_are_loaded_only_by_processes_that_use_them(module: str, unused
     script = f"import sys, {module}; print(*[one for one in {unused!r} if one in sys.modules])"
     ran = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
     assert ran.stdout.split() == []
+
+
+def test_help_is_shown_without_rich_and_pydantic() -> None:
+    command = [sys.executable, "-X", "importtime", "-m", "afspm", "--help"]
+    ran = subprocess.run(command, check=True, capture_output=True, text=True)
+    imported = {line.split("|")[-1].strip() for line in ran.stderr.splitlines()}
+    assert "typer" in imported
+    assert not imported & {"rich", "pydantic", *ARRAYS, "zmq"}

@@ -43,7 +43,7 @@ class DeclaredCommands(HelpWhenBare):
 app = typer.Typer(
     name="afspm",
     cls=DeclaredCommands,
-    rich_markup_mode="markdown",  # paragraphs are wrapped, and [security] stays text
+    rich_markup_mode=None,  # Rich takes as long to import as all else that the help needs
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -103,7 +103,7 @@ def _declared(name: str) -> Command | None:
     if found is None:
         return None
     if not isinstance(found, typer.Typer):
-        function, found = found, typer.Typer(rich_markup_mode="markdown")
+        function, found = found, typer.Typer(rich_markup_mode=None)
         found.command()(function)
     command = typer.main.get_command(found)
     command.name = name

@@ -30,10 +30,26 @@ NoProgress = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progres
 
 
 class HelpWhenBare(TyperGroup):
-    """Command group that shows its help if nothing is asked of it, and ends with 0 as with --help."""
+    """Command group that shows its help if nothing is asked of it, and ends with 0 as with --help.
+
+    The help lists the commands by their panels, each with its whole first paragraph.
+    """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         return super().parse_args(ctx, args or [ctx.help_option_names[0]])
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        found = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        shown = [(name, command) for name, command in found if command is not None and not command.hidden]
+        width = max(len(name) for name, _ in shown)
+        panels: dict[str, list[tuple[str, str]]] = {}
+        for name, command in shown:
+            panel = getattr(command, "rich_help_panel", None)  # typer's DefaultPlaceholder if none was given
+            rows = panels.setdefault(panel if isinstance(panel, str) else "Commands", [])
+            rows.append((f"{name:{width}}", (command.help or "").partition("\n\n")[0]))
+        for panel, rows in panels.items():
+            with formatter.section(panel):
+                formatter.write_dl(rows)
 
 
 def opt(help_text: str, *flags: str, **more: Any) -> object:

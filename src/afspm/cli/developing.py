@@ -268,7 +268,7 @@ Name = Annotated[str, typer.Argument(metavar="NAME", help="Of it and of its fold
 Into = Annotated[Path, typer.Option("--into", metavar="DIR", help="Where to make its folder.")]
 
 new_app = typer.Typer(
-    cls=HelpWhenBare, rich_markup_mode="markdown", help="Make an experiment, component or driver to begin with."
+    cls=HelpWhenBare, rich_markup_mode=None, help="Make an experiment, component or driver to begin with."
 )
 
 

@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from typer.core import TyperGroup
 
-from afspm.cli.arguments import RUNS, OptionalFiles, RecordedRun, Runs, opt
+from afspm.cli.arguments import RUNS, HelpWhenBare, OptionalFiles, RecordedRun, Runs, opt
 
 _WATCH = "watch"
 
 
-class ShadowCommands(TyperGroup):
+class ShadowCommands(HelpWhenBare):
     """The commands of `afspm shadow`; without the name of one it is `watch`."""
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
@@ -23,8 +22,7 @@ class ShadowCommands(TyperGroup):
 
 app = typer.Typer(
     cls=ShadowCommands,
-    no_args_is_help=True,
-    rich_markup_mode="markdown",
+    rich_markup_mode=None,
     help="Watch a person's work at the microscope, and write down what afspm would have done.",
 )
 

@@ -95,7 +95,7 @@ def test_shell_completes_commands_of_all_packages_and_their_options(
     assert some <= {*runner.invoke(app, [], prog_name="afspm", env=asked).stdout.split()}
 
 
-@pytest.mark.parametrize("group", [(), ("new",), ("drift",), ("bench",)])
+@pytest.mark.parametrize("group", [(), ("new",), ("shadow",), ("drift",), ("bench",)])
 def test_bare_group_of_commands_shows_its_help_and_ends_with_0(group: tuple[str, ...], runner: CliRunner) -> None:
     bare, helped = runner.invoke(app, [*group]), runner.invoke(app, [*group, "--help"])
     assert (bare.exit_code, bare.stdout) == (0, helped.stdout)
@@ -103,7 +103,7 @@ def test_bare_group_of_commands_shows_its_help_and_ends_with_0(group: tuple[str,
 
 
 def test_help_keeps_names_in_brackets_and_fills_its_paragraphs(runner: CliRunner) -> None:
-    helped = " ".join(runner.invoke(app, ["keys", "--help"]).output.replace("│", " ").split())
+    helped = " ".join(runner.invoke(app, ["keys", "--help"]).output.split())
     assert "Default: [security] keys of the file" in helped
     lines = runner.invoke(app, ["run", "--help"]).output.splitlines()
     paragraph = [line for line in lines if "Ctrl-C ends the" in line]
@@ -111,11 +111,12 @@ def test_help_keeps_names_in_brackets_and_fills_its_paragraphs(runner: CliRunner
     assert len(paragraph[0].rstrip()) > 70
 
 
-def test_each_command_is_listed_in_its_panel(runner: CliRunner) -> None:
+def test_each_command_is_listed_in_its_panel_with_its_whole_first_paragraph(runner: CliRunner) -> None:
     helped = runner.invoke(app, ["--help"]).output
     order = ["run ", "Before", "check", "While it runs", "watch", "Afterwards", "report", "Microscopes", "emulate"]
-    places = [helped.index(f"─ {title}" if title[0].isupper() else f"│ {title}") for title in order]
+    places = [helped.index(f"\n{title}:\n" if title[0].isupper() else f"\n  {title}") for title in order]
     assert places == sorted(places)
+    assert "Does not disturb the experiment." in " ".join(helped.split())
 
 
 def test_version_is_printed(runner: CliRunner) -> None:

@@ -12,7 +12,7 @@ from afspm.processes import HelpWhenBare
 
 app = typer.Typer(
     cls=HelpWhenBare,
-    rich_markup_mode="markdown",
+    rich_markup_mode=None,
     help="AFMBench-Sim: try agents and algorithms on simulated tasks with known truth.",
 )
 Output = Annotated[

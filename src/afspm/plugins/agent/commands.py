@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 NAME_VARIABLE = "AFSPM_AGENT"
 """Environment variable with name and token of an agent: NAME:TOKEN."""
 
-approve_app = typer.Typer(rich_markup_mode="markdown", rich_help_panel=MEANWHILE)
-agent_app = typer.Typer(rich_markup_mode="markdown", rich_help_panel=MEANWHILE)
+approve_app = typer.Typer(rich_markup_mode=None, rich_help_panel=MEANWHILE)
+agent_app = typer.Typer(rich_markup_mode=None, rich_help_panel=MEANWHILE)
 
 
 @approve_app.command()

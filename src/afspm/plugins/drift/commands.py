@@ -24,7 +24,7 @@ class FilesUnlessNamed(HelpWhenBare):
 
 app = typer.Typer(
     cls=FilesUnlessNamed,
-    rich_markup_mode="markdown",
+    rich_markup_mode=None,
     rich_help_panel=AFTERWARDS,
     help="Follow drift in recorded scans (afspm drift FILE…; its options: afspm drift files --help), or study settings "
     "in simulated nights (afspm drift study).",

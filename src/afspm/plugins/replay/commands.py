@@ -10,7 +10,7 @@ import typer
 from afspm.basics import counted
 from afspm.processes import AFTERWARDS, RUNS, RecordedRun, names_in, opt
 
-app = typer.Typer(rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
+app = typer.Typer(rich_markup_mode=None, rich_help_panel=AFTERWARDS)
 
 
 @app.command()

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 NAME_OF_CLASS = "Dashboard"
 
-app = typer.Typer(rich_markup_mode="markdown", rich_help_panel=MEANWHILE)
+app = typer.Typer(rich_markup_mode=None, rich_help_panel=MEANWHILE)
 
 
 @app.command()

@@ -25,7 +25,7 @@ INCOMPLETE = 1
 _MOST_SHOWN = 10
 GivenChanges: TypeAlias = dict[str, dict[str, object]] | Path | None
 """The changed experiment file, or new settings by component."""
-app = typer.Typer(rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
+app = typer.Typer(rich_markup_mode=None, rich_help_panel=AFTERWARDS)
 
 
 @app.command()

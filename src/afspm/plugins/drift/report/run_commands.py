@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from afspm.model import Region
     from afspm.plugins.drift.frame.remount import Remount
 
-compare_app = typer.Typer(rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
-find_app = typer.Typer(rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
+compare_app = typer.Typer(rich_markup_mode=None, rich_help_panel=AFTERWARDS)
+find_app = typer.Typer(rich_markup_mode=None, rich_help_panel=AFTERWARDS)
 
 
 @compare_app.command()
