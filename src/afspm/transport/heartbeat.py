@@ -5,6 +5,7 @@ from __future__ import annotations
 import hmac
 import math
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -61,7 +62,7 @@ class HeartbeatSender:
         network: Network | None = None,
     ) -> None:
         self._network = network or Network()
-        self._period_ms = max(1, round(period_s * 1000.0))
+        self._period_s = period_s
         self._step_age_s = step_age_s
         self._longest_step_s = longest_step_s
         self._token = token.encode()
@@ -78,7 +79,8 @@ class HeartbeatSender:
         poller.register(self._socket, zmq.POLLIN)
         poller.register(self._stop.fileno(), zmq.POLLIN)
         while True:
-            ready = dict(poller.poll(self._period_ms))
+            # at multiples of the period: the processes of a computer beat together, and wake up their supervisor once
+            ready = dict(poller.poll(milliseconds(self._period_s - time.monotonic() % self._period_s)))
             while receive_frames(self._socket):
                 self.heard.set()
             if self._stop.fileno() in ready:
