@@ -16,6 +16,7 @@ LOOK_UP = ("importlib.metadata", "email", "zipfile")
     ("module", "unused"),
     [
         ("afspm.scheduler", (*ARRAYS, *LOOK_UP)),
+        ("afspm.scheduler.scheduler", (*ARRAYS, *LOOK_UP, "zmq", "afspm.scheduler.events", "afspm.storage")),
         ("afspm.supervisor.run", ARRAYS),
         ("afspm.supervisor.reporter", ARRAYS),
         ("afspm.supervisor.host", (*ARRAYS, *LOOK_UP, "zmq", "google.protobuf", "afspm.model", "logging")),
@@ -27,7 +28,7 @@ LOOK_UP = ("importlib.metadata", "email", "zipfile")
         ("afspm.components.notifier", (*ARRAYS, *LOOK_UP)),
         ("afspm.cli.app", (*ARRAYS, "zmq", "google.protobuf")),
         ("afspm.cli.status", (*ARRAYS, "zmq", "google.protobuf")),
-        ("afspm.cli.follower", ARRAYS),
+        ("afspm.cli.follower", (*ARRAYS, "afspm.client.scope")),
         ("afspm.simulation.simulator", ("scipy", "h5py", "importlib.metadata")),
         ("afspm.components.recording", ("scipy", "h5py", "importlib.metadata")),
         ("afspm.components.tip_corrector", ("scipy", "h5py", "importlib.metadata")),

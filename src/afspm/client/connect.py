@@ -8,13 +8,13 @@ import logging
 import weakref
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError, FileError, NoResponse
 from afspm.basics.launch import Launch, Sockets
 from afspm.basics.plain_data import Plain, from_json
 from afspm.client.experiment_link import ExperimentLink
-from afspm.client.scope import Scope
 from afspm.model import Frame, ProblemNames
 from afspm.model.events import is_process_name
 from afspm.record.run_json import RUN_FILE, STATE_DIR, latest_run, read_run_json, run_json_or_empty
@@ -22,6 +22,9 @@ from afspm.record.run_lock import cut_off_message, is_locked
 from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import open_port
 from afspm.wire.message_types import register_all
+
+if TYPE_CHECKING:
+    from afspm.client.scope import Scope
 
 GUEST = "guest"
 GUEST_KEYS = "guest.keys"
@@ -63,6 +66,8 @@ def join(folder: Path, name: str, messages: Sequence[str] = ()) -> Scope:
 
     The name may also be "terminal:ada", for a person, who takes no keyed measurements.
     """
+    from afspm.client.scope import Scope  # imported late: who only follows a run needs none
+
     launch = guest_of(folder, name)
     log = _log_of(name)
     register_all(messages)

@@ -7,30 +7,23 @@ import threading
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from afspm import wire
 from afspm.basics import named_imports
 from afspm.basics.errors import ConfigError, FileError, InvalidValue
 from afspm.basics.exit_codes import ExitCode
-from afspm.model.fencing import Epoch
 from afspm.model.snapshot import from_plain
-from afspm.scheduler.coordinate_frame import TIP_FRAME, CoordinateFrame
 from afspm.scheduler.instruments.conditions import InstrumentSettings
 from afspm.scheduler.publishing.envelopes import CacheSettings, EnvelopeMapping, Envelopes
 from afspm.scheduler.safety.limits import ExperimentLimits
-from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.scheduler.settings import ControlSettings, RunFacts, SchedulerSettings
-from afspm.scheduler.shell import FrameWorker, SchedulerShell
-from afspm.scheduler.step_log import RecordedCore, StepLog
-from afspm.scheduler.wire_codec import WireCodec
-from afspm.scheduler.write_ahead import StateFile, WriteAhead
-from afspm.storage.packet_log import PacketLog, cached_packets, log_folder
-from afspm.transport.polling import milliseconds
-from afspm.transport.probe import versions_here
-from afspm.transport.process.context import ProcessContext
-from afspm.transport.rate_limited_log import RateLimitedLog
-from afspm.transport.scheduler_sockets import SchedulerSockets
+
+if TYPE_CHECKING:
+    from afspm.scheduler.coordinate_frame import CoordinateFrame
+    from afspm.scheduler.scheduler_core import SchedulerCore
+    from afspm.scheduler.shell import FrameWorker
+    from afspm.scheduler.write_ahead import StateFile
+    from afspm.transport.process.context import ProcessContext
 
 T = TypeVar("T")
 
@@ -44,7 +37,7 @@ class Coordinates:
         worker: the worker for the frame's jobs; None: the frame has no jobs.
     """
 
-    frame: CoordinateFrame = TIP_FRAME
+    frame: CoordinateFrame
     worker: FrameWorker | None = None
 
 
@@ -81,6 +74,18 @@ class Scheduler:
         Raises:
             AfspmError: an address, a setting or the saved state can't be used.
         """
+        # imported late: to check an experiment file, only the settings are needed, and 60 modules less
+        from afspm import wire
+        from afspm.scheduler.scheduler_core import SchedulerCore
+        from afspm.scheduler.shell import SchedulerShell
+        from afspm.scheduler.step_log import RecordedCore, StepLog
+        from afspm.scheduler.wire_codec import WireCodec
+        from afspm.scheduler.write_ahead import StateFile, WriteAhead
+        from afspm.storage.packet_log import PacketLog, log_folder
+        from afspm.transport.polling import milliseconds
+        from afspm.transport.rate_limited_log import RateLimitedLog
+        from afspm.transport.scheduler_sockets import SchedulerSockets
+
         launch, clock, log = context.launch, context.clock, context.log
         folder = Path(launch.state_dir) if launch.state_dir else None
         state = StateFile(folder and folder / f"{launch.name}.json", log)
@@ -119,6 +124,8 @@ class Scheduler:
         Raises:
             ConfigError: [control] end_on names an unknown problem, or the mapping of [cache] can't be loaded.
         """
+        from afspm.transport.probe import versions_here
+
         launch, control, cache = context.launch, self._control, self._cache
         try:
             rules = control.rules(context.problems)
@@ -140,15 +147,21 @@ class Scheduler:
         Args:
             in_process: whether the worker works in this process and at once, as a test needs it.
         """
-        return Coordinates()
+        from afspm.scheduler.coordinate_frame import TIP_FRAME
+
+        return Coordinates(TIP_FRAME)
 
 
 def _epoch(context: ProcessContext) -> bytes:
+    from afspm.model.fencing import Epoch
+
     launch = context.launch
     return Epoch(launch.run, context.clock.now_ns(), launch.simulated).encode() if launch.run else b""
 
 
 def _restore(core: SchedulerCore, state: StateFile, log: Path | None) -> None:
+    from afspm.storage.packet_log import cached_packets
+
     try:
         if (saved := state.load()) is not None:
             core.restore(saved)
