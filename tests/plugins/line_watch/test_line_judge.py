@@ -113,6 +113,40 @@ def test_hum_is_no_change(period_px: float) -> None:
     assert stopped(taught(), humming) is None
 
 
+def taught_without_retrace() -> LineJudge:
+    judge = LineJudge()
+    for number, picture in enumerate(night()[:LEARNT]):
+        judge.learn(heights(picture)[:1], HOME, KIND, number * PERIOD_S)
+    return judge
+
+
+def alarms_without_retrace(judge: LineJudge, picture: Picture, at_s: float, hum: float) -> tuple[list[Alarm], float]:
+    """Return the alarms of a trace with a hum that is in step in all rows, and the noise at its end."""
+    heights_m = heights(picture)[0]
+    usual_m = LineStatistic(judge._kinds[0].pairs).flat_m / np.sqrt(2.0)
+    heights_m += hum * usual_m * np.sin(2.0 * np.pi * np.arange(ROWS) * 11.0 / 128.0)
+    running = judge.begin(HOME, KIND, at_s, channels=1)
+    assert running is not None
+    found = [alarm for row in range(ROWS) if (alarm := running.add(row, [heights_m[row]])) is not None]
+    judge.learn([heights_m], HOME, KIND, at_s)
+    return found, running.noise
+
+
+def test_hum_in_step_in_all_rows_is_noise_without_retrace() -> None:
+    judge, good = taught_without_retrace(), night()[LEARNT]
+    alarms, noise = alarms_without_retrace(judge, good, LEARNT * PERIOD_S, hum=3.0)
+    assert not alarms
+    assert noise > 1.25
+    alarms, _ = alarms_without_retrace(judge, good, LEARNT * PERIOD_S + 1.0, hum=0.0)
+    assert not alarms, "the hum of the reference is no change of the tip, either"
+
+
+def test_changed_tip_stops_a_humming_scan_without_retrace() -> None:
+    alarms, _ = alarms_without_retrace(taught_without_retrace(), night()[-1], LEARNT * PERIOD_S, hum=3.0)
+    assert alarms[-1].level is AlarmLevel.STOP
+    assert CHANGED_ROW <= alarms[0].row <= alarms[-1].row <= CHANGED_ROW + 20
+
+
 def adorned(picture: Heights, at: tuple[int, int]) -> Heights:
     """Return a scan with a round adsorbate."""
     y, x = np.mgrid[0:ROWS, 0:ROWS]

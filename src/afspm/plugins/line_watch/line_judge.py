@@ -14,6 +14,10 @@ threshold `LOOK`, once enough lines since the change are known. Before an alarm,
 whether the sample has jumped: then the template explains the lines again. A scan is stopped only for a change of the
 whole line, or for one that lasts, as a tip makes it: an adsorbate, or a particle that was dragged, changes one or two
 narrow parts of some lines.
+
+Without retrace, the waves of a hum may be in step in successive lines, as an image is. But a hum has one frequency, and
+a changed tip many. So before an alarm, a narrow peak in the spectrum of the differing lines is removed from these and
+later lines, and counts as noise; a changed tip differs without it, too.
 """
 
 from __future__ import annotations
@@ -69,6 +73,12 @@ ELSEWHERE = 0.4  # share of the threshold that the rest of the lines must reach 
 LASTING = 3 / 8
 """Share of the rows for which a sum grows before the change counts as the tip's, and not as a single adsorbate's.
 Without this rule a double tip among few particles in 64 rows never stopped a scan."""
+HUM_PEAK = 6.0
+"""Power of a hum relative to the frequencies beside it. Of 80 scans with hum, 20 raised an alarm, 19 of these with
+such a peak; so did 7 of 45 changed tips, and were stopped in the same rows without it."""
+BESIDE_HUM = (2.5, 5.5)  # periods per line from the peak: a Hann window widens it by two
+FINER = 8  # steps of frequency in a period per line: two steps off leave a twentieth of a hum's power
+MOST_HUMS = 3  # frequencies in one scan
 LEAST_SPREAD = 0.05  # of the image's part
 NEWER = 0.15  # weight of the newest line in the spectrum of the noise
 GOOD_DECAY = 5.0  # decay, with the evidence, of the share of good scans that reach it: assumed, not fitted
@@ -304,7 +314,8 @@ class NoiseFilter:
     recordings may agree by chance.
 
     Attributes:
-        square: mean square of the noise's part, over the newest lines, relative to `PairStatistics.flat_m` squared.
+        square: mean square of the noise's part, over the newest lines, relative to `PairStatistics.flat_m` squared,
+            without a removed hum.
     """
 
     def __init__(self, flat_m: float, per_slope: float) -> None:
@@ -315,7 +326,7 @@ class NoiseFilter:
 
     def add(self, fits: Sequence[RowFit]) -> Array:
         """Learn the noise of a line, and return its products; see `products`."""
-        first, second = self._relative(fits)
+        first, second = self.relative(fits)
         there = np.isfinite(first + second)
         noise = np.where(there, first - second, 0.0) / math.sqrt(2.0)
         power = np.abs(np.fft.rfft(noise)) ** 2 / max(1, int(there.sum()))
@@ -328,7 +339,7 @@ class NoiseFilter:
 
     def products(self, fits: Sequence[RowFit]) -> Array:
         """Return the products of both recordings' differences at each pixel, noisy frequencies reduced."""
-        first, second = self._relative(fits)
+        first, second = self.relative(fits)
         there = np.isfinite(first + second)
         if self._power is not None:
             reduced = 1.0 / np.sqrt(np.maximum(1.0, self._power))
@@ -337,7 +348,8 @@ class NoiseFilter:
             )
         return np.where(there, first * second, np.nan)
 
-    def _relative(self, fits: Sequence[RowFit]) -> tuple[Array, Array]:
+    def relative(self, fits: Sequence[RowFit]) -> tuple[Array, Array]:
+        """Return the differences of both recordings relative to their usual sizes, clipped."""
         first, second = (
             np.clip(fit.residual / np.hypot(self._flat_m, self._per_slope * fit.steepness), -CLIP_SIGMAS, CLIP_SIGMAS)
             for fit in fits
@@ -351,6 +363,7 @@ class _Comparer:
     registration: RowRegistration
     jumps: int = 0  # of the sample, in this scan
     before: RowFit | None = None  # the line before, without retrace
+    hums: tuple[float, ...] = ()  # frequencies per pixel, removed from lines without retrace
 
     def follow(self, row: int, line: Sequence[Array]) -> None:
         self.registration.follow(row, line[0])
@@ -359,6 +372,9 @@ class _Comparer:
         # two recordings of the image: trace and retrace, or a line and the one before; else none
         found = [self.registration.fit(row, values, of) for of, values in zip(self.place.templates, line, strict=True)]
         if len(line) == 1:
+            if self.hums and found[0] is not None:
+                # fitted again: a hum moves the shift of its line
+                found = [self.registration.fit(row, line[0] - _waves(found[0].residual, self.hums))]
             found.append(self.before)
             self.before = found[0]
         fits = [fit for fit in found if fit is not None]
@@ -382,6 +398,7 @@ class ScanJudge:
         self._sums: list[float] = []  # since the CUSUM last left zero
         self._home = comparer.registration.shift
         self._followed = 0
+        self._hum = 0.0  # mean square of the removed hums, relative to flat_m squared
         self._recent: list[tuple[int, list[Array]]] = []
 
     @property
@@ -398,7 +415,9 @@ class ScanJudge:
     def noise(self) -> float:
         """Standard deviation of the newest lines' noise, relative to good scans; 1 before there are enough lines."""
         enough = self._followed >= ACQUIRE + REMEMBERED
-        return math.sqrt(self._filter.square / self._statistic.noise) if enough else 1.0
+        # a changed tip may have a narrow peak, too, but raises an alarm without it
+        hum = self._hum if self.alarm is None else 0.0
+        return math.sqrt((self._filter.square + hum) / self._statistic.noise) if enough else 1.0
 
     def add(self, row: int, line: Sequence[Array]) -> Alarm | None:
         """Judge a line; return an alarm if its level is higher than before, else None.
@@ -422,8 +441,10 @@ class ScanJudge:
         self.fitted[row] = fits
         self._cusum.add(row, self._statistic.sigmas(products))
         self._sums = [*self._sums, self._cusum.value] if self._cusum.value else []
-        found = self._level()
-        if found is None or (self.alarm is not None and self.alarm.level in (found, AlarmLevel.STOP)):
+        found = self._higher_level()
+        while found is not None and self._hums():
+            found = self._higher_level()
+        if found is None:
             return None
         if self._has_jumped():
             self._cusum, self._sums = Cusum(), []
@@ -432,6 +453,10 @@ class ScanJudge:
         basis = f"{self.evidence:.1f} times the threshold from {self._statistic.pairs} good pairs of scans"
         self.alarm = Alarm(found, row, since, self.evidence, f"{self._what} since row {since} ({basis})")
         return self.alarm
+
+    def _higher_level(self) -> AlarmLevel | None:
+        found = self._level()
+        return None if self.alarm is not None and self.alarm.level in (found, AlarmLevel.STOP) else found
 
     def _level(self) -> AlarmLevel | None:
         suspects = sum(self._is_suspect(row) for row, _ in self._recent)
@@ -453,7 +478,8 @@ class ScanJudge:
     def _differ(self, lines: Sequence[tuple[int, Sequence[Array]]], where: NDArray[np.bool_]) -> bool:
         # fitted again: an adsorbate moves the shift of its line, which then differs everywhere (3 of 20 scans with a
         # new adatom were stopped)
-        again, cusum, highest = _Comparer(self._comparer.place, self._comparer.registration), Cusum(), 0.0
+        again = replace(self._comparer, before=None)
+        cusum, highest = Cusum(), 0.0
         for row, line in lines:
             if fits := again.fits(row, [np.where(where, values, np.nan) for values in line]):
                 cusum.add(row, self._sigmas(fits))
@@ -462,6 +488,32 @@ class ScanJudge:
 
     def _sigmas(self, fits: Sequence[RowFit]) -> float:
         return self._statistic.sigmas(self._filter.products(fits))
+
+    def _hums(self) -> bool:
+        # whether a hum was found and removed, and the sum taken again
+        comparer = self._comparer
+        if len(comparer.place.templates) > 1 or len(comparer.hums) == MOST_HUMS:
+            return False
+        suspects = [row for row, _ in self._recent if self._is_suspect(row) and self.fitted.get(row)]
+        if not suspects:
+            return False
+        peak, frequency = _narrowest(np.array([self._filter.relative(self.fitted[row])[0] for row in suspects]))
+        if peak < HUM_PEAK:
+            return False
+        waves = [_waves(self.fitted[row][0].residual, [frequency]) for row in suspects]
+        self._hum += float(np.mean(np.square(waves))) / self._statistic.flat_m**2
+        comparer.hums = (*comparer.hums, frequency)
+        comparer.before = None
+        for row, line in self._recent:
+            fits = comparer.fits(row, line)
+            if row in self.fitted:
+                self.fitted[row] = fits
+        self._cusum, self._sums = Cusum(), []
+        for row in suspects:
+            if self.fitted[row]:
+                self._cusum.add(row, self._sigmas(self.fitted[row]))
+                self._sums = [*self._sums, self._cusum.value] if self._cusum.value else []
+        return True
 
     def _has_jumped(self) -> bool:
         if self._comparer.jumps >= MOST_JUMPS:
@@ -480,7 +532,8 @@ class ScanJudge:
             likely = likely_shifts(template, traces, about, JUMP_REACH, statistic.flat_m)
             # an earlier jump may have been none, and an earlier scan may itself have jumped back on its way
             for shift in (*likely, self._home):
-                again = _Comparer(self._comparer.place, RowRegistration(template, shift, NEAR, steady=1.0))
+                registration = RowRegistration(template, shift, NEAR, steady=1.0)
+                again = replace(self._comparer, registration=registration, before=None)
                 for row, line in lines:
                     again.follow(row, line)
                 sigmas = {row: self._sigmas(fits) for row, line in newest if (fits := again.fits(row, line))}
@@ -513,6 +566,25 @@ def _elsewhere(total: Array, parts: int, width: float) -> NDArray[np.bool_]:
         first = int(inside.argmax())
         elsewhere[first : first + wide] = False
     return elsewhere
+
+
+def _narrowest(lines: Array) -> tuple[float, float]:
+    # the highest peak in the spectrum, relative to the higher of both sides, and its frequency per pixel
+    count = lines.shape[1]
+    power = np.mean(np.abs(np.fft.rfft(np.nan_to_num(lines) * np.hanning(count), n=FINER * count)) ** 2, axis=0)
+    near, far = (round(FINER * periods) for periods in BESIDE_HUM)
+    sums = np.append(0.0, np.cumsum(np.pad(power, far, mode="reflect")))
+    means = (sums[far - near + 1 :] - sums[: -(far - near + 1)]) / (far - near + 1)
+    beside = np.maximum(means[: power.size], means[far + near :][: power.size])
+    at = int(np.argmax(power / beside))
+    return float(power[at] / beside[at]), at / (FINER * count)
+
+
+def _waves(residual: Array, hums: Sequence[float]) -> Array:
+    # the least squares' waves of these frequencies in a residual
+    turns = math.tau * np.outer(np.arange(residual.size), hums)
+    basis, there = np.concatenate([np.cos(turns), np.sin(turns)], axis=1), np.isfinite(residual)
+    return np.asarray(basis @ np.linalg.lstsq(basis[there], residual[there], rcond=None)[0])
 
 
 def _median(values: Collection[float]) -> float:
