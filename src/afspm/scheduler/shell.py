@@ -325,9 +325,11 @@ class SchedulerShell:
         return self._replay
 
     def _deadlines(self, now_s: float) -> None:
-        if self._core_due_s() <= now_s:
+        due_s = self._core_due_s()
+        if due_s <= now_s:
             self._step_with(events.Tick())
-        self._next_deadline_s = self._core_due_s()
+            due_s = self._core_due_s()
+        self._next_deadline_s = due_s
 
     def _core_due_s(self) -> float:
         due_s = self._core.deadline_s()
