@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 from afspm.basics import units
@@ -107,22 +108,22 @@ class Commands:
         values = wanted_values(request, self._driver)
         return self._success(request) if values is None else self._set(request, values)
 
-    def _success(self, request: Request) -> CommandOutcome:
+    def _success(self, request: Request, read_back: Mapping[str, Value] = MappingProxyType({})) -> CommandOutcome:
         # a parameter is returned in the unit that the peer used
         asked, payload = request.subject, b""
         if isinstance(asked, Parameter):
             spec = self._driver.table.find(asked.name)
-            text, unit = spec.for_peer(self._driver.in_force([spec.name])[spec.name], asked.unit)
+            in_force = read_back or self._driver.in_force([spec.name])
+            text, unit = spec.for_peer(in_force[spec.name], asked.unit)
             payload = encode(Parameter(spec.name, text, unit or None))[1]
         return CommandOutcome(Response(ControlResponse.SUCCESS, payload, id=request.id))
 
     def _set(self, request: Request, values: Mapping[str, Value]) -> CommandOutcome:
         driver = self._driver
         self._refuse_if_busy(all(name in driver.adjustable or driver.table[name].while_busy for name in values))
-        if values:
-            apply(self._driver, values, lambda: self._about_to_act(request))
+        read_back = apply(driver, values, lambda: self._about_to_act(request)) if values else {}
         steps = self._sequence.begin(ScopeState.MOVING) if MOVES & values.keys() else []
-        done = self._success(request)
+        done = self._success(request, read_back)
         done.steps = steps
         if request.kind == ControlRequest.PARAM:
             messages = (message for message in _ANNOUNCED.values() if set(of_message(message)) & values.keys())

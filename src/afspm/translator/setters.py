@@ -54,8 +54,10 @@ def wanted_values(request: Request, driver: DriverBase) -> dict[str, Value] | No
     return values if asked else None
 
 
-def apply(driver: DriverBase, values: Mapping[str, Value], about_to_act: Callable[[], None] = lambda: None) -> None:
-    """Set the values; after any error except a lost controller the former values are restored.
+def apply(
+    driver: DriverBase, values: Mapping[str, Value], about_to_act: Callable[[], None] = lambda: None
+) -> dict[str, Value]:
+    """Set values and return them as read back; after an error, unless the controller is lost, restore the former ones.
 
     Args:
         about_to_act: called after all checks, right before the first change.
@@ -90,6 +92,7 @@ def apply(driver: DriverBase, values: Mapping[str, Value], about_to_act: Callabl
             driver.put_in_force(former)
             made, asked = (table[name].quantity(one) for one in (after[name], wanted[name]))
             raise refuse_value(name, f"the controller set {made} instead of {asked}; the former values were restored")
+    return after
 
 
 def _values_in(subject: object) -> dict[str, Parameter | Value]:

@@ -56,8 +56,8 @@ class SettingsGroup(ABC):
         """
 
     def merged(self, values: Mapping[str, Value]) -> Plain:
-        """Return all values of the group, with `values` changed."""
-        return {**self.read(), **values}
+        """Return all values of the group, with `values` changed; the others are read from the controller."""
+        return dict(values) if values.keys() >= set(self.names) else {**self.read(), **values}
 
 
 class KeptSettings(SettingsGroup):

@@ -350,6 +350,22 @@ def test_measurement_costs_few_questions(bench: Make, action: str, start: str, m
     assert len(asked) <= most, asked
 
 
+def test_setting_is_read_before_and_after_it_once(bench: Make) -> None:
+    made = bench()
+    peer = made.start(poll_period_s=3600.0, trace=True)
+    ready(peer)
+    frame = ScanParameters(Region((1e-8, 2e-8), (4e-7, 3e-7)), (32, 64), "")
+    assert peer.ask(ControlRequest.SET_SCAN_PARAMS, frame).ok
+    assert peer.set(names.TIP_BIAS_VOLTAGE, "0.1").ok
+    asked = [one.what for one in read_trace(made.folder / FILE) if isinstance(one, TracedExchange)]
+    frame_set, bias_set = asked.index("Scan.FrameSet"), asked.index("Bias.Set")
+    before = asked[frame_set - 6 : frame_set]
+    assert before[:3] == ["Scan.BufferGet", "Scan.FrameGet", "Scan.SpeedGet"]
+    assert before[3:] == ["Scan.BufferGet", "Scan.BufferSet", "Scan.SpeedGet"], asked
+    assert asked[frame_set + 1 : frame_set + 3] == ["Scan.BufferGet", "Scan.FrameGet"]
+    assert asked[bias_set - 1 :] == ["Bias.Get", "Bias.Set", "Bias.Get"]
+
+
 def test_stopped_spectrum_is_not_published(bench: Make) -> None:
     made = bench(speed=2.0)
     peer = made.start()

@@ -227,7 +227,8 @@ class DriftRate(Group):
                     f"drift compensation has reached its limit of {limit_percent:g} % of the piezo's range and stopped "
                     "along this axis; switch it off and on at the controller to begin again",
                 )
-        x, y = (float(self.merged(values)[name]) for name in self.names)
+        merged = self.merged(values)
+        x, y = (float(merged[name]) for name in self.names)
         # while it is off, a velocity left from earlier is not in force, and must not come into force unasked
         up_m_s = up_m_s if on else 0.0
         follows = bool(x or y or up_m_s)
