@@ -151,6 +151,8 @@ class PlannedScans(Component):
         due_s = rhythm.next_due_s(self.memory.get("done_s"))
         before_s = float(self.memory.get("due_s", due_s))
         left_out = rhythm.left_out(max(before_s, self._began_s), due_s)
+        if self._total is not None:  # periods after the planned end had no scan
+            left_out = min(left_out, max(0, self._total - step.index) // len(self.plan.regions))
         too_slow = rhythm.too_slow_for(left_out, float(self.memory.get("pace_s", 0.0)))
         if too_slow and not self.memory.setdefault("is_slow", False):
             self.memory["is_slow"] = True

@@ -117,6 +117,14 @@ def test_setting_missed_decides_on_scans_missed_while_control_was_lost(
     assert [note.text for note in notes_of(lab)] == [told]
 
 
+@pytest.mark.parametrize(("missed", "taken"), [("extend", 3), ("skip", 2)])
+def test_no_more_scans_are_missed_than_are_left(missed: str, taken: int) -> None:
+    lab = Lab("series")
+    assert len(at_times(series(3, missed=missed), lab)) == taken
+    (note,) = notes_of(lab)
+    assert note.text.startswith("1 scan could not begin in time")
+
+
 def notes_of(lab: Lab) -> list[Note]:
     relayed = [request.subject for request in lab.requests if request.kind == RELAY_REQUEST]
     return [wire.decode(one.message, one.payload) for one in relayed if one.message == "Note"]
