@@ -19,6 +19,7 @@ from afspm.model import (
     ControlRequest,
     MeasurementConditions,
     PanelAct,
+    Parameter,
     Request,
     ScopeState,
     ScopeStatus,
@@ -221,7 +222,10 @@ class Observer:
     def asked(self, request: Request) -> None:
         """Note that a request of the run is about to change something."""
         action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
-        self.panel.asked(action, sets_feedback=feedback_of(request) is not None)
+        sets: Sequence[str] | None = setting_groups.FRAME if request.kind == ControlRequest.SET_SCAN_PARAMS else None
+        if isinstance(request.subject, Parameter):
+            sets = (request.subject.name,)
+        self.panel.asked(action, sets=sets, sets_feedback=feedback_of(request) is not None)
         self._others_told = False
 
     def look_before_start(self) -> None:

@@ -66,6 +66,7 @@ class PanelWatch:
         self._still: ScopeState | None = None
         self._tip_is_moved = False
         self._before_spectrum: dict[str, Value] = {}
+        self._by_hand: dict[str, Value] = {}
         self.is_certain = False
         self.tip = TipStatus(by_hand=kept.get("tip_by_hand", ""))
 
@@ -74,12 +75,13 @@ class PanelWatch:
         """Whether the tip was at the sample at any reading of this run."""
         return bool(self._kept.get("was_engaged"))
 
-    def asked(self, action: str = "", *, sets_feedback: bool = False) -> None:
+    def asked(self, action: str = "", *, sets: Collection[str] | None = None, sets_feedback: bool = False) -> None:
         """Note that the run changes something: what the next reading shows may be its doing.
 
         Args:
             action: the action that it asks for, if it asks for one. Its effect on the tip may show later, but not after
                 a measurement has begun.
+            sets: the settings that it sets; None: not known.
             sets_feedback: whether it switches the z feedback.
         """
         # the tip is looked at right before each start
@@ -88,6 +90,9 @@ class PanelWatch:
             self._tip_is_moved = False
         elif action and action not in STARTS.values():
             self._tip_is_moved = True
+        if action not in STARTS:  # a start sets nothing
+            kept = {} if sets is None else self._by_hand
+            self._by_hand = {name: value for name, value in kept.items() if name not in (sets or ())}
         if action != names.START_SPEC:
             stays = FEEDBACK_ON in self._before_spectrum and not (self._tip_is_moved or sets_feedback)
             self._before_spectrum = {FEEDBACK_ON: self._before_spectrum[FEEDBACK_ON]} if stays else {}
@@ -95,7 +100,7 @@ class PanelWatch:
     def lost(self) -> None:
         """Note a restart or a lost controller: until the microscope is free, nothing is certain."""
         self._last, self._still, self.is_certain = None, None, False
-        self._before_spectrum = {}
+        self._before_spectrum, self._by_hand = {}, {}
 
     def read(
         self, before: Mapping[str, Value], now: Mapping[str, Value], state: ScopeState, now_ns: int, withdrew: str = ""
@@ -122,7 +127,8 @@ class PanelWatch:
         # a running scan moves the tip, and a spectrum may
         watched = _SETTINGS if state is ScopeState.SCANNING or is_after_spectrum else _SETTINGS | set(POSITION)
         if last in _CALM and state in _CALM and (changes := self._changes(before, now, watched)):
-            acts.append(ActByHand(now_ns, PanelAct.VALUES, changes=changes))
+            acts.append(ActByHand(now_ns, PanelAct.VALUES, changes=tuple(changes.values())))
+            self._by_hand |= {name: now[name] for name in changes if name in _SETTINGS}
         self._see_tip(now)
         return acts
 
@@ -151,12 +157,16 @@ class PanelWatch:
 
     def _changes(
         self, before: Mapping[str, Value], now: Mapping[str, Value], watched: Collection[str]
-    ) -> tuple[ChangedValue, ...]:
-        return tuple(
-            self._change(name, before[name], value)
+    ) -> dict[str, ChangedValue]:
+        return {
+            name: self._change(name, before[name], value)
             for name, value in now.items()
-            if name in watched and name in before and before[name] != value and not self._written(name, value)
-        )
+            if name in watched and name in before and before[name] != value and not self._is_by_run(name, before, value)
+        }
+
+    def _is_by_run(self, name: str, before: Mapping[str, Value], now: Value) -> bool:
+        # the effect of a request may show late, but not after a person has changed the same setting
+        return self._written(name, now) and self._by_hand.get(name) != before[name]
 
     def _change(self, name: str, before: Value, after: Value) -> ChangedValue:
         (old, unit), (new, _) = (self._table[name].for_peer(value) for value in (before, after))

@@ -68,6 +68,23 @@ def test_a_value_set_by_the_run_is_no_act_by_hand(bench: Any) -> None:
     assert acts(bench) == []
 
 
+def test_a_value_set_back_to_that_of_the_run_is_an_act_by_hand_too(bench: Any) -> None:
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(setpoint=2e-9)).code == OK
+    bench.look()
+    bench.microscope.values["Setpoint"] = 5.0
+    bench.look()
+    bench.look()
+    # another request in between sets something else
+    assert bench.ask(PARAM, Parameter("tip-bias-voltage", "0.3", "V")).code == OK
+    bench.look()
+    bench.look()
+    bench.microscope.values["Setpoint"] = 2.0
+    bench.look()
+    bench.heard()
+    changes = [change for one in bench.beside if isinstance(one, ActByHand) for change in one.changes]
+    assert [(float(one.before), float(one.after)) for one in changes] == [(2e-9, 5e-9), (5e-9, 2e-9)]
+
+
 def test_what_changed_while_the_controller_was_lost_is_no_act_by_hand(bench: Any) -> None:
     bench.microscope.lost = True
     bench.look()
