@@ -14,6 +14,7 @@ from afspm.model import (
     ControlMode,
     ControlRequest,
     ControlResponse,
+    Feedback,
     PanelAct,
     Parameter,
     ProcessCondition,
@@ -104,6 +105,25 @@ def test_value_outside_the_limits_is_manual_until_it_is_set_back() -> None:
     hand(lab, PanelAct.VALUES, bias(2.0))
     assert lab.mode("person", AUTOMATED) is OK
     assert lab.take_control("experiment") is OK
+
+
+def test_value_changed_at_the_panel_in_manual_is_in_the_list_of_what_stays() -> None:
+    lab = scanning()
+    lab.publish("ZCtrlParameters", Feedback(setpoint=1e-10))
+    lab.mode("person", MANUAL)
+
+    def left() -> list[str]:
+        lab.effects.clear()
+        lab.mode("person", AUTOMATED)
+        return [one.text for one in lab.effects if isinstance(one, Log) and "still in force" in one.text]
+
+    hand(lab, PanelAct.VALUES, bias(1.5), ChangedValue(names.ZCTRL_SETPOINT, "1e-10", "4e-10", "A"))
+    lab.publish("ZCtrlParameters", Feedback(setpoint=4e-10))
+    assert left() == ["set by hand, and still in force: tip-bias-voltage = 1.5 V, zctrl-setpoint = 400 pA"]
+    lab.mode("person", MANUAL)
+    for before, after in (("1.5", "3"), ("3", "1.5")):
+        hand(lab, PanelAct.VALUES, ChangedValue(names.TIP_BIAS_VOLTAGE, before, after, "V"))
+    assert left() == []
 
 
 def test_run_continues_only_once_the_tip_is_back() -> None:

@@ -21,6 +21,7 @@ from afspm.model import (
     GRANT_REQUEST,
     LEASE_REQUEST,
     RESTART_REQUEST,
+    ChangedValue,
     ControlMode,
     ControlRequest,
     Feedback,
@@ -33,6 +34,7 @@ from afspm.model import (
     RegionChange,
     Request,
     ScanParameters,
+    names,
     request_name,
 )
 from afspm.model.scan import ShapeChange
@@ -45,7 +47,13 @@ from afspm.scheduler.control.arbitration import (
     Transition,
 )
 
-_FEEDBACK_WORDS = {"on": "feedback", "proportional_gain": "P gain", "integral_gain": "I gain", "setpoint": "setpoint"}
+# for each field of the feedback its word, and the parameter that has the same value with its unit
+_FEEDBACK_WORDS = {
+    "on": ("feedback", names.FEEDBACK_ON),
+    "proportional_gain": ("P gain", names.ZCTRL_PGAIN),
+    "integral_gain": ("I gain", names.ZCTRL_IGAIN),
+    "setpoint": ("setpoint", names.ZCTRL_SETPOINT),
+}
 
 
 def is_routine(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, holder_logged: str | None) -> bool:
@@ -94,15 +102,17 @@ def _ended_control(holder: str, cause: Cause) -> str:
 
 @dataclass(frozen=True)
 class HandSettings:
-    """Settings changed in MANUAL mode: parameters set by requests, and the z feedback, also when changed at the panel.
+    """Settings changed in MANUAL mode, by requests or at the panel.
 
     Attributes:
         parameters: value with its unit, by name.
+        at_panel: for each parameter changed only at the panel, its value when MANUAL began.
         before: the feedback in force when MANUAL began; None: not known.
         now: the feedback in force; None: not known.
     """
 
     parameters: Mapping[str, str] = field(default_factory=dict)
+    at_panel: Mapping[str, str] = field(default_factory=dict)
     before: Feedback | None = None
     now: Feedback | None = None
 
@@ -114,15 +124,26 @@ class HandSettings:
         value = f"{parameter.value} {parameter.unit or ''}".rstrip()
         return replace(self, parameters={**self.parameters, parameter.name: value})
 
+    def changed(self, change: ChangedValue) -> HandSettings:
+        """Add a setting changed at the panel in MANUAL mode; remove it if it has its first value again."""
+        name, at_panel = change.parameter, self.at_panel
+        if name not in self.parameters:
+            at_panel = {**at_panel, name: at_panel.get(name, change.before)}
+        parameters = {**self.parameters, name: _value(change.after, change.unit)}
+        if at_panel.get(name) == change.after:
+            del parameters[name]
+        return replace(self, parameters=parameters, at_panel=at_panel)
+
     def published(self, feedback: Feedback, *, is_manual: bool) -> HandSettings:
         return replace(self, now=feedback, before=self.before if is_manual and self.before else feedback)
 
     def handed_back(self) -> tuple[HandSettings, tuple[str, ...]]:
         """Return emptied settings, and the text of each setting that stays in force after MANUAL."""
         told = [f"{name} = {value}" for name, value in self.parameters.items()]
-        for name, word in _FEEDBACK_WORDS.items():
+        for name, (word, parameter) in _FEEDBACK_WORDS.items():
             value = getattr(self.now, name, None)
-            if value is not None and value != getattr(self.before, name, None):
+            is_changed = value is not None and value != getattr(self.before, name, None)
+            if is_changed and parameter not in self.parameters:
                 told.append(f"{word} = {value:g}" if name != "on" else f"{word} {'on' if value else 'off'}")
         return HandSettings(before=self.now, now=self.now), tuple(told)
 

@@ -101,7 +101,10 @@ def _update_state(draft: StateDraft, published: object) -> None:
 
 def _take_act(draft: StateDraft, act: ActByHand) -> None:
     draft.limits = draft.limits.seen(Parameter(one.parameter, one.after, one.unit or None) for one in act.changes)
+    is_manual = draft.control.mode is ControlMode.MANUAL
     for one in act.changes:
+        if is_manual:
+            draft.by_hand = draft.by_hand.changed(one)
         changed = Parameter(one.parameter, one.after, one.unit or None)
         draft.panel = draft.panel.with_change(one.parameter, draft.limits.outside(changed))
         draft.limits = draft.limits.in_force(changed, draft.now_ns)
