@@ -37,17 +37,18 @@ def person() -> str:
 
 
 @contextmanager
-def looking(where: Path, *, lines: bool = False, as_json: bool = False) -> Iterator[Follower]:
+def looking(where: Path, *, lines: bool = False, as_json: bool = False, acts: bool = False) -> Iterator[Follower]:
     """Open a follower of the run at `where`; if no run goes on there, end the command with `NOT_RUNNING`.
 
     Args:
         where: the folder of a run, a folder of runs (its newest) or an experiment file (its newest run).
         lines: whether to follow lines of unfinished scans, too.
         as_json: whether a program reads the output, also that no run goes on.
+        acts: whether the command acts on the run afterwards: then several runs in the folder are refused.
     """
     from afspm.cli.follower import Follower
 
-    folder = _running(where, as_json=as_json)
+    folder = _running(where, as_json=as_json, acts=acts)
     with Follower(folder, TERMINAL, lines=lines) as follower:
         with _only_if_running(folder, as_json=as_json):
             follower.catch_up()
@@ -61,7 +62,7 @@ def acting(where: Path) -> Iterator[Scope]:
     """Connect to the run at `where`, as for `looking`, in the user's name; end the command if no run goes on there."""
     from afspm.client.connect import join
 
-    folder = _running(where, as_json=False)
+    folder = _running(where, as_json=False, acts=True)
     with _only_if_running(folder, as_json=False):
         scope = join(folder, person())
     with scope:
@@ -116,18 +117,31 @@ def _end_without_run(why: str, *, as_json: bool, running: bool | None) -> NoRetu
     raise typer.Exit(NOT_RUNNING)
 
 
-def _running(where: Path, *, as_json: bool) -> Path:
+def _running(where: Path, *, as_json: bool, acts: bool) -> Path:
     from afspm.basics.errors import FileError
     from afspm.client.connect import find_run
-    from afspm.record.run_json import ENDED, read_run_json
+    from afspm.record.run_json import ENDED, RUN_FILE, read_run_json
+    from afspm.record.run_lock import is_locked
 
     try:
         folder = find_run(where)
     except FileError as error:
         say_nothing_runs(str(error), as_json=as_json)
+    # the newest run of a folder may not be the run that the user has in mind
+    others = [] if folder.resolve() == where.resolve() else sorted(where.glob(f"*/{RUN_FILE}"))
+    others = [run.parent for run in others if not run.parent.is_symlink() and is_locked(run.parent)]
+    others = [run for run in others if run.name != folder.resolve().name]
+    if not (folder / RUN_FILE).exists():
+        why = "it is about to start: repeat the command in a few seconds; or its files were removed"
+        say_nothing_runs(f"{folder.name} has no {RUN_FILE}: {why}", as_json=as_json)
     ended = read_run_json(folder).get(ENDED)
     if ended:
-        say_nothing_runs(f"{folder.resolve().name} has ended ({ended})", as_json=as_json)
+        more = f"; {others[-1]} goes on: name its folder" if others else ""
+        say_nothing_runs(f"{folder.resolve().name} has ended ({ended}){more}", as_json=as_json)
+    if others and acts:
+        names = " and ".join(run.name for run in [*others, folder])
+        hint = f"name the folder of the one that you mean, for example {others[0]}"
+        raise FileError(f"several experiments run here, {names}", where=str(where), hint=hint)
     return folder
 
 

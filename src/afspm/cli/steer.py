@@ -37,7 +37,7 @@ def go_on(
     """
     from afspm.model import ControlMode, TipStatus
 
-    with looking(where) as follower:
+    with looking(where, acts=True) as follower:
         seen = follower.overview
     if seen.by_hand:
         typer.echo(f"{seen.by_hand}; now {(seen.tip or TipStatus()).to_continue_with}")

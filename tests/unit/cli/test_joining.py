@@ -52,6 +52,36 @@ def test_message_on_a_run_that_was_cut_off_names_resume_and_on_a_running_one_the
     assert ("lacks the public key of terminal" in said) is (runs and keys != "null")
 
 
+def a_run(runs: Path, name: str, **facts: str) -> Path:
+    (runs / name / "state").mkdir(parents=True)
+    (runs / name / "run.json").write_text(json.dumps({"name": "night", **facts}), encoding="utf-8")
+    (runs / "latest.txt").write_text(name, encoding="utf-8")
+    return runs / name
+
+
+@pytest.mark.parametrize("command", ["pause", "continue", "end"])
+def test_command_that_acts_refuses_a_folder_with_several_running_experiments(command: str, tmp_path: Path) -> None:
+    with lock_run(a_run(tmp_path, "night-1")), lock_run(a_run(tmp_path, "night-2")):
+        result = CliRunner().invoke(app, [command, str(tmp_path)])
+    assert "several experiments run here, night-1 and night-2" in str(result.exception)
+    assert f"name the folder of the one that you mean, for example {tmp_path / 'night-1'}" in str(result.exception)
+
+
+def test_command_names_the_run_that_goes_on_beside_a_newest_run_that_has_ended(tmp_path: Path) -> None:
+    with lock_run(a_run(tmp_path, "night-1")):
+        a_run(tmp_path, "test-2", ended="all plans are done")
+        result = CliRunner().invoke(app, ["pause", str(tmp_path)])
+    assert result.exit_code == NOT_RUNNING
+    assert f"test-2 has ended (all plans are done); {tmp_path / 'night-1'} goes on: name its folder" in result.output
+
+
+def test_command_in_the_first_second_of_a_run_says_when_to_repeat_it(tmp_path: Path) -> None:
+    (a_run(tmp_path, "night-1") / "run.json").unlink()
+    result = CliRunner().invoke(app, ["pause", str(tmp_path)])
+    assert result.exit_code == NOT_RUNNING
+    assert "night-1 has no run.json: it is about to start: repeat the command in a few seconds" in result.output
+
+
 @pytest.mark.parametrize("command", ["status", "problems"])
 def test_program_learns_that_a_run_has_ended(command: str, tmp_path: Path) -> None:
     folder = tmp_path / "night-1"
