@@ -81,7 +81,7 @@ class RecordWriter:
         self._progress = LogProgress(log)
         self._inbox = RecordInbox()
         self._error: BaseException | None = None
-        self._told_full = self._told_behind = False
+        self._told_full = self._told_behind = self._told_removed = False
         self._look_s = LOOK_S
         self._heard_s = self._committed_s = clock.monotonic_s()
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
@@ -219,6 +219,14 @@ class RecordWriter:
                 self._wake()
             return True
 
+    def _tell_removed(self) -> None:
+        # the system keeps an open file that was removed, so no write fails until the process ends
+        journal = self._folder / JOURNAL_FILE
+        if not self._told_removed and not journal.exists():
+            self._told_removed = True
+            text = "%s was removed while the run goes on: its record is lost; end the run, and start a new one"
+            self._logger.critical(text, journal)
+
     def _put_off(self, error: Exception) -> bool:
         # the disk is full or gone: logged once, then tried again until it has room, or the run ends
         if not self._told_full:
@@ -251,6 +259,7 @@ class RecordWriter:
     def _commit(self, store: RecordStore) -> None:
         # the log may be overwritten up to here
         self._committed_s = self._clock.monotonic_s()
+        self._tell_removed()
         try:
             with self._step():
                 self._progress.commit(store.sync)

@@ -120,6 +120,18 @@ def test_log_and_packets_of_other_publishers_are_recorded_once_in_order(bench: B
     assert bench.is_committed
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows removes no open file")
+def test_record_that_is_removed_in_a_run_is_logged_once(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    writer = bench.writer()
+    bench.publish(control(1))
+    _until(lambda: bench.times() == [1])
+    (bench.folder / JOURNAL_FILE).unlink()
+    _until(lambda: f"{bench.folder / JOURNAL_FILE} was removed while the run goes on" in caplog.text)
+    bench.publish(control(2))
+    writer.finish(ended=False)
+    assert caplog.text.count("was removed") == 1
+
+
 def test_restarted_recorder_continues_at_the_committed_position(bench: Bench) -> None:
     bench.publish(*map(control, range(1, 6)))
     bench.writer().finish(ended=False)

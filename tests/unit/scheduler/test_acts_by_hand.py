@@ -107,7 +107,7 @@ def test_value_outside_the_limits_is_manual_until_it_is_set_back() -> None:
     assert lab.take_control("experiment") is OK
 
 
-def test_value_changed_at_the_panel_in_manual_is_in_the_list_of_what_stays() -> None:
+def test_value_changed_at_the_panel_in_manual_stays_and_is_logged() -> None:
     lab = scanning()
     lab.publish("ZCtrlParameters", Feedback(setpoint=1e-10))
     lab.mode("person", MANUAL)

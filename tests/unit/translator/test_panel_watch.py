@@ -68,7 +68,7 @@ def test_a_value_set_by_the_run_is_no_act_by_hand(bench: Any) -> None:
     assert acts(bench) == []
 
 
-def test_a_value_set_back_to_that_of_the_run_is_an_act_by_hand_too(bench: Any) -> None:
+def test_a_value_set_back_at_the_panel_is_an_act_by_hand_too(bench: Any) -> None:
     assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(setpoint=2e-9)).code == OK
     bench.look()
     bench.microscope.values["Setpoint"] = 5.0
