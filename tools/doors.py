@@ -1,8 +1,8 @@
 """Holds plug-ins to the doors of the core: `python tools/doors.py`, and writes their page for tools/docs.py.
 
-A door is a package whose `__init__` lists what others may use. A plug-in, or a distribution in packages/, imports
-doors, its own folder, and the modules of PAST_THE_DOORS, a list that may only get shorter. So do the tests of
-plug-ins, whose imports past the doors are counted.
+A door is a package whose `__init__` lists what others may use. A plug-in, a distribution in packages/, or a sample of a
+package imports doors, its own folder, and the modules of PAST_THE_DOORS, a list that may only get shorter. So do the
+tests of plug-ins, whose imports past the doors are counted.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CORE = ROOT / "src" / "afspm"
 PACKAGES = ROOT / "packages"
 TESTS = ROOT / "tests" / "plugins"
+SAMPLES = (ROOT / "tests" / "support" / "example_maker", ROOT / "tests" / "support" / "example_plugin")
 DOORS: Final = {
     "afspm": "components and scripts",
     "afspm.basics": "all: errors, units, quantities as text, clocks, plain data",
@@ -151,6 +152,7 @@ def _used() -> Iterator[tuple[str, str, str]]:
     """Yield (plug-in, module of the core, name) for each import of a plug-in."""
     folders = [(file, file.relative_to(CORE).parts[1]) for file in (CORE / "plugins").rglob("*.py")]
     folders += [(file, file.relative_to(PACKAGES).parts[0]) for file in PACKAGES.glob("*/src/**/*.py")]
+    folders += [(file, sample.name) for sample in SAMPLES for file in sample.rglob("*.py")]
     yield from _imports(folders)
 
 

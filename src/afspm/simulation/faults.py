@@ -94,6 +94,9 @@ class Faults:
         start_s: the experiment time from which `Fault.at_s` counts.
         kept: JSON-able storage for the remaining faults, so that they outlive a restart (a crash strikes once).
 
+    Attributes:
+        known: all kinds, with the effect of each.
+
     Raises:
         ConfigError: an unknown kind.
     """
@@ -101,7 +104,7 @@ class Faults:
     def __init__(
         self, faults: Iterable[Fault], known: Mapping[str, str], start_s: float, kept: Plain | None = None
     ) -> None:
-        self._known = known
+        self.known = known
         self._start_s = start_s
         self._kept: Plain = {} if kept is None else kept
         given = list(faults)
@@ -148,7 +151,7 @@ class Faults:
         self._kept["left"] = [asdict(fault) for fault in self._left]
 
     def _check(self, kind: str, where: str = "faults") -> None:
-        if kind not in self._known:
-            near = difflib.get_close_matches(kind, self._known, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(self._known)}"
+        if kind not in self.known:
+            near = difflib.get_close_matches(kind, self.known, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(self.known)}"
             raise ConfigError(f"there is no fault {kind!r}", where=where, hint=hint)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 import threading
 import time
@@ -10,10 +11,13 @@ from pathlib import Path
 
 import pytest
 from deadlines import DEADLINE_S
+from fake_clock import FakeClock
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError, TransportError
+from afspm.emulation import Faults, SimulatedInstrument
 from afspm.plugins.asylum.emulator import AsylumEmulator
+from afspm.plugins.park.emulator.smartscan import SmartScanProgram
 from afspm.simulation.emulation.emulator import Emulator, emulator_names, find_emulator
 
 from .tiny import Tiny, ask
@@ -165,3 +169,10 @@ def test_unexpected_error_ends_the_activity_and_not_the_emulator(
         "of a request",
         "of the end of a scan",
     ]
+
+
+def test_program_refuses_an_emulator_that_does_not_declare_its_faults(tmp_path: Path) -> None:
+    faults = Faults([], {"stopped": "a scan is stopped", "crash": "it vanishes"}, 0.0)
+    rig = SimulatedInstrument({}, seed=3, start_s=0.0)
+    with pytest.raises(TypeError, match=r"lack scan-refused, spectrum-refused, withdrawn, .*add \*\*MakerProgram"):
+        SmartScanProgram(rig, faults, FakeClock(), tmp_path, logging.getLogger("test"), start_s=0.1, file_s=0.1)

@@ -99,7 +99,10 @@ class Emulator(ABC):
     usual: ClassVar[PlainMapping] = {}
     """Settings for the usual address of the vendor's own controller, used by `afspm emulate` on request."""
     fault_kinds: ClassVar[Mapping[str, str]] = {}
-    """The faults of the maker's program, with the effect of each; `all_faults` adds the common faults."""
+    """The faults of the emulator, with the effect of each; with a `MakerProgram` also `**MakerProgram.fault_kinds`.
+
+    `all_faults` adds the faults of every emulator.
+    """
 
     modes: ClassVar[Sequence[str]] = ("amplitude", "current", "frequency-shift")
     """The modes of the simulated feedback that the controller supports."""

@@ -5,14 +5,15 @@ from __future__ import annotations
 import logging
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import ClassVar
 
 from afspm.basics.clock import Clock
 from afspm.basics.errors import AfspmError
 from afspm.simulation.activities import ScanActivity, SpectrumActivity
 from afspm.simulation.emulation.pending_writes import PendingWrites
-from afspm.simulation.faults import Faults
+from afspm.simulation.faults import INSTRUMENT_FAULTS, Faults
 from afspm.simulation.instrument import InstrumentBusy, SimulatedInstrument, busy_with
 
 NamedFile = tuple[str, bytes]
@@ -31,7 +32,13 @@ class MakerProgram(ABC):
         rig: the instrument.
         repeats: True if another scan starts after each complete scan.
         saves_partial: True if an interrupted scan is saved.
+
+    Raises:
+        TypeError: the emulator's `fault_kinds` lack a fault of `fault_kinds` here.
     """
+
+    fault_kinds: ClassVar[Mapping[str, str]] = INSTRUMENT_FAULTS
+    """The faults that the program injects by itself. The emulator declares them: `{**MakerProgram.fault_kinds, …}`."""
 
     def __init__(
         self,
@@ -44,6 +51,9 @@ class MakerProgram(ABC):
         start_s: float,
         file_s: float,
     ) -> None:
+        if missing := [kind for kind in self.fault_kinds if kind not in faults.known]:
+            lacks = f"the emulator's fault_kinds lack {', '.join(missing)}"
+            raise TypeError(f"{lacks}: add **MakerProgram.fault_kinds to them")  # else the first scan would fail
         self.rig = rig
         self.faults = faults
         self.clock = clock

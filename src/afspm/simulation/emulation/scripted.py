@@ -17,7 +17,6 @@ from typing import ClassVar, Final, Protocol
 from afspm.basics.errors import AfspmError
 from afspm.simulation.emulation.emulator import Crashed, Emulator
 from afspm.simulation.emulation.program import MakerProgram
-from afspm.simulation.faults import INSTRUMENT_FAULTS
 
 SCRIPT_FAULTS: Final = {
     "no-reply": "a script is run but not answered",
@@ -29,7 +28,7 @@ SCRIPT_FAULTS: Final = {
     "dialog": "a dialog waits on the screen: nothing is answered for the duration",
     "restart": "the program closes its socket, and opens it again after the duration",
     "crash": "the program vanishes",
-    **INSTRUMENT_FAULTS,
+    **MakerProgram.fault_kinds,
 }
 
 Client = Hashable

@@ -18,7 +18,6 @@ from afspm.emulation import (
     TcpServer,
 )
 from afspm.model import Region, Scan
-from afspm.simulation.faults import INSTRUMENT_FAULTS
 from example_maker.files import packed
 
 
@@ -54,7 +53,7 @@ class AcmeEmulator(Emulator):
 
     vendor = "Acme"
     usual: ClassVar = {"port": 7654}
-    fault_kinds: ClassVar = INSTRUMENT_FAULTS
+    fault_kinds: ClassVar = MakerProgram.fault_kinds
 
     def open(self) -> str:
         self._program = AcmeProgram(self.rig, self.faults, self.clock, self.folder, self.log, start_s=0.2, file_s=0.1)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from afspm.driver import FileContent
 from afspm.model import Region, Scan
-from afspm.storage.formats import FileContent
 
 
 def read_example(path: Path, zone: tzinfo | None) -> FileContent:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from afspm.simulation.simulator import Simulator
+from afspm.emulation import Simulator
 
 
 class ExampleScope(Simulator):
