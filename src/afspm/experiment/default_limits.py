@@ -15,10 +15,7 @@ from afspm.experiment.document import Document
 from afspm.experiment.findings import nearest
 from afspm.experiment.limits_section import LimitsReader
 from afspm.experiment.toml_lines import Table
-from afspm.scheduler.safety.limits import ExperimentLimits, Limit, limit_key
-
-_SMALLER = ("high", "step", "rate_per_s")
-_LARGER = ("low", "interval_s")
+from afspm.scheduler.safety.limits import ExperimentLimits, Limit, bounds, limit_key
 
 
 @dataclass(frozen=True)
@@ -37,10 +34,9 @@ class DefaultLimits:
         limits = self.limits
         places = {name: limit.source for name, limit in (*limits.parameters.items(), *limits.actions.items())}
         places |= {name: rule.source for name, rule in limits.forbid.items()}
-        if limits.region is not None:
-            places["region"] = limits.region_source
-        if limits.most_pixels != ExperimentLimits.most_pixels:
-            places["most_pixels"] = limits.region_source.rpartition(":")[0] or "limits.toml"
+        for name in bounds(ExperimentLimits):
+            if getattr(limits, name) != getattr(ExperimentLimits, name):
+                places[limit_key(name)] = str(getattr(limits, f"{name}_source"))
         return places
 
     def lines(self) -> Iterator[str]:
@@ -80,16 +76,15 @@ def merged(given: ExperimentLimits, defaults: DefaultLimits, table: Table, docum
     for name in kept & base.actions.keys():
         actions[name] = merge.limit(("limits", "actions", name), base.actions[name], given.actions.get(name))
     result = replace(given, parameters=parameters, actions=actions)
-    if "region" in kept and base.region is not None:
-        if given.region is None:
-            result = replace(result, region=base.region, region_source=base.region_source)
-        elif not all(base.region.contains((float(x), float(y))) for x, y in given.region.corners_m()):
-            merge.exceeds(("limits", "region"), "region", base.region_source)
-    if "most_pixels" in kept:
-        if "most_pixels" not in table:
-            result = replace(result, most_pixels=base.most_pixels)
-        elif given.most_pixels > base.most_pixels:
-            merge.exceeds(("limits", "most_pixels"), "most_pixels", defaults.sources()["most_pixels"])
+    for name, bound in bounds(ExperimentLimits).items():
+        key = limit_key(name)
+        if key not in kept:
+            continue
+        value, default = getattr(given, name), getattr(base, name)
+        if key not in table or value is None:  # None: the value of the file is wrong, and reported
+            result = replace(result, **{name: default, f"{name}_source": known[key]})
+        elif not bound.is_within(value, default):
+            merge.exceeds(("limits", key), key, known[key])
     return replace(result, forbid={**{name: base.forbid[name] for name in base.forbid if name in kept}, **given.forbid})
 
 
@@ -106,17 +101,15 @@ class _Merge:
         if given.unit != default.unit:
             self.exceeds(path, path[-1], default.source, f"counts in {given.unit}, which is another unit")
             return default
-        for key in (*_SMALLER, *_LARGER):
+        for key, bound in bounds(Limit).items():
             ours, theirs = getattr(given, key), getattr(default, key)
             if theirs is None:
                 continue
             if ours is None:
                 tight = replace(tight, **{key: theirs})
-            elif ours > theirs if key in _SMALLER else ours < theirs:
+            elif not bound.is_within(ours, theirs):
                 self.exceeds((*path, limit_key(key)), path[-1], default.source)
-        if default.only is not None and not set(given.only or ()) <= set(default.only):
-            self.exceeds((*path, "only"), path[-1], default.source)
-        return tight if default.only is None or given.only is not None else replace(tight, only=default.only)
+        return tight
 
     def exceeds(self, path: tuple[str, ...], name: str, source: str, how: str = "is looser") -> None:
         what = f"[{'.'.join(path[:-1])}] {path[-1]} {how} than the driver's limit ({source})"

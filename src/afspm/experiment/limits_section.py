@@ -32,7 +32,7 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pydantic
 
@@ -48,7 +48,7 @@ from afspm.model import Parameter, Region, component_of, names
 from afspm.model.instruments import instrument_of
 from afspm.scheduler.safety import rule_language
 from afspm.scheduler.safety.forbidden_states import STATES
-from afspm.scheduler.safety.limits import ExperimentLimits, ForbiddenState, Limit, RoleLimits
+from afspm.scheduler.safety.limits import ExperimentLimits, ForbiddenState, Limit, RoleLimits, bounds, limit_key
 from afspm.scheduler.safety.rule_language import RuleComparison, RuleError, RuleTree
 
 Quantity = str | float
@@ -71,7 +71,7 @@ class RegionSection(Section):
 
 
 class LimitsSection(Section):
-    """Keys of [limits] that are not parameters."""
+    """Keys of [limits] that are not parameters: the bounds of `ExperimentLimits`, and loosened defaults."""
 
     region: RegionSection | None = None
     most_pixels: Count = ExperimentLimits.most_pixels
@@ -133,15 +133,20 @@ class LimitsReader:
         limits = ExperimentLimits(
             parameters={name: limit for name, keys in parameters.items() if (limit := self._parameter(name, keys))},
             actions={name: limit for name, keys in actions.items() if (limit := self._action(name, keys))},
-            region=None if whole.region is None else self._region(whole.region),
-            region_source=str(self.document.place("limits", "region")),
-            most_pixels=whole.most_pixels,
+            **self._bounds(whole, table),
             sets={action: parameters for action, parameters in self.sets.items() if parameters},
             roles=self._roles(table.get("roles", {})),
             forbid=self._forbid(table.get("forbid", [])),
         )
         self._check_sizes(limits)
         return limits
+
+    def _bounds(self, whole: LimitsSection, table: Table) -> dict[str, Any]:
+        given: dict[str, Any] = {name: getattr(whole, limit_key(name)) for name in bounds(ExperimentLimits)}
+        given = {name: self._region(one) if isinstance(one, RegionSection) else one for name, one in given.items()}
+        keys = {name: key for name in given if (key := limit_key(name)) in table}
+        places = {f"{name}_source": str(self.document.place("limits", key)) for name, key in keys.items()}
+        return given | places
 
     @property
     def _known_parameters(self) -> list[str]:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import pytest
 from typer.testing import CliRunner
 
 from afspm.cli.app import app
 from afspm.experiment import Experiment
+from afspm.experiment.limits_section import LimitsSection
+from afspm.scheduler.safety.limits import ExperimentLimits, Limit, bounds, limit_key
 
 from .conftest import Write, errors, only_error
 
@@ -34,6 +38,9 @@ rate = "1 V/s"
 [limits.actions.x-pulse]
 every = "10 s"
 """
+LINES = DEFAULTS.splitlines()
+OF_BIAS = f"limits.toml:{LINES.index('[limits.tip-bias-voltage]') + 1}"
+OF_RULE = f"limits.toml:{LINES.index('[limits.forbid]') + 2}"
 FRAME = """
 [scheduler]
 component = true
@@ -60,10 +67,11 @@ def test_defaults_hold_and_are_shown_with_their_source(staged: Write) -> None:
     assert (limits.parameters["tip-bias-voltage"].high, limits.most_pixels) == (10.0, 1000)
     assert limits.actions["x-pulse"].interval_s == 10.0
     assert limits.region is not None
+    assert limits.most_pixels_source.endswith(f"limits.toml:{LINES.index('most_pixels = 1000') + 1}")
     assert list(limits.forbid) == ["gentle"]
     shown = CliRunner().invoke(app, ["check", str(experiment.files[0])]).output
-    assert "limits.toml:9: limit of the driver: tip-bias-voltage" in shown
-    assert "limits.toml:7: limit of the driver: gentle" in shown
+    assert f"{OF_BIAS}: limit of the driver: tip-bias-voltage" in shown
+    assert f"{OF_RULE}: limit of the driver: gentle" in shown
 
 
 def test_file_tightens_defaults(staged: Write) -> None:
@@ -74,7 +82,7 @@ def test_file_tightens_defaults(staged: Write) -> None:
     bias = limits.parameters["tip-bias-voltage"]
     assert (bias.low, bias.high, bias.rate_per_s, limits.most_pixels) == (-10.0, 3.0, 1.0, 10)
     assert "night.toml:4" in bias.source
-    assert "limits.toml:9" in bias.source
+    assert OF_BIAS in bias.source
     assert len(limits.forbid) == 2
 
 
@@ -100,3 +108,14 @@ def test_default_is_loosened_by_name_alone(staged: Write, text: str, name: str) 
 def test_rule_is_dropped_by_its_name(staged: Write) -> None:
     assert not staged('[limits]\nloosen = ["gentle"]\n').resolved.limits.forbid
     assert "did you mean 'gentle'" in only_error(staged('[limits]\nloosen = ["gentel"]\n')).hint
+
+
+def test_each_limit_has_a_default_that_a_file_may_tighten() -> None:
+    assert {one.name for one in fields(Limit)} == {*bounds(Limit), "unit", "source"}
+    of_experiment = bounds(ExperimentLimits)
+    assert LimitsSection.model_fields.keys() == {*map(limit_key, of_experiment), "loosen"}
+    places, merged_by_name = (f"{name}_source" for name in of_experiment), ("parameters", "actions", "forbid")
+    of_file_alone = ("sets", "roles")
+    assert {one.name for one in fields(ExperimentLimits)} == {
+        *of_experiment, *places, *merged_by_name, *of_file_alone
+    }  # fmt: skip

@@ -252,7 +252,7 @@ def test_a_kind_of_spectra_that_the_microscope_lacks_is_an_error(write: Write, p
 @pytest.mark.parametrize(
     ("limit", "what"),
     [
-        ("[limits]\nmost_pixels = 40_000\n", "a scan of 256 x 256 pixels; the highest number allowed is 40000"),
+        ("[limits]\nmost_pixels = 40_000\n", "256 x 256 pixels is above the highest number allowed, 40000 pixels"),
         ('[limits.scan-size-y]\nmin = "1.5 um"\n', "scan-size-y = 1 µm is below the lowest allowed, 1.5 µm"),
     ],
 )

@@ -228,10 +228,11 @@ def test_a_part_of_a_position_is_checked_with_the_rest_of_it() -> None:
 
 
 def test_pixels_along_one_axis_are_counted_with_those_along_the_other() -> None:
-    limits = checker(ExperimentLimits(most_pixels=1000))
+    limits = checker(ExperimentLimits(most_pixels=1000, most_pixels_source="toml:7"))
     limits.in_force(ScanParameters(STAGE, (100, 5)), 0)
     assert why(limits, scan(shape=ShapeChange(columns=10))) == ""
-    assert "11 x 100" in why(limits, scan(shape=ShapeChange(columns=11)))
+    refusal = "11 x 100 pixels is above the highest number allowed, 1000 pixels (toml:7): choose fewer"
+    assert refusal in why(limits, scan(shape=ShapeChange(columns=11)))
 
 
 def test_an_angle_without_a_unit_is_in_degrees() -> None:

@@ -51,7 +51,7 @@ _UNRECORDED = {
     "has_people": "what people do at its pages is not in the record",
     "is_instrument": "the answers of its instrument are not in the record",
 }
-_PLACES = ("source", "region_source")
+_PLACE = "source"  # the end of the keys with a file and line
 
 Changes = Mapping[str, Mapping[str, object] | type[Component]] | str | Path | None
 
@@ -446,7 +446,7 @@ def at_recorded_places(before: object, now: object) -> Any:
     if not (isinstance(before, dict) and isinstance(now, dict)):
         return now
     return {
-        key: before[key] if key in _PLACES and key in before else at_recorded_places(before.get(key), value)
+        key: before[key] if key.endswith(_PLACE) and key in before else at_recorded_places(before.get(key), value)
         for key, value in now.items()
     }
 

@@ -444,7 +444,8 @@ class LimitChecker:
             shape = shape.onto(self.state.position.shape or (1, 1))
         if shape is not None and shape[0] * shape[1] > self.limits.most_pixels:
             raise _param_error(
-                f"a scan of {shape[1]} x {shape[0]} pixels; the highest number allowed is {self.limits.most_pixels}"
+                f"a scan of {shape[1]} x {shape[0]} pixels is above the highest number allowed,"
+                f" {self.limits.most_pixels} pixels ({self.limits.most_pixels_source}): choose fewer"
             )
         if isinstance(region, RegionChange):
             region = self._region_after(region)

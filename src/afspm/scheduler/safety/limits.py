@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import operator
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import ClassVar
+from functools import cache, cached_property
+from typing import Annotated, Any, ClassVar, get_type_hints
 
 from afspm.basics.units import PositiveDuration
 from afspm.model import Parameter, Region
@@ -13,11 +14,39 @@ from afspm.scheduler.safety import rule_language
 from afspm.scheduler.safety.rule_language import RuleTree
 
 _KEYS = {"low": "min", "high": "max", "rate_per_s": "rate", "interval_s": "every"}
+"""The keys in the experiment file of fields with another name."""
 
 
 def limit_key(name: str) -> str:
-    """Return the key in the experiment file of an attribute of a `Limit`."""
+    """Return the key in the experiment file of a field of `Limit` or `ExperimentLimits`."""
     return _KEYS.get(name, name)
+
+
+@dataclass(frozen=True)
+class Bound:
+    """The mark of a field that bounds requests: a driver may set its default, which an experiment file may tighten.
+
+    Attributes:
+        is_within: whether a value (first argument) is at least as strict as another.
+    """
+
+    is_within: Callable[[Any, Any], bool]
+
+
+@cache
+def bounds(kind: type) -> Mapping[str, Bound]:
+    """Return the fields of a dataclass that are bounds, by name."""
+    hints = get_type_hints(kind, include_extras=True)
+    marks = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
+    return {name: mark for name, metadata in marks.items() for mark in metadata if isinstance(mark, Bound)}
+
+
+def _is_part(components: tuple[str, ...], allowed: tuple[str, ...]) -> bool:
+    return set(components) <= set(allowed)
+
+
+def _lies_in(region: Region, allowed: Region) -> bool:
+    return all(allowed.contains((float(x), float(y))) for x, y in region.corners_m())
 
 
 @dataclass(frozen=True)
@@ -35,12 +64,12 @@ class Limit:
         source: the place in the experiment file, e.g. "experiment.toml:42".
     """
 
-    low: float | None = None
-    high: float | None = None
-    step: float | None = None
-    rate_per_s: float | None = None
-    interval_s: PositiveDuration | None = None
-    only: tuple[str, ...] | None = None
+    low: Annotated[float | None, Bound(operator.ge)] = None
+    high: Annotated[float | None, Bound(operator.le)] = None
+    step: Annotated[float | None, Bound(operator.le)] = None
+    rate_per_s: Annotated[float | None, Bound(operator.le)] = None
+    interval_s: Annotated[PositiveDuration | None, Bound(operator.ge)] = None
+    only: Annotated[tuple[str, ...] | None, Bound(_is_part)] = None
     unit: str | None = None
     source: str = "[limits]"
 
@@ -104,6 +133,8 @@ class RoleLimits:
 class ExperimentLimits:
     """All limits of an experiment.
 
+    Beside each `Bound` is a field for its place, `<bound>_source`.
+
     Attributes:
         parameters: the limits of parameters, by name.
         actions: the limits of actions, by name.
@@ -111,6 +142,7 @@ class ExperimentLimits:
             outside is refused even if the place was set at the panel.
         region_source: the place in the experiment file where the region was set.
         most_pixels: the largest number of pixels of a scan.
+        most_pixels_source: the place in the experiment file where that number was set.
         sets: for each action by name, the parameters that the microscope sets as that action.
         roles: further limits by name of a component, or of a person or agent: "agent", "agent:claude".
         forbid: the forbidden states, by name.
@@ -118,9 +150,10 @@ class ExperimentLimits:
 
     parameters: Mapping[str, Limit] = field(default_factory=dict)
     actions: Mapping[str, Limit] = field(default_factory=dict)
-    region: Region | None = None
+    region: Annotated[Region | None, Bound(_lies_in)] = None
     region_source: str = "[limits] region"
-    most_pixels: int = 8192 * 8192
+    most_pixels: Annotated[int, Bound(operator.le)] = 8192 * 8192
+    most_pixels_source: str = "[limits] most_pixels"
     sets: Mapping[str, tuple[Parameter, ...]] = field(default_factory=dict)
     roles: Mapping[str, RoleLimits] = field(default_factory=dict)
     forbid: Mapping[str, ForbiddenState] = field(default_factory=dict)
