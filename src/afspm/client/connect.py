@@ -61,17 +61,20 @@ def connect(where: str | Path = "runs", name: str = "notebook", *, messages: Seq
     return join(find_run(Path(where)), name, messages)
 
 
-def join(folder: Path, name: str, messages: Sequence[str] = ()) -> Scope:
+def join(folder: Path, name: str, messages: Sequence[str] | None = None) -> Scope:
     """Join the run in a folder. Arguments and errors as of `connect`.
 
     The name may also be "terminal:ada", for a person, who takes no keyed measurements.
+
+    Args:
+        messages: None: the program reads no message types of the laboratory, so no warning names them.
     """
     from afspm.client.scope import Scope  # imported late: who only follows a run needs none
 
     launch = guest_of(folder, name)
     log = _log_of(name)
-    register_all(messages)
-    if unread := set(map(_stem, launch.messages)) - set(map(_stem, messages)):
+    register_all(messages or ())
+    if messages is not None and (unread := set(map(_stem, launch.messages)) - set(map(_stem, messages))):
         log.warning("messages of %s are not read: name it in connect(messages=[…])", ", ".join(sorted(unread)))
     clock = ExperimentClock.from_dict(launch.clock)
     port = open_port(launch, clock)

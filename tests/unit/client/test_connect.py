@@ -109,6 +109,8 @@ def test_module_that_a_run_folder_names_is_imported_only_if_the_caller_names_it(
     (folder / "run.json").write_text(json.dumps(facts), encoding="utf-8")
     monkeypatch.setattr(connect, "open_port", lambda launch, clock: Port(ControlConnected(), CaughtUp(PUBLISHER)))
     caplog.set_level("WARNING")
+    connect.join(folder, "terminal:ada")  # a command such as `afspm end` reads no messages
+    assert "beside_the_run" not in caplog.text
     afspm.connect(folder)
     assert "messages of beside_the_run are not read" in caplog.text
     with pytest.raises(SystemExit, match="it was run"):
