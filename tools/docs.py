@@ -334,6 +334,8 @@ def example_maker() -> str:
         ("pyproject.toml", "ini"),
         ("example_maker/parameters.toml", "ini"),
         ("example_maker/driver.py", "py"),
+        ("example_maker/emulator.py", "py"),
+        ("example_maker/files.py", "py"),
         ("example_maker/emulated.toml", "ini"),
     ]
     parts = (f"`{name}`:\n\n```{kind}\n{(package / name).read_text(encoding='utf-8')}```\n" for name, kind in shown)
