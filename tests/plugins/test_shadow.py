@@ -11,6 +11,7 @@ from pkgutil import resolve_name
 from typing import Any, cast
 
 import pytest
+from tests.plugins.gxsm.gxsm_bench import Calls
 from tests.plugins.nanosurf.test_nanosurf_at_panel import until
 from tests.plugins.panel_table import PANELS, Panel
 from tests.plugins.test_makers import MAKERS, Maker
@@ -120,15 +121,8 @@ def beside(watched: Watched, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
             made.translator = class_  # type: ignore[misc]
             settings = {**SOON, **panel.settings, **watched.settings}
             if watched.name == "gxsm":  # its bridge proves its address, so that no tap can stand between
-                called: list[str] = []
-                answer = made.emulator._calls.answer
-
-                def recorded(method: str, arguments: tuple[object, ...]) -> object:
-                    called.append(method)
-                    return answer(method, arguments)
-
-                monkeypatch.setattr(made.emulator._calls, "answer", recorded)
-                return Beside(made, made.address, settings, lambda: list(called))
+                calls = Calls(made)
+                return Beside(made, made.address, settings, lambda: [method for method, *_ in calls.answered])
             tap, address = stack.enter_context(tapped(made.address))
             return Beside(
                 made, address, settings, lambda: [what for one in tap.sent for what in watched.asked(bytes(one))]

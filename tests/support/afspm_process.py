@@ -54,6 +54,12 @@ class AfspmProcess:
                 raise AssertionError(f"no line with {wanted} came:\n{self.output}")
             return found[count - 1]
 
+    def read_to_the_end(self) -> str:
+        """Return all that the command has written, once it has ended."""
+        assert self.process.wait(DEADLINE_S) == 0, self.output
+        self._reader.join(DEADLINE_S)
+        return self.output
+
     def wait_for_next(self, *wanted: str) -> str:
         """Return the next such line after the present ones."""
         with self._changed:

@@ -35,13 +35,56 @@ class Bench(VendorBench[Emulated]):
         super().__init__(folder, stack, speed, {"block": block, **emulator})
 
 
-def until(made: Bench, what: Callable[[], bool]) -> None:
+def until(made: VendorBench[Any], what: Callable[[], bool]) -> None:
     """Wait for a condition, polled as often as other programs do, so that the emulator gets processor time."""
     until_s = made.clock.monotonic_s() + DEADLINE_S
     pace = Event()
     while not what():
         assert made.clock.monotonic_s() < until_s
         pace.wait(0.005)
+
+
+ACTING = {"startscan", "stopscan", "set", "moveto_scan_xy"}
+"""Functions of GXSM that do something to the tip, beside actions."""
+
+
+class Calls:
+    """The calls that the emulated GXSM has answered."""
+
+    def __init__(self, made: VendorBench[Any]) -> None:
+        self.made = made
+        self.answered: list[tuple[str, tuple[object, ...], object]] = []
+        functions = made.emulator._calls
+        answer = functions.answer
+
+        def listening(method: str, arguments: tuple[object, ...]) -> object:
+            found = answer(method, arguments)
+            self.answered.append((method, arguments, found))
+            return found
+
+        functions.answer = listening
+
+    def until_scan_is_seen(self) -> None:
+        """Wait until the translator's poll has shown the scan: only then the names of its files are asked for."""
+
+        def is_seen() -> bool:
+            seen = [
+                number
+                for number, (method, arguments, found) in enumerate(self.answered)
+                if (method, arguments) == ("rtquery", ("s",)) and isinstance(found, tuple) and int(found[0]) & 2
+            ]
+            return bool(seen) and any(call[:2] == ("chfname", (0,)) for call in self.answered[seen[0] :])
+
+        until(self.made, is_seen)
+
+    @property
+    def acting(self) -> list[str]:
+        """The calls that do something beside switching Auto Save."""
+        return [
+            f"{method}{arguments}"
+            for method, arguments, _ in self.answered
+            if method in ACTING or (method == "action" and "MainAutoSave" not in str(arguments))
+        ]
 
 
 HELD_S = 1e6

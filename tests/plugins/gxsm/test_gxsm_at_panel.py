@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from tests.plugins.by_hand import act_all, acts, set_all
-from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_until_line, until
+from tests.plugins.gxsm.gxsm_bench import Bench, Calls, hold_scan, scan_until_line
 from tests.plugins.vendor_bench import Peer, ready, scanned, scans, states
 
 from afspm.model import ActByHand, ControlRequest, PanelAct, ProbePosition, Region, ScopeState, ScopeStatus, names
@@ -17,51 +17,10 @@ FREE = ScopeState.FREE
 SIMULATOR: dict[str, Any] = {"card": "simulator"}
 KINDS: list[dict[str, Any]] = [{"version": 3}, {"transport": "shm"}, {"card": "RPSPMC"}, SIMULATOR]
 KIND_IDS = ["gxsm3", "gxsm4-shm", "rpspmc", "simulator"]
-ACTING = {"startscan", "stopscan", "set", "moveto_scan_xy"}
-"""Functions of GXSM that do something to the tip, beside actions."""
 
 
 def is_paused(packet: object) -> bool:
     return packet == ScopeStatus(ScopeState.SCANNING, paused=True)
-
-
-class Calls:
-    """The calls that the emulated GXSM has answered."""
-
-    def __init__(self, made: Bench) -> None:
-        self.made = made
-        self.answered: list[tuple[str, tuple[object, ...], object]] = []
-        functions = made.emulator._calls
-        answer = functions.answer
-
-        def listening(method: str, arguments: tuple[object, ...]) -> object:
-            found = answer(method, arguments)
-            self.answered.append((method, arguments, found))
-            return found
-
-        functions.answer = listening  # type: ignore[method-assign]
-
-    def until_scan_is_seen(self) -> None:
-        """Wait until the translator's poll has shown the scan: only then the names of its files are asked for."""
-
-        def is_seen() -> bool:
-            seen = [
-                number
-                for number, (method, arguments, found) in enumerate(self.answered)
-                if (method, arguments) == ("rtquery", ("s",)) and isinstance(found, tuple) and int(found[0]) & 2
-            ]
-            return bool(seen) and any(call[:2] == ("chfname", (0,)) for call in self.answered[seen[0] :])
-
-        until(self.made, is_seen)
-
-    @property
-    def acting(self) -> list[str]:
-        """The calls that do something beside switching Auto Save."""
-        return [
-            f"{method}{arguments}"
-            for method, arguments, _ in self.answered
-            if method in ACTING or (method == "action" and "MainAutoSave" not in str(arguments))
-        ]
 
 
 def small(made: Bench, **settings: Any) -> Peer:

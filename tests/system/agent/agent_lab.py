@@ -121,10 +121,7 @@ class AgentRun(AfspmProcess):
 
     def person(self, *arguments: str) -> str:
         """Let a person use a command of `afspm`."""
-        command = AfspmProcess(*arguments, folder=self.home)
-        assert command.process.wait(DEADLINE_S) == 0, command.output
-        command._reader.join(DEADLINE_S)
-        return command.output
+        return AfspmProcess(*arguments, folder=self.home).read_to_the_end()
 
     def grant(self, text: str = GRANT) -> None:
         """Let a person give a grant."""

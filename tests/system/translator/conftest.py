@@ -126,7 +126,7 @@ class Running:
         self.folder, self.log = folder, folder / "log.txt"
         self.serve, self.publish = f"tcp://127.0.0.1:{ports.take()}", f"tcp://127.0.0.1:{ports.take()}"
         self.clock = ExperimentClock.starting_now(start_s=1_767_225_600.0, speed=speed)
-        self._launch = Launch(
+        self.launch = Launch(
             "translator",
             "afspm.simulation.simulator.Simulator",
             settings,
@@ -147,7 +147,7 @@ class Running:
                 [sys.executable, "-m", "afspm.supervisor.host"], stdin=subprocess.PIPE, stderr=log
             )
         assert self.process.stdin is not None
-        self.process.stdin.write(self._launch.to_json().encode() + b"\n")
+        self.process.stdin.write(self.launch.to_json().encode() + b"\n")
         self.process.stdin.flush()
 
     def kill(self) -> None:

@@ -59,7 +59,7 @@ def started(run: Any, identity: str) -> Any:
     """A translator of a run."""
     running = run(speed=1.0)
     running.kill()
-    running._launch = replace(running._launch, run=identity)
+    running.launch = replace(running.launch, run=identity)
     running.start()
     return running
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from declared_messages import forget_afterwards
 from google.protobuf.wrappers_pb2 import DoubleValue
 from published_schemas import require_valid
 from rich.console import Console
@@ -21,7 +22,6 @@ from afspm.model import ControlMode, ControlState, ProcessCondition, ScopeState
 from afspm.model.events import LogLines
 from afspm.model.planned_work import PlannedWork
 from afspm.record.overview import Overview
-from afspm.wire import messages
 
 S = 1_000_000_000
 START = 1_700_000_000 * S
@@ -200,8 +200,8 @@ def test_status_shows_the_end_of_the_experiment(night: Overview) -> None:
 
 
 def test_newest_relayed_message_of_each_component_is_shown(night: Overview, monkeypatch: pytest.MonkeyPatch) -> None:
-    own = wire.MessageDeclaration(type=DoubleValue, relayed=True)
-    monkeypatch.setitem(messages._declared, own.name, own)  # for this test alone
+    forget_afterwards(monkeypatch)
+    own = wire.declare(wire.MessageDeclaration(type=DoubleValue, relayed=True))
     for after_s, name, value in ((1, "level", 0.5), (2, "level", 0.25), (2, "other", 0.0)):
         night.take(own.name, DoubleValue(value=value), START + (200 + after_s) * S, f"{own.name}_{name}")
     assert "DoubleValue_level: value: 0.25" in " ".join(shown(night).split())

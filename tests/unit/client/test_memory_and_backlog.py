@@ -86,9 +86,11 @@ def test_memory_file_of_another_kind_is_refused(tmp_path: Path, content: str) ->
 
 def test_unwritable_folder_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """An unmounted drive must not end a component, which would be given up before the drive is back."""
-    (tmp_path / "file").write_text("")
-    memory = Memory(None)
-    memory._path = tmp_path / "file" / "x.json"
+    drive = tmp_path / "drive"
+    drive.mkdir()
+    memory = Memory(drive / "x.json")
+    drive.rmdir()
+    drive.write_text("")
     assert memory.save() is False
     assert [record.levelname for record in caplog.records] == ["CRITICAL"]
 

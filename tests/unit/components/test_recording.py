@@ -89,6 +89,11 @@ class Bench:
         position = committed(self.packets)
         return position is not None and not LogReader(self.packets, position).read(1)
 
+    def rows(self, query: str) -> list[tuple[Any, ...]]:
+        """Return rows of the journal."""
+        with contextlib.closing(sqlite3.connect(self.folder / JOURNAL_FILE)) as journal:
+            return journal.execute(query).fetchall()
+
     def times(self) -> list[int | None]:
         """Return the times of the recorded packets; none before the record exists."""
         with contextlib.suppress(FileError), afspm.open_run(self.folder) as run:
@@ -116,7 +121,7 @@ def test_log_and_packets_of_other_publishers_are_recorded_once_in_order(bench: B
     bench.publish(control(7))
     writer.finish(ended=True)
     assert bench.times() == [1, 2, 3, 4, 5, 7]
-    assert afspm.open_run(bench.folder)._query("SELECT source FROM packets WHERE time_ns = 6") == [("tcp://another",)]
+    assert bench.rows("SELECT source FROM packets WHERE time_ns = 6") == [("tcp://another",)]
     assert bench.is_committed
 
 
@@ -292,7 +297,7 @@ def test_packet_without_a_time_gets_the_current_time(bench: Bench) -> None:
     writer = bench.writer()
     writer.put(Packet("ControlState", control(1).payload), "tcp://another")
     writer.finish(ended=True)
-    row = afspm.open_run(bench.folder)._query("SELECT source, time_ns > 0 FROM packets")
+    row = bench.rows("SELECT source, time_ns > 0 FROM packets")
     assert row == [("tcp://another", 1)]
 
 
@@ -377,7 +382,7 @@ class _Disk:
 
 
 def _all_times(bench: Bench) -> list[int]:
-    return [row[0] for row in afspm.open_run(bench.folder)._query("SELECT time_ns FROM packets ORDER BY time_ns")]
+    return [row[0] for row in bench.rows("SELECT time_ns FROM packets ORDER BY time_ns")]
 
 
 def _until(condition: Callable[[], bool]) -> None:

@@ -36,6 +36,7 @@ from afspm.model import (
 )
 from afspm.model.events import LogLines
 from afspm.record import report
+from afspm.record.journal import JOURNAL_FILE
 from afspm.record.run_json import EXPERIMENT_FILE
 from afspm.record.store import _PROCESS, RecordSettings, RecordStore
 from afspm.storage import formats
@@ -424,8 +425,9 @@ def test_requests_processes_and_log_lines_have_their_tables(night: Night, store:
     assert [line.text for line in run.log] == ["scan 1 of 3"]
 
 
-def test_process_change_is_found_without_a_search_of_the_whole_night(store: RecordStore) -> None:
-    ((*_, plan),) = store._journal.execute(f"EXPLAIN QUERY PLAN {_PROCESS}", ("series",)).fetchall()
+def test_process_change_is_found_without_a_search_of_the_whole_night(store: RecordStore, tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / JOURNAL_FILE)) as journal:
+        ((*_, plan),) = journal.execute(f"EXPLAIN QUERY PLAN {_PROCESS}", ("series",)).fetchall()
     assert "processes_by_name" in plan
 
 

@@ -17,11 +17,10 @@ HERE = (0.0, 0.0)
 
 def cured(world: World, attempts: int, **pulse: float) -> float:
     """Return the share of pulses of a new flawed tip that cured it."""
-    states = world.state()
+    state = world.state()
     found = []
     for number in range(attempts):
-        world.restore(states)
-        world._calls = number  # a draw of its own
+        world.restore({**state, "calls": number})  # a draw of its own
         found.append(world.pulse(pulse["voltage_v"], 50e-3, 1.0) == "cured")
     return float(np.mean(found))
 
@@ -70,7 +69,7 @@ def test_crash_cures_best_at_its_depth_and_worsens_more_below_it() -> None:
     outcomes = []
     for number in range(300):
         world = world_of("blunt", answers_seed=1)
-        world._calls = number
+        world.restore({**world.state(), "calls": number})
         outcomes.append(world.crash(HERE, one.depth_m, 1.0, 1.0))
     assert np.mean([outcome == "cured" for outcome in outcomes]) == pytest.approx(one.crash_cures, abs=0.08)
 

@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
+from declared_messages import forget_afterwards
 
 from afspm import wire
 from afspm.supervisor import own_runs
-from afspm.wire import messages
 
 MODULE = """
 from google.protobuf.wrappers_pb2 import FloatValue
@@ -23,7 +23,7 @@ TILT = MessageDeclaration(type=FloatValue, relayed=True)
 def test_messages_are_imported_from_the_folder_of_the_experiment_file_of_an_own_run_alone(
     is_own: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(messages, "_declared", dict(messages._declared))
+    forget_afterwards(monkeypatch)
     monkeypatch.setattr(own_runs, "state_folder", lambda: tmp_path / "state")
     lab, run = tmp_path / "lab", tmp_path / "lab" / "runs" / "night"
     run.mkdir(parents=True)

@@ -11,7 +11,7 @@ from afspm.basics.launch import Launch
 from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlRequest, ControlResponse, Response
 from afspm.model.events import LONGEST_ANNOUNCEMENT, LogLines
 from afspm.supervisor import reporter as reporting
-from afspm.supervisor.reporter import Reporter
+from afspm.supervisor.reporter import Reporter, ReportQueue
 from afspm.supervisor.supervision.supervisor_events import EndRefused, UseReported
 from afspm.wire import encode
 
@@ -22,20 +22,25 @@ def reporter() -> Reporter:
     return Reporter(Launch("supervisor:lab"), ExperimentClock.real(), "lab")
 
 
-def test_oldest_lines_are_dropped_and_counted(reporter: Reporter) -> None:
+@pytest.fixture
+def queue() -> ReportQueue:
+    return ReportQueue(ExperimentClock.real(), "supervisor:lab")
+
+
+def test_oldest_lines_are_dropped_and_counted(queue: ReportQueue) -> None:
     for n in range(reporting.MOST_LINES + 7):
-        reporter.line("one", logging.INFO, f"line {n}")
-    lines = reporter._queue.take_lines()
+        queue.put_line("one", "INFO", f"line {n}")
+    lines = queue.take_lines()
     assert lines[0].text == "dropped 7 lines that the scheduler did not take"
     assert lines[0].level == "WARNING"
     assert lines[1].text == "line 7"
-    assert reporter._queue.take_lines()[0].text == f"line {len(lines) + 6}"
+    assert queue.take_lines()[0].text == f"line {len(lines) + 6}"
 
 
-def test_a_batch_is_no_longer_than_the_scheduler_takes(reporter: Reporter) -> None:
+def test_a_batch_is_no_longer_than_the_scheduler_takes(queue: ReportQueue) -> None:
     for _ in range(1000):
-        reporter.line("one", logging.INFO, "µ" * 10_000)
-    lines = reporter._queue.take_lines()
+        queue.put_line("one", "INFO", "µ" * 10_000)
+    lines = queue.take_lines()
     assert len(lines[0].text) == reporting.LONGEST_LINE
     assert len(encode(LogLines(lines))[1]) <= LONGEST_ANNOUNCEMENT
 

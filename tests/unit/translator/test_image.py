@@ -12,6 +12,7 @@ import pytest
 from afspm.basics.errors import ConfigError, FileError
 from afspm.model import Scan, ScopeState
 from afspm.plugins.image import ImageMicroscope
+from afspm.simulation.scan_drawing import run_at_once
 
 SIZE_M = (2e-6, 1.5e-6)
 
@@ -32,10 +33,9 @@ def picture(tmp_path: Path) -> Path:
 def scanned(microscope: ImageMicroscope, folder: Path, clock: Any) -> Scan:
     microscope.clock, microscope.log, microscope.run_dir = clock, logging.getLogger("test"), folder
     microscope.memory, microscope.wake = {}, lambda: None
+    microscope.run_drawing = run_at_once  # type: ignore[method-assign]
     microscope.connect()
     microscope.start_scan()
-    assert microscope._controller is not None
-    microscope._controller.instrument.drawing.wait()
     clock.t_s += 1e4
     assert microscope.status().state is ScopeState.FREE
     (height,) = [scan for scan in microscope.load(microscope.results()[-1]) if getattr(scan, "channel", "") == "Height"]

@@ -13,6 +13,7 @@ from afspm.basics.clock import NS_PER_S, ExperimentClock
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.basics.shared_time import Publication
 from afspm.model import ControlRequest, Region, ScanLines, ScopeState, ScopeStatus, names
+from afspm.simulation.scan_drawing import run_at_once
 from afspm.simulation.simulator import Simulator
 from afspm.translator.observer import LiveLines
 
@@ -161,10 +162,9 @@ def test_the_simulators_lines_make_up_its_scan(direction: str, tmp_path: Path, f
     simulator = Simulator(initial={"scan-resolution-x": 8, "scan-resolution-y": 16, "x-scan-direction": direction})
     simulator.clock, simulator.log, simulator.run_dir = fake_clock, logging.getLogger("test"), tmp_path
     simulator.memory, simulator.wake = {}, lambda: None
+    simulator.run_drawing = run_at_once  # type: ignore[method-assign]
     simulator.connect()
     simulator.start_scan()  # 16 lines of a second
-    assert simulator._controller is not None
-    simulator._controller.instrument.drawing.wait()
     pictures: dict[str, np.ndarray] = {}
     start = 0
     for seconds, rows in ((0.5, 0), (3.0, 3), (3.0, 3), (9.0, 9)):

@@ -11,6 +11,7 @@ import pytest
 
 from afspm.basics.errors import Refused
 from afspm.model import ScopeState
+from afspm.simulation.scan_drawing import run_at_once
 from afspm.simulation.simulator import Simulator
 from afspm.translator.driver_base import ControllerLost
 
@@ -22,6 +23,7 @@ def scope(request: Any, tmp_path: Path, fake_clock: Any) -> Simulator:
     """A microscope with one fault, whose scans take 4 s."""
     initial: dict[str, object] = {"scan-resolution-x": 8, "scan-resolution-y": 4}
     made = Simulator(faults=[request.param], initial=initial)
+    made.run_drawing = run_at_once  # type: ignore[method-assign]
     made.clock, made.log, made.run_dir = fake_clock, logging.getLogger("test"), tmp_path
     made.memory, made.wake = {}, lambda: None
     made.connect()
@@ -31,6 +33,7 @@ def scope(request: Any, tmp_path: Path, fake_clock: Any) -> Simulator:
 def restarted(scope: Simulator, memory: Any) -> Simulator:
     """The microscope after a restart with this saved state, without faults."""
     made = Simulator()
+    made.run_drawing = run_at_once  # type: ignore[method-assign]
     made.clock, made.log, made.run_dir = scope.clock, scope.log, scope.run_dir
     made.memory, made.wake = memory, lambda: None
     made.connect()
@@ -40,8 +43,6 @@ def restarted(scope: Simulator, memory: Any) -> Simulator:
 def scanned(scope: Simulator, fake_clock: Any) -> ScopeState:
     """The state after the time of a scan."""
     scope.start_scan()
-    assert scope._controller is not None
-    scope._controller.instrument.drawing.wait()
     fake_clock.t_s += 5.0
     return scope.status().state
 
@@ -103,8 +104,6 @@ def test_controller_is_lost_for_a_while_and_its_scan_goes_on(scope: Simulator, f
             ask()
     fake_clock.t_s += 10.0
     scope.connect()
-    assert scope._controller is not None
-    scope._controller.instrument.drawing.wait()
     assert scope.status().state is FREE
     assert len(scope.results()) == 1
 

@@ -549,7 +549,7 @@ def test_only_disturbing_requests_are_refused_during_a_scan(bench: Any) -> None:
     assert bench.ask(ACTION, names.START_SPEC).code == NOT_FREE
     assert bench.ask(FRAME, ScanParameters(shape=(4, 4))).code == NOT_FREE
     assert bench.ask(PARAM, Parameter("scan-speed", "1", "um/s")).code == NOT_FREE
-    bench.translator.requests.commands._driver.adjustable = frozenset({"scan-speed"})
+    bench.microscope.adjustable = frozenset({"scan-speed"})
     assert bench.ask(PARAM, Parameter("scan-speed", "1", "um/s")).code == OK
     assert "SS_SCANNING" in bench.ask(PARAM, Parameter("zctrl-pgain", "1")).reason
     assert bench.ask(PARAM, Parameter("scan-speed")).code == OK

@@ -11,6 +11,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from declared_messages import forget_afterwards
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 import afspm
@@ -27,7 +28,7 @@ from afspm.record.overview import Overview
 from afspm.record.run import open_run
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.scheduler.publishing.cache import PacketCache
-from afspm.wire import MessageDeclaration, MessageKind, messages
+from afspm.wire import MessageDeclaration, MessageKind
 from afspm.wire.message_types import register_all
 
 SOURCES = Path(afspm.__file__).parent
@@ -46,7 +47,7 @@ def message_class(name: str, package: str = "lab") -> Any:
 @pytest.fixture
 def tilt(monkeypatch: pytest.MonkeyPatch) -> MessageDeclaration:
     """Declare a message that is not built in."""
-    monkeypatch.setattr(messages, "_declared", dict(messages._declared))
+    forget_afterwards(monkeypatch)
     return wire.declare(
         MessageDeclaration(
             type=message_class("StageTilt"),
@@ -126,7 +127,7 @@ def test_a_declared_message_comes_back_from_the_record(tilt: MessageDeclaration,
 
 def test_a_module_of_the_user_declares_its_messages(monkeypatch: pytest.MonkeyPatch) -> None:
     module = ModuleType("lab_level")
-    monkeypatch.setattr(messages, "_declared", dict(messages._declared))
+    forget_afterwards(monkeypatch)
     monkeypatch.setitem(sys.modules, module.__name__, module)
     with pytest.raises(ConfigError, match="holds no message types"):
         register_all([module.__name__])
