@@ -64,22 +64,22 @@ def examine(experiment: Experiment | None, runs: Path, listen_s: float, commands
     Args:
         commands: names of afspm's own commands, which no package can replace.
     """
-    found = Examination([] if experiment is None else [*_file(experiment)])
-    found.found += diagnosis.of_packages(entry_points.inventory(commands))
-    if experiment is not None and diagnosis.is_well(found.found):
-        found.found += _keys(experiment)
-        _Connections(experiment, found).examine(listen_s)
-        found.found += _devices(experiment)
-        found.found += _load(experiment)
-    found.found += _disk(runs)
-    found.found.append(diagnosis.of_memory(psutil.virtual_memory().available, _sizes(found.pids)))
-    return found
+    examination = Examination([] if experiment is None else [*_file(experiment)])
+    examination.found += diagnosis.of_packages(entry_points.inventory(commands))
+    if experiment is not None and diagnosis.is_well(examination.found):
+        examination.found += _keys(experiment)
+        _Connections(experiment, examination).examine(listen_s)
+        examination.found += _devices(experiment)
+        examination.found += _load(experiment)
+    examination.found += _disk(runs)
+    examination.found.append(diagnosis.of_memory(psutil.virtual_memory().available, _sizes(examination.pids)))
+    return examination
 
 
 def _file(experiment: Experiment) -> Iterator[Diagnosis]:
-    errors = [one for one in experiment.check() if one.is_error]
-    for one in errors:
-        yield Diagnosis("file", Severity.ERROR, str(one.place), one.what, one.hint)
+    errors = [error for error in experiment.check() if error.is_error]
+    for error in errors:
+        yield Diagnosis("file", Severity.ERROR, str(error.place), error.what, error.hint)
     if not errors:
         yield diagnosis.fine("file", str(experiment.files[0]), "nothing wrong")
         for translator in experiment.resolved.with_role(Role.TRANSLATOR):
@@ -144,7 +144,7 @@ def _load(experiment: Experiment) -> Iterator[Diagnosis]:
 
 
 def _disk(runs: Path) -> Iterator[Diagnosis]:
-    folder = next(one for one in (runs.resolve(), *runs.resolve().parents) if one.is_dir())
+    folder = next(parent for parent in (runs.resolve(), *runs.resolve().parents) if parent.is_dir())
     clock, file = ExperimentClock.real(), folder / f".afspm-doctor-{os.getpid()}"
     try:
         began_s = clock.monotonic_s()
@@ -185,7 +185,7 @@ class _Connections:
             self._into.found.append(Diagnosis("not-running", Severity.WARNING, "scheduler", what, hint))
         elif reached.get(launch.sockets.control, probe.reach(launch.sockets.control)) is Reach.OPEN:
             self._speak(launch, listen_s)
-        if not any(one.code == "versions" for one in self._into.found):
+        if not any(finding.code == "versions" for finding in self._into.found):
             self._into.found.append(diagnosis.of_versions(probe.versions_here(), None))
 
     def _addresses(self) -> dict[str, Reach]:
@@ -195,12 +195,12 @@ class _Connections:
             for slot in slots
             if slot.address is not None and slot.address.startswith("tcp://")
         }
-        runs = any(slot.owner == self._scheduler and one is Reach.OPEN for slot, one in reached.values())
-        for address, (slot, one) in reached.items():
+        runs = any(slot.owner == self._scheduler and reach is Reach.OPEN for slot, reach in reached.values())
+        for address, (slot, reach) in reached.items():
             is_here = probe.is_of_this_computer(address)
-            found = diagnosis.of_address(slot.owner, address, one, is_here=is_here, expected=runs or not is_here)
-            self._into.found.append(found)
-        return {connectable(address): one for address, (_, one) in reached.items()}
+            diagnosed = diagnosis.of_address(slot.owner, address, reach, is_here=is_here, expected=runs or not is_here)
+            self._into.found.append(diagnosed)
+        return {connectable(address): reach for address, (_, reach) in reached.items()}
 
     def _launch(self) -> Launch | None:
         # a run that goes on here is joined as a guest: keys made for a run are in its folder, not in the file
@@ -290,8 +290,8 @@ class _Connections:
         if not isinstance(states, ProcessStates):
             return
         if states.supervisor.startswith(computer_name()):
-            self._into.pids |= {one.name: one.pid for one in states.processes if one.pid}
-        known = {one.where for one in self._into.found if one.code == "process"}
+            self._into.pids |= {process.name: process.pid for process in states.processes if process.pid}
+        known = {finding.where for finding in self._into.found if finding.code == "process"}
         for process in states.processes:
             where = f"{process.name} on {states.supervisor}"
             if process.condition in _ILL and where not in known:

@@ -117,13 +117,15 @@ def read(run: Run, hidden: Iterable[str] = ()) -> ShadowPack:
         raise InvalidValue(f"the run in {run.folder} is no shadow", hint=hint)
     traces = sorted(run.folder.glob(f"*{FILE}"))
     protocol = " ".join({line.what for line in _lines(traces) if isinstance(line, TracedExchange)})
-    found = {one.text: one for one in reversed([*_named(hidden), *_private(run, traces)]) if one.text.strip()}
-    kept, short = list[PrivateText](), list[PrivateText]()
-    for one in sorted(found.values(), key=lambda one: -len(one.text)):
-        is_asked = one.where == _ASKED
-        too_short = not is_asked and (len(one.text) < _SHORTEST or one.text in protocol)
-        (short if too_short else kept).append(one)
-    return ShadowPack(run, night, traces, kept, short)
+    texts = {
+        private.text: private for private in reversed([*_named(hidden), *_private(run, traces)]) if private.text.strip()
+    }
+    replaced, short = list[PrivateText](), list[PrivateText]()
+    for private in sorted(texts.values(), key=lambda private: -len(private.text)):
+        is_asked = private.where == _ASKED
+        too_short = not is_asked and (len(private.text) < _SHORTEST or private.text in protocol)
+        (short if too_short else replaced).append(private)
+    return ShadowPack(run, night, traces, replaced, short)
 
 
 def _lines(traces: Iterable[Path]) -> Iterator[TraceLine]:
@@ -162,10 +164,10 @@ def _private(run: Run, traces: Iterable[Path]) -> Iterator[PrivateText]:
 @lru_cache(maxsize=4096)
 def _folders(content: bytes) -> tuple[str, ...]:
     texts = list(_texts(content))
-    found = [text for text in texts if _WHOLE_FOLDER.fullmatch(text)] + [
-        one for text in texts for one in _FOLDER.findall(text)
+    paths = [text for text in texts if _WHOLE_FOLDER.fullmatch(text)] + [
+        path for text in texts for path in _FOLDER.findall(text)
     ]
-    folders = (one.decode("utf-8", "replace").replace("\\\\", "\\").rstrip("\\/:") for one in found)
+    folders = (path.decode("utf-8", "replace").replace("\\\\", "\\").rstrip("\\/:") for path in paths)
     return tuple(dict.fromkeys(folders))
 
 
@@ -221,28 +223,30 @@ class Mask:
 
     def __init__(self, private: Iterable[PrivateText]) -> None:
         plain, escaped, in_binary = list[bytes](), list[bytes](), list[bytes]()
-        for one in private:
-            end = rb"" if one.is_start else rb"(?![A-Za-z0-9])"
-            start = rb"(?<![A-Za-z0-9])" if one.text[:1].isalnum() else rb""
-            for form in {one.text.encode(), one.text.encode("cp1252", "replace")}:
+        for hidden in private:
+            end = rb"" if hidden.is_start else rb"(?![A-Za-z0-9])"
+            start = rb"(?<![A-Za-z0-9])" if hidden.text[:1].isalnum() else rb""
+            for form in {hidden.text.encode(), hidden.text.encode("cp1252", "replace")}:
                 plain.append(start + re.escape(form) + end)
                 length = re.escape(len(form).to_bytes(4, "big"))
                 within = rb"" if len(form) >= _LONG else rb"(?:(?<=[\t\n\r\x20-\x7e]{4})|(?<=" + length + rb"))"
                 in_binary.append(within + plain[-1])
-            once = json.dumps(one.text)[1:-1]
-            for text in {once, json.dumps(once)[1:-1], json.dumps(one.text, ensure_ascii=False)[1:-1]} - {one.text}:
+            once = json.dumps(hidden.text)[1:-1]
+            for text in {once, json.dumps(once)[1:-1], json.dumps(hidden.text, ensure_ascii=False)[1:-1]} - {
+                hidden.text
+            }:
                 escaped.append(start + re.escape(text.encode()) + end)
-            wide = re.escape(one.text.encode("utf-16-le"))
-            in_binary += [wide] if len(one.text) >= _SHORTEST else []
+            wide = re.escape(hidden.text.encode("utf-16-le"))
+            in_binary += [wide] if len(hidden.text) >= _SHORTEST else []
         self._escaped, self._plain, self._in_binary = _any_of(escaped), _any_of(plain), _any_of(in_binary)
 
     def of(self, content: bytes) -> bytes:
         """Return the content with each private text replaced."""
         is_text = _is_text(content)
         if is_text and self._escaped is not None:
-            content = self._escaped.sub(lambda found: _LETTERS.sub(_letter, found[0]), content)
+            content = self._escaped.sub(lambda match: _LETTERS.sub(_letter, match[0]), content)
         pattern = self._plain if is_text else self._in_binary
-        return content if pattern is None else pattern.sub(lambda found: _x(found[0]), content)
+        return content if pattern is None else pattern.sub(lambda match: _x(match[0]), content)
 
     def text(self, text: str) -> str:
         return self.of(text.encode()).decode("utf-8", "replace")
@@ -253,18 +257,18 @@ class Mask:
 
 
 def _any_of(patterns: list[bytes]) -> re.Pattern[bytes] | None:
-    longest_first = sorted(set(patterns), key=lambda one: -len(one))
+    longest_first = sorted(set(patterns), key=lambda pattern: -len(pattern))
     return re.compile(b"|".join(longest_first), re.IGNORECASE) if patterns else None
 
 
-def _x(found: bytes) -> bytes:
-    return bytes(120 if chr(one).isalnum() or one >= 0x80 else one for one in found)
+def _x(text: bytes) -> bytes:
+    return bytes(120 if chr(byte).isalnum() or byte >= 0x80 else byte for byte in text)
 
 
-def _letter(found: re.Match[bytes]) -> bytes:
-    if found[0].startswith(b"\\u"):
+def _letter(match: re.Match[bytes]) -> bytes:
+    if match[0].startswith(b"\\u"):
         return b"x" * 6
-    return found[0] if found[0].startswith(b"\\") else b"x"
+    return match[0] if match[0].startswith(b"\\") else b"x"
 
 
 def _masked_hdf5(content: bytes, mask: Mask) -> bytes:
@@ -297,18 +301,18 @@ def _masked_strings(value: Any, mask: Mask) -> Any:
         masked = mask.text(value)
         return masked if masked != value else None
     if isinstance(value, bytes):
-        return found if (found := mask.of(value)) != value else None
+        return masked_bytes if (masked_bytes := mask.of(value)) != value else None
     if isinstance(value, np.ndarray) and value.dtype.kind == "S":
         # a text may be an array of single characters
         whole = value.tobytes()
         masked_bytes = mask.of(whole)
         return np.frombuffer(masked_bytes, value.dtype).reshape(value.shape) if masked_bytes != whole else None
     if isinstance(value, np.ndarray) and value.dtype.kind == "O":
-        parts = [_masked_strings(one, mask) for one in value.ravel()]
+        parts = [_masked_strings(element, mask) for element in value.ravel()]
         if all(part is None for part in parts):
             return None
         pairs = zip(parts, value.ravel(), strict=True)
-        return np.array([one if part is None else part for part, one in pairs], object).reshape(value.shape)
+        return np.array([element if part is None else part for part, element in pairs], object).reshape(value.shape)
     return None
 
 
@@ -369,7 +373,7 @@ def _values(file: TracedFile) -> tuple[bytes, ...] | None:
         path = Path(folder) / file.file
         path.write_bytes(file.content)
         try:
-            return tuple(one.values.tobytes() for one in formats.read(path))
+            return tuple(measured.values.tobytes() for measured in formats.read(path))
         except AfspmError:
             return None
 
@@ -387,7 +391,7 @@ def _facts(pack: ShadowPack) -> dict[str, object]:
         "began": driver.began,
         "scans": len(pack.run.scans),
         "interrupted": sum(scan.interrupted for scan in pack.run.scans),
-        "agreement": [asdict(one) for one in pack.night.agreement],
+        "agreement": [asdict(agreement) for agreement in pack.night.agreement],
         "load": None if load is None else asdict(load),
     }
 

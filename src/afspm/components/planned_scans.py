@@ -298,14 +298,14 @@ class PlannedScans(Component):
         with self.scope.events(tip_verdict.OF_LINES, "ScopeStateMsg") as events:
             while True:
                 part, lasted_ns = rest.of(step), None
-                seen: list[PublishedEvent] = []
+                published: list[PublishedEvent] = []
                 try:
                     return self._scan(part, repeat=False)
                 except ControlLost as lost:
                     self._round_began_s = None
                     self.log.warning("%s: %s", part.key, lost.what)
-                    seen += events.waiting()
-                    lasted_ns = _newest_scan_ns(seen)
+                    published += events.waiting()
+                    lasted_ns = _newest_scan_ns(published)
                 except Refused as refused:
                     if part is step:
                         raise
@@ -315,22 +315,24 @@ class PlannedScans(Component):
                     self.memory.save()
                 with self.scope.control():  # in control again: the tip is repaired, and all verdicts have arrived
                     pass
-                seen += events.waiting()
-                rest = self._since_change(step, rest, seen, lasted_ns)
+                published += events.waiting()
+                rest = self._since_change(step, rest, published, lasted_ns)
 
     def _since_change(
-        self, step: PlanStep, rest: PlanRest, seen: Sequence[PublishedEvent], lasted_ns: tuple[int, int] | None
+        self, step: PlanStep, rest: PlanRest, published: Sequence[PublishedEvent], lasted_ns: tuple[int, int] | None
     ) -> PlanRest:
         part = rest.of(step)
-        messages = (event.message for event in seen if not isinstance(event.message, ScopeStatus))
-        found = [one for one in map(tip_verdict.read_line_verdict, messages) if one is not None and one.stops]
+        messages = (event.message for event in published if not isinstance(event.message, ScopeStatus))
+        verdicts = [
+            verdict for verdict in map(tip_verdict.read_line_verdict, messages) if verdict is not None and verdict.stops
+        ]
         # of this scan only: a verdict on an earlier scan, or on another component's scan, would leave out rows here
-        stopping = [one for one in found if one.shape == part.shape and _is_of(one, lasted_ns)]
+        stopping = [verdict for verdict in verdicts if verdict.shape == part.shape and _is_of(verdict, lasted_ns)]
         if not stopping:
             return rest
         # a restarted or second watch may have seen the change later: the verdict that leaves the most rows counts
-        rests = [rest.since(one.since_row, downwards=one.downwards) for one in stopping]
-        rest = max(rests, key=lambda one: one.last - one.first)
+        rests = [rest.since(verdict.since_row, downwards=verdict.downwards) for verdict in stopping]
+        rest = max(rests, key=lambda left: left.last - left.first)
         self.log.info("%s: rows %d to %d are left", part.key, rest.first, rest.last)
         # saved before the request: after a kill the same rows are requested, under the same key
         self.memory["rest"] = [step.key, rest.first, rest.last]
@@ -416,7 +418,7 @@ class ScanList(PlannedScans):
     ) -> None:
         super().__init__(**planned)
         listed = (given if isinstance(given, ListedRegion) else ListedRegion(**given) for given in regions)
-        self.plan = _plan(tuple(one.region for one in listed), pixels, rounds)
+        self.plan = _plan(tuple(entry.region for entry in listed), pixels, rounds)
         self.beat_s = period(every)
 
 
@@ -454,9 +456,13 @@ class RegionGrid(PlannedScans):
         self.beat_s = period(every)
 
 
-def _newest_scan_ns(seen: Sequence[PublishedEvent]) -> tuple[int, int] | None:
+def _newest_scan_ns(published: Sequence[PublishedEvent]) -> tuple[int, int] | None:
     # start and end by the published states; None if no start was seen
-    states = [(one.message.state, one.time_ns) for one in seen if isinstance(one.message, ScopeStatus) and one.time_ns]
+    states = [
+        (event.message.state, event.time_ns)
+        for event in published
+        if isinstance(event.message, ScopeStatus) and event.time_ns
+    ]
     known = [(state, at_ns) for state, at_ns in states if state is not ScopeState.UNDEFINED]
     before = (ScopeState.UNDEFINED, *(state for state, _ in known))
     begins = ScopeState.SCANNING

@@ -120,11 +120,11 @@ class KnownPlace:
     expected: Array
     scans: int = 1
 
-    def follow(self, seen: TipMetrics, correlation: Array) -> None:
+    def follow(self, measured: TipMetrics, correlation: Array) -> None:
         """Add a good scan to the means: equal weights at first, then at least FOLLOW for the newest."""
         weight = max(FOLLOW, 1.0 / (self.scans + 1))
         self.expected = np.round(self.expected + weight * (correlation - self.expected), DECIMALS)
-        now, new = asdict(self.usual), asdict(seen)
+        now, new = asdict(self.usual), asdict(measured)
         self.usual = TipMetrics(**{name: now[name] + weight * (new[name] - now[name]) for name in now})
         self.scans += 1
 
@@ -169,12 +169,12 @@ class TipReference:
                 return place
         return None
 
-    def note(self, place: KnownPlace | None, region: Region, seen: TipMetrics, correlation: Array) -> None:
+    def note(self, place: KnownPlace | None, region: Region, measured: TipMetrics, correlation: Array) -> None:
         """Add a scan with a good tip to a place; None as `place` begins a new place."""
         if place is not None:
-            place.follow(seen, correlation)
+            place.follow(measured, correlation)
             return
-        self.places.append(KnownPlace(region.center_m, replace(seen, ghost=0.0), np.round(correlation, DECIMALS)))
+        self.places.append(KnownPlace(region.center_m, replace(measured, ghost=0.0), np.round(correlation, DECIMALS)))
         del self.places[:-MOST_PLACES]
 
     def spread(self, name: str) -> float:
@@ -188,7 +188,9 @@ class TipReference:
     def usual_anywhere(self) -> TipMetrics:
         """Return the median metrics of the scans that were learnt from."""
         names = asdict(self.first[0])
-        return TipMetrics(**{name: float(np.median([getattr(seen, name) for seen in self.first])) for name in names})
+        return TipMetrics(
+            **{name: float(np.median([getattr(measured, name) for measured in self.first])) for name in names}
+        )
 
 
 @dataclass
@@ -261,23 +263,23 @@ class TipJudge:
         kind = self._reference_for(region, shape)
         place = kind.place(region)
         correlation = autocorrelation(seen_slopes, min(REACH_PX, min(shape) // 3))
-        seen = metrics(seen_slopes, correlation, place.expected if place else None)
-        if seen.contrast < LEAST_CONTRAST:
-            return Verdict(Opinion.UNCLEAR, f"nothing to see but noise (contrast {seen.contrast:.2f})", seen)
-        if seen.ghost > 1.0:  # trace and retrace agree more at another place than at their own
+        measured = metrics(seen_slopes, correlation, place.expected if place else None)
+        if measured.contrast < LEAST_CONTRAST:
+            return Verdict(Opinion.UNCLEAR, f"nothing to see but noise (contrast {measured.contrast:.2f})", measured)
+        if measured.ghost > 1.0:  # trace and retrace agree more at another place than at their own
             why = "trace and retrace do not agree: the feedback does not follow the surface at this speed"
-            return Verdict(Opinion.UNCLEAR, why, seen)
+            return Verdict(Opinion.UNCLEAR, why, measured)
         if not self._is_known(kind):
-            return self._learn(kind, place, seen, correlation, region)
-        verdict = self._compare(kind, place, seen)
+            return self._learn(kind, place, measured, correlation, region)
+        verdict = self._compare(kind, place, measured)
         self._state.doubtful = verdict.opinion is not Opinion.GOOD
         if verdict.opinion is Opinion.GOOD:
-            kind.note(place, region, seen, correlation)
-            for one in self._state.kinds:
-                one.confirmed = True
+            kind.note(place, region, measured, correlation)
+            for other in self._state.kinds:
+                other.confirmed = True
         elif verdict.opinion is Opinion.BAD:
             # scans learnt from since the last good comparison may show the bad tip
-            self._state.kinds = [one for one in self._state.kinds if one.confirmed or one is kind]
+            self._state.kinds = [other for other in self._state.kinds if other.confirmed or other is kind]
         return verdict
 
     @property
@@ -289,69 +291,76 @@ class TipJudge:
 
     def _reference_for(self, region: Region, shape: tuple[int, int]) -> TipReference:
         kinds = self._state.kinds
-        kind = next((one for one in kinds if one.fits(region, shape)), None)
+        kind = next((known for known in kinds if known.fits(region, shape)), None)
         if kind is not None:
             kinds.remove(kind)
         elif len(kinds) >= MOST_KINDS:
-            kinds.remove(next((one for one in kinds if not self._is_known(one)), kinds[0]))
+            kinds.remove(next((known for known in kinds if not self._is_known(known)), kinds[0]))
         kind = kind or TipReference(region.size_m, region.angle_rad, shape)
         kinds.append(kind)
         return kind
 
     def _learn(
-        self, reference: TipReference, place: KnownPlace | None, seen: TipMetrics, correlation: Array, region: Region
+        self,
+        reference: TipReference,
+        place: KnownPlace | None,
+        measured: TipMetrics,
+        correlation: Array,
+        region: Region,
     ) -> Verdict:
         if place is not None:
-            reference.deviations.append(_relative(seen, place.usual))
-        reference.first.append(seen)
+            reference.deviations.append(_relative(measured, place.usual))
+        reference.first.append(measured)
         reference.confirmed = False
-        reference.note(place, region, seen, correlation)
+        reference.note(place, region, measured, correlation)
         of = _kind_text(region, reference.shape)
-        return Verdict(Opinion.LEARNING, f"reference {len(reference.first)} of {self.reference_scans} of {of}", seen)
+        return Verdict(
+            Opinion.LEARNING, f"reference {len(reference.first)} of {self.reference_scans} of {of}", measured
+        )
 
-    def _compare(self, reference: TipReference, place: KnownPlace | None, seen: TipMetrics) -> Verdict:
-        faults = self._faults_anywhere(reference, seen)
+    def _compare(self, reference: TipReference, place: KnownPlace | None, measured: TipMetrics) -> Verdict:
+        faults = self._faults_anywhere(reference, measured)
         if place is not None:
-            faults += self._faults_here(reference, place, seen)
+            faults += self._faults_here(reference, place, measured)
         worst = max(way for way, _, _ in faults)
         if worst >= 1.0:
             reference.suspect = reference.suspect or place is not None
-            found = [(flaw, why) for way, flaw, why in faults if way >= 1.0]
-            flaws = tuple(flaw for flaw in FLAWS if flaw in dict(found))
-            return Verdict(Opinion.BAD, "; ".join(why for _, why in found), seen, flaws)
+            certain = [(flaw, why) for way, flaw, why in faults if way >= 1.0]
+            flaws = tuple(flaw for flaw in FLAWS if flaw in dict(certain))
+            return Verdict(Opinion.BAD, "; ".join(why for _, why in certain), measured, flaws)
         if worst > self.tolerance.margin:
             return Verdict(
                 Opinion.UNCLEAR,
                 "nearly " + "; ".join(why for way, _, why in faults if way > self.tolerance.margin),
-                seen,
+                measured,
             )
         if place is not None:
             self._clear_suspicion(reference)
         if any(kind.suspect for kind in self._state.kinds):
             missing = "there is no reference of this place" if place is None else "a finer kind of scan showed a fault"
-            return Verdict(Opinion.UNCLEAR, f"nothing wrong, but {missing}", seen)
-        return Verdict(Opinion.GOOD, _summary(seen, place.usual if place else reference.usual_anywhere()), seen)
+            return Verdict(Opinion.UNCLEAR, f"nothing wrong, but {missing}", measured)
+        return Verdict(Opinion.GOOD, _summary(measured, place.usual if place else reference.usual_anywhere()), measured)
 
     def _clear_suspicion(self, by: TipReference) -> None:
         # only a comparison at least as fine as the one that found the fault can clear it
         for kind in self._state.kinds:
             kind.suspect = kind.suspect and by.pixel_m > (1.0 + SAME_SIZE) * kind.pixel_m
 
-    def _faults_anywhere(self, reference: TipReference, seen: TipMetrics) -> list[Fault]:
+    def _faults_anywhere(self, reference: TipReference, measured: TipMetrics) -> list[Fault]:
         usual, tolerance = reference.usual_anywhere(), self.tolerance
-        now = _relative(seen, usual)
+        now = _relative(measured, usual)
         worn = f"worn: {now.detail:.0%} of the first scans' fine detail is left"
         faults = [((1.0 - now.detail) / (1.0 - tolerance.worn), BLUNT, worn)]
         if usual.unrest_m > 0.0:  # zero without retrace
             limit = 1.0 + max(tolerance.unrest - 1.0, tolerance.sigmas * reference.spread("unrest_m"))
-            what = f"{seen.unrest_m * 1e9:.2f} nm instead of {usual.unrest_m * 1e9:.2f} nm"
+            what = f"{measured.unrest_m * 1e9:.2f} nm instead of {usual.unrest_m * 1e9:.2f} nm"
             faults.append(
                 ((now.unrest_m - 1.0) / (limit - 1.0), CONTAMINATED, f"unsteady: trace and retrace disagree by {what}")
             )
         return faults
 
-    def _faults_here(self, reference: TipReference, place: KnownPlace, seen: TipMetrics) -> list[Fault]:
-        tolerance, now = self.tolerance, _relative(seen, place.usual)
+    def _faults_here(self, reference: TipReference, place: KnownPlace, measured: TipMetrics) -> list[Fault]:
+        tolerance, now = self.tolerance, _relative(measured, place.usual)
         loss = max(1.0 - tolerance.detail, tolerance.sigmas * reference.spread("detail"))
         ghost = max(tolerance.ghost, tolerance.sigmas * reference.spread("ghost"))
         blunt = (1.0 - now.detail) / loss
@@ -393,11 +402,14 @@ def _kind_text(region: Region, shape: tuple[int, int]) -> str:
     return f"scans of {area_text(region.size_m)}, {shape[1]} x {shape[0]} pixels"
 
 
-def _relative(seen: TipMetrics, usual: TipMetrics) -> TipMetrics:
+def _relative(measured: TipMetrics, usual: TipMetrics) -> TipMetrics:
     # ghost and contrast are correlations already, and need no usual value
-    unrest = seen.unrest_m / usual.unrest_m if usual.unrest_m > 0 else 1.0
-    return TipMetrics(seen.detail / usual.detail if usual.detail > 0 else 1.0, seen.ghost, unrest, seen.contrast)
+    unrest = measured.unrest_m / usual.unrest_m if usual.unrest_m > 0 else 1.0
+    return TipMetrics(
+        measured.detail / usual.detail if usual.detail > 0 else 1.0, measured.ghost, unrest, measured.contrast
+    )
 
 
-def _summary(seen: TipMetrics, usual: TipMetrics) -> str:
-    return f"detail {_relative(seen, usual).detail:.0%}, ghost {seen.ghost:.2f}, unrest {seen.unrest_m * 1e9:.2f} nm"
+def _summary(measured: TipMetrics, usual: TipMetrics) -> str:
+    detail, unrest_nm = _relative(measured, usual).detail, measured.unrest_m * 1e9
+    return f"detail {detail:.0%}, ghost {measured.ghost:.2f}, unrest {unrest_nm:.2f} nm"

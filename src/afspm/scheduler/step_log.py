@@ -57,7 +57,7 @@ _PLAIN = (
     events.Connected, events.Disconnected, events.Greeted, events.TranslatorUp, events.TranslatorDown,
     events.TranslatorCaughtUp, events.ProblemSeen, events.Announced, events.Stopped, events.Tick,
 )  # fmt: skip
-_BY_NAME: dict[str, type] = {one.__name__: one for one in _PLAIN}
+_BY_NAME: dict[str, type] = {event.__name__: event for event in _PLAIN}
 
 
 @dataclass(frozen=True)
@@ -147,14 +147,14 @@ class StepLog:
         """Return the log of a scheduler, in the folder of its run."""
         return cls(LineLog(log_path(Path(launch.run_dir or "."), launch.name), logger), launch)
 
-    def keep(self, one: Restored | Step) -> None:
+    def keep(self, recorded: Restored | Step) -> None:
         """Append the beginning of a life, or a step."""
-        if isinstance(one, Step):
-            event = None if one.event is None else _plain_event(one.event)
-            self._log.add(["step", event, one.now_s, one.now_ns, one.effects, one.state])
+        if isinstance(recorded, Step):
+            event = None if recorded.event is None else _plain_event(recorded.event)
+            self._log.add(["step", event, recorded.now_s, recorded.now_ns, recorded.effects, recorded.state])
             return
-        saved = None if one.saved is None else snapshot(one.saved, KIND, VERSION, lists=True)
-        cached = [[_plain_packet(entry.packet), entry.source_ns, entry.history] for entry in one.cached]
+        saved = None if recorded.saved is None else snapshot(recorded.saved, KIND, VERSION, lists=True)
+        cached = [[_plain_packet(entry.packet), entry.source_ns, entry.history] for entry in recorded.cached]
         launch = json.loads(replace(self._launch, keys=None, beat_token="").to_json())
         self._log.add(["life", launch, saved, cached])
 
@@ -196,7 +196,7 @@ def read_event(plain: PlainList | None, reports: Iterable[type] = ()) -> events.
     if name == "ReplayRequested":
         return events.ReplayRequested(given[0], tuple(given[1]), given[2])
     if name == "FrameReported":
-        return events.FrameReported(from_plain({one.__name__: one for one in reports}[given[0]], given[1]))
+        return events.FrameReported(from_plain({report.__name__: report for report in reports}[given[0]], given[1]))
     made: events.Input = from_plain(_BY_NAME[name], given[0])
     return made
 
@@ -215,10 +215,10 @@ def facts_of(effect: events.Effect) -> PlainList:
             text, total = f"{len(packet.payload)} bytes", _packet_sum(packet)
             return ["Publish", packet.envelope, text, packet.time_ns, source_ns, history, total]
         case events.Replay(_, packets):
-            order = [(one.envelope, one.time_ns) for one in packets]
+            order = [(packet.envelope, packet.time_ns) for packet in packets]
             return ["Replay", "", f"{len(packets)} packets", zlib.crc32(repr(order).encode())]
         case events.SaveState(state):
-            sums = {one.name: _plain_sum(getattr(state, one.name)) for one in fields(state)}
+            sums = {part.name: _plain_sum(getattr(state, part.name)) for part in fields(state)}
             return ["SaveState", "", "", sums]
         case events.Log(level, text):
             return ["Log", level, text]
@@ -258,21 +258,23 @@ def _request(request: Request) -> list[str]:
 
 def _plain_packet(packet: Packet, message: str = "") -> PlainList:
     payload: Buffer = packet.payload
-    kept: object
+    content: object
     if len(payload) <= INLINE_BYTES:
-        kept = _text(payload)
+        content = _text(payload)
     elif (zeros := _with_zeros(message, payload)) is not None:
-        kept = [_text(zlib.compress(zeros, 1))]
+        content = [_text(zlib.compress(zeros, 1))]
     else:
-        kept = len(payload)
-    return [packet.envelope, packet.time_ns, kept]
+        content = len(payload)
+    return [packet.envelope, packet.time_ns, content]
 
 
 def _packet(plain: PlainList) -> Packet:
-    envelope, time_ns, kept = plain
-    if isinstance(kept, int):
-        return Packet(envelope, bytes(kept), time_ns)
-    return Packet(envelope, zlib.decompress(b64decode(kept[0])) if isinstance(kept, list) else b64decode(kept), time_ns)
+    envelope, time_ns, content = plain
+    if isinstance(content, int):
+        return Packet(envelope, bytes(content), time_ns)
+    return Packet(
+        envelope, zlib.decompress(b64decode(content[0])) if isinstance(content, list) else b64decode(content), time_ns
+    )
 
 
 def _packet_sum(packet: Packet) -> int:
@@ -299,9 +301,9 @@ def _canonical(value: object) -> str:
     if isinstance(value, Enum):
         return repr(value.value)
     if is_dataclass(value) and not isinstance(value, type):
-        return f"({','.join(_canonical(getattr(value, one.name)) for one in fields(value))})"
+        return f"({','.join(_canonical(getattr(value, part.name)) for part in fields(value))})"
     if isinstance(value, Mapping):
-        return f"{{{','.join(sorted(f'{_canonical(key)}:{_canonical(one)}' for key, one in value.items()))}}}"
+        return f"{{{','.join(sorted(f'{_canonical(key)}:{_canonical(item)}' for key, item in value.items()))}}}"
     if isinstance(value, set | frozenset):
         return f"{{{','.join(sorted(map(_canonical, value)))}}}"
     if isinstance(value, list | tuple | deque):

@@ -98,10 +98,10 @@ def _figures(figures: Sequence[FigurePicture]) -> str:
     names = ["", *(f"figure-{number}" for number in range(len(figures))), ""]
     made = [
         markup.figure(
-            names[k + 1], f'<img src="{data_url(one.image)}" alt="{escape(one.name)}">', escape(one.name), {},
-            beside=(names[k], names[k + 2]), style="drawn", ratio=one.ratio,
+            names[k + 1], f'<img src="{data_url(picture.image)}" alt="{escape(picture.name)}">', escape(picture.name),
+            {}, beside=(names[k], names[k + 2]), style="drawn", ratio=picture.ratio,
         )
-        for k, one in enumerate(figures)
+        for k, picture in enumerate(figures)
     ]  # fmt: skip
     return f'<div class="sheet wide">{"".join(made)}</div>' if made else ""
 
@@ -116,7 +116,7 @@ def _cards(story: RunStory) -> str:
         ("spectra", story.spectra, ""),
         *(_decisions(story) or [flagged]),
         *_registered(story),
-        ("refusals", sum(one.count for one in story.refusals), ""),
+        ("refusals", sum(refused.count for refused in story.refusals), ""),
         ("restarts", len(story.restarts), f"given up: {', '.join(story.given_up)}" if story.given_up else ""),
     ]
     made = [
@@ -165,12 +165,12 @@ def _drift(story: RunStory, clock: PageTimes) -> str:
 
 
 def _shares(story: RunStory) -> str:
-    seen, styles = story.overview, colours(story)
+    overview, styles = story.overview, colours(story)
     return '<div class="shares">' + "".join(
         [
-            _share_table(story, "in control", seen.timelines.control, styles),
-            _share_table(story, "microscope", seen.timelines.scope_state, {}),
-            _share_table(story, "mode", seen.timelines.mode, {"manual": "manual"}),
+            _share_table(story, "in control", overview.timelines.control, styles),
+            _share_table(story, "microscope", overview.timelines.scope_state, {}),
+            _share_table(story, "mode", overview.timelines.mode, {"manual": "manual"}),
         ]
     ) + "</div>"  # fmt: skip
 
@@ -210,9 +210,9 @@ def _problems(story: RunStory, clock: PageTimes) -> str:
         for span in story.overview.routine_spans
     )
     watched = "".join(
-        f'<p class="note">{escape(name)} watched {one.watched} of {counted(one.complete, "complete scan")}; '
-        f"{counted(one.late_lines, 'line')} came after the end of their scan.</p>"
-        for name, one in story.watched.items()
+        f'<p class="note">{escape(name)} watched {counts.watched} of {counted(counts.complete, "complete scan")}; '
+        f"{counted(counts.late_lines, 'line')} came after the end of their scan.</p>"
+        for name, counts in story.watched.items()
     )
     nothing = "A shadow sets no problems: see its decisions above." if story.shadow.agreement else "None."
     return (
@@ -256,11 +256,21 @@ def _treatments(story: RunStory) -> str:
 
 def _instruments(story: RunStory) -> str:
     rows = []
-    for name in dict.fromkeys(one.name for row in story.beside_instruments for one in row.instruments):
-        at = [(row, one) for row in story.beside_instruments for one in row.instruments if one.name == name]
-        known = [bound for _, one in at for bound in (one.lowest, one.value, one.highest) if bound is not None]
-        unit = next((one.unit for _, one in at if one.unit), "")
-        outside = [row for row, one in at if one.outside]
+    for name in dict.fromkeys(instrument.name for row in story.beside_instruments for instrument in row.instruments):
+        at = [
+            (row, instrument)
+            for row in story.beside_instruments
+            for instrument in row.instruments
+            if instrument.name == name
+        ]
+        known = [
+            bound
+            for _, instrument in at
+            for bound in (instrument.lowest, instrument.value, instrument.highest)
+            if bound is not None
+        ]
+        unit = next((instrument.unit for _, instrument in at if instrument.unit), "")
+        outside = [row for row, instrument in at if instrument.outside]
         links = [
             f'<a href="#{sample.name_of(row)}">{row.number}</a>'
             if isinstance(row, ScanRow)
@@ -296,13 +306,13 @@ def _notes(story: RunStory, clock: PageTimes) -> str:
 def _refusals(story: RunStory, clock: PageTimes) -> str:
     rows = [
         [
-            clock.both(one.first_ns) + (f" … {clock.both(one.last_ns)}" if one.count > 1 else ""),
-            str(one.count),
-            escape(one.who),
-            escape(one.what),
-            escape(one.reason),
+            clock.both(refused.first_ns) + (f" … {clock.both(refused.last_ns)}" if refused.count > 1 else ""),
+            str(refused.count),
+            escape(refused.who),
+            escape(refused.what),
+            escape(refused.reason),
         ]
-        for one in story.refusals[:MOST_ROWS]
+        for refused in story.refusals[:MOST_ROWS]
     ]
     left_out = len(story.refusals) - len(rows)
     more = f'<p class="note">{left_out} more are in the record.</p>' if left_out else ""
@@ -311,7 +321,7 @@ def _refusals(story: RunStory, clock: PageTimes) -> str:
 
 def _restarts(story: RunStory, clock: PageTimes) -> str:
     rows = [
-        [clock.both(one.time_ns), escape(one.name), str(one.starts), escape(one.last_exit)]
-        for one in story.restarts[:MOST_ROWS]
+        [clock.both(restart.time_ns), escape(restart.name), str(restart.starts), escape(restart.last_exit)]
+        for restart in story.restarts[:MOST_ROWS]
     ]
     return table(["when", "process", "start number", "had ended"], rows) or "<p>None.</p>"

@@ -164,17 +164,17 @@ class ShadowNight:
 
     def row(self, number: int) -> ShadowRow:
         """Return a row by its number. Raises InvalidValue if there is none."""
-        for one in self.rows:
-            if one.number == number:
-                return one
+        for row in self.rows:
+            if row.number == number:
+                return row
         hint = f"1 to {len(self.rows)}" if self.rows else "the run is no shadow, or nothing has happened yet"
         raise InvalidValue(f"the shadow's table has no row {number}", hint=hint)
 
     @property
     def answered(self) -> tuple[int, int]:
         """The number of decisions with a counted agreement, and the number that the person answered."""
-        some = [one for one in self.agreement if one.kind in COUNTED]
-        return sum(one.count for one in some), sum(one.agreed for one in some)
+        some = [of_kind for of_kind in self.agreement if of_kind.kind in COUNTED]
+        return sum(of_kind.count for of_kind in some), sum(of_kind.agreed for of_kind in some)
 
     def left_s(self, *, right: bool) -> float:
         """Return the scan time left at all line alarms that a person marked right, or wrong."""
@@ -197,7 +197,7 @@ def mark_text(row: ShadowRow, opinion: str) -> str:
 
 
 def _opinion(text: str) -> ShadowMark | None:
-    word = next((one for one in _MARKS if text.lower().startswith(one)), "")
+    word = next((known for known in _MARKS if text.lower().startswith(known)), "")
     rest = text[len(word) :]
     return ShadowMark(word == RIGHT, rest.strip(" ,;:.")) if word and not rest[:1].isalnum() else None
 
@@ -270,15 +270,15 @@ def compare(
     """
     answers = [act for act in acts if act.answers]
     rows, foreseen = [], set[int]()
-    for one in decisions:
-        soon = [act for act in answers if 0 <= act.time_ns - one.time_ns <= SOON_S * NS_PER_S]
-        if one.kind in COUNTED:
+    for decision in decisions:
+        soon = [act for act in answers if 0 <= act.time_ns - decision.time_ns <= SOON_S * NS_PER_S]
+        if decision.kind in COUNTED:
             foreseen |= {act.time_ns for act in soon}
-        if soon and one.kind not in _UNANSWERED:
-            after_s = (soon[0].time_ns - one.time_ns) / NS_PER_S
-            rows.append(replace(one, did=soon[0].text, after_s=after_s))
+        if soon and decision.kind not in _UNANSWERED:
+            after_s = (soon[0].time_ns - decision.time_ns) / NS_PER_S
+            rows.append(replace(decision, did=soon[0].text, after_s=after_s))
         else:
-            rows.append(one)
+            rows.append(decision)
     rows += [*limits, *(ShadowRow(act.time_ns, ShadowKind.PERSON, "", act.text) for act in acts)]
     marks = _marks(notes)
     numbered = [
@@ -299,13 +299,13 @@ def _agreements(rows: Sequence[ShadowRow]) -> Iterator[Agreement]:
 
 
 def _marks(notes: Sequence[NoteRow]) -> dict[tuple[int, ShadowKind], ShadowMark]:
-    found = {}
+    marks = {}
     for note in sorted(notes, key=lambda note: note.written_ns or 0):
         kind, colon, opinion = note.text.partition(": ")
         mark = _opinion(opinion) if colon else None
         if mark is not None and kind in list(ShadowKind):
-            found[note.time_ns, ShadowKind(kind)] = mark
-    return found
+            marks[note.time_ns, ShadowKind(kind)] = mark
+    return marks
 
 
 def html(night: ShadowNight, clock: PageTimes) -> str:
@@ -354,16 +354,16 @@ def agreement_lines(night: ShadowNight) -> list[tuple[str, ...]]:
     """Return a line of each kind: number, number answered with interval, and number marked right, wrong, interval."""
     return [
         (
-            *(one.kind.value, str(one.count)),
-            *((str(one.agreed), _between(one.interval)) if one.kind in (*COUNTED, ShadowKind.PERSON) else ("", "")),
-            *(str(one.right), str(one.wrong), _between(one.interval_right) if one.right + one.wrong else ""),
+            *(row.kind.value, str(row.count)),
+            *((str(row.agreed), _between(row.interval)) if row.kind in (*COUNTED, ShadowKind.PERSON) else ("", "")),
+            *(str(row.right), str(row.wrong), _between(row.interval_right) if row.right + row.wrong else ""),
         )
-        for one in night.agreement
+        for row in night.agreement
     ]
 
 
 def _between(share: tuple[float, float]) -> str:
-    return "{:.0f} % to {:.0f} %".format(*(100.0 * one for one in share))
+    return "{:.0f} % to {:.0f} %".format(*(100.0 * bound for bound in share))
 
 
 def _word(mark: ShadowMark) -> str:
@@ -390,12 +390,12 @@ def _is_flag(entry: JournalEntry) -> bool:
 def _lost_in(run: Run, scans: Sequence[ScanRow]) -> list[ScanRow]:
     # a scan that a lost contact interrupts goes on at the controller: no person has ended it
     states = [(packet.time_ns or 0, status.state) for packet, _, status in run.messages(("ScopeStateMsg",))]
-    found = []
+    lost = []
     for scan in scans:
         later = (state for time_ns, state in states if time_ns >= scan.time_ns and state not in _OF_THE_SCAN)
         if next(later, None) is ScopeState.UNDEFINED:
-            found.append(scan)
-    return found
+            lost.append(scan)
+    return lost
 
 
 def _judged(scan: ScanRow) -> str:
@@ -426,11 +426,11 @@ def _of_lines(time_ns: int, verdict: TipVerdict, scans: Sequence[ScanRow]) -> Sh
 
 
 def _solvers(run: Run) -> Mapping[str, Sequence[str]]:
-    found: dict[str, list[str]] = {}
+    solvers: dict[str, list[str]] = {}
     for name, process in (run.facts.get("processes") or {}).items():
         for problem in process.get(SOLVES, ()):
-            found.setdefault(problem, []).append(name)
-    return found
+            solvers.setdefault(problem, []).append(name)
+    return solvers
 
 
 def _asked(journal: Sequence[JournalEntry]) -> Iterator[ShadowRow]:
@@ -456,14 +456,14 @@ def of_drift(
     placed: list[ScanRow] = []
     for scan in scans:
         began_ns = scan.time_ns if scan.began_ns is None else scan.began_ns
-        point = next((one for one in points if began_ns <= one.time_ns <= scan.time_ns), None)
+        point = next((candidate for candidate in points if began_ns <= candidate.time_ns <= scan.time_ns), None)
         if point is None or scan.region is None or scan.region.frame is Frame.SAMPLE:
             continue
         if not placed and point.translation_m == (0.0, 0.0):  # the first scan, from which the drift is counted
             placed, first[scan.number] = [scan], point.translation_m
             continue
         moved_m, doubt = point.translation_m, quantity(point.sd_m, "m", 3)
-        before = next((one for one in placed if _same_frame(one, scan)), None)
+        before = next((earlier for earlier in placed if _same_frame(earlier, scan)), None)
         if before is None:
             placed.append(scan)
             first[scan.number] = moved_m
@@ -486,8 +486,8 @@ def _place(xy_m: tuple[float, float]) -> str:
     return position_text((x, y))
 
 
-def _same_frame(one: ScanRow, other: ScanRow) -> bool:
-    if one.region is None or other.region is None:
+def _same_frame(scan: ScanRow, other: ScanRow) -> bool:
+    if scan.region is None or other.region is None:
         return False
-    pairs = zip(one.region.center_m + one.region.size_m, other.region.center_m + other.region.size_m, strict=True)
-    return all(abs(a - b) <= _SAME_FRAME * min(one.region.size_m) for a, b in pairs)
+    pairs = zip(scan.region.center_m + scan.region.size_m, other.region.center_m + other.region.size_m, strict=True)
+    return all(abs(a - b) <= _SAME_FRAME * min(scan.region.size_m) for a, b in pairs)

@@ -57,9 +57,9 @@ class Playback:
         exchanges = [(number, line) for number, line in enumerate(lines, 1) if isinstance(line, TracedExchange)]
         numbered = [(number, line) for number, line in exchanges if line.asked is not None]
         self._files = [(number, line) for number, line in enumerate(lines, 1) if isinstance(line, TracedFile)]
-        connections = sorted({one.connection for _, one in exchanges})
+        connections = sorted({exchange.connection for _, exchange in exchanges})
         self._recorded = [[entry for entry in numbered if entry[1].connection == number] for number in connections]
-        self._looks = {_compared(one.asked) for _, one in numbered if not one.command}
+        self._looks = {_compared(exchange.asked) for _, exchange in numbered if not exchange.command}
         self._cursors: list[_Cursor] = []
         self._last_line = numbered[-1][0] if numbered else 0
         self._reached = 0
@@ -67,7 +67,7 @@ class Playback:
     @property
     def transport(self) -> str:
         """The transport of the recorded controller; empty without exchanges."""
-        return next((one[1].transport for exchanges in self._recorded for one in exchanges), "")
+        return next((entry[1].transport for exchanges in self._recorded for entry in exchanges), "")
 
     @property
     def missing(self) -> list[tuple[int, TracedExchange]]:
@@ -89,12 +89,12 @@ class Playback:
             Deviation: the recording differs.
         """
         cursor = self._cursors[connection]
-        found = self._match(cursor, content)
-        if found is None:
+        match = self._match(cursor, content)
+        if match is None:
             if self._may_continue(cursor, content):
                 return None
             raise Deviation(self._difference(cursor, content))
-        index, (line, exchange) = found
+        index, (line, exchange) = match
         if index >= cursor.next:
             self._reached = max(self._reached, _line_before(cursor, index))
             if exchange.after < line - 1 and not self._has_passed(connection, exchange.after, line):
@@ -116,13 +116,14 @@ class Playback:
     def _last_before(self, line: int, file: TracedFile) -> int:
         entries = [entry for exchanges in self._recorded for entry in exchanges]
         return max(
-            (number for number, one in entries if number < line and one.at_s + one.took_s <= file.at_s), default=0
+            (number for number, exchange in entries if number < line and exchange.at_s + exchange.took_s <= file.at_s),
+            default=0,
         )
 
     def _has_passed(self, connection: int, after: int, line: int) -> bool:
         # the order between connections is part of the recording
         others = [cursor for number, cursor in enumerate(self._cursors) if number != connection]
-        meanwhile = [one for cursor in others for one, _ in cursor.exchanges if after < one < line]
+        meanwhile = [number for cursor in others for number, _ in cursor.exchanges if after < number < line]
         return not meanwhile or self._reached >= max(meanwhile)
 
     def _match(self, cursor: _Cursor, content: bytes) -> tuple[int, tuple[int, TracedExchange]] | None:
@@ -145,8 +146,10 @@ class Playback:
 
     def _may_continue(self, cursor: _Cursor, content: bytes) -> bool:
         rest = cursor.exchanges[cursor.next :]
-        questions = {one.asked for _, one in cursor.exchanges if one.asked is not None and not one.command}
-        questions |= {one.asked for _, one in rest if one.asked is not None}
+        questions = {
+            exchange.asked for _, exchange in cursor.exchanges if exchange.asked is not None and not exchange.command
+        }
+        questions |= {exchange.asked for _, exchange in rest if exchange.asked is not None}
         return any(asked != content and asked.startswith(content) for asked in questions)
 
     def _difference(self, cursor: _Cursor, content: bytes) -> str:
@@ -166,28 +169,28 @@ def _line_before(cursor: _Cursor, index: int) -> int:
 
 def _compared(asked: bytes | None) -> bytes:
     # without the ids that a client gives its requests
-    found = _json(asked or b"")
-    if found is None or not any(key in found for key in _IDS):
+    request = _json(asked or b"")
+    if request is None or not any(key in request for key in _IDS):
         return asked or b""
-    return json.dumps({key: value for key, value in found.items() if key not in _IDS}, sort_keys=True).encode()
+    return json.dumps({key: value for key, value in request.items() if key not in _IDS}, sort_keys=True).encode()
 
 
 def _with_ids_of(asked: bytes, answer: bytes) -> bytes:
-    question, found = _json(asked), _json(answer)
-    if question is None or found is None:
+    question, reply = _json(asked), _json(answer)
+    if question is None or reply is None:
         return answer
-    ids = {key: question[key] for key in _IDS if key in question and key in found}
-    return json.dumps({**found, **ids}).encode() if ids else answer
+    ids = {key: question[key] for key in _IDS if key in question and key in reply}
+    return json.dumps({**reply, **ids}).encode() if ids else answer
 
 
 def _json(content: bytes) -> Plain | None:
     if not content.startswith(b"{"):
         return None
     try:
-        found = from_json(content)
+        value = from_json(content)
     except ValueError:
         return None
-    return found if isinstance(found, dict) else None
+    return value if isinstance(value, dict) else None
 
 
 def _shown(content: bytes) -> str:
