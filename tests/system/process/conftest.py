@@ -121,5 +121,8 @@ def host(start: Start) -> Callable[[Launch], Child]:
 @pytest.fixture
 def waiting_host(start: Start) -> Child:
     """Start a host without its launch line, but with its imports: on a busy computer they take long."""
-    run = "run_module('afspm.supervisor.host', run_name='__main__')"
-    return start([sys.executable, "-c", f"import afspm.supervisor.hosting; from runpy import run_module; {run}"], None)
+    imports = "afspm.supervisor.hosting, afspm.simulation.simulator, process_parts"
+    run = "from runpy import run_module; run_module('afspm.supervisor.host', run_name='__main__')"
+    host = start([sys.executable, "-c", f"import {imports}; print('imported'); {run}"], None)
+    host.expect("imported")
+    return host
