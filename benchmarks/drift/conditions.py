@@ -110,7 +110,10 @@ CONDITIONS: dict[str, Condition] = {
 
 
 def wandered(rows: int, condition: Condition, random: np.random.Generator) -> Array:
-    """Return the displacement of each row, px, shape (2, rows): zero mean, and creep at the first rows."""
+    """Return the displacement of each row, px, shape (2, rows), and creep at the first rows.
+
+    Its mean over the rows is no drift of the sample: it is part of the error of a pair, as on a real scanner.
+    """
     keep = np.exp(-1.0 / condition.wander_rows)
     made = _remembered(random.standard_normal((4 * rows, 2)), keep)
     if condition.wander == "smooth":
@@ -122,7 +125,7 @@ def wandered(rows: int, condition: Condition, random: np.random.Generator) -> Ar
     made = made / np.sqrt(np.mean(made**2, axis=0))
     taken = made[3 * rows :] * condition.wander_px
     crept = np.exp(-np.arange(rows) / condition.slow_creep_rows)[:, None] * np.array(condition.slow_creep_px)
-    return np.asarray((taken - taken.mean(axis=0) + crept).T)
+    return np.asarray((taken + crept).T)
 
 
 def measured(image: Array, condition: Condition, random: np.random.Generator, gain: float = 1.0) -> Array:

@@ -52,7 +52,7 @@ class Circumstances:
         drift_px: standard deviation of the drift during each scan.
         turn_rad, stretch: of the sample between the scans, standard deviations; unknown to the estimator.
         creep_px, creep_length_px: of the lines' starts.
-        wander_px, wander_rows: of lines, in each direction: standard deviation, and the longest period of its spectrum.
+        wander_px, wander_rows: of lines, in each direction: standard deviation, and the mean period if they are waves.
         slow_creep_px, slow_creep_rows: of the slow axis after the start of a frame.
         tip: fall of the tip's flanks for each pixel.
         overlap: least and greatest share of the area.
@@ -419,19 +419,33 @@ def foreign_pair(cell: str, surface: str, seed: int) -> ForeignPair:
 
 
 def wander(frame: Frame, how: Circumstances, random: Random) -> Array:
-    """Return the displacement (2, y, 1) of each line: waves of random periods, and slow creep at the first lines."""
-    rows = np.arange(frame.pixels)
-    moved = np.zeros((2, frame.pixels))
+    """Return the displacement (2, y, 1) of each line: waves or 1/f noise, and slow creep at the first lines.
+
+    Its mean over the lines belongs to the error of a pair.
+    """
+    rows = np.arange(frame.pixels, dtype=np.float64)
+    made = _waves(rows, how.wander_rows, random) if random.random() < 0.5 else _one_over_f(frame.pixels, random)
+    crept = how.slow_creep_px * random.choice((-1.0, 1.0)) * np.exp(-rows / how.slow_creep_rows)
+    own = frame.step_px * (how.wander_px * made + np.outer((0.0, 1.0), crept))
+    return np.asarray((frame.axes @ own)[:, :, None])
+
+
+def _waves(rows: Array, mean_period: float, random: Random) -> Array:
+    moved, power = np.zeros((2, rows.size)), np.zeros((2, 1))
     for axis in range(2):
         for _ in range(24):
-            period = how.wander_rows * random.uniform(0.1, 1.0)
+            period = mean_period * random.uniform(0.1, 2.0)
             size, start = period * math.sqrt(random.exponential()), random.random()
             moved[axis] += size * np.sin(2 * np.pi * (rows / period + start))
-    moved -= moved.mean(axis=1, keepdims=True)
-    moved *= how.wander_px * frame.step_px / np.sqrt(np.mean(moved**2, axis=1, keepdims=True))
-    crept = how.slow_creep_px * frame.step_px * random.choice((-1.0, 1.0)) * np.exp(-rows / how.slow_creep_rows)
-    own = moved + np.outer((0.0, 1.0), crept)
-    return np.asarray((frame.axes @ own)[:, :, None])
+            power[axis] += size**2 / 2
+    return np.asarray(moved / np.sqrt(power))
+
+
+def _one_over_f(count: int, random: Random) -> Array:
+    # of unit rms over eight frames
+    size = random.standard_normal((2, 4 * count)) / np.sqrt(np.arange(1, 4 * count + 1))
+    turned = np.fft.irfft(np.column_stack([np.zeros(2), size * np.exp(2j * np.pi * random.random(size.shape))]))
+    return np.asarray((turned / turned.std(axis=1, keepdims=True))[:, :count])
 
 
 def _frames(how: Circumstances, random: Random) -> tuple[Frame, Frame]:

@@ -67,10 +67,25 @@ def test_ellipses_match_the_errors_and_grow_with_a_significant_doubt() -> None:
         shared, varied = random.uniform(0.0, 1.0, 2)
         chi2 = 2.0 * math.exp(1.5 * shared) * random.exponential(2.0)
         outcomes.append(_outcome(seed, GOOD, wrong=False, chi2=chi2, varied=varied, shared=shared))
-    spread = fit._spread(outcomes, fit.COVERED)
+    spread = fit._spread(outcomes)
     assert spread["shared"] == pytest.approx(1.5, abs=0.2)
     assert abs(spread["varied"]) < 0.2
     assert spread["all"] == pytest.approx(2.0 * math.log(1.0 - fit.COVERED) / math.log(0.05), rel=0.15)
+
+
+def test_errors_have_the_covariance_of_the_doubt_though_some_are_far_off() -> None:
+    random = np.random.default_rng(5)
+    outcomes = []
+    for seed in range(4000):
+        shared, varied = random.uniform(0.0, 1.0, 2)
+        tail = (fit.FREEDOM - 2.0) / random.chisquare(fit.FREEDOM)
+        chi2 = fit.DOUBT_OF_ALL * math.exp(1.5 * varied) * tail * random.exponential(2.0)
+        outcomes.append(
+            _outcome(seed, GOOD, wrong=False, chi2=chi2, cell=fit.WANDERING[0], varied=varied, shared=shared)
+        )
+    doubt = fit._doubt(outcomes)
+    assert doubt["varied"] == pytest.approx(1.5, abs=0.15)
+    assert doubt["shared"] == pytest.approx(0.0, abs=0.15)
 
 
 def test_no_doubt_makes_an_ellipse_smaller() -> None:
@@ -80,7 +95,7 @@ def test_no_doubt_makes_an_ellipse_smaller() -> None:
         shared, varied = random.uniform(0.0, 1.0, 2)
         chi2 = 2.0 * math.exp(-1.5 * shared) * random.exponential(2.0)
         outcomes.append(_outcome(seed, GOOD, wrong=False, chi2=chi2, varied=varied, shared=shared))
-    spread = fit._spread(outcomes, fit.COVERED)
+    spread = fit._spread(outcomes)
     assert all(spread[name] >= 0.0 for name in fit.DOUBTS)
 
 
