@@ -211,7 +211,6 @@ bench-guests: $(TEST)
 	@$(BIN)/python -m benchmarks.line_watch --rooms 40
 	@$(BIN)/python -m benchmarks.tip_learning --full
 	@$(BIN)/python -m benchmarks.adaptive
-	@$(BIN)/python -m benchmarks.adaptive --textbook --maps 2
 	@$(BIN)/python -m benchmarks.line_watch --rooms 40 --without-retrace
 
 ## malformed requests and packets, and random calls of every emulated controller: make soak MESSAGES=20000 CALLS=5000

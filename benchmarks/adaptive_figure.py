@@ -33,6 +33,8 @@ def draw(path: Path, seed: int) -> None:
         drawn = axes.imshow(truth, origin="lower", extent=(-0.5, 0.5, -0.5, 0.5), cmap=gold())
         x, y = one.measurements[:, :2].T * 1e6
         axes.plot(x, y, ".", color=CATEGORICAL[0], markersize=4.0, markeredgewidth=0.0)
+        axes.set_xlim(-0.52, 0.52)
+        axes.set_ylim(-0.52, 0.52)
         axes.set_axis_off()
         axes.set_title(f"{name}: {len(x)} spectra, {one.until(GOAL) / 3600:.1f} h", size=_TEXT)
         draw_scale_bar(axes, REGION.size_m, (-0.5, -0.5), 1e6, font=_TEXT)

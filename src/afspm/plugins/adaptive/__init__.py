@@ -7,13 +7,12 @@ there are any `register_failures`, `should_stop`), so its Ax and Xopt backends f
 | module | content |
 | --- | --- |
 | `gaussian_process` | the map and its expected error, from values with their times; also the drift of the sample |
-| `refinement` | the optimisers: nested lattices, complete or refined where the map is rough |
-| `tours` | short ways between positions; the cost of a measurement in seconds, learnt from the run |
+| `refinement` | the optimisers: the largest variance per second, or complete nested lattices |
 | `quantities` | from a curve to a number |
 | `mapping` | the loop, for the component and for scripts |
 | `adaptive`, `map_picture` | the component, and its picture |
 
-The first three are pure: the same measurements give the same suggestions. Invariants: a position is suggested once; the
+The first two are pure: the same measurements give the same suggestions. Invariants: a position is suggested once; the
 component's memory suffices to continue after a kill, since a map follows from its measurements alone.
 """
 

@@ -1,17 +1,16 @@
 """Optimisers that map a quantity over a region, behind the protocol of bluesky-adaptive 1.0: `suggest` and `ingest`.
 
-**Theory of operation.** The region carries nested lattices, each twice as fine as the last. A round of
-`AdaptiveMap` takes positions of the next finer lattice, but only beside positions that are measured already, and only
-where the Gaussian process expects an error worth the seconds. On a map that is rough everywhere the whole lattice
-is taken, exactly as by a nested grid; on a map that is rough in a few places, mostly these places.
+**Theory of operation.** The region carries nested lattices, each twice as fine as the last. `AdaptiveMap` measures the
+first one row by row, and then always the position with the largest variance of the Gaussian process per second: curve
+and way. The variance is scaled by the local roughness, so even ground is measured less densely than a spot. A spot is
+found only by a measurement nearby, so the candidates reach over the whole region in the third refinement. Those nearer
+to a failure than to a value come last: where one position has no value, the next may have none either.
 
-The usual choice, the position of the largest variance, is not taken for two reasons. The variance of a stationary
-process depends on positions alone, so it measures even ground as densely as a spot; and with slow moves the ways
-between such positions take longer than the curves. `NestedGrid` has the same process and follows drift alike: a grid
-with a weaker map would make the comparison look better, and show nothing about the choice of positions.
+`NestedGrid` has the same process and follows drift alike: a grid with a weaker map would make the comparison look
+better, and show nothing about the choice of positions.
 
     comes in      measured values with their times and the seconds that they took
-    state         the measurements, the rest of the round, the parameters of the process
+    state         the measurements, the rest of a lattice, the parameters of the process
     goes out      positions to measure next, the map, its expected error
     always holds  the same measurements give the same suggestions; a position is suggested once
 """
@@ -20,6 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass
 from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
@@ -27,18 +27,18 @@ import numpy as np
 from afspm import Array
 from afspm.basics import InvalidValue
 from afspm.model import Region
-from afspm.plugins.adaptive.gaussian_process import GaussianProcess, Parameters, fitted
-from afspm.plugins.adaptive.tours import Cell, MeasurementCost, learnt_cost, short_tour, snake, way_m
+from afspm.plugins.adaptive.gaussian_process import GaussianProcess, Parameters, distances, fitted
 
 Point = Mapping[str, Any]
+Cell = tuple[int, int]
 
 ID: Final = "_id"
 COARSEST: Final = 5  # positions along the longer side of the first lattice
 LEVELS: Final = 6  # number of refinements
 _MORE: Final = 1.2  # times as many measurements as at the last fit
-_PART: Final = 0.5  # share of the good positions in a round where ways cost little: the next round knows more
-_EVEN: Final = 0.6  # share of good positions above which a map is rough everywhere
-_WORTH: Final = 0.2  # least gain of a good position, as a part of the gain of a typical good position
+_REMEMBERED: Final = 60  # latest measurements, from which the costs are learnt
+_CANDIDATES: Final = 3  # refinements of the candidates everywhere: 33 x 33 positions with a first lattice of 5 x 5
+_LEAST_S: Final = 1e-9  # a learnt cost may be of ways alone, and a way zero
 
 
 @runtime_checkable
@@ -52,6 +52,46 @@ class Optimizer(Protocol):
     def ingest(self, points: Sequence[Point]) -> None:
         """Take measured values: `x`, `y` (m) and the quantity by its name; with `_id` if the position was suggested."""
         ...
+
+
+@dataclass(frozen=True)
+class MeasurementCost:
+    """Cost of a measurement in seconds: a fixed part (settling, curve, requests), and a part per distance moved."""
+
+    fixed_s: float = 1.0
+    per_m_s: float = 0.0
+
+    def of(self, distance_m: float) -> float:
+        return self.fixed_s + self.per_m_s * distance_m
+
+
+def learnt_cost(distances_m: Sequence[float], seconds: Sequence[float]) -> MeasurementCost:
+    """Return the cost that fits the latest measurements best; neither part is negative.
+
+    Measurements that took more than five times the median are left out.
+    """
+    way_m, took_s = np.asarray(distances_m[-_REMEMBERED:]), np.asarray(seconds[-_REMEMBERED:])
+    if len(took_s) == 0:
+        return MeasurementCost()
+    # the median: an interruption by a person or a tip repair is no cost of a way
+    usual = took_s <= 5.0 * np.median(took_s)
+    way_m, took_s = way_m[usual], took_s[usual]
+    spread = float(np.var(way_m))
+    slope = float(np.mean((way_m - way_m.mean()) * (took_s - took_s.mean())) / spread) if spread > 0.0 else 0.0
+    slope = max(slope, 0.0)
+    fixed = float(took_s.mean() - slope * way_m.mean())
+    if fixed < 0.0:
+        return MeasurementCost(0.0, float(took_s.sum() / max(way_m.sum(), 1e-30)))
+    return MeasurementCost(fixed, slope)
+
+
+def snake(cells: Sequence[Cell]) -> list[Cell]:
+    """Return lattice cells (column, row) row by row, every other row backwards."""
+    order: list[Cell] = []
+    for turn, row in enumerate(sorted({row for _, row in cells})):
+        in_row = sorted(cell for cell in cells if cell[1] == row)
+        order += in_row[::-1] if turn % 2 else in_row
+    return order
 
 
 class NestedLattices:
@@ -133,6 +173,7 @@ class LatticeMap:
         self._follows_drift = velocity_m_s is None
         self._fitted = 0
         self._done: set[Cell] = set()
+        self._failed: list[Cell] = []
         self._asked: dict[str, Cell] = {}
         self._queue: list[Cell] = []
         self._rows: list[tuple[float, float, float, float]] = []  # x, y, value, time
@@ -186,7 +227,9 @@ class LatticeMap:
     def register_failures(self, suggestions: Sequence[Point]) -> None:
         """Leave out suggested positions that can't be measured."""
         for point in suggestions:
-            self._done.add(self._cell(point[ID]))
+            cell = self._cell(point[ID])
+            self._done.add(cell)
+            self._failed.append(cell)
             self._asked.pop(str(point[ID]), None)
 
     def get_best_points(self) -> Sequence[tuple[int, Point, Point]]:
@@ -299,7 +342,10 @@ class NestedGrid(LatticeMap):
 
 
 class AdaptiveMap(LatticeMap):
-    """Nested lattices, refined where the expected error is worth the seconds."""
+    """Positions with the largest expected square error per second.
+
+    The candidates are the positions of the third refinement, and of finer ones between positions that are measured.
+    """
 
     def _round(self) -> list[Cell]:
         first = [cell for cell in self.lattice.cells(0) if cell not in self._done]
@@ -308,79 +354,28 @@ class AdaptiveMap(LatticeMap):
         if not self._rows:  # no position of the first lattice has a value
             return self._rest_of_lattice()
         self.fit()
-        cells, gains = self._candidates()
+        cells = self._candidates()
         if not cells:
             return []
-        if not gains.any():  # all values are the same: no position is better than another
-            gains = np.ones(len(cells))
-        # the gain of a typical good position: the mean, weighted by the gain itself
-        least = _WORTH * float((gains**2).sum() / gains.sum())
-        good = [cell for cell, gain in zip(cells, gains, strict=True) if gain >= least]
-        if len(good) > _EVEN * len(cells):
-            level = min(self.lattice.level(cell) for cell in cells)
-            return snake([cell for cell in cells if self.lattice.level(cell) == level])
-        if self._travels():
-            good += self._finer(good, least)
-        else:
-            best = sorted(zip(gains, cells, strict=True), reverse=True)[: math.ceil(_PART * len(good))]
-            good = [cell for _, cell in best]
-        order = self._ordered(good)
-        taken = set(order)
-        others = [(cell, float(gain)) for cell, gain in zip(cells, gains, strict=True) if cell not in taken]
-        return self._with_those_on_the_way(order, others, least)
-
-    def _travels(self) -> bool:
-        # whether the way to the next position costs more than its curve
-        return self.cost.per_m_s * self._reached_m() > self.cost.fixed_s
-
-    def _finer(self, good: list[Cell], least: float) -> list[Cell]:
-        # positions of the next level that will be good after these: a second visit would cost the way again
-        done = self._done.union(good)
-        cells, areas = self._beside(done)
-        if not cells:
-            return []
-        gains = self.model.variance(self.lattice.xy_m(cells), self.lattice.xy_m(good)) * areas
-        return [cell for cell, gain in zip(cells, gains, strict=True) if gain >= least]
-
-    def _seconds_of(self, order: list[Cell]) -> float:
-        return len(order) * self.cost.fixed_s + self.cost.per_m_s * way_m(self.lattice.xy_m(order), self._at_m())
-
-    def _candidates(self) -> tuple[list[Cell], Array]:
-        cells, areas = self._beside(self._done)
-        return cells, self.model.variance(self.lattice.xy_m(cells)) * areas if cells else areas
-
-    def _beside(self, done: Set[Cell]) -> tuple[list[Cell], Array]:
-        # the next finer cells around these, and the area that each stands for
-        found = [
-            (cell, level)
-            for level in range(1, min(self._reached(done) + 1, self.lattice.levels) + 1)
-            for cell in self.lattice.new(level)
-            if cell not in done and all(one in done for one in self.lattice.parents(cell, level))
-        ]
-        return [cell for cell, _ in found], np.array([self.lattice.spacing_m(level) ** 2 for _, level in found])
-
-    def _ordered(self, cells: list[Cell]) -> list[Cell]:
-        start = self._at_m()
-        rows, toured = snake(cells), cells
         xy = self.lattice.xy_m(cells)
-        toured = [cells[i] for i in short_tour(xy, start)]
-        return min((rows, toured), key=lambda order: way_m(self.lattice.xy_m(order), start))
+        if self._failed:
+            # the expected error stays large around a failure, where all other positions may fail, too
+            failure_m = distances(xy, self.lattice.xy_m(self._failed)).min(axis=1)
+            likely = distances(xy, self.model.positions_m).min(axis=1) < failure_m
+            if likely.any():
+                cells, xy = [cell for cell, kept in zip(cells, likely, strict=True) if kept], xy[likely]
+        # on the sample, as the candidates: with drift the tip's own position is another
+        ways_m = np.hypot(*(xy - self.model.positions_m[-1]).T)
+        seconds = np.maximum(self.cost.fixed_s + self.cost.per_m_s * ways_m, _LEAST_S)
+        return [cells[int(np.argmax(self.model.variance(xy) / seconds))]]
 
-    def _with_those_on_the_way(self, order: list[Cell], others: list[tuple[Cell, float]], least: float) -> list[Cell]:
-        # a position of little gain is worth its curve where it costs hardly any way
-        xy = np.vstack([self._at_m(), self.lattice.xy_m(order)])
-        legs = np.hypot(*np.diff(xy, axis=0).T)
-        worth_per_s = least / self.cost.of(float(legs.mean()))
-        added: dict[int, list[tuple[float, Cell]]] = {}
-        for cell, gain in others:
-            at = self.lattice.xy_m([cell])[0]
-            reach = np.hypot(*(xy - at).T)
-            detours = reach[:-1] + reach[1:] - legs
-            leg = int(np.argmin(detours))
-            if gain >= worth_per_s * self.cost.of(float(detours[leg])):
-                added.setdefault(leg, []).append((float(reach[leg]), cell))
-        result: list[Cell] = []
-        for leg, cell in enumerate(order):
-            result += [one for _, one in sorted(added.get(leg, []))]
-            result.append(cell)
-        return result
+    def _candidates(self) -> list[Cell]:
+        coarse = min(_CANDIDATES, self.lattice.levels)
+        cells = [cell for cell in self.lattice.cells(coarse) if cell not in self._done]
+        for level in range(coarse + 1, min(self._reached(self._done) + 1, self.lattice.levels) + 1):
+            cells += [
+                cell
+                for cell in self.lattice.new(level)
+                if cell not in self._done and self._done.issuperset(self.lattice.parents(cell, level))
+            ]
+        return cells
