@@ -64,9 +64,8 @@ def watch(
         require_no_errors(experiment, (), ())
         ended = running.run(experiment, running.RunOptions(runs=runs), terminal=sys.stdout)
     with open_run(ended.folder) as found:
-        for line in watched.agreement_lines(watched.read(found)):
-            if line[2]:  # an act answers this kind
-                typer.echo("{}: {}, the person acted at {} of them ({} with 95 %)".format(*line))
+        for line in watched.agreement_in_words(watched.read(found)):
+            typer.echo(line)
     raise typer.Exit(ended.outcome.exit_code)
 
 

@@ -14,7 +14,7 @@ from record_lab import REGION, Night
 from afspm.basics.errors import InvalidValue
 from afspm.basics.formatting import duration_text
 from afspm.components.tip_verdict import OF_LINES, LineVerdict, line_verdict_message, verdict_message
-from afspm.model import Region, Scan, ScopeState
+from afspm.model import ActByHand, ChangedValue, PanelAct, Region, Scan, ScopeState, names
 from afspm.record.bad_scans import BAD, VERDICT_MESSAGE
 from afspm.record.measurement_history import DriftPoint
 from afspm.record.report.markup import PageTimes
@@ -25,6 +25,7 @@ from afspm.record.report.shadow import (
     ShadowKind,
     ShadowNight,
     ShadowRow,
+    agreement_in_words,
     agreement_lines,
     compare,
     csv_text,
@@ -59,6 +60,9 @@ def test_decision_is_answered_by_the_first_act_soon_after_it() -> None:
     assert (row.did, row.after_s) == ("act at 130 s", 30.0)
     assert counted(night, ShadowKind.LINES) == (1, 1)
     assert counted(night, ShadowKind.PERSON) == (3, 2)
+    spoken = agreement_in_words(night)
+    assert any(line.startswith("line alarm: 1, the person acted at 1 of them") for line in spoken)
+    assert any(line.startswith("by hand: 3, afspm had decided before 2 of them") for line in spoken)
 
 
 @pytest.mark.parametrize(("after_s", "is_answered"), [(0.0, True), (SOON_S, True), (SOON_S + 0.001, False)])
@@ -214,3 +218,24 @@ def test_scan_that_a_lost_contact_ends_is_no_act_of_the_person(
     (row,) = [row for row in found.rows if "scan 1" in row.would + row.did]
     assert row.kind is kind
     assert counted(found, ShadowKind.PERSON) == (int(kind is ShadowKind.PERSON), 0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "row", "answers"),
+    [
+        (names.SCAN_TOP_LEFT_X, "scan 1 has no result: its frame was changed while it ran", 1),
+        (names.TIP_BIAS_VOLTAGE, "scan 1 ended before its last line", 2),
+    ],
+    ids=["frame", "bias"],
+)
+def test_scan_whose_frame_a_person_changes_is_not_reported_as_stopped(
+    night: Night, store: RecordStore, tmp_path: Path, changed: str, row: str, answers: int
+) -> None:
+    (tmp_path / "experiment.toml").write_text("[control]\nshadow = true\n", encoding="utf-8")
+    store.take([night.state(state) for state in (ScopeState.FREE, ScopeState.SCANNING)])
+    act = ActByHand(night.now_ns, PanelAct.VALUES, changes=(ChangedValue(changed, "0", "1e-7"),))
+    store.take([night.packet(act, "ActByHand")])
+    store.take([night.state(state) for state in (ScopeState.INTERRUPTED, ScopeState.FREE)])
+    found = read(open_run(tmp_path))
+    assert [one.did for one in found.rows if "scan 1" in one.did] == [row]
+    assert counted(found, ShadowKind.PERSON) == (answers, 0)

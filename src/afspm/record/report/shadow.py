@@ -15,6 +15,7 @@ from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import FileError, InvalidValue
 from afspm.basics.formatting import counted, duration_text, position_text, quantity
 from afspm.model import (
+    ActByHand,
     ControlEvent,
     ControlRequest,
     ControlResponse,
@@ -24,6 +25,7 @@ from afspm.model import (
     Problem,
     RegistrationOutcome,
     ScopeState,
+    names,
 )
 from afspm.record.bad_scans import BAD, read_verdict
 from afspm.record.measurement_history import DriftPoint
@@ -44,10 +46,17 @@ _HEADS: Final = ("number", "time_ns", "kind", "afspm", "person", "after_s", "lef
 RIGHT: Final = "right"
 WRONG: Final = "wrong"
 _MARKS: Final = (RIGHT, WRONG)
+_FRAME: Final = frozenset({
+    *(names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.SCAN_SIZE_X, names.SCAN_SIZE_Y, names.SCAN_ANGLE),
+    *(names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y),
+})  # fmt: skip
+"""Settings with which a translator discards the running scan when a person changes them."""
 _SAME_FRAME: Final = 1e-3
 """Frames are equal if their edges differ by less than this part of their size."""
 
 
+_ANSWERED: Final = "the person acted at"
+_AFTER_A_DECISION: Final = "afspm had decided before"
 _TIP_CHANGED: Final = "; the tip changed meanwhile, which may have shifted the image"
 
 
@@ -210,7 +219,7 @@ def read(run: Run) -> ShadowNight:
         is_shadow = False
     if not is_shadow:
         return ShadowNight()
-    scans, names, solvers = run.scans, run.problem_names, _solvers(run)
+    scans, problems, solvers = run.scans, run.problem_names, _solvers(run)
     judgements = list(run.judgements())
     decisions = [*of_drift(run.drift, scans, changes=run.tip_changes_ns())]
     taken = [
@@ -225,13 +234,13 @@ def read(run: Run) -> ShadowNight:
         ShadowRow(scan.time_ns, ShadowKind.CONTACT, f"lost contact with the controller in scan {scan.number}")
         for scan in lost
     ]
-    acts = [
-        PersonAct(scan.time_ns, f"scan {scan.number} ended before its last line", answers=True)
-        for scan in early
-        if scan not in lost
-    ]
-    for _, _, act in run.messages(("ActByHand",)):
-        acts.append(PersonAct(act.time_ns, str(act), act.act in ANSWERS))
+    by_hand: list[ActByHand] = [act for _, _, act in run.messages(("ActByHand",))]
+    acts = [PersonAct(act.time_ns, str(act), act.act in ANSWERS) for act in by_hand]
+    for short in (scan for scan in early if scan not in lost):
+        if spoiled := _spoiled(short, by_hand):  # it may have its last line, and the act counts already
+            acts.append(PersonAct(short.time_ns, f"scan {short.number} has no result: {spoiled}", answers=False))
+        else:
+            acts.append(PersonAct(short.time_ns, f"scan {short.number} ended before its last line", answers=True))
     for time_ns, verdict in judgements:
         if isinstance(verdict, TipVerdict):
             _add_alarm(alarms, time_ns, verdict, scans)
@@ -240,7 +249,7 @@ def read(run: Run) -> ShadowNight:
             which = "" if scan is None else f" of scan {scan.number}"
             decisions.append(ShadowRow(time_ns, ShadowKind.SCAN, f"would have taken the tip{which} for bad"))
     for entry in filter(_is_flag, run.journal):
-        problem = names.name(entry.problem or 0)
+        problem = problems.name(entry.problem or 0)
         would = f"{entry.who} would have had {problem} solved"
         decisions.append(ShadowRow(entry.time_ns, ShadowKind.PROBLEM, would))
         for solver in solvers.get(problem, ()):
@@ -328,7 +337,7 @@ def html(night: ShadowNight, clock: PageTimes) -> str:
     heads = (
         "decisions",
         "number",
-        "the person acted",
+        "the person acted (by hand: after a decision)",
         "95 % interval",
         "marked right",
         "marked wrong",
@@ -359,6 +368,16 @@ def agreement_lines(night: ShadowNight) -> list[tuple[str, ...]]:
             *(str(row.right), str(row.wrong), _between(row.interval_right) if row.right + row.wrong else ""),
         )
         for row in night.agreement
+    ]
+
+
+def agreement_in_words(night: ShadowNight) -> list[str]:
+    """Return a sentence for each kind that an act answers, and one for the acts by hand."""
+    return [
+        f"{kind}: {count}, {_AFTER_A_DECISION if kind == ShadowKind.PERSON else _ANSWERED} {agreed} of them"
+        f" ({share} with 95 %)"
+        for kind, count, agreed, share, *_ in agreement_lines(night)
+        if agreed
     ]
 
 
@@ -396,6 +415,17 @@ def _lost_in(run: Run, scans: Sequence[ScanRow]) -> list[ScanRow]:
         if next(later, None) is ScopeState.UNDEFINED:
             lost.append(scan)
     return lost
+
+
+def _spoiled(scan: ScanRow, by_hand: Sequence[ActByHand]) -> str:
+    # the act during a scan for which its translator discards it, also if it was scanned to its last line
+    for act in by_hand:
+        if scan.began_ns is not None and scan.began_ns <= act.time_ns <= scan.time_ns:
+            if act.act is PanelAct.VALUES and any(change.parameter in _FRAME for change in act.changes):
+                return "its frame was changed while it ran"
+            if act.act is PanelAct.FEEDBACK_OFF:
+                return "the z feedback was switched off while it ran"
+    return ""
 
 
 def _judged(scan: ScanRow) -> str:
