@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from afspm.basics.plain_data import Plain
-from afspm.storage.disk import DiskThread, DiskTimeout
+from afspm.storage.atomic import OutageLog
+from afspm.storage.disk import DiskThread
 
 
 class Truth:
     """A file of JSON objects, one per line, with `n`, `time_s` (experiment), `event` and its facts.
 
-    While the disk hangs, lines are queued: the microscope does not wait for the disk.
+    While the disk hangs, lines are queued: the microscope does not wait for the disk. A full disk loses lines, which is
+    logged, and refuses no measurement.
 
     Args:
         kept: storage for the number of the last line, which then survives a kill. After a kill the last event may be
@@ -27,12 +29,13 @@ class Truth:
         self._path = path
         self._kept: Plain = {} if kept is None else kept
         self._disk = DiskThread()
+        self._outage = OutageLog("the ground truth lacks events", logging.getLogger("afspm.truth"))
 
     def note(self, time_s: float, event: str, facts: Mapping[str, object]) -> None:
         """Append an event."""
         self._kept["truth_lines"] = number = int(self._kept.get("truth_lines", 0)) + 1
         line = json.dumps({"n": number, "time_s": time_s, "event": event, **facts}, default=_plain)
-        with contextlib.suppress(DiskTimeout):
+        with self._outage.trying():
             self._disk.run(lambda: self._append(line), len(line))
 
     def _append(self, line: str) -> None:
