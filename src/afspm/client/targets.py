@@ -50,9 +50,12 @@ class ScanTarget:
             return cls(region, None)
         try:
             rows, columns = shape
-            return cls(region, (int(rows), int(columns)))
-        except (TypeError, ValueError) as error:
+            whole = int(rows), int(columns)
+        except (TypeError, ValueError, OverflowError) as error:
             raise InvalidValue(f"a shape is (rows, columns), not {shape!r}", hint="e.g. (256, 256)") from error
+        if whole != (rows, columns):  # also texts: a part of a pixel, or "64", is a mistake of the caller
+            raise InvalidValue(f"a shape is two whole numbers, not {shape!r}", hint="e.g. (256, 256)")
+        return cls(region, whole)
 
     @property
     def parameters(self) -> ScanParameters:

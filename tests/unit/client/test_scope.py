@@ -815,6 +815,9 @@ def test_prefix_of_an_envelope_in_either_length_is_accepted(scope: Scope) -> Non
 def test_values_of_the_wrong_kind_are_refused_with_a_valid_example(lab: Lab, scope: Scope) -> None:
     with pytest.raises(InvalidValue, match="rows, columns"):
         scope.scan(REGION, shape=128)  # type: ignore[arg-type]
+    for shape in ((127.5, 64), ("128", "64"), (math.inf, 64)):
+        with pytest.raises(InvalidValue, match="256, 256"):
+            scope.scan(REGION, shape=shape)  # type: ignore[arg-type]
     with pytest.raises(InvalidValue, match="key"):
         scope.scan(REGION, key=5)  # type: ignore[arg-type]
     with pytest.raises(InvalidValue, match="mode"):
