@@ -121,28 +121,35 @@ def _running(where: Path, *, as_json: bool, acts: bool) -> Path:
     from afspm.basics.errors import FileError
     from afspm.client.connect import find_run
     from afspm.record.run_json import ENDED, RUN_FILE, read_run_json
-    from afspm.record.run_lock import is_locked
 
     try:
         folder = find_run(where)
     except FileError as error:
         say_nothing_runs(str(error), as_json=as_json)
-    # the newest run of a folder may not be the run that the user has in mind
-    others = [] if folder.resolve() == where.resolve() else sorted(where.glob(f"*/{RUN_FILE}"))
-    others = [run.parent for run in others if not run.parent.is_symlink() and is_locked(run.parent)]
-    others = [run for run in others if run.name != folder.resolve().name]
     if not (folder / RUN_FILE).exists():
         why = "it is about to start: repeat the command in a few seconds; or its files were removed"
         say_nothing_runs(f"{folder.name} has no {RUN_FILE}: {why}", as_json=as_json)
     ended = read_run_json(folder).get(ENDED)
+    others = _others_running(where, folder) if ended or acts else []
     if ended:
         more = f"; {others[-1]} goes on: name its folder" if others else ""
         say_nothing_runs(f"{folder.resolve().name} has ended ({ended}){more}", as_json=as_json)
-    if others and acts:
+    if others:
         names = " and ".join(run.name for run in [*others, folder])
         hint = f"name the folder of the one that you mean, for example {others[0]}"
         raise FileError(f"several experiments run here, {names}", where=str(where), hint=hint)
     return folder
+
+
+def _others_running(where: Path, newest: Path) -> list[Path]:
+    # the newest run of a folder may not be the run that the user has in mind
+    from afspm.record.run_json import RUN_FILE
+    from afspm.record.run_lock import is_locked
+
+    if newest.resolve() == where.resolve():
+        return []
+    runs = (file.parent for file in sorted(where.glob(f"*/{RUN_FILE}")))
+    return [run for run in runs if not run.is_symlink() and run.name != newest.resolve().name and is_locked(run)]
 
 
 @contextmanager

@@ -91,8 +91,8 @@ class PanelWatch:
         elif action and action not in STARTS.values():
             self._tip_is_moved = True
         if action not in STARTS:  # a start sets nothing
-            kept = {} if sets is None else self._by_hand
-            self._by_hand = {name: value for name, value in kept.items() if name not in (sets or ())}
+            kept = set() if sets is None else self._by_hand.keys() - set(sets)
+            self._by_hand = {name: self._by_hand[name] for name in kept}
         if action != names.START_SPEC:
             stays = FEEDBACK_ON in self._before_spectrum and not (self._tip_is_moved or sets_feedback)
             self._before_spectrum = {FEEDBACK_ON: self._before_spectrum[FEEDBACK_ON]} if stays else {}

@@ -439,8 +439,7 @@ class ScanJudge:
         if self._followed <= ACQUIRE:
             return None  # the scanner still creeps from its last move: the first lines only find the shift, and noise
         self.fitted[row] = fits
-        self._cusum.add(row, self._statistic.sigmas(products))
-        self._sums = [*self._sums, self._cusum.value] if self._cusum.value else []
+        self._sum_up(row, self._statistic.sigmas(products))
         found = self._higher_level()
         while found is not None and self._hums():
             found = self._higher_level()
@@ -453,6 +452,10 @@ class ScanJudge:
         basis = f"{self.evidence:.1f} times the threshold from {self._statistic.pairs} good pairs of scans"
         self.alarm = Alarm(found, row, since, self.evidence, f"{self._what} since row {since} ({basis})")
         return self.alarm
+
+    def _sum_up(self, row: int, sigmas: float) -> None:
+        self._cusum.add(row, sigmas)
+        self._sums = [*self._sums, self._cusum.value] if self._cusum.value else []
 
     def _higher_level(self) -> AlarmLevel | None:
         found = self._level()
@@ -511,8 +514,7 @@ class ScanJudge:
         self._cusum, self._sums = Cusum(), []
         for row in suspects:
             if self.fitted[row]:
-                self._cusum.add(row, self._sigmas(self.fitted[row]))
-                self._sums = [*self._sums, self._cusum.value] if self._cusum.value else []
+                self._sum_up(row, self._sigmas(self.fitted[row]))
         return True
 
     def _has_jumped(self) -> bool:
