@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import lru_cache
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
@@ -146,9 +147,11 @@ def read_scans(
     rows_of_scans = query("SELECT * FROM scans ORDER BY number")
     keys = _keys(query, "scans", rows_of_scans)
     positions = _positions(query)
-    rows = [scan_row(row, keys.get(row[0], ""), *positions.get(row[0], (None, None))) for row in rows_of_scans]
-    scores = last_scores((row.time_ns for row in rows), verdicts)
-    rows = [replace(row, tip_score=scores.get(row.time_ns)) for row in rows]
+    scores = last_scores((row[1] for row in rows_of_scans), verdicts)
+    rows = []
+    for row in rows_of_scans:
+        registration, sd_m = positions.get(row[0], (None, None))
+        rows.append(scan_row(row, keys.get(row[0], ""), registration, sd_m, scores.get(row[1])))
     rows = _with_instruments(query, "scans", rows, readings, bands)
     return KeyedTable(_with_settings(query, "scans", rows), ScanRow)
 
@@ -255,8 +258,18 @@ def _describe_keys(keys: Sequence[str]) -> str:
     return f"there are {', '.join(keys[:20])}{' …' if len(keys) > 20 else ''}"
 
 
+@lru_cache(maxsize=64)
+def _listed(text: str) -> tuple[Any, ...]:
+    # the rows of a night repeat a few texts
+    return tuple(tuple(one) if isinstance(one, list) else one for one in from_json(text))
+
+
 def scan_row(
-    row: Row, key: str = "", registration: RegistrationOutcome | None = None, position_sd_m: float | None = None
+    row: Row,
+    key: str = "",
+    registration: RegistrationOutcome | None = None,
+    position_sd_m: float | None = None,
+    tip_score: float | None = None,
 ) -> ScanRow:
     (
         number, time_ns, began_ns, filename, file, interrupted, x, y, width, height, angle, frame, rows, columns,
@@ -267,18 +280,19 @@ def scan_row(
         number,
         time_ns,
         began_ns,
-        tuple((name, unit) for name, unit in from_json(channels)),
+        _listed(channels),
         region,
         None if rows is None else (rows, columns),
         bool(interrupted),
         holder,
         mode,
-        tuple(from_json(problems)),
+        _listed(problems),
         filename,
         file,
         key,
         registration,
         position_sd_m,
+        tip_score=tip_score,
     )
 
 
@@ -294,11 +308,11 @@ def spectrum_row(row: Row, key: str = "") -> SpectrumRow:
         None if x is None else (x, y),
         Frame(frame),
         points,
-        tuple(from_json(names)),
-        tuple(from_json(units)),
+        _listed(names),
+        _listed(units),
         holder,
         mode,
-        tuple(from_json(problems)),
+        _listed(problems),
         filename,
         file,
         key,
