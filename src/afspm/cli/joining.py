@@ -44,7 +44,7 @@ def looking(where: Path, *, lines: bool = False, as_json: bool = False, acts: bo
         where: the folder of a run, a folder of runs (its newest) or an experiment file (its newest run).
         lines: whether to follow lines of unfinished scans, too.
         as_json: whether a program reads the output, also that no run goes on.
-        acts: whether the command acts on the run afterwards: then several runs in the folder are refused.
+        acts: whether the command acts on the run afterwards: then several running runs are refused.
     """
     from afspm.cli.follower import Follower
 
@@ -119,8 +119,9 @@ def _end_without_run(why: str, *, as_json: bool, running: bool | None) -> NoRetu
 
 def _running(where: Path, *, as_json: bool, acts: bool) -> Path:
     from afspm.basics.errors import FileError
-    from afspm.client.connect import find_run
+    from afspm.client.connect import find_one_run, find_run, others_running, several_run
     from afspm.record.run_json import ENDED, RUN_FILE, read_run_json
+    from afspm.record.run_lock import goes_on
 
     try:
         folder = find_run(where)
@@ -129,27 +130,16 @@ def _running(where: Path, *, as_json: bool, acts: bool) -> Path:
     if not (folder / RUN_FILE).exists():
         why = "it is about to start: repeat the command in a few seconds; or its files were removed"
         say_nothing_runs(f"{folder.name} has no {RUN_FILE}: {why}", as_json=as_json)
-    ended = read_run_json(folder).get(ENDED)
-    others = _others_running(where, folder) if ended or acts else []
-    if ended:
+    ended, others = read_run_json(folder).get(ENDED), others_running(where, folder)
+    if ended or (others and not goes_on(folder)):
+        how = f"has ended ({ended})" if ended else "was cut off"
         more = f"; {others[-1]} goes on: name its folder" if others else ""
-        say_nothing_runs(f"{folder.resolve().name} has ended ({ended}){more}", as_json=as_json)
+        say_nothing_runs(f"{folder.resolve().name} {how}{more}", as_json=as_json)
+    if acts:
+        return find_one_run(where)
     if others:
-        names = " and ".join(run.name for run in [*others, folder])
-        hint = f"name the folder of the one that you mean, for example {others[0]}"
-        raise FileError(f"several experiments run here, {names}", where=str(where), hint=hint)
+        typer.echo(f"afspm: {several_run(folder, others)}: this is {folder}", err=True)
     return folder
-
-
-def _others_running(where: Path, newest: Path) -> list[Path]:
-    # the newest run of a folder may not be the run that the user has in mind
-    from afspm.record.run_json import RUN_FILE
-    from afspm.record.run_lock import is_locked
-
-    if newest.resolve() == where.resolve():
-        return []
-    runs = (file.parent for file in sorted(where.glob(f"*/{RUN_FILE}")))
-    return [run for run in runs if not run.is_symlink() and run.name != newest.resolve().name and is_locked(run)]
 
 
 @contextmanager

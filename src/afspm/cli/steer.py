@@ -120,7 +120,7 @@ def note(
     """
     from afspm.basics.clock import ExperimentClock
     from afspm.cli.joining import acting, person
-    from afspm.client.connect import find_run
+    from afspm.client.connect import find_one_run
     from afspm.record.notes import append_note
     from afspm.record.report import REPORT_FILE, shadow, write
     from afspm.record.run import open_run
@@ -131,7 +131,7 @@ def note(
         raise typer.BadParameter("put the text into quotation marks")
     if scan is not None and row is not None:
         raise typer.BadParameter("a note is on a scan or on a row", param_hint="--row")
-    folder = find_run(Path(where[0]) if where else RUNS)
+    folder = find_one_run(Path(where[0]) if where else RUNS)
     measured = marked = None
     with open_run(folder) as run:
         if scan is not None:

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import logging
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,7 @@ from afspm.client.experiment_link import ExperimentLink
 from afspm.model import Frame, ProblemNames
 from afspm.model.events import is_process_name
 from afspm.record.run_json import RUN_FILE, STATE_DIR, latest_run, read_run_json, run_json_or_empty
-from afspm.record.run_lock import cut_off_message, is_locked
+from afspm.record.run_lock import cut_off_message, goes_on, is_locked
 from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import open_port
 from afspm.wire.message_types import register_all
@@ -43,13 +43,13 @@ def connect(where: str | Path = "runs", name: str = "notebook", *, messages: Seq
 
     Args:
         where: the folder of the run, the folder of all runs (for the newest), or the experiment file (for its newest
-            run, in the folder `runs` here or beside it).
+            run, in the folder `runs` here or beside it). If several of these runs go on, name the folder of one.
         name: name of this program in the experiment, shown as the holder of control. Two programs need two names.
         messages: modules and .proto files with message types of your own, as in the experiment file. Only these are
             imported, not the run's own list, since its folder may come from another person.
 
     Raises:
-        FileError: there is no such run.
+        FileError: there is no such run, or several go on.
         ConfigError: the run has no scheduler to connect to, `messages` can't be imported, or `name` can't be a name.
         NoResponse: the scheduler does not answer within 5 s (60 s if the run is going on on this computer), or its
             cached packets do not arrive within 30 s.
@@ -58,7 +58,7 @@ def connect(where: str | Path = "runs", name: str = "notebook", *, messages: Seq
     if not is_process_name(name):
         hint = "letters, digits, - and _, with spaces and dots between them"
         raise ConfigError(f"{name!r} can't be the name of a program", where="connect", hint=hint)
-    return join(find_run(Path(where)), name, messages)
+    return join(find_one_run(Path(where)), name, messages)
 
 
 def join(folder: Path, name: str, messages: Sequence[str] | None = None) -> Scope:
@@ -167,12 +167,10 @@ def find_run(where: Path) -> Path:
     if where.suffix == ".toml" and (where.parent / RUN_FILE).is_file():  # the expanded file of a run
         return where.parent
     if where.suffix == ".toml":
-        name = where.resolve().parent.name if where.stem == "experiment" else where.stem
-        runs = (Path("runs"), where.resolve().parent / "runs")
-        found = [run for folder in runs if (run := _newest(folder, name, where)) is not None]
+        found = [runs for runs in _of_experiment(where) if runs]
         if not found:
             raise FileError("no run of this experiment is found", where=str(where), hint="start it with `afspm run`")
-        return found[0]
+        return max(found[0], key=_started)
     if (where / RUN_FILE).is_file():
         return where.resolve() if where.is_symlink() else where
     if (latest := latest_run(where)) is not None:
@@ -181,17 +179,53 @@ def find_run(where: Path) -> Path:
     raise FileError("there is no run here", where=str(where), hint=hint)
 
 
-def _newest(runs: Path, name: str, file: Path) -> Path | None:
-    name = _name_in(file) or name
-    written = [run for run in runs.glob(f"*/{RUN_FILE}") if not run.parent.is_symlink()]
-    found = [run for run in written if run_json_or_empty(run.parent).get("name") == name]
-    return max(found, key=_started).parent if found else None
+def find_one_run(where: Path) -> Path:
+    """Return the run that `find_run` returns, for a program that acts on it.
+
+    Raises:
+        FileError: there is no such run, or it is one of several that go on: another one may be meant.
+    """
+    folder = find_run(where)
+    if goes_on(folder) and (others := others_running(where, folder)):
+        hint = f"name the folder of the one that you mean, for example {others[0]}"
+        raise FileError(several_run(folder, others), where=str(where), hint=hint)
+    return folder
+
+
+def others_running(where: Path, chosen: Path) -> list[Path]:
+    """Return the runs that go on on this computer and that `where` may mean, too, if `find_run` returned `chosen`."""
+    if where.suffix == ".toml" and not (where.parent / RUN_FILE).is_file():
+        runs = [run for found in _of_experiment(where) for run in found]
+    elif chosen.resolve() == where.resolve():
+        return []
+    else:
+        runs = _runs_in(where)
+    there = {run.resolve(): run for run in runs}
+    return [run for place, run in there.items() if place != chosen.resolve() and is_locked(run)]
+
+
+def several_run(newest: Path, others: Sequence[Path]) -> str:
+    """Return the message that `newest` and others go on."""
+    return f"several experiments run here, {' and '.join(run.name for run in [*others, newest])}"
+
+
+def _of_experiment(file: Path) -> Iterator[list[Path]]:
+    # the runs in the folder here, then those in the folder beside the file
+    home = file.resolve().parent
+    name = _name_in(file) or (home.name if file.stem == "experiment" else file.stem)
+    for folder in (Path("runs"), home / "runs"):
+        yield [run for run in _runs_in(folder) if run_json_or_empty(run).get("name") == name]
+
+
+def _runs_in(folder: Path) -> list[Path]:
+    runs = (file.parent for file in sorted(folder.glob(f"*/{RUN_FILE}")))
+    return [run for run in runs if not run.is_symlink()]
 
 
 def _started(run: Path) -> tuple[float, int]:
     # the origin of its clock, else the time of run.json
-    clock = run_json_or_empty(run.parent).get("clock") or {}
-    return float(clock.get("origin_s", 0.0)), run.stat().st_mtime_ns
+    clock = run_json_or_empty(run).get("clock") or {}
+    return float(clock.get("origin_s", 0.0)), (run / RUN_FILE).stat().st_mtime_ns
 
 
 def _name_in(file: Path) -> str | None:

@@ -59,20 +59,42 @@ def a_run(runs: Path, name: str, **facts: str) -> Path:
     return runs / name
 
 
-@pytest.mark.parametrize("command", ["pause", "continue", "end"])
-def test_command_that_acts_refuses_a_folder_with_several_running_experiments(command: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("named", ["runs", "night.toml"])
+@pytest.mark.parametrize("command", ["pause", "continue", "end", "note"])
+def test_command_that_acts_refuses_several_running_experiments(
+    command: str, named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("night.toml").write_text('name = "night"\n', encoding="utf-8")
+    runs = Path("runs")
+    arguments = [command, named, "the tip is new"] if command == "note" else [command, named]
+    with lock_run(a_run(runs, "night-0")):
+        pass  # was cut off
+    with lock_run(a_run(runs, "night-1")), lock_run(a_run(runs, "night-2")):
+        result = CliRunner().invoke(app, arguments)
+    assert "several experiments run here, night-" in str(result.exception)
+    assert "night-0" not in str(result.exception)
+    assert "name the folder of the one that you mean, for example " in str(result.exception)
+
+
+def test_command_that_looks_says_which_of_several_experiments_it_shows(tmp_path: Path) -> None:
     with lock_run(a_run(tmp_path, "night-1")), lock_run(a_run(tmp_path, "night-2")):
-        result = CliRunner().invoke(app, [command, str(tmp_path)])
-    assert "several experiments run here, night-1 and night-2" in str(result.exception)
-    assert f"name the folder of the one that you mean, for example {tmp_path / 'night-1'}" in str(result.exception)
+        result = CliRunner().invoke(app, ["status", str(tmp_path)])
+    assert f"several experiments run here, night-1 and night-2: this is {tmp_path / 'night-2'}" in result.stderr
 
 
-def test_command_names_the_run_that_goes_on_beside_a_newest_run_that_has_ended(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("facts", "how"), [({"ended": "all plans are done"}, "has ended (all plans are done)"), ({}, "was cut off")]
+)
+def test_command_names_the_run_that_goes_on_beside_a_newest_run_that_is_over(
+    facts: dict[str, str], how: str, tmp_path: Path
+) -> None:
     with lock_run(a_run(tmp_path, "night-1")):
-        a_run(tmp_path, "test-2", ended="all plans are done")
+        with lock_run(a_run(tmp_path, "test-2", **facts)):
+            pass
         result = CliRunner().invoke(app, ["pause", str(tmp_path)])
     assert result.exit_code == NOT_RUNNING
-    assert f"test-2 has ended (all plans are done); {tmp_path / 'night-1'} goes on: name its folder" in result.output
+    assert f"test-2 {how}; {tmp_path / 'night-1'} goes on: name its folder" in result.output
 
 
 def test_command_in_the_first_second_of_a_run_says_when_to_repeat_it(tmp_path: Path) -> None:
