@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from afspm.basics.argument_checks import PATH, TEXT, checked
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError, FileError, NoResponse
 from afspm.basics.launch import Launch, Sockets
@@ -35,6 +36,7 @@ STARTED_WITHIN_S = 60.0
 HEARD_WITHIN_S = 30.0  # the cache may hold many large scans
 
 
+@checked({"where": PATH, "name": TEXT})
 def connect(where: str | Path = "runs", name: str = "notebook", *, messages: Sequence[str] = ()) -> Scope:
     """Join a running experiment; use the returned scope like `self.scope` in a component.
 

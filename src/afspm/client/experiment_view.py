@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from numbers import Real
+from numbers import Integral
 
 from afspm import wire
+from afspm.basics.argument_checks import FINITE, NAME, NUMBER, SECONDS, TEXT, WHOLE, Argument, checked, is_number
 from afspm.basics.errors import AfspmError, ExperimentEnded, InvalidValue
 from afspm.client.events import Events
 from afspm.client.experiment_link import ExperimentLink
@@ -22,6 +23,34 @@ from afspm.model import (
     TipStatus,
 )
 from afspm.model.state import FeedbackUnits
+
+_PROBLEM = Argument(
+    "a problem's name or number", lambda value: isinstance(value, str | Integral), '"tip-shape-changed"'
+)
+_MODE = Argument(
+    "a mode", lambda value: isinstance(value, int) and value in {*ControlMode}, "ControlMode.MANUAL or .AUTOMATED"
+)
+checked_call = checked({
+    **dict.fromkeys(("parameter", "name", "action", "process"), NAME),
+    **dict.fromkeys(("text", "unit", "kind", "key"), TEXT),
+    **dict.fromkeys(("problem", "solving"), _PROBLEM),
+    **dict.fromkeys(("done", "of", "time_ns", "seed"), WHOLE),
+    **dict.fromkeys(("proportional_gain", "integral_gain"), FINITE),
+    "setpoint": Argument(FINITE.what, FINITE.fits, 'scope.set("zctrl-setpoint", "50 pA") takes a text with a unit'),
+    "timeout_s": SECONDS,
+    "left_s": NUMBER,
+    "on": Argument("True or False", lambda value: isinstance(value, int) and value in (0, 1)),
+    "mode": _MODE,
+    "grant": Argument("a grant", lambda value: hasattr(value, "agent")),
+    "scan": Argument("a scan", lambda value: hasattr(value, "time_ns"), "a ScanSet, a Scan, or a row of run.scans"),
+    "condition": Argument("a function", callable, "e.g. lambda: scope.in_control"),
+    "parameters": Argument(
+        "a dict of values by parameter",
+        lambda value: isinstance(value, Mapping) and all(map(NAME.fits, value)),
+        'e.g. {"scan-speed": ["1 um/s", "2 um/s"]}',
+    ),
+})  # fmt: skip
+"""A decorator that checks the arguments of a scope's calls by their names, before anything is sent."""
 
 
 class ExperimentView:
@@ -101,6 +130,7 @@ class ExperimentView:
         self._catch_up()
         return self._link.view.probe_position
 
+    @checked_call
     def events(self, *envelopes: str, timeout_s: float | None = None) -> Events:
         """Iterate over messages published from now on, as `PublishedEvent(envelope, message, time_ns)`.
 
@@ -118,6 +148,7 @@ class ExperimentView:
                 self._link.take_in()  # else packets of long ago, which wait unread, would count as new
         return Events(self._link, envelopes, timeout_s, self._before_wait)
 
+    @checked_call
     def wait_until(self, condition: Callable[[], bool], *, timeout_s: float | None = None) -> bool:
         """Wait until `condition()`, tested after each event; return False after `timeout_s` of real time."""
         with self._call():
@@ -131,7 +162,7 @@ class ExperimentView:
             InvalidValue: the time is not a number, or below zero.
             ExperimentEnded: the experiment has ended.
         """
-        if not (isinstance(experiment_s, Real) and experiment_s >= 0.0):
+        if not (is_number(experiment_s) and experiment_s >= 0.0):
             raise InvalidValue(f"can't wait for {experiment_s!r}", hint="a number of seconds, zero or more")
         clock = self._link.clock
         end_s = clock.now_s() + experiment_s
@@ -140,6 +171,7 @@ class ExperimentView:
             while (left_s := end_s - clock.now_s()) > 0.0:
                 self._link.wait(lambda: False, self._link.until(clock.real_s(left_s)))
 
+    @checked_call
     def is_flagged(self, problem: int | str) -> bool:
         """Return whether a problem, by name or number, is flagged."""
         return self.problems.number(problem) in self.control_state.problems

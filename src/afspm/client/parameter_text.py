@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
 from afspm import wire
+from afspm.basics.argument_checks import FINITE, is_text
 from afspm.basics.errors import InvalidValue, UnitError
 from afspm.basics.units import convert, parse_quantity, require_unit
 from afspm.model import Parameter, Response
@@ -17,11 +16,15 @@ def to_parameter(name: str, value: Value, unit: str | None) -> Parameter:
     """Convert a value into a parameter to set: a number in `unit` (default: SI), text such as "2 um/s", True …
 
     Raises:
-        InvalidValue: the number is not finite.
+        InvalidValue: neither text nor a finite number.
         UnitError: a number without a unit is implausibly large in SI.
     """
     if isinstance(value, bool):
         return Parameter(name, "true" if value else "false", unit)
+    if not (is_text(value) or FINITE.fits(value)):
+        raise InvalidValue(
+            f"{name} can't be set to {value!r}", where="set", hint="a finite number, text with a unit, True or False"
+        )
     if isinstance(value, str):
         if unit is None and value[:1] in "+-.0123456789" and (quantity := _quantity(value)) is not None:
             number, given = quantity
@@ -29,8 +32,6 @@ def to_parameter(name: str, value: Value, unit: str | None) -> Parameter:
                 require_unit(number, BASE_PARAMETERS.get(name) or "")
             return Parameter(name, repr(number), given or BASE_PARAMETERS.get(name))
         return Parameter(name, value, unit)
-    if not math.isfinite(value):
-        raise InvalidValue(f"{name} can't be set to {value}")
     if unit is None:
         require_unit(value, BASE_PARAMETERS.get(name) or "")
     # the repr of a numpy number is "np.float64(…)"

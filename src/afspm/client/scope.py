@@ -15,7 +15,7 @@ from afspm.client.command_retry import CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.events import Events, PublishedEvent
 from afspm.client.experiment_link import ExperimentLink
-from afspm.client.experiment_view import ExperimentView
+from afspm.client.experiment_view import ExperimentView, checked_call
 from afspm.client.instrument_targets import InstrumentTargets
 from afspm.client.keyed_results import KeyedResults, check_key
 from afspm.client.measurement import MeasurementRunner
@@ -102,6 +102,7 @@ class Scope(ExperimentView):
 
     # --- measuring ---
 
+    @checked_call
     def scan(
         self,
         region: Region | None = None,
@@ -128,6 +129,7 @@ class Scope(ExperimentView):
             target = ScanTarget.of(region, shape, self._frame)
             return self._runner.take(target, key, self._link.until(timeout_s), repeat=repeat).scans
 
+    @checked_call
     def spectrum(
         self,
         at: Place | None = None,
@@ -146,6 +148,7 @@ class Scope(ExperimentView):
             target = SpectrumTarget.of(at, kind, self._frame)
             return self._runner.take(target, key, self._link.until(timeout_s)).spectrum
 
+    @checked_call
     @contextmanager
     def sweep(
         self,
@@ -230,12 +233,14 @@ class Scope(ExperimentView):
         if sweep.left_behind:
             self._link.log.warning("a sweep ended before its parameters were set back to %s", sweep.left_behind)
 
+    @checked_call
     def forget(self, key: str) -> None:
         """Remove the saved result of a keyed measurement that is no longer needed, to save space in a long series."""
         self._results.forget(check_key(key))
 
     # --- setting and getting ---
 
+    @checked_call
     def set(
         self,
         parameter: str,
@@ -265,6 +270,7 @@ class Scope(ExperimentView):
             in_force = value_in(response, asked, asked.unit)
             return self._targets.arrival(asked, float(in_force), until_s) if wait else in_force
 
+    @checked_call
     def get(self, parameter: str, unit: str | None = None, *, timeout_s: float | None = ANSWER_S) -> Value:
         """Return a parameter's value in `unit`; without `unit`, in SI for base parameters, else as received."""
         with self._call():
@@ -274,6 +280,7 @@ class Scope(ExperimentView):
                 raise refused(ControlRequest.PARAM, response, parameter)
             return value_in(response, asked, unit)
 
+    @checked_call
     def set_feedback(
         self,
         *,
@@ -291,18 +298,15 @@ class Scope(ExperimentView):
             setpoint: in the unit of the operating mode: A for a tunnelling current; V, m, Hz or N in force microscopy.
 
         Raises:
-            InvalidValue: a gain or the setpoint is text.
+            InvalidValue: a gain or the setpoint is no finite number.
         """
-        for name, value in (("proportional", proportional_gain), ("integral", integral_gain), ("setpoint", setpoint)):
-            if isinstance(value, str):
-                hint = f'scope.set("zctrl-setpoint", {value!r}) takes a text with a unit' if name == "setpoint" else ""
-                raise InvalidValue(f"{value!r} is text, not a number", where=name, hint=hint)
         with self._call():
             feedback = Feedback(on, proportional_gain, integral_gain, setpoint)
             until_s = self._link.until(timeout_s)
             with self._control.hold(until_s=until_s):
                 self._setup.set_feedback(feedback, until_s)
 
+    @checked_call
     def move_probe(self, xy_m: Place, *, timeout_s: float | None = None) -> None:
         """Move the probe to (x, y), in m or as text, ("1 um", "0 nm"); return when it is there."""
         with self._call():
@@ -310,6 +314,7 @@ class Scope(ExperimentView):
             with self._control.hold(until_s=until_s):
                 self._setup.move_probe(xy_of(xy_m), until_s)
 
+    @checked_call
     def set_scan_region(
         self, region: Region, *, shape: tuple[int, int] | None = None, timeout_s: float | None = None
     ) -> None:
@@ -322,11 +327,13 @@ class Scope(ExperimentView):
             with self._control.hold(until_s=until_s):
                 self._setup.set_scan(ScanTarget.of(region, shape, self._frame).parameters, until_s)
 
+    @checked_call
     def action(self, name: str, *, timeout_s: float | None = None) -> None:
         """Start an action of the microscope by its name; return when the microscope has accepted it."""
         with self._call():
             self._commands.in_control(ControlRequest.ACTION, name, self._link.until(timeout_s))
 
+    @checked_call
     def supports(self, action: str, *, timeout_s: float | None = ANSWER_S) -> bool:
         """Return whether the microscope has an action, such as "x-retract", without starting the action.
 
@@ -342,6 +349,7 @@ class Scope(ExperimentView):
 
     # --- control ---
 
+    @checked_call
     @contextmanager
     def control(
         self, *, solving: int | str | None = None, timeout_s: float | None = None, unbroken: bool = False
@@ -368,6 +376,7 @@ class Scope(ExperimentView):
         self._catch_up()
         return self._control.held
 
+    @checked_call
     def flag(self, problem: int | str) -> None:
         """Flag a problem, by name or number.
 
@@ -383,6 +392,7 @@ class Scope(ExperimentView):
             self._link.send_only(ControlRequest.ADD_EXP_PRBLM, number)
             raise
 
+    @checked_call
     def clear(self, problem: int | str) -> None:
         """Remove the flag of a problem; a problem without a flag is no error."""
         self._ask_scheduler(ControlRequest.RMV_EXP_PRBLM, self.problems.number(problem))
@@ -394,16 +404,16 @@ class Scope(ExperimentView):
             self.clear(problem)
         return tuple(map(self.problems.name, flagged))
 
+    @checked_call
     def set_mode(self, mode: ControlMode) -> None:
         """Set MANUAL (no component has control) or AUTOMATED.
 
         Raises:
-            InvalidValue: `mode` is text.
+            InvalidValue: `mode` is no mode.
         """
-        if isinstance(mode, str):
-            raise InvalidValue(f"{mode!r} is not a mode", hint="ControlMode.MANUAL or ControlMode.AUTOMATED")
         self._ask_scheduler(ControlRequest.SET_CONTROL_MODE, int(mode))
 
+    @checked_call
     def restart(self, process: str) -> None:
         """Restart a process of the experiment, even a process that was given up."""
         self._ask_scheduler(RESTART_REQUEST, process)
@@ -417,6 +427,7 @@ class Scope(ExperimentView):
         facts: Plain = json.loads(response.payload)
         return {name: facts.get(name) for name in ("run", "limits", "offset_m", "now_ns")}
 
+    @checked_call
     def approve(self, grant: Grant) -> None:
         """Approve a plan of an agent, give the agent a grant, or revoke its approvals; needs the role `approve`."""
         self._ask_scheduler(GRANT_REQUEST, grant)
@@ -427,6 +438,7 @@ class Scope(ExperimentView):
         with suppress(ExperimentEnded):  # the signal may come before the answer
             self._ask_scheduler(ControlRequest.END_EXPERIMENT, None)
 
+    @checked_call
     def progress(self, done: int, of: int, *, left_s: float | None = None) -> None:
         """Publish the progress of the component, for display. Never waits.
 
@@ -444,6 +456,7 @@ class Scope(ExperimentView):
         """Return the experiment time since this process has joined, without the time in MANUAL."""
         return self._link.worked_s()
 
+    @checked_call
     def note(
         self, text: str, *, scan: HasTime | None = None, time_ns: int | None = None, key: str | None = None
     ) -> None:

@@ -155,13 +155,16 @@ def xy_of(xy_m: Any) -> XY:
     """
     try:
         x, y = xy_m
-        return si_or_text(x, "m"), si_or_text(y, "m")
+        place_m = si_or_text(x, "m"), si_or_text(y, "m")
+        if not all(map(math.isfinite, place_m)):
+            raise ValueError("not finite")
     except UnitError:
         raise
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InvalidValue(
-            f"a place is (x, y) in metres, not {xy_m!r}", hint='e.g. (1e-7, 0) or ("100 nm", 0)'
+            f"a place is (x, y), finite and in metres, not {xy_m!r}", hint='e.g. (1e-7, 0) or ("100 nm", 0)'
         ) from error
+    return place_m
 
 
 def is_set(wanted: ScanParameters, now: ScanParameters | None, tolerance: float) -> bool:

@@ -58,17 +58,22 @@ class Region:
             values = (*lengths_m, si_or_text(self.angle_rad, "rad"))
         except UnitError:
             raise
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise InvalidValue(
                 f"a region needs (x, y) and (width, height), not centre {self.center_m!r} and size {self.size_m!r}",
                 hint='numbers in metres or text, e.g. Region((0, 0), (1e-6, 1e-6)) or Region((0, 0), ("1 um", "1 um"))',
             ) from error
         if not all(map(math.isfinite, values)):
             raise InvalidValue(
-                f"a region needs finite numbers, not centre {self.center_m}, size {self.size_m}, angle {self.angle_rad}"
+                f"a region is finite, not of centre {self.center_m}, size {self.size_m} and angle {self.angle_rad}",
+                hint="in metres and radians, or as text with units",
             )
         if values[2] <= 0.0 or values[3] <= 0.0:
             raise InvalidValue(f"a region of {area_text(values[2:4])} is empty", hint="both sizes are above zero")
+        if not isinstance(self.frame, Frame):
+            raise InvalidValue(
+                f"the frame of a region is a Frame, not {self.frame!r}", hint="Frame.TIP or Frame.SAMPLE"
+            )
         # the class is frozen; text was converted to numbers above
         object.__setattr__(self, "center_m", values[:2])
         object.__setattr__(self, "size_m", values[2:4])

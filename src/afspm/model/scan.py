@@ -6,7 +6,7 @@ import operator
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from afspm.basics.clock import utc_time
 from afspm.basics.entry_points import DISPLAYS, required
@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     import xarray
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
+
+_SHAPE: Final = "two whole numbers, e.g. shape=(128, 128)"
+_MOST: Final = 2**32 - 1
+"""The largest number of rows or columns on the wire."""
 
 
 @dataclass(frozen=True)
@@ -66,10 +70,12 @@ class ScanParameters:
         except (TypeError, ValueError) as error:
             raise InvalidValue(
                 f"the shape of a scan is (rows, columns), not {self.shape!r}",
-                hint="two whole numbers, e.g. shape=(128, 128)",
+                hint=_SHAPE,
             ) from error
         if min(rows, columns) < 1:
-            raise InvalidValue(f"a scan of {rows} rows and {columns} columns has no pixels")
+            raise InvalidValue(f"a scan of {rows} rows and {columns} columns has no pixels", hint=_SHAPE)
+        if max(rows, columns) > _MOST:
+            raise InvalidValue(f"a scan of {rows} rows and {columns} columns is too large", hint=_SHAPE)
         object.__setattr__(self, "shape", (rows, columns))
 
     def onto(self, current: ScanParameters) -> ScanParameters:

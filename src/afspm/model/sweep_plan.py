@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
+from afspm.basics.argument_checks import FINITE, is_number
 from afspm.basics.errors import InvalidValue, UnitError
 from afspm.basics.units import convert, parse_quantity, require_unit, si_unit
 from afspm.model.instruments import is_of_instrument
@@ -183,6 +184,10 @@ def _in_unit(name: str, value: SweptValue, unit: str | None) -> SweptValue:
             return _finite(name, convert(number, given, unit if unit is not None else given))
     else:
         number = value
+    if not FINITE.fits(number):  # also None
+        raise InvalidValue(
+            f"{name} can't be set to {number!r}", hint="a finite number, text with a unit, True or False"
+        )
     if unit and not BASE_PARAMETERS.get(name):  # its own unit or the unit of the others? A person knows
         raise UnitError(f"{name}: {value!r} has no unit, others have", hint=f"write it as in '1 {unit}'")
     require_unit(number, unit or "")
@@ -191,7 +196,7 @@ def _in_unit(name: str, value: SweptValue, unit: str | None) -> SweptValue:
 
 def _finite(name: str, number: float) -> float:
     if not math.isfinite(number):
-        raise InvalidValue(f"{name} can't be set to {number}")
+        raise InvalidValue(f"{name} can't be set to {number}", hint="a finite number")
     return float(f"{number:.{_DIGITS}g}")
 
 
@@ -221,7 +226,8 @@ def _in_range(name: str, given: Mapping[str, SweptValue]) -> tuple[SweptValue, .
 
 
 def _points(name: str, given: SweptValue) -> int:
-    if isinstance(given, str | bool) or not float(given).is_integer() or not 2 <= given <= MOST_POINTS:
+    # the bounds first: a float does not hold each whole number
+    if not is_number(given) or not 2 <= given <= MOST_POINTS or not float(given).is_integer():
         raise InvalidValue(f"{name}: a range of {given!r} points", hint="a whole number, 2 at least")
     return int(given)
 

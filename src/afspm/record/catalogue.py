@@ -16,6 +16,7 @@ from typing import Final
 
 import numpy as np
 
+from afspm.basics.argument_checks import PATH, Argument, checked, is_text
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import FileError, InvalidValue
 from afspm.basics.formatting import counted
@@ -36,6 +37,11 @@ _FORMAT: Final = 3
 _WATCHED: Final = (RUN_FILE, "journal.sqlite", "journal.sqlite-wal")
 """Files of a run whose change shows that the run has changed."""
 _SEARCHED: Final = ("sample", "person", "project", "technique", "probe")
+_WORDS: Final = Argument(
+    "a list of texts",
+    lambda value: isinstance(value, Sequence) and not isinstance(value, str) and all(map(is_text, value)),
+    'e.g. ["sample:gold"]',
+)
 _WORD: Final = re.compile(r"(?:(\w+):)?(.+)", re.DOTALL)
 
 
@@ -96,8 +102,9 @@ FIELDS: Final = tuple(RunSummary("", "").texts())
 """The fields that a search may name, as `field:word`."""
 
 
+@checked({"root": PATH, "words": _WORDS})
 def find_runs(
-    root: Path, words: Sequence[str] = (), since: date | None = None, until: date | None = None
+    root: str | Path, words: Sequence[str] = (), since: date | None = None, until: date | None = None
 ) -> list[RunSummary]:
     """Return the runs under a folder whose texts contain all words, the newest first.
 
@@ -110,7 +117,7 @@ def find_runs(
         FileError: there is no such folder.
         InvalidValue: a word names an unknown field.
     """
-    wanted = [_read_word(word) for word in words]
+    wanted, root = [_read_word(word) for word in words], Path(root)
     if not root.is_dir():
         raise FileError(
             "there is no such folder", where=str(root), hint="runs are in runs/, or in the folder of --runs"
@@ -122,7 +129,7 @@ def find_runs(
 def _read_word(word: str) -> tuple[str, str]:
     match = _WORD.fullmatch(word.strip())
     if match is None:
-        raise InvalidValue("a word to look for is empty")
+        raise InvalidValue(f"{word!r} is no word to look for", hint='e.g. "gold" or "sample:gold"')
     if match[1] and match[1] not in FIELDS:
         raise InvalidValue(f"runs have no {match[1]!r} to look in", hint=f"there are {', '.join(FIELDS)}")
     return match[1] or "", match[2].casefold()

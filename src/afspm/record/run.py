@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from afspm import wire
+from afspm.basics.argument_checks import PATH, checked
 from afspm.basics.errors import FileError, InvalidValue, NoSuchItem, WireError
 from afspm.basics.formatting import counted
 from afspm.basics.plain_data import from_json
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
 _SAME_SCAN_NS = 1_000_000_000
 
 
+@checked({"path": PATH})
 def open_run(path: str | Path = "runs", *, messages: Sequence[str] = ()) -> Run:
     """Open the record of a run, also of a running or killed one.
 

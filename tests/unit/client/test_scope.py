@@ -740,9 +740,9 @@ def test_reading_takes_control_if_the_scheduler_requires_it(lab: Lab, scope: Sco
 
 
 def test_feedback_as_text_is_refused_with_the_call_that_takes_it(scope: Scope) -> None:
-    with pytest.raises(InvalidValue, match="'80 pA' is text") as caught:
+    with pytest.raises(InvalidValue, match="a finite number, not '80 pA'") as caught:
         scope.set_feedback(setpoint="80 pA")  # type: ignore[arg-type]
-    assert "scope.set(\"zctrl-setpoint\", '80 pA')" in caught.value.hint
+    assert 'scope.set("zctrl-setpoint", "50 pA")' in caught.value.hint
 
 
 def test_set_feedback_returns_when_the_feedback_is_published(lab: Lab, scope: Scope) -> None:
@@ -1063,3 +1063,34 @@ def test_wait_outlasts_a_restart_of_the_instrument_but_not_an_error(lab: Lab, sc
     lasts_s = math.inf
     with pytest.raises(NoResponse, match=r"no value for 60 s .* status 400: no sensor"):
         scope.set("source.bias", 0.25, "V", wait=True)
+
+
+MISTAKES: dict[str, Callable[[Scope], object]] = {
+    "set: parameter": lambda scope: scope.set(b"scan-speed", 1.0),  # type: ignore[arg-type]
+    "set: unit": lambda scope: scope.set("x-gain", 1.0, 5),  # type: ignore[arg-type]
+    "set: x-gain": lambda scope: scope.set("x-gain", None),  # type: ignore[arg-type]
+    "set: scan-speed": lambda scope: scope.set("scan-speed", 10**400),
+    "get: timeout_s": lambda scope: scope.get("scan-speed", timeout_s="5"),  # type: ignore[arg-type]
+    "action: name": lambda scope: scope.action(""),
+    "flag: problem": lambda scope: scope.flag(math.nan),  # type: ignore[arg-type]
+    "control: solving": lambda scope: scope.control(solving=1.5).__enter__(),  # type: ignore[arg-type]
+    "set_mode: mode": lambda scope: scope.set_mode(-1),  # type: ignore[arg-type]
+    "set_feedback: setpoint": lambda scope: scope.set_feedback(setpoint=math.nan),
+    "progress: done": lambda scope: scope.progress(-1, 0),
+    "progress: of": lambda scope: scope.progress(0, 10**20),
+    "note: text": lambda scope: scope.note("\ud800"),
+    "wait_until: condition": lambda scope: scope.wait_until(None),  # type: ignore[arg-type]
+    "sweep: parameters": lambda scope: scope.sweep({1: [0.5]}),  # type: ignore[dict-item]
+    "a place is": lambda scope: scope.move_probe((math.inf, 0.0)),
+    "a scan of": lambda scope: scope.scan(REGION, shape=(10**20, 10)),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_wrong_argument_is_an_error_with_a_remedy_before_anything_is_sent(lab: Lab, scope: Scope, mistake: str) -> None:
+    with pytest.raises(InvalidValue) as error:
+        MISTAKES[mistake](scope)
+    assert str(error.value).startswith(mistake)
+    assert error.value.hint or "must be" in error.value.what
+    sent = {request.kind for request in lab.requests}
+    assert sent <= {ControlRequest.REQUEST_CTRL, ControlRequest.RELEASE_CTRL}

@@ -183,3 +183,9 @@ def test_foreign_index_is_rebuilt(root: Path) -> None:
         endless = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i FROM n) SELECT i, i, i FROM n"
         index.execute(f"CREATE VIEW runs (folder, stamp, about) AS {endless}")
     assert find_runs(root)
+
+
+def test_search_takes_a_path_as_text_and_refuses_one_text_as_a_list(tmp_path: Path) -> None:
+    assert find_runs(str(tmp_path), ["gold"]) == []
+    with pytest.raises(InvalidValue, match="words must be a list of texts, not 'gold'"):
+        find_runs(tmp_path, "gold")

@@ -104,7 +104,8 @@ class ScanFrame:
         region = self.region()
         u_m, v_m = in_frame(region, xy_m)
         if self._ask.number("moveto_scan_xy", u_m / ANGSTROM_M, v_m / ANGSTROM_M) != 0.0:
-            reason = f"GXSM moves the tip only within the scan frame; {position_text(xy_m)} is outside"
+            place = position_text(xy_m)
+            reason = f"GXSM moves the tip only within the scan frame; {place} is outside: set a scan region around it"
             raise Refused(ControlResponse.PARAM_ERROR, reason)
 
     def tip(self) -> tuple[float, float]:

@@ -20,6 +20,7 @@ from datetime import tzinfo
 from pathlib import Path
 
 from afspm.basics import entry_points
+from afspm.basics.argument_checks import PATH, checked
 from afspm.basics.errors import FileError
 from afspm.storage.formats.content import FileContent, OtherFormat
 
@@ -37,6 +38,7 @@ def suffixes() -> tuple[str, ...]:
     return tuple(dict.fromkeys(f".{name}" for name in names if name != _ANY))
 
 
+@checked({"path": PATH})
 def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     """Return the scans and spectra of a file.
 
@@ -53,7 +55,7 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileError("no such file", where=str(path))
+        raise FileError("no such file", where=str(path), hint="a relative path begins in the current folder")
     try:
         return _with_unique_channels(_first_that_reads(path, zone))
     except FileError as error:
