@@ -164,7 +164,8 @@ def _sheet(
     palette = np.vstack([colour_map("gold"), [_rgb(NEUTRAL)]])  # the last colour marks unmeasured pixels
     for i, shot in enumerate(shots):
         y, x = i // COLUMNS * tall, i % COLUMNS * pitch + GAP_PX // 2
-        picture = palette[_fitted(indices(shot.picture.values, spans[shot.picture.kind]))[::-1]]  # drawn with y upwards
+        levels = indices(shot.picture.values, spans[shot.picture.kind])
+        picture = palette[_fitted(levels, (shot.picture.width_m, shot.picture.height_m))[::-1]]  # drawn with y upwards
         canvas[y : y + THUMB_PX, x : x + THUMB_PX] = picture
         bar_px = _scale_bar_px(shot.picture)[1]
         canvas[y + THUMB_PX - 8 : y + THUMB_PX - 3, x + 3 : x + 5 + bar_px] = 0
@@ -186,9 +187,8 @@ def _sheet(
 
 def _scale_bar_px(picture: Thumbnail) -> tuple[float, int]:
     # length in m, and in pixels of the sheet
-    ny, nx = picture.levels.shape
     length_m = round_length_m(picture.width_m / 2.5)
-    return length_m, max(1, round(length_m / picture.width_m * THUMB_PX * nx / max(nx, ny)))
+    return length_m, max(1, round(length_m / max(picture.width_m, picture.height_m) * THUMB_PX))
 
 
 _LABEL: dict[str, object] = {"boxstyle": "square,pad=0.12", "facecolor": "black", "alpha": 0.55, "linewidth": 0}
@@ -311,12 +311,11 @@ def _clipped(span: Span, limits: tuple[int, int]) -> tuple[float, float]:
     return float(max(span.start_ns, limits[0])), float(min(end, limits[1]))
 
 
-def _fitted(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _fitted(picture: NDArray[np.uint8], size_m: tuple[float, float]) -> NDArray[np.uint8]:
+    # the sides follow the region, not the pixels: few lines over a tall region are a tall image
+    width_px, height_px = (max(1, round(THUMB_PX * side_m / max(size_m))) for side_m in size_m)
     ny, nx = picture.shape
-    scale = THUMB_PX / max(ny, nx)
-    rows = np.minimum((np.arange(max(1, round(ny * scale))) / scale).astype(int), ny - 1)
-    columns = np.minimum((np.arange(max(1, round(nx * scale))) / scale).astype(int), nx - 1)
-    small = picture[np.ix_(rows, columns)]
+    small = picture[np.ix_(np.arange(height_px) * ny // height_px, np.arange(width_px) * nx // width_px)]
     canvas = np.full((THUMB_PX, THUMB_PX), UNMEASURED, np.uint8)
     y, x = (THUMB_PX - small.shape[0]) // 2, (THUMB_PX - small.shape[1]) // 2
     canvas[y : y + small.shape[0], x : x + small.shape[1]] = small

@@ -29,12 +29,14 @@ class Thumbnail:
         levels: [y, x], y upwards: indices into a colour map.
         span: the values of the first and the last colour, in `unit`.
         width_m: the width of the scan.
+        height_m: the height of the scan, also with pixels that are not square.
     """
 
     levels: NDArray[np.uint8]
     span: ValueRange
     unit: str
     width_m: float
+    height_m: float
 
     @property
     def kind(self) -> tuple[str, float]:
@@ -114,7 +116,10 @@ class NightRecord:
         if kind == "scan":
             levels = np.frombuffer(base64.b64decode(entry["picture"]), np.uint8).reshape(entry["shape"])
             span = ValueRange(*entry["span"])
-            picture = Thumbnail(levels, span, entry["unit"], entry["width_m"])
+            width_m = entry["width_m"]
+            # an entry that an earlier version wrote before a resume has no height: its pixels count as squares
+            height_m = entry.get("height_m", width_m * levels.shape[0] / levels.shape[1])
+            picture = Thumbnail(levels, span, entry["unit"], width_m, height_m)
             self.shots.append(Shot(time_ns, entry["start_ns"], entry["holder"], picture))
         elif kind == "control":
             state = ControlState(ControlMode(entry["mode"]), entry["holder"], tuple(entry["problems"]))
@@ -203,6 +208,7 @@ def scan_entry(scan: Scan, time_ns: int, start_ns: int | None, holder: str | Non
         "span": [picture.span.low, picture.span.high],
         "unit": picture.unit,
         "width_m": picture.width_m,
+        "height_m": picture.height_m,
     }
 
 
@@ -224,6 +230,6 @@ def mark_entry(
 
 
 def thumbnail(scan: Scan, largest_px: int = THUMBNAIL_PX) -> Thumbnail:
-    small = flattened(reduced(scan.values, largest_px))
+    small = flattened(reduced(scan.values, largest_px, each_side=True))
     span = value_range(small)
-    return Thumbnail(indices(small, span), span, scan.unit, scan.region.size_m[0])
+    return Thumbnail(indices(small, span), span, scan.unit, *scan.region.size_m)

@@ -33,7 +33,7 @@ from afspm.model import (
     ScopeStatus,
 )
 from afspm.model.problems import CONDITIONS
-from afspm.record.drawing.palette import LEVELS, UNMEASURED
+from afspm.record.drawing.palette import LEVELS, NEUTRAL, UNMEASURED
 from afspm.record.night_record import (
     THUMBNAIL_PX,
     NightRecord,
@@ -149,7 +149,7 @@ def test_a_thumbnail_is_small_and_shows_scans_of_any_shape_and_with_holes() -> N
     assert max(picture.shape) <= THUMBNAIL_PX
     assert picture.dtype == np.uint8
     assert (picture[0] == UNMEASURED).all()
-    assert picture[34, 9] == LEVELS - 1
+    assert picture[34, 30] == LEVELS - 1
     assert np.median(picture[10:]) < 30
     assert thumb(np.zeros((5, 5))).shape == (5, 5)
 
@@ -157,7 +157,7 @@ def test_a_thumbnail_is_small_and_shows_scans_of_any_shape_and_with_holes() -> N
 @pytest.mark.parametrize("shape", [(4, 512), (512, 4), (1, 300), (1, 1)])
 def test_a_few_long_lines_have_a_thumbnail_too(shape: tuple[int, int]) -> None:
     picture = thumb(np.arange(float(np.prod(shape))).reshape(shape))
-    assert min(picture.shape) == 1
+    assert min(picture.shape) == min(shape)
     assert max(picture.shape) <= THUMBNAIL_PX
 
 
@@ -338,3 +338,21 @@ def test_scale_bar_of_a_night_is_as_long_as_its_label(tmp_path: Path, monkeypatc
     pixels = white[(white >= night_figure.GAP_PX // 2 + 4) & (white < night_figure.THUMB_PX)]
     bar_px = int(np.argmax(np.diff(pixels, append=10**6) > 1)) + 1
     assert bar_px == pytest.approx(float(length.split()[0]) * 1e-9 / 1e-6 * night_figure.THUMB_PX, abs=1.0)
+
+
+def test_tile_of_a_night_has_the_proportions_of_its_region(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    figures: list[Any] = []
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda self, *rest, **how: figures.append(self))
+    tall = Region((0.0, 0.0), (0.5e-6, 1e-6))
+    values = np.random.default_rng(1).random((16, 128))  # few long lines, as of a fast overview
+    record = NightRecord()
+    record.add(control_entry(ControlState(holder="series"), 0))
+    record.add(scan_entry(Scan(tall, "Height", "m", values, 0), 2 * MINUTE_NS, 0, "series"))
+    draw(record, tmp_path / "night.png", {})
+    sheet = next(ax for ax in figures[0].axes if any(text.get_text().endswith("nm") for text in ax.texts))
+    side, left = night_figure.THUMB_PX, night_figure.GAP_PX // 2
+    tile = np.asarray(sheet.images[0].get_array())[:side, left : left + side]
+    grey = tuple(int(NEUTRAL[i : i + 2], 16) for i in (1, 3, 5))  # beside the scan
+    measured = ~(tile == grey).all(axis=2)
+    assert np.flatnonzero(measured[side // 4]).size == side // 2
+    assert np.flatnonzero(measured[:, side // 2]).size == side
