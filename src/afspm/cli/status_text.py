@@ -192,7 +192,7 @@ class StatusText:
         return f"{duration_text(left_ns / NS_PER_S)} left{real}"
 
     def _progress(self) -> Iterator[Text]:
-        for report in self._seen.progress_reports.values():
+        for report in self._seen.progress_at(self._now_ns).values():
             if report.of <= 0:
                 continue
             left_ns = report.remaining_ns(self._now_ns)
@@ -208,7 +208,7 @@ class StatusText:
 
     def _end_ns(self) -> int | None:
         run = self._run
-        return expected_end_ns(run.plans, self._seen.progress_reports, run.began_ns, self._now_ns)
+        return expected_end_ns(run.plans, self._seen.progress_at(self._now_ns), run.began_ns, self._now_ns)
 
     def _drift(self) -> Iterator[Text]:
         if registered := self._seen.registration:
@@ -282,7 +282,7 @@ class StatusText:
             "problems": problems_as_json(seen),
             "state": seen.status.state.name if seen.status else None,
             "scan": None if running is None else {"part": round(running[0], 4), "remaining_s": _seconds(running[1])},
-            "progress": {name: self._progress_json(report) for name, report in seen.progress_reports.items()},
+            "progress": {name: self._progress_json(report) for name, report in seen.progress_at(self._now_ns).items()},
             "end": None if end_ns is None else {"time": _iso(end_ns), "remaining_s": _seconds(end_ns - self._now_ns)},
             "processes": [self._process_json(state) for state in seen.processes.values()],
             "refusals": [

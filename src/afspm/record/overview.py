@@ -264,6 +264,17 @@ class Overview:
         """The spans of problems that are routine; see `is_routine`."""
         return [s for lane in self.timelines.problems.values() for s in lane.spans if self.is_routine(s)]
 
+    def progress_at(self, now_ns: int) -> dict[str, Progress]:
+        """Return the newest progress of each component, moved by the time in MANUAL since: no task goes on then."""
+        manual = [span for span in self.timelines.mode.spans if span.label == ControlMode.MANUAL.name.lower()]
+
+        def held_ns(since_ns: int) -> int:
+            spans = (replace(span, start_ns=max(span.start_ns, since_ns)) for span in manual)
+            return sum(span.lasted_ns(now_ns) for span in spans)
+
+        reports = self.progress_reports.items()
+        return {name: replace(report, time_ns=report.time_ns + held_ns(report.time_ns)) for name, report in reports}
+
     @property
     def in_control(self) -> str:
         """The holder of control; in MANUAL the person who set that mode, or "a person"; empty without a holder."""

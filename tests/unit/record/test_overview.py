@@ -395,3 +395,14 @@ def test_alarm_is_open_until_a_line_of_its_process_ends_it() -> None:
     assert [one.ended_ns for one in night.alarms] == [7 * S, None]
     night = seen(*packets, logged(7, "recorder", "INFO", over), logged(8, "recorder", "CRITICAL", full))
     assert [(one.name, one.time_ns // S) for one in night.open_alarms] == [("scheduler", 4), ("recorder", 8)]
+
+
+def test_time_in_manual_does_not_count_as_progress_of_a_component() -> None:
+    overview = Overview()
+    overview.take("ControlState", control("series"), 1 * S)
+    overview.take("Progress", model.Progress(10 * S, "series", 1, 5, left_s=100.0), 10 * S)
+    overview.take("ControlState", control(None, mode=ControlMode.MANUAL), 30 * S)
+    left = {now_s: overview.progress_at(now_s * S)["series"].remaining_ns(now_s * S) for now_s in (20, 30, 500)}
+    assert left == {20: 90 * S, 30: 80 * S, 500: 80 * S}
+    overview.take("ControlState", control(None), 600 * S)
+    assert overview.progress_at(610 * S)["series"].remaining_ns(610 * S) == 70 * S

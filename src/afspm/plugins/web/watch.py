@@ -103,7 +103,7 @@ class Watch:
 
     def expected_end_ns(self, overview: Overview, now_ns: int) -> int | None:
         """Return the experiment time of the end, estimated from plans and progress; None if unknown."""
-        return expected_end_ns(self._plans, overview.progress_reports, self._began_ns, now_ns)
+        return expected_end_ns(self._plans, overview.progress_at(now_ns), self._began_ns, now_ns)
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[Overview]:

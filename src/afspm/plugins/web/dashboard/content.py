@@ -313,7 +313,7 @@ def status_html(watch: Watch, overview: Overview) -> str:
         *_microscope(overview, now_ns),
     ]
     end_ns = watch.expected_end_ns(overview, now_ns)
-    for name, report in overview.progress_reports.items():
+    for name, report in overview.progress_at(now_ns).items():
         left_ns = report.remaining_ns(now_ns) if report.done < report.of else None
         # the component that decides the end needs no end of its own
         has_end = left_ns and (end_ns is None or abs(now_ns + left_ns - end_ns) > _MINUTE_NS)
