@@ -80,7 +80,11 @@ def _text(file: Path, findings: Findings) -> str | None:
         what = f"the file is not UTF-8 text: {error.reason} at byte {error.start}"
         findings.error(what, SourceLocation(str(file), line), 'save it as "UTF-8" in your editor')
     except OSError as error:
-        findings.error(f"the file can't be read: {error.strerror or error}", SourceLocation(str(file)))
+        if file.is_dir():
+            hint = "name the experiment file in it; `afspm run --resume` goes on with a run"
+            findings.error("this is a folder, not an experiment file", SourceLocation(str(file)), hint)
+        else:
+            findings.error(f"the file can't be read: {error.strerror or error}", SourceLocation(str(file)))
     return None
 
 

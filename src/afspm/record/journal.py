@@ -91,7 +91,10 @@ def open_to_read(folder: Path) -> sqlite3.Connection:
     """
     path = folder / JOURNAL_FILE
     if not path.is_file():
-        raise FileError("there is no record in this folder", where=str(folder), hint="name the folder of a run, runs/…")
+        what = "there is no record in this folder"
+        if not folder.is_dir():
+            what = "this is a file, not the folder of a run" if folder.exists() else "there is no such folder"
+        raise FileError(what, where=str(folder), hint="name the folder of a run, runs/…")
     try:
         try:
             return _checked(read_only(path.resolve()), path)

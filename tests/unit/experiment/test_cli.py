@@ -47,6 +47,13 @@ def test_check_of_a_missing_file_prints_only_that(runner: CliRunner) -> None:
     assert result.output == "absent.toml: error: the file can't be read: No such file or directory\n"
 
 
+def test_check_of_the_folder_of_a_run_says_what_to_name(runner: CliRunner, tmp_path: Path) -> None:
+    result = runner.invoke(app, ["check", str(tmp_path)])
+    assert result.exit_code == 1
+    assert f"{tmp_path}: error: this is a folder, not an experiment file\n" in result.output
+    assert "afspm run --resume" in result.output
+
+
 def test_check_merges_files(write: Write, runner: CliRunner) -> None:
     write(CORRECTOR, '[repair]\nvoltage = "2 nm"\n')
     result = runner.invoke(app, ["check", "night.toml", "over1.toml"])

@@ -399,3 +399,10 @@ def test_page_and_record_number_scans_alike_after_interruptions(
     for overview in (page, past, run.overview()):
         assert {one.filename: one.number for one in overview.scans if one.filename} == numbers
         assert overview.scan_count == 5
+
+
+def test_wrong_path_of_a_run_is_named_for_what_it_is(tmp_path: Path) -> None:
+    (tmp_path / "night.toml").write_text("")
+    for name, reason in {"night.toml": "this is a file", "absent": "no such folder", ".": "no record in this"}.items():
+        with pytest.raises(FileError, match=reason):
+            afspm.open_run(tmp_path / name)

@@ -11,6 +11,7 @@ from afspm.plugins.drift.estimators import estimator
 from afspm.plugins.drift.registration import DriftScan
 
 _ALIKE = 1e-3
+_DIGITS = 12  # decimals of a displacement in m: less than a picometre comes from rounding
 
 
 def onto_first(first: Array, region: Region, second: Array, second_region: Region) -> tuple[Array, str]:
@@ -33,7 +34,8 @@ def _displacement(first: Array, region: Region, second: Array, other: Region) ->
     if not found.accepted:
         return unmoved, f"not registered ({found.reason}): compared pixel by pixel"
     x, y = map(float, found.displacement_m)
-    return (x, y), f"registered: the second scan was moved by {typeset_position((-x, -y))}"
+    moved_m = (round(-x, _DIGITS) + 0.0, round(-y, _DIGITS) + 0.0)  # adding zero removes the sign of -0
+    return (x, y), f"registered: the second scan was moved by {typeset_position(moved_m)}"
 
 
 def _moved(values: Array, region: Region, displacement_m: tuple[float, float]) -> Array:
