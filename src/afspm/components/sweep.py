@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+from functools import reduce
+from operator import add
 from typing import Literal
 
 from afspm.basics.errors import ConfigError, InvalidValue, UnitError
@@ -14,6 +17,8 @@ from afspm.components.pace import Pace
 from afspm.components.planned_scans import FRAME, Pixels, pair, shape_of
 from afspm.components.scan_plan import ScanPlan
 from afspm.model import Parameter, Region, names
+from afspm.model.instruments import is_of_instrument
+from afspm.model.planned_work import PlannedWork, planned_rounds
 from afspm.model.snapshot import to_plain
 from afspm.model.sweep_plan import SweepOrder, SweepPlan, SweptValue
 
@@ -76,6 +81,7 @@ class Sweep(Component):
                 raise ConfigError("needs the `size` of the scans", where=name)
         region = None if size is None else Region(pair(center or (0.0, 0.0)), pair(size), angle or 0.0)
         shape = None if pixels is None else shape_of(pixels)
+        self._frame = region, shape
         self._what = {"region": region, "shape": shape} if measure == "scan" else {"at": at and pair(at), "kind": kind}
         self.needs_actions = (names.START_SCAN if measure == "scan" else names.START_SPEC,)
         fixed = (
@@ -99,6 +105,22 @@ class Sweep(Component):
         return {
             "parameters": tuple(axis.parameter(place) for axis in self.sweep.axes for place in range(len(axis.values)))
         }
+
+    def planned_work(self, speed_m_s: float | None) -> PlannedWork:
+        total, ends = self.sweep.total, self.end_when_done
+        if self.measure != "scan":
+            why = "the controller sets the duration of a spectrum"
+            return PlannedWork(spectra=total, ends_experiment=ends, why=why)
+        region, shape = self._frame
+        if region is None or shape is None:
+            why = "the file sets no size and pixels"
+            return PlannedWork(total, path_m=None, pixels=None, ends_experiment=ends, why=why)
+        speeds = next((axis.values for axis in self.sweep.axes if axis.name == names.SCAN_SPEED), (speed_m_s,))
+        each = total // len(speeds)
+        work = reduce(add, (planned_rounds((region,), shape, each, 0.0, speed) for speed in map(_number, speeds)))
+        if arrivals := [axis.name for axis in self.sweep.axes if is_of_instrument(axis.name)]:
+            work = replace(work, duration_s=None, why=f"the time in which {arrivals[0]} arrives is unknown")
+        return replace(work, ends_experiment=ends)
 
     def run(self) -> None:
         sweep = to_plain(self.sweep) | {"measure": self.measure}
@@ -128,6 +150,10 @@ class Sweep(Component):
     def _text(self, values: Mapping[str, SweptValue]) -> str:
         units = {axis.name: axis.unit or "" for axis in self.sweep.axes}
         return ", ".join(f"{name} {value_text(value, units[name])}" for name, value in values.items())
+
+
+def _number(value: SweptValue | None) -> float | None:
+    return float(value) if isinstance(value, int | float) else None
 
 
 def value_text(value: SweptValue, unit: str) -> str:

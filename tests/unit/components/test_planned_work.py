@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from afspm.components.planned_scans import ListedRegion, RegionGrid, ScanList, ScanSeries
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
 from afspm.components.survey import Survey
+from afspm.components.sweep import Sweep
 from afspm.model.planned_work import SPEED_UNKNOWN, PlannedWork, planned_end_s
 from afspm.testing import Bench
 from afspm.testing.components.simulated_time import START_S
@@ -121,3 +124,18 @@ def test_simulated_night_takes_as_long_as_planned() -> None:
         assert end_ns is not None
         took_s = end_ns / 1e9 - START_S
         assert planned.duration_s <= took_s < 1.05 * planned.duration_s + 5.0
+
+
+def test_sweep_plans_each_of_its_speeds_and_names_unknown_parts() -> None:
+    swept: dict[str, Any] = {"zctrl-igain": [100, 200, 300], "scan-speed": ["2 um/s", "4 um/s"]}
+    work = Sweep(swept, size=(2e-6, 1e-6), pixels=(64, 100)).planned_work(SPEED_M_S)
+    assert (work.scans, work.pixels) == (6, 6 * 6400)
+    assert work.duration_s == pytest.approx(3 * 200.0 + 3 * 100.0)
+    present = Sweep(swept).planned_work(SPEED_M_S)
+    assert (present.scans, present.path_m, present.duration_s) == (6, None, None)
+    assert "size" in present.why
+    warming: dict[str, Any] = {"cryo.temperature": ["4 K", "6 K"]}
+    cold = Sweep(warming, size=(2e-6, 1e-6), pixels=(64, 100)).planned_work(SPEED_M_S)
+    assert (cold.scans, cold.end_s) == (2, None)
+    assert "cryo.temperature" in cold.why
+    assert Sweep(swept, measure="spectrum").planned_work(None).spectra == 6
