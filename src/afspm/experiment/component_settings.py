@@ -69,7 +69,8 @@ def resolve(
             unknown.append(name)
             replaced = "" if closest(name, parameters) else _replaced_class_hint(path, name, document)
             what = f"[{'.'.join(path)}] has no setting {name!r}"
-            document.error(what, *path, name, hint=replaced or nearest(name, parameters))
+            hint = replaced or nearest(name, parameters) or f"the class {component.__name__} has no settings"
+            document.error(what, *path, name, hint=hint)
     _report_missing(parameters, settings, unknown, path, document)
     return checked
 

@@ -47,7 +47,7 @@ def test_check_of_a_missing_file_prints_only_that(runner: CliRunner) -> None:
     assert result.output == "absent.toml: error: the file can't be read: No such file or directory\n"
 
 
-def test_check_of_the_folder_of_a_run_says_what_to_name(runner: CliRunner, tmp_path: Path) -> None:
+def test_check_of_a_folder_asks_for_the_experiment_file(runner: CliRunner, tmp_path: Path) -> None:
     result = runner.invoke(app, ["check", str(tmp_path)])
     assert result.exit_code == 1
     assert f"{tmp_path}: error: this is a folder, not an experiment file\n" in result.output

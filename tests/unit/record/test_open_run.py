@@ -401,7 +401,7 @@ def test_page_and_record_number_scans_alike_after_interruptions(
         assert overview.scan_count == 5
 
 
-def test_wrong_path_of_a_run_is_named_for_what_it_is(tmp_path: Path) -> None:
+def test_wrong_path_of_a_run_has_its_reason(tmp_path: Path) -> None:
     (tmp_path / "night.toml").write_text("")
     for name, reason in {"night.toml": "this is a file", "absent": "no such folder", ".": "no record in this"}.items():
         with pytest.raises(FileError, match=reason):
