@@ -13,6 +13,7 @@ caches have been appended again.
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections import deque
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -169,7 +170,7 @@ class LogReader:
         self.newest = position.segment
         self._folder = folder
 
-    def read(self, most_bytes: int) -> list[tuple[LoggedPacket, Position]]:
+    def read(self, most_bytes: int, most_packets: int = sys.maxsize) -> list[tuple[LoggedPacket, Position]]:
         """Return the next packets, of about `most_bytes` in all, each with the position after it.
 
         Raises:
@@ -177,16 +178,17 @@ class LogReader:
         """
         found: list[tuple[LoggedPacket, Position]] = []
         segment, start = self.position
+        is_full = False
         while True:
             later = [number for number in map(number_of, segments(self._folder)) if number > segment]
             self.newest = max(later, default=segment)
             for entry, offset in read_segment(path_of(self._folder, segment), start):
                 found.append((entry, Position(segment, offset)))
                 most_bytes -= len(entry.packet.payload)
-                if most_bytes <= 0:
+                if is_full := most_bytes <= 0 or len(found) >= most_packets:
                     break
             # a segment does not grow once it has a successor
-            if most_bytes <= 0 or not later:
+            if is_full or not later:
                 self.position = found[-1][1] if found else Position(segment, start)
                 return found
             segment, start = later[0], 0

@@ -64,14 +64,14 @@ class Bench:
         self.woken = threading.Event()
         self.writers: list[RecordWriter] = []
 
-    def writer(self) -> RecordWriter:
+    def writer(self, step: Callable[[], contextlib.AbstractContextManager[None]] | None = None) -> RecordWriter:
         writer = RecordWriter(
             self.folder,
             self.packets,
             RecordSettings(),
             ExperimentClock.real(),
             logging.getLogger("recorder"),
-            step=contextlib.nullcontext,
+            step=step or contextlib.nullcontext,
             wake=self.woken.set,
         )
         self.writers.append(writer)
@@ -123,6 +123,27 @@ def test_log_and_packets_of_other_publishers_are_recorded_once_in_order(bench: B
     assert bench.times() == [1, 2, 3, 4, 5, 7]
     assert bench.rows("SELECT source FROM packets WHERE time_ns = 6") == [("tcp://another",)]
     assert bench.is_committed
+
+
+def test_flood_of_packets_is_recorded_in_short_steps_that_follow_each_other(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    activity, reads, plain = ProcessActivity(ExperimentClock.real()), list[tuple[int, bool]](), LogReader.read
+
+    def read(reader: LogReader, *limits: int) -> Any:
+        is_in_step = activity.since_s is not None
+        found = plain(reader, *limits)
+        reads.append((len(found), is_in_step))
+        return found
+
+    monkeypatch.setattr(recording, "MOST_AT_ONCE", 10)
+    monkeypatch.setattr(LogReader, "read", read)
+    bench.publish(*map(control, range(1, 26)))
+    writer = bench.writer(activity.step)
+    writer.finish(ended=True)
+    # a heartbeat between two batches shows a recorder at work, which is not asked to end
+    assert reads[:4] == [(10, False), (10, True), (5, True), (0, True)]
+    assert bench.times() == [*range(1, 26)]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows removes no open file")
