@@ -17,13 +17,28 @@ LOCK_FILE = "running"
 
 
 @contextlib.contextmanager
+def writing_to(folder: Path) -> Iterator[None]:
+    """Raise FileError for an OSError of the block, which writes into a run's folder before anything is started."""
+    try:
+        yield
+    except OSError as error:
+        raise FileError(
+            f"the folder of the run can't be written: {error.strerror or error}",
+            where=str(folder),
+            hint="nothing was started; make room on its disk, or make it writable, and start again",
+        ) from error
+
+
+@contextlib.contextmanager
 def lock_run(folder: Path) -> Iterator[None]:
     """Hold the lock of a run in the block; the system releases the lock of a killed process.
 
     Raises:
-        FileError: another process holds the lock: the run is still going on.
+        FileError: another process holds the lock: the run is still going on; or its file can't be written.
     """
-    with (folder / STATE_DIR / LOCK_FILE).open("a+b") as file:
+    with writing_to(folder):
+        opened = (folder / STATE_DIR / LOCK_FILE).open("a+b")
+    with opened as file:
         try:
             lock(file)
         except OSError as error:

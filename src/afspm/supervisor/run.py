@@ -32,7 +32,7 @@ from afspm.record.run_json import (
     WAITS_GIVEN_UP,
     run_json_or_empty,
 )
-from afspm.record.run_lock import lock_run
+from afspm.record.run_lock import lock_run, writing_to
 from afspm.storage.disk import run_bounded
 from afspm.storage.packet_log import discard_if_recorded, expect_recorder, log_folder
 from afspm.supervisor import key_handout, own_runs, post_run, run_folder, run_identity
@@ -94,7 +94,7 @@ def run(experiment: Experiment, options: RunOptions = RunOptions(), terminal: Te
 
     Raises:
         ConfigError: the experiment file has errors, or the options don't fit it; nothing was started.
-        FileError: the run folder can't be made; nothing was started.
+        FileError: the run folder can't be made or written; nothing was started.
     """
     experiment.require_valid(options.only, options.without)
     own = _own_identity(experiment, options)
@@ -106,7 +106,8 @@ def run(experiment: Experiment, options: RunOptions = RunOptions(), terminal: Te
     common = common_identity(experiment, first, own, options, terminal)
     folder = run_folder.create(options.runs, experiment.name, now())
     with lock_run(folder):
-        run_folder.write_experiment(folder, experiment.expanded(secrets=False))
+        with writing_to(folder):
+            run_folder.write_experiment(folder, experiment.expanded(secrets=False))
         return go(experiment, options, common, folder, experiment.name, terminal, names)
 
 
@@ -124,11 +125,15 @@ def go(
     Args:
         name: name of the experiment.
         names: names of its processes.
+
+    Raises:
+        FileError: the folder can't be written; nothing was started.
     """
-    if experiment.resolved.sections.clock.waits:
-        common = replace(common, clock=common.clock.waiting_in(folder / STATE_DIR / CLOCK_FILE))
-    clock = common.clock
-    run_log = RunLog(folder / run_folder.LOG_FILE, clock, terminal=terminal, level=options.log_level, names=names)
+    with writing_to(folder):
+        if experiment.resolved.sections.clock.waits:
+            common = replace(common, clock=common.clock.waiting_in(folder / STATE_DIR / CLOCK_FILE))
+        clock = common.clock
+        run_log = RunLog(folder / run_folder.LOG_FILE, clock, terminal=terminal, level=options.log_level, names=names)
     security = experiment.resolved.sections.security
     new = new_addresses(private=security.are_sockets_private, tcp=security.tcp)
     with closing(run_log) as log, new as addresses:
@@ -145,9 +150,10 @@ def go(
         handed = key_handout.hand_over(experiment, starts)
         # before run.json: a program that finds it may join at once
         with handed.laid_down(folder):
-            run_folder.write_run(folder, facts)
-            if {start.launch.name for start in starts} & set(experiment.recorders):
-                expect_recorder(log_folder(folder / STATE_DIR))
+            with writing_to(folder):
+                run_folder.write_run(folder, facts)
+                if {start.launch.name for start in starts} & set(experiment.recorders):
+                    expect_recorder(log_folder(folder / STATE_DIR))
             log.write(LOGGED_AS, logging.INFO, f"{name}: {counted(len(starts), 'process', 'processes')}, into {folder}")
             if not common.simulated and (warning := _ahead_of_wall(clock)):
                 log.write(LOGGED_AS, logging.WARNING, warning)

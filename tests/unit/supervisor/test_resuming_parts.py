@@ -13,11 +13,11 @@ import pytest
 from deadlines import DEADLINE_S
 
 from afspm.basics.clock import ExperimentClock
-from afspm.basics.errors import ConfigError
+from afspm.basics.errors import ConfigError, FileError
 from afspm.experiment import Role, load
 from afspm.experiment.experiment import load_expanded
 from afspm.supervisor import run as running
-from afspm.supervisor.resume import ResumableRun, _resumed_identity, _wait_until_gone
+from afspm.supervisor.resume import ResumableRun, _resumed_identity, _wait_until_gone, resume
 from afspm.supervisor.run import ONLY, RUN, WITHOUT, RunOptions, dry_run, facts_to_resume
 
 PARTS = """
@@ -92,6 +92,20 @@ def test_component_added_at_a_resume_runs_in_that_life(tmp_path: Path) -> None:
     facts = facts_to_resume(added.experiment, starts, added.options(RunOptions()))
     again = replace(plain, facts=facts)
     assert {start.launch.name for start in dry_run(again.experiment, again.options(RunOptions()))} == before
+
+
+@pytest.mark.parametrize("file", ["state/running", "state/clock", "log.txt", "run.json"])
+def test_folder_that_can_not_be_written_is_refused_in_words(file: str, tmp_path: Path) -> None:
+    source = tmp_path / "experiment.toml"
+    source.write_text(PARTS, encoding="utf-8")
+    folder = tmp_path / "night"
+    (folder / "state").mkdir(parents=True)
+    (folder / file).mkdir()
+    found = ResumableRun(
+        folder, "night", load(source), {"clock": ExperimentClock(0.0, 0.0, 60.0).as_dict()}, (tmp_path,)
+    )
+    with pytest.raises(FileError, match=r"the folder of the run can't be written: .*nothing was started"):
+        resume(found, RunOptions())
 
 
 def test_all_processes_are_asked_at_once_whether_they_are_gone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
