@@ -441,6 +441,24 @@ def test_process_in_an_endless_loop_is_killed_soon_on_an_idle_computer() -> None
     assert killed_after_s(_only_series(), 1.0) <= CLOSES_WITHIN_S + KILL_AFTER_S + 0.2
 
 
+@pytest.mark.parametrize(("left", "waited_s"), [("series", KILL_AFTER_S), ("recorder", 1.0 + KILL_AFTER_S)])
+def test_frozen_process_has_no_grace_after_the_end_of_other_processes(left: str, waited_s: float) -> None:
+    run = Run(SPECS[0], ChildSpec("series"), ChildSpec("recorder", leaves_last=True))
+    run.beat(*run.pids)
+    run.step(EndSignal(signal.SIGINT))
+    assert len(run.step(TimePassed())) == 3
+    asked_s = run.now_s
+    while run.now_s < asked_s + 1.0:  # the translator retracts the tip
+        run.step(Beaten("scope", Beat(step_age_s=0.1)), 0.1)
+        run.step(TimePassed())
+    for name in {*run.pids} - {left}:
+        run.exits(name, ExitCode.DONE)
+    while not run.step(TimePassed(), 0.1):
+        assert run.now_s < asked_s + 60.0
+    assert run.commands[-1] == (KILL, left)
+    assert run.now_s - asked_s == pytest.approx(waited_s, abs=0.25)
+
+
 def _only_series() -> Run:
     run = Run(ChildSpec("series"))
     run.beat("series")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
@@ -85,6 +86,7 @@ class SupervisorCore:
         self._awaits_scheduler = awaits_scheduler
         self._idle = IdleWatch(ends_idle)
         self._has_told_waiting = False
+        self._waited_for: set[str] = set()  # processes that were busy after the request to end
         self._effects: list[SupervisorEffect] = []
         self._now_s = 0.0
 
@@ -383,6 +385,10 @@ class SupervisorCore:
         if self._has_just_ended:
             self._release_scheduler()
         busy = unfinished(ending, self.children, self._now_s, self._liveness)
+        if ending.last is EndStep.ASK:
+            self._waited_for.update(busy)
+        if not any(child.life and self._needs_grace(child) for child in self.children.values()):
+            ending = replace(ending, busy_s=-math.inf)
         self.ending, step = ending.step(self._now_s, busy=bool(busy))
         postponed = step is None and self.ending.deadline_s() != ending.deadline_s()
         if busy and postponed and not self._has_told_waiting:
@@ -391,6 +397,11 @@ class SupervisorCore:
         for child in self.children.values():
             if child.life is not None and step is not None:
                 self._carry_out(step, child, child.life.pid)
+
+    def _needs_grace(self, child: SupervisedChild) -> bool:
+        # A process that was busy needs a moment to leave, and the scheduler and recorder then publish and record its
+        # last packets. Any other process was asked to end long ago: a grace for it would be spent on a frozen one.
+        return child.spec.name in self._waited_for or child.spec.leaves_last or child.spec.role is Role.SCHEDULER
 
     def _carry_out(self, step: EndStep, child: SupervisedChild, pid: int) -> None:
         match step:
