@@ -40,8 +40,12 @@ class Truth:
 
     def _append(self, line: str) -> None:
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(line + "\n")
+        with self._path.open("a+b") as file:
+            if size := file.tell():
+                file.seek(size - 1)
+                if file.read(1) != b"\n":  # a kill or a full disk has left a part of a line: keep it apart
+                    line = f"\n{line}"
+            file.write(f"{line}\n".encode())
 
 
 def _plain(value: object) -> object:

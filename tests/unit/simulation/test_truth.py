@@ -23,3 +23,13 @@ def test_disk_that_refuses_the_truth_refuses_no_measurement(tmp_path: Path, capl
     assert [record.levelname for record in caplog.records] == ["CRITICAL", "INFO"]
     (line,) = (folder / "truth.jsonl").read_text(encoding="utf-8").splitlines()
     assert json.loads(line)["n"] == 3, "the number shows that two events are missing"
+
+
+def test_line_after_a_part_of_a_line_is_whole(tmp_path: Path) -> None:
+    file = tmp_path / "truth.jsonl"
+    file.write_text('{"n": 1, "time', encoding="utf-8")
+    for number in range(2):
+        Truth(file, {"truth_lines": number + 1}).note(0.0, "scan starts", {})
+    part, *lines = file.read_text(encoding="utf-8").splitlines()
+    assert part == '{"n": 1, "time'
+    assert [json.loads(line)["n"] for line in lines] == [2, 3]
