@@ -11,6 +11,7 @@ from afspm.basics.formatting import quantity
 _DIGITS: Final = 7
 """As many as single precision has: many controllers keep their settings in it."""
 _ALL_DIGITS: Final = 15
+_ROUNDING: Final = 1e-12
 
 
 class PanelAct(StrEnum):
@@ -59,9 +60,11 @@ class ChangedValue:
 
     def _text(self, value: str, digits: int) -> str:
         try:
-            return quantity(float(value), self.unit, digits)
+            number, other = float(value), max(abs(float(self.before)), abs(float(self.after)))
         except ValueError:
             return f"{value} {self.unit}".rstrip()
+        # a corner at 0 is a difference of two lengths, which leaves their rounding: 3e-24 m
+        return quantity(0.0 if abs(number) < _ROUNDING * other else number, self.unit, digits)
 
 
 @dataclass(frozen=True, slots=True)

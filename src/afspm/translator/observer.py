@@ -191,7 +191,10 @@ class Observer:
                 values = True
         if values:
             withdrew = self._driver.withdrew_tip()
-            self._tell(self.panel.read(before, self.values, status.state, self._clock.now_ns(), withdrew))
+            acts = self.panel.read(before, self.values, status.state, self._clock.now_ns(), withdrew)
+            if self._result_since_s is not None and any(map(self._spoils, acts)):
+                self._publish_earlier_scan()
+            self._tell(acts)
         was, is_requested = sequence.published, sequence.is_requested
         # a fast simulated clock waits here: otherwise much experiment time would pass before the results are published
         with self._clock.late() if is_over else nullcontext():
@@ -218,6 +221,14 @@ class Observer:
         if self._result_since_s is None:
             self._result_since_s = now_s
         return now_s - self._result_since_s >= self._driver.patience_s(self._driver.common.result_timeout_s / 2)
+
+    def _publish_earlier_scan(self) -> None:
+        # A panel that repeats scans: the waiting result was complete before the act, which ended the scan after it.
+        sequence, running = self._state.sequence, self._state.sequence.published
+        self._result_since_s = None
+        self.play(
+            [*sequence.follow(is_whole=True), *sequence.observe(running, results=False, now_s=self._clock.now_s())]
+        )
 
     def asked(self, request: Request) -> None:
         """Note that a request of the run is about to change something."""
@@ -265,9 +276,7 @@ class Observer:
             self._log.warning("by hand: %s", act)
             if self._state.sequence.published.state in MEASURING:
                 self._acts.append(act)
-                # a spectrum may be taken without feedback, and is over when its end is seen to have left it off
-                is_scanning = self._state.sequence.published.state is ScopeState.SCANNING
-                if act.act is PanelAct.WITHDRAW or (act.act is PanelAct.FEEDBACK_OFF and is_scanning):
+                if self._spoils(act):
                     self._state.kept["spoiled"] = str(act)
                     self._live.end()
         if acts:
@@ -275,6 +284,11 @@ class Observer:
         for act in acts:
             self._port.publish(*wire.encode(act), self._state.stamp()[0])
         self._publish_tip()
+
+    def _spoils(self, act: ActByHand) -> bool:
+        # a spectrum may be taken without feedback, and is over when its end is seen to have left it off
+        is_scanning = self._state.sequence.published.state is ScopeState.SCANNING
+        return act.act is PanelAct.WITHDRAW or (act.act is PanelAct.FEEDBACK_OFF and is_scanning)
 
     def _publish_channels(self) -> None:
         # at constant height another channel shows the surface

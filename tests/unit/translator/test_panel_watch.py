@@ -9,6 +9,7 @@ import pytest
 
 from afspm.model import (
     ActByHand,
+    ChangedValue,
     ControlRequest,
     ControlResponse,
     Feedback,
@@ -162,6 +163,21 @@ def test_a_tip_withdrawn_just_before_the_end_of_a_scan_spoils_it(bench: Any, sca
     bench.heard()
     bench.microscope.values["Engaged"] = False
     end_scan(bench, scan)
+    assert bench.heard() == ["INTERRUPTED", "FREE"]
+
+
+def test_withdrawn_tip_spoils_the_running_scan_and_not_the_one_before_it(bench: Any, scan: Any) -> None:
+    bench.microscope.state = ScopeState.SCANNING  # at the panel, which repeats it
+    bench.look()
+    bench.microscope.files["a"] = [scan()]
+    bench.look()
+    bench.heard()
+    bench.microscope.values["Engaged"], bench.microscope.state = False, ScopeState.FREE
+    bench.look()
+    assert bench.heard() == ["Scan2d", "FREE", "SCANNING"]
+    assert acts(bench) == [PanelAct.SCAN, PanelAct.WITHDRAW]
+    bench.microscope.files["b"] = [scan()]  # of the stopped scan, as if it were whole
+    bench.look()
     assert bench.heard() == ["INTERRUPTED", "FREE"]
 
 
@@ -359,3 +375,8 @@ def test_a_scan_that_a_restarted_controller_lost_is_no_act_by_hand(
         bench.look(1.0)
     assert bench.heard()[-2:] == ["INTERRUPTED", "FREE"]
     assert acts(bench) == []
+
+
+def test_rounding_of_a_corner_at_zero_is_shown_as_zero() -> None:
+    change = ChangedValue(names.SCAN_TOP_LEFT_X, "5e-09", "3.308722e-24", "m")
+    assert str(change) == "scan-top-left-x = 0 m (before: 5 nm)"
