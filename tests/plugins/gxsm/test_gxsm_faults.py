@@ -260,6 +260,28 @@ def test_nothing_is_begun_after_a_restart_until_channels_are_set(bench: Make, se
         pass
 
 
+def test_scan_begun_at_a_restarted_gxsm_is_not_the_scan_that_ended_with_the_old_one(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    assert scanned(peer)
+    made.at_panel(lambda emulator: hold_scan(emulator.program, 1))
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.strike("crash")
+    peer.until(UNDEFINED)
+    made.start_controller_again(channels_set=False)
+    made.until_logged("GXSM reports no channel, as after a restart")
+    made.at_panel(lambda emulator: emulator.program.set_channels())
+    made.at_panel(lambda emulator: hold_scan(emulator.program, 1))
+    made.at_panel(lambda emulator: emulator.program.start_scan())
+    # after a lost contact the last published state is repeated
+    assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
+    peer.until(ScopeState.SCANNING)
+    made.at_panel(lambda emulator: emulator.program.stop_scan())
+    peer.until(FREE)
+    assert scanned(peer)
+
+
 def test_nothing_is_begun_once_the_channels_are_switched_off(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made)

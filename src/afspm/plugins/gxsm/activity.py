@@ -206,6 +206,7 @@ class GxsmActivity(Activity):
         After a restart Gxsm4 has no channels. A scan would only open a dialog, which takes all later starts, too.
         """
         if self._files.channels and all(self._reported(channel) is None for channel in range(_CHANNELS)):
+            self._files.end_with_gxsm()
             hint = (
                 "set the channels at its panel, close its dialog about them, and start a scan there:"
                 " GXSM reports a channel only from its first scan on"

@@ -226,7 +226,17 @@ class GxsmFiles(ResultFiles):
     def followed(self) -> bool | None:
         """Return once whether a measurement directly followed by the next has a result; None: nothing to report."""
         found, self._outcome = self._outcome, None
-        return found
+        return False if self._kept.pop("has_lost", False) else found
+
+    def end_with_gxsm(self) -> None:
+        """Give up the running measurement, since GXSM has ended and was started again.
+
+        A scan that a person begins in the new GXSM must not be taken for it.
+        """
+        if self.what:
+            self._log.error("the %s has no result: GXSM, which was started again, ended in it", self.what)
+            self.forget()
+            self._kept["has_lost"] = True  # until the next connection, which has a new object
 
     def forget(self) -> None:
         """Forget the running or ended measurement after a stop."""
@@ -353,9 +363,8 @@ class GxsmFiles(ResultFiles):
         if self._before:
             return f"GXSM saved an earlier scan in {folder}: check that this one began"
         if ended["what"] == SCAN:
-            return (
-                f"no new file in {folder} belongs to it: check that it began, and that a channel is set and saved (AS)"
-            )
+            to_check = "close GXSM's dialog if one is open, and check that a channel is set and saved (AS)"
+            return f"no new file in {folder} belongs to it: {to_check}"
         return f"no new .vpdata in {folder}: switch on Auto Save of probes in GXSM, and set probe_dir to its folder"
 
     def _give_up(self, why: str, *, has_second_row: bool | None = None) -> None:
