@@ -59,6 +59,7 @@ class NanonisActivity(Activity):
         self.curve: CurveEnded | None = None
         self._kind_asked = ""
         self._reported: ScanEnded | None = None
+        self._doubted: ScanEnded | None = None
         self._was_safe = False
         self._shows_until_s = self._shown_s = 0.0
 
@@ -193,9 +194,11 @@ class NanonisActivity(Activity):
                 self._listener.scan()  # an earlier event belonged to the scan before
                 return ScopeStatus(ScopeState.SCANNING)
             path = None
-        if self._files.what == SCAN or path is not None:
+        if self._files.what == SCAN:
             self._look_for_new_frame()
             self.end(path)
+        elif path is not None:  # it comes after the end, perhaps while a spectrum runs
+            self._files.scan_reported(self._clock.now_s(), path)
         return self.at_rest(self._besides_scans())
 
     def refuse_safe_tip(self) -> None:
@@ -211,16 +214,22 @@ class NanonisActivity(Activity):
     def _scanning(self, reported: ScanEnded | None) -> ScopeStatus:
         # One scan has ended, and the next is running: of a continuous series, or stopped and begun at the panel between
         # two polls. A call from before the poll that first showed the scan may report the end of an earlier one.
-        if reported is not None and reported.asked_s >= self._shown_s:
+        doubted, self._doubted = self._doubted, None
+        if reported is not None and reported.asked_s < self._shown_s:
+            if reported.path:
+                self.end(reported.path)
+        elif reported is not None and reported is not doubted:
+            # a state that lags behind the report shows a scan that has ended: the next poll decides
+            self._doubted = self._reported = reported
+        elif reported is not None:
             self._files.end_followed(self._clock.now_ns(), self._clock.now_s(), reported.path)
-        elif reported is not None and reported.path:
-            self.end(reported.path)
         if self._files.what != SCAN or not self._files.was_seen:
             self._shown_s = self._clock.monotonic_s()
         self.follow(SCAN)
         if not self._stopping:
             self._files.seen()
-            self._listener.scan()
+            if self._doubted is None:
+                self._listener.scan()
             self._look_for_new_frame()
             if self._watch_safe_tip():
                 self.stop_scan()  # the scan may go on in the air, and its picture look plausible

@@ -102,8 +102,17 @@ class NanonisFiles(ResultFiles):
             # Without access to the folder no file can appear: fetch at once.
             patience_s = self._patience_s if Path(running["folder"]).is_dir() else 0.0
             self._ends({"reported": path, "end_ns": now_ns, "fetch_at_s": now_s + patience_s})
+        if path is not None:
+            self._reported(now_s, path)
+
+    def scan_reported(self, now_s: float, path: str) -> None:
+        """Register the reported file of a scan that has ended; arguments as of `end`."""
+        if self._kept["ended"] is not None and self._kept["ended"]["what"] == SCAN:
+            self._reported(now_s, path)
+
+    def _reported(self, now_s: float, path: str) -> None:
         ended = self._kept["ended"]
-        if ended is not None and path is not None:
+        if ended is not None:
             ended["reported"] = path
             if not path:
                 ended["fetch_at_s"] = now_s
