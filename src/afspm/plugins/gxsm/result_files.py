@@ -363,8 +363,10 @@ class GxsmFiles(ResultFiles):
         if self._before:
             return f"GXSM saved an earlier scan in {folder}: check that this one began"
         if ended["what"] == SCAN:
-            to_check = "close GXSM's dialog if one is open, and check that a channel is set and saved (AS)"
-            return f"no new file in {folder} belongs to it: {to_check}"
+            return (
+                f"no new file in {folder} belongs to it: close GXSM's dialog if one is open, and check that a channel "
+                "is set and saved (AS)"
+            )
         return f"no new .vpdata in {folder}: switch on Auto Save of probes in GXSM, and set probe_dir to its folder"
 
     def _give_up(self, why: str, *, has_second_row: bool | None = None) -> None:
