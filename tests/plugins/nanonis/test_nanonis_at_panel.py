@@ -83,35 +83,6 @@ def test_stopped_scan_is_an_act_by_hand_and_nothing_follows_it(bench: Make, monk
     assert called == []
 
 
-@pytest.mark.parametrize("requested", [True, False], ids=["requested scan", "scan of the person"])
-def test_scan_stopped_and_begun_again_within_a_poll_is_seen_as_two(
-    bench: Make, monkeypatch: pytest.MonkeyPatch, requested: bool
-) -> None:
-    made, asked, begun_again = bench(), list[str](), list[bool]()
-    if requested:
-        peer = slow_scan(made)
-    else:
-        monkeypatch.setattr(made, "translator", "afspm.plugins.nanonis.shadow.NanonisShadow")
-        (peer := made.start()).until(FREE)
-        call(made, "Scan.SpeedSet", 1e-6, 1e-6, 1e5, 1e5, 2, 1.0)
-        call(made, "Scan.Action", 0, 1)
-        peer.until(ScopeState.SCANNING)
-    plain = made.emulator._answer
-
-    def answer(connection: Any, called: Any, *rest: Any) -> None:
-        plain(connection, called, *rest)
-        asked.append(called.name)
-        # the third poll is proof that the first has shown the scan; only a wait begun after that counts
-        if called.name == "Scan.WaitEndOfScan" and asked.count("Scan.StatusGet") >= 3 and not begun_again:
-            begun_again.append(True)
-            does("Scan.Action", 0, 1)(made.emulator)
-
-    monkeypatch.setattr(made.emulator, "_answer", answer)
-    received = peer.until(FREE) + peer.until(ScopeState.SCANNING)
-    assert states(received) == ["INTERRUPTED", "FREE", "SCANNING"]
-    assert acts(received)[:1] == ([PanelAct.STOP] if requested else [])
-
-
 def test_stop_by_request_is_no_act_by_hand(bench: Make) -> None:
     peer = slow_scan(bench())
     assert peer.act(names.STOP_SCAN).ok

@@ -58,10 +58,9 @@ class NanonisActivity(Activity):
         self._kept = kept
         self.curve: CurveEnded | None = None
         self._kind_asked = ""
-        self._reported: ScanEnded | None = None
-        self._doubted: ScanEnded | None = None
+        self._reported_path: str | None = None
         self._was_safe = False
-        self._shows_until_s = self._shown_s = 0.0
+        self._shows_until_s = 0.0
 
     # --- start and stop ---
 
@@ -184,10 +183,9 @@ class NanonisActivity(Activity):
         for event in self._listener.events():
             self._take(event)
         scanning = bool(self._ask("Scan.StatusGet")[0])
-        reported, self._reported = self._reported, None
+        path, self._reported_path = self._reported_path, None
         if scanning:
-            return self._scanning(reported)
-        path = None if reported is None else reported.path
+            return self._scanning(path)
         if self._files.what == SCAN and not self._files.was_seen and not self._files.has_file():
             # The tip may still be moving to the first line; until then, Nanonis' memory holds the last scan.
             if self._clock.monotonic_s() < self._shows_until_s:
@@ -211,25 +209,15 @@ class NanonisActivity(Activity):
         # the safe tip ends a scan as well
         return "" if self._tip.is_safe else super().stopped_by_hand()
 
-    def _scanning(self, reported: ScanEnded | None) -> ScopeStatus:
-        # One scan has ended, and the next is running: of a continuous series, or stopped and begun at the panel between
-        # two polls. A call from before the poll that first showed the scan may report the end of an earlier one.
-        doubted, self._doubted = self._doubted, None
-        if reported is not None and reported.asked_s < self._shown_s:
-            if reported.path:
-                self.end(reported.path)
-        elif reported is not None and reported is not doubted:
-            # a state that lags behind the report shows a scan that has ended: the next poll decides
-            self._doubted = self._reported = reported
-        elif reported is not None:
-            self._files.end_followed(self._clock.now_ns(), self._clock.now_s(), reported.path)
-        if self._files.what != SCAN or not self._files.was_seen:
-            self._shown_s = self._clock.monotonic_s()
+    def _scanning(self, path: str | None) -> ScopeStatus:
+        if path and self._ask("Scan.PropsGet")[0]:  # a continuous scan: one frame has ended, the next is running
+            self._files.end_followed(self._clock.now_ns(), self._clock.now_s(), path)
+        elif path:
+            self.end(path)
         self.follow(SCAN)
         if not self._stopping:
             self._files.seen()
-            if self._doubted is None:
-                self._listener.scan()
+            self._listener.scan()
             self._look_for_new_frame()
             if self._watch_safe_tip():
                 self.stop_scan()  # the scan may go on in the air, and its picture look plausible
@@ -291,7 +279,7 @@ class NanonisActivity(Activity):
 
     def _take(self, event: ListenerEvent) -> None:
         if isinstance(event, ScanEnded):
-            self._reported = event
+            self._reported_path = event.path
         elif isinstance(event, CurveEnded):
             self._kind_asked, self.curve = "", event
         elif isinstance(event, ControllerLost):

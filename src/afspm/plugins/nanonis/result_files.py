@@ -55,7 +55,7 @@ class NanonisFiles(ResultFiles):
         self._session_dir = session_dir
         self._own_folder = own_folder
         self._patience_s = patience_s
-        self._outcome: bool | None = None
+        self._has_followed = False
         kept.setdefault("fetched", 0)
         kept.setdefault("followed", None)
 
@@ -118,34 +118,25 @@ class NanonisFiles(ResultFiles):
                 ended["fetch_at_s"] = now_s
 
     def end_followed(self, now_ns: int, now_s: float, path: str) -> None:
-        """Register the end of a scan, and that the next scan is running already.
+        """Register the end of a scan, and that the next scan of a continuous series is running already.
 
-        The scan's data is not fetched if it has no complete file: Nanonis' memory already holds the next scan.
+        The scan's data is not fetched if the file is incomplete: Nanonis' memory already holds the next scan.
 
         Args:
-            path: file path reported by Nanonis; empty: not saved. A file from before the scan is left out: the report
-                came late.
+            path: file path reported by Nanonis. A file from before the scan is left out: the report came late.
         """
-        if not path:
-            self._kept["running"], self._outcome = None, False
-            return
         self.end(now_ns, now_s, path)
         ended = self._kept["ended"]
         if ended is not None and self._file(ended) is not None:
             self._kept["followed"], self._kept["ended"] = ended, None
 
     def followed(self) -> bool | None:
-        """Return once how a scan registered by `end_followed` ended; None otherwise.
-
-        True once its file is read; False if it has none.
-        """
-        found, self._outcome = self._outcome, None
-        if found is False:
-            self.missing = "the next scan began at once; it has no file"
-        return found
+        """Return True once for each scan registered by `end_followed`, when its file is read; None otherwise."""
+        found, self._has_followed = self._has_followed, False
+        return found or None
 
     def forget(self) -> None:
-        self._kept["followed"], self._outcome = None, None
+        self._kept["followed"], self._has_followed = None, False
         super().forget()
 
     def has_file(self) -> bool:
@@ -225,7 +216,7 @@ class NanonisFiles(ResultFiles):
             self._log.error("the scan before the present one is not published: %s", NEW_FRAME)
         elif file is not None and (content := self._whole(file, followed)) is not None:
             self._add(str(file), followed, {}, content)
-            self._kept["followed"], self._outcome = None, True
+            self._kept["followed"], self._has_followed = None, True
         elif now_s >= followed["fetch_at_s"]:
             self._kept["followed"] = None
             self._log.error("the scan before the present one is lost: its file %s is incomplete", followed["reported"])

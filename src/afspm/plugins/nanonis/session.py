@@ -99,7 +99,7 @@ class Session:
             self.opened = {module for module in (*MODULES.values(), APPROACH) if self._open(module)}
             self._find_range()
             second = self.link(addresses[-1], timeout_s, driver.clock.monotonic_s, self._link.release)
-            self._listener = self.listener = Listener(second, driver.wake, driver.clock.monotonic_s)
+            self._listener = self.listener = Listener(second, driver.wake)
             driver.prove()
         except AfspmError:
             self.close()
@@ -142,11 +142,9 @@ class ScanEnded:
 
     Attributes:
         path: file path on Nanonis' computer; empty: not saved.
-        asked_s: real time of the call that reports it: an earlier end is not its subject.
     """
 
     path: str
-    asked_s: float
 
 
 @dataclass(frozen=True)
@@ -171,17 +169,15 @@ class Listener:
 
     Args:
         wake: called from that thread when `events` has new entries.
-        monotonic_s: returns the real time.
 
     Attributes:
         for_scan: whether the thread waits for the end of a scan, or is about to.
         for_curve: whether it waits for the end of a spectrum, or is about to.
     """
 
-    def __init__(self, link: Link, wake: Callable[[], None], monotonic_s: Callable[[], float]) -> None:
+    def __init__(self, link: Link, wake: Callable[[], None]) -> None:
         self._link = link
         self._wake = wake
-        self._monotonic_s = monotonic_s
         self._jobs: SimpleQueue[Callable[[], ListenerEvent | None] | None] = SimpleQueue()
         self._events: SimpleQueue[ListenerEvent] = SimpleQueue()
         self.for_scan = self.for_curve = self._closed = False
@@ -235,11 +231,10 @@ class Listener:
     def _next_end_of_scan(self) -> ListenerEvent | None:
         # Short waits in a loop: a dead connection is noticed, and a spectrum gets its turn.
         while self.for_scan and not self._closed:
-            asked_s = self._monotonic_s()
             timed_out, path = self._link.ask("Scan.WaitEndOfScan", _WAIT_MS, longer_s=_WAIT_MS / 1000)
             if not timed_out:
                 self.for_scan = False
-                return ScanEnded(path, asked_s)
+                return ScanEnded(path)
         return None
 
     def _curve(self, module: str, base_name: str) -> ListenerEvent:
