@@ -226,9 +226,8 @@ class Observer:
         # A panel that repeats scans: the waiting result was complete before the act, which ended the scan after it.
         sequence, running = self._state.sequence, self._state.sequence.published
         self._result_since_s = None
-        self.play(
-            [*sequence.follow(is_whole=True), *sequence.observe(running, results=False, now_s=self._clock.now_s())]
-        )
+        steps = [*sequence.follow(is_whole=True), *sequence.observe(running, results=False, now_s=self._clock.now_s())]
+        self.play(self._without_spoiled(steps))
 
     def asked(self, request: Request) -> None:
         """Note that a request of the run is about to change something."""

@@ -380,3 +380,17 @@ def test_a_scan_that_a_restarted_controller_lost_is_no_act_by_hand(
 def test_rounding_of_a_corner_at_zero_is_shown_as_zero() -> None:
     change = ChangedValue(names.SCAN_TOP_LEFT_X, "5e-09", "3.308722e-24", "m")
     assert str(change) == "scan-top-left-x = 0 m (before: 5 nm)"
+
+
+def test_spoiled_earlier_scan_of_a_repeating_panel_is_not_published(bench: Any, scan: Any) -> None:
+    bench.microscope.state = ScopeState.SCANNING  # at the panel, which repeats it
+    bench.look()
+    for engaged in (False, True):
+        bench.microscope.values["Engaged"] = engaged
+        bench.look()
+    bench.microscope.files["a"] = [scan()]  # of the scan in which the tip was withdrawn
+    bench.look()
+    bench.heard()
+    bench.microscope.values["Engaged"] = False
+    bench.look()
+    assert "Scan2d" not in bench.heard()
