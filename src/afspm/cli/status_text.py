@@ -10,7 +10,7 @@ from afspm import wire
 from afspm.basics.clock import NS_PER_S, utc_time
 from afspm.basics.formatting import area_text, day_and_time, duration_text, time_of_day
 from afspm.model import LogLine, ProcessCondition, ProcessState, Progress, Region, ScopeState
-from afspm.record.expected_end import Plans, expected_end_ns
+from afspm.record.expected_end import Plans
 from afspm.record.overview import OLD_S, OVER, ROUTINE, Overview
 from afspm.record.timeline import Span
 
@@ -207,8 +207,7 @@ class StatusText:
             yield _label("end").append(f"about {day_and_time(end_ns, seconds=False)}, {left}")
 
     def _end_ns(self) -> int | None:
-        run = self._run
-        return expected_end_ns(run.plans, self._seen.progress_at(self._now_ns), run.began_ns, self._now_ns)
+        return self._seen.expected_end_ns(self._run.plans, self._run.began_ns, self._now_ns)
 
     def _drift(self) -> Iterator[Text]:
         if registered := self._seen.registration:

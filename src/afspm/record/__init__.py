@@ -41,7 +41,7 @@ if TYPE_CHECKING:  # the page shows a night while it goes on
     from afspm.record.drawing.raster import Contrast
     from afspm.record.drawing.timeline import CSS as TIMELINE_CSS
     from afspm.record.drawing.timeline import TimelineRow, timeline_html, tint_class
-    from afspm.record.expected_end import Plans, expected_end_ns, plans_of
+    from afspm.record.expected_end import Plans, plans_of
     from afspm.record.overview import OVER, ROUTINE, DriftPoint, FoundPlace, RunningScan, SpectrumSummary
     from afspm.record.report import REPORT_FILE
     from afspm.record.report import write as write_report
@@ -109,7 +109,6 @@ __all__ = [
     "draw_scale_bar",
     "drift_at",
     "drift_knowledge",
-    "expected_end_ns",
     "experiment_name",
     "field_names",
     "goes_on",

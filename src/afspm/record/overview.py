@@ -50,6 +50,7 @@ from afspm.model.grants import with_proposal
 from afspm.model.parameter_names import START_SCAN
 from afspm.model.problems import CONDITIONS
 from afspm.record.allowed_bands import AllowedBands, ReadingCurve
+from afspm.record.expected_end import Plans, expected_end_ns
 from afspm.record.measurement_history import (
     SOON_NS,
     DriftPoint,
@@ -265,15 +266,26 @@ class Overview:
         return [s for lane in self.timelines.problems.values() for s in lane.spans if self.is_routine(s)]
 
     def progress_at(self, now_ns: int) -> dict[str, Progress]:
-        """Return the newest progress of each component, moved by the time in MANUAL since: no task goes on then."""
+        """Return the newest progress of each component, moved by the time in MANUAL since."""
+        return {
+            name: replace(report, time_ns=report.time_ns + self.manual_ns(report.time_ns, now_ns))
+            for name, report in self.progress_reports.items()
+        }
+
+    def manual_ns(self, since_ns: int, now_ns: int) -> int:
+        """Return the time in MANUAL since `since_ns`: no task goes on then."""
         manual = [span for span in self.timelines.mode.spans if span.label == ControlMode.MANUAL.name.lower()]
+        spans = (replace(span, start_ns=max(span.start_ns, since_ns)) for span in manual)
+        return sum(span.lasted_ns(now_ns) for span in spans)
 
-        def held_ns(since_ns: int) -> int:
-            spans = (replace(span, start_ns=max(span.start_ns, since_ns)) for span in manual)
-            return sum(span.lasted_ns(now_ns) for span in spans)
+    def expected_end_ns(self, plans: Plans, began_ns: int | None, now_ns: int) -> int | None:
+        """Return the experiment time of the end from plans and progress; time in MANUAL puts it off.
 
-        reports = self.progress_reports.items()
-        return {name: replace(report, time_ns=report.time_ns + held_ns(report.time_ns)) for name, report in reports}
+        Arguments and result are those of `expected_end.expected_end_ns`.
+        """
+        if began_ns is not None:
+            began_ns += self.manual_ns(began_ns, now_ns)
+        return expected_end_ns(plans, self.progress_at(now_ns), began_ns, now_ns)
 
     @property
     def in_control(self) -> str:

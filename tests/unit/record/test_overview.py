@@ -20,6 +20,7 @@ from afspm.model import (
     ScopeState,
 )
 from afspm.model.events import NO_LONGER_TRUE, LogLines
+from afspm.model.planned_work import PlannedWork
 from afspm.record.allowed_bands import MOST_POINTS
 from afspm.record.overview import MOST_LINES, Overview
 
@@ -406,3 +407,10 @@ def test_time_in_manual_does_not_count_as_progress_of_a_component() -> None:
     assert left == {20: 90 * S, 30: 80 * S, 500: 80 * S}
     overview.take("ControlState", control(None), 600 * S)
     assert overview.progress_at(610 * S)["series"].remaining_ns(610 * S) == 70 * S
+
+
+def test_time_in_manual_puts_off_the_planned_end_before_the_first_report() -> None:
+    overview, plans = Overview(), {"series": PlannedWork(duration_s=1000.0, ends_experiment=True)}
+    overview.take("ControlState", control(None, mode=ControlMode.MANUAL), 10 * S)
+    overview.take("ControlState", control("series"), 310 * S)
+    assert overview.expected_end_ns(plans, 0, 400 * S) == 1300 * S

@@ -15,7 +15,7 @@ from afspm import Array, tip_verdict
 from afspm.basics import Clock
 from afspm.model import ChannelRoles, ProblemNames, Scan, ScanLines, ScopeState, Spectrum
 from afspm.plugins.web.frames import FrameStore
-from afspm.record import AllowedBands, Overview, Plans, expected_end_ns
+from afspm.record import AllowedBands, Overview, Plans
 
 MOST_SPECTRA, SPECTRA_BYTES = 200, 64 << 20
 
@@ -103,7 +103,7 @@ class Watch:
 
     def expected_end_ns(self, overview: Overview, now_ns: int) -> int | None:
         """Return the experiment time of the end, estimated from plans and progress; None if unknown."""
-        return expected_end_ns(self._plans, overview.progress_at(now_ns), self._began_ns, now_ns)
+        return overview.expected_end_ns(self._plans, self._began_ns, now_ns)
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[Overview]:
