@@ -368,7 +368,8 @@ class LogProgress:
         for entry, behind in self._reader.read(AT_ONCE_BYTES, MOST_AT_ONCE):
             found.append(SourcedPacket(entry.packet, SCHEDULER, before))
             before = behind
-        self.has_more = len(found) >= MOST_AT_ONCE
+        read_bytes = sum(len(one.packet.payload) for one in found)
+        self.has_more = len(found) >= MOST_AT_ONCE or read_bytes >= AT_ONCE_BYTES
         return found
 
     def behind_bytes(self) -> int:
