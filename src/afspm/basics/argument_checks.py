@@ -1,4 +1,4 @@
-"""Checks of arguments where people's programs call afspm: a wrong one is named before anything is sent or read.
+"""Checks of arguments where people's programs call afspm, before anything is sent or read.
 
 Without these, a wrong type fails far inside, as a bare TypeError of the wire format or of a path.
 """
@@ -13,7 +13,7 @@ import reprlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from numbers import Integral, Real
-from typing import Final, ParamSpec, TypeGuard, TypeVar
+from typing import Any, Final, ParamSpec, TypeGuard, TypeVar
 
 from afspm.basics.errors import InvalidValue
 
@@ -38,6 +38,11 @@ class Argument:
     hint: str = ""
 
 
+def plain(value: Any) -> Any:
+    """Return Python's own number for a number of numpy or xarray, perhaps an array without dimensions."""
+    return value.item() if getattr(value, "shape", None) == () else value
+
+
 def is_text(value: object) -> TypeGuard[str]:
     """Return whether a value is text that can be sent."""
     if not isinstance(value, str):
@@ -51,6 +56,7 @@ def is_text(value: object) -> TypeGuard[str]:
 
 def is_number(value: object) -> TypeGuard[float]:
     """Return whether a value is a number that a float can hold, perhaps infinite, but not NaN."""
+    value = plain(value)
     if isinstance(value, bool) or not isinstance(value, Real):
         return False
     try:

@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from numbers import Integral
 
 from afspm import wire
-from afspm.basics.argument_checks import FINITE, NAME, NUMBER, SECONDS, TEXT, WHOLE, Argument, checked, is_number
+from afspm.basics.argument_checks import FINITE, NAME, NUMBER, SECONDS, TEXT, WHOLE, Argument, checked, is_number, plain
 from afspm.basics.errors import AfspmError, ExperimentEnded, InvalidValue
 from afspm.client.events import Events
 from afspm.client.experiment_link import ExperimentLink
@@ -39,7 +39,7 @@ checked_call = checked({
     "setpoint": Argument(FINITE.what, FINITE.fits, 'scope.set("zctrl-setpoint", "50 pA") takes a text with a unit'),
     "timeout_s": SECONDS,
     "left_s": NUMBER,
-    "on": Argument("True or False", lambda value: isinstance(value, int) and value in (0, 1)),
+    "on": Argument("True or False", lambda value: isinstance(plain(value), int) and plain(value) in (0, 1)),
     "mode": _MODE,
     "grant": Argument("a grant", lambda value: hasattr(value, "agent")),
     "scan": Argument("a scan", lambda value: hasattr(value, "time_ns"), "a ScanSet, a Scan, or a row of run.scans"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from afspm import wire
-from afspm.basics.argument_checks import FINITE, is_text
+from afspm.basics.argument_checks import FINITE, is_text, plain
 from afspm.basics.errors import InvalidValue, UnitError
 from afspm.basics.units import convert, parse_quantity, require_unit
 from afspm.model import Parameter, Response
@@ -19,6 +19,7 @@ def to_parameter(name: str, value: Value, unit: str | None) -> Parameter:
         InvalidValue: neither text nor a finite number.
         UnitError: a number without a unit is implausibly large in SI.
     """
+    value = plain(value)
     if isinstance(value, bool):
         return Parameter(name, "true" if value else "false", unit)
     if not (is_text(value) or FINITE.fits(value)):

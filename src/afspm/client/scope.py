@@ -298,7 +298,7 @@ class Scope(ExperimentView):
             setpoint: in the unit of the operating mode: A for a tunnelling current; V, m, Hz or N in force microscopy.
 
         Raises:
-            InvalidValue: a gain or the setpoint is no finite number.
+            InvalidValue: a gain or the setpoint is not a finite number.
         """
         with self._call():
             feedback = Feedback(on, proportional_gain, integral_gain, setpoint)
@@ -409,7 +409,7 @@ class Scope(ExperimentView):
         """Set MANUAL (no component has control) or AUTOMATED.
 
         Raises:
-            InvalidValue: `mode` is no mode.
+            InvalidValue: `mode` is not a ControlMode.
         """
         self._ask_scheduler(ControlRequest.SET_CONTROL_MODE, int(mode))
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
-from afspm.basics.argument_checks import FINITE, is_number
+from afspm.basics.argument_checks import FINITE, is_number, plain
 from afspm.basics.errors import InvalidValue, UnitError
 from afspm.basics.units import convert, parse_quantity, require_unit, si_unit
 from afspm.model.instruments import is_of_instrument
@@ -171,6 +171,7 @@ def _unit_of(name: str, given: Sequence[SweptValue]) -> str | None:
 
 
 def _in_unit(name: str, value: SweptValue, unit: str | None) -> SweptValue:
+    value = plain(value)
     if isinstance(value, bool):
         return value
     if isinstance(value, str):

@@ -129,7 +129,7 @@ def find_runs(
 def _read_word(word: str) -> tuple[str, str]:
     match = _WORD.fullmatch(word.strip())
     if match is None:
-        raise InvalidValue(f"{word!r} is no word to look for", hint='e.g. "gold" or "sample:gold"')
+        raise InvalidValue(f"{word!r} is not a word to search for", hint='e.g. "gold" or "sample:gold"')
     if match[1] and match[1] not in FIELDS:
         raise InvalidValue(f"runs have no {match[1]!r} to look in", hint=f"there are {', '.join(FIELDS)}")
     return match[1] or "", match[2].casefold()

@@ -718,8 +718,10 @@ def test_switches_and_words_are_set_too(lab: Lab, scope: Scope) -> None:
     assert scope.set("x-light", True, "") is True
     assert lab.values["x-light"] == "true"
     assert scope.set("x-mode", "tapping", "") == "tapping"
-    assert scope.set("x-count", np.float64(3.0), "") == 3.0
-    assert lab.values["x-count"] == "3.0"
+    assert scope.set("x-light", np.False_, "") is False  # type: ignore[arg-type]
+    for count in (np.float64(3.0), np.array(3.0)):
+        assert scope.set("x-count", count, "") == 3.0  # type: ignore[arg-type]
+        assert lab.values["x-count"] == "3.0"
 
 
 def test_reading_needs_no_control(lab: Lab, scope: Scope) -> None:
@@ -746,7 +748,7 @@ def test_feedback_as_text_is_refused_with_the_call_that_takes_it(scope: Scope) -
 
 
 def test_set_feedback_returns_when_the_feedback_is_published(lab: Lab, scope: Scope) -> None:
-    scope.set_feedback(on=False, setpoint=2.0)
+    scope.set_feedback(on=np.False_, setpoint=2.0)  # type: ignore[arg-type]
     assert scope.feedback == model.Feedback(on=False, setpoint=2.0)
 
 
