@@ -59,12 +59,18 @@ class ChangedValue:
         return f"{self.parameter} = {after} (before: {before})"
 
     def _text(self, value: str, digits: int) -> str:
-        try:
-            number, other = float(value), max(abs(float(self.before)), abs(float(self.after)))
-        except ValueError:
+        if (number := _number(value)) is None:
             return f"{value} {self.unit}".rstrip()
         # a corner at 0 is a difference of two lengths, which leaves their rounding: 3e-24 m
-        return quantity(0.0 if abs(number) < _ROUNDING * other else number, self.unit, digits)
+        largest = max(abs(_number(one) or 0.0) for one in (self.before, self.after))
+        return quantity(0.0 if abs(number) < _ROUNDING * largest else number, self.unit, digits)
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
 
 
 @dataclass(frozen=True, slots=True)
