@@ -81,6 +81,7 @@ class Rig:
         self.peers: list[Any] = []  # of version 1
         self.settings: dict[str, Any] = {}
         self.request_timeout_s = 20.0
+        self.class_ = "afspm.scheduler.Scheduler"
         self.translator: ZmqServerPort | None = self.make_translator(ANY, ANY)
         self.source = str(self.translator.publish_address), self.translator.serve_address
         self.process: subprocess.Popen[bytes] | None = None
@@ -94,7 +95,7 @@ class Rig:
     def launch(self) -> Launch:
         return Launch(
             "scheduler",
-            "afspm.scheduler.Scheduler",
+            self.class_,
             self.settings,
             Sockets(self.publish, (self.source[0],), self.serve, self.source[1]),
             clock=self.clock.as_dict(),

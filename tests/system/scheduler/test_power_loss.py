@@ -25,6 +25,7 @@ def test_published_problem_is_still_flagged_after_a_power_cut(
     monkeypatch.setenv("PYTHONPATH", str(LOSSY))
     monkeypatch.setenv("LOSSY_FOLDER", str(state))
     shadow = runpy.run_path(str(LOSSY / "sitecustomize.py"))["Shadow"](str(state))
+    rig.class_ = "patient_scheduler.PatientScheduler"
     rig.start()
     for number, flag in enumerate(FLAGS, start=1):
         component = rig.component(f"Component {number}")
