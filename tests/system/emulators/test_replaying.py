@@ -54,7 +54,7 @@ class Ender(Component):
         self.has_begun = True
 
     def on_problem(self, problem, flagged):
-        if self.has_begun:
+        if self.has_begun and flagged:
             self.scope.end_experiment()
 """
 
