@@ -341,16 +341,13 @@ class LogProgress:
 
     Args:
         log: folder of the packet log; it may be missing.
-
-    Attributes:
-        has_more: whether the last batch was cut: more packets were there.
     """
 
     def __init__(self, log: Path) -> None:
         self._log = log
         self._reader = LogReader(log, committed(log) or START)
         self._committed = self._reader.position
-        self._stopped = self.has_more = False
+        self._stopped = False
         self._waiting: dict[tuple[int | None, str], Position] = {}
 
     def begin_again(self) -> None:
@@ -368,9 +365,12 @@ class LogProgress:
         for entry, behind in self._reader.read(AT_ONCE_BYTES, MOST_AT_ONCE):
             found.append(SourcedPacket(entry.packet, SCHEDULER, before))
             before = behind
-        read_bytes = sum(len(one.packet.payload) for one in found)
-        self.has_more = len(found) >= MOST_AT_ONCE or read_bytes >= AT_ONCE_BYTES
         return found
+
+    @property
+    def has_more(self) -> bool:
+        """Whether the last batch was cut: more packets may be there."""
+        return self._reader.is_cut
 
     def behind_bytes(self) -> int:
         """Return the nominal size in bytes of the unread segments, without the present and the newest segment."""

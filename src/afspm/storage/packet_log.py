@@ -163,11 +163,13 @@ class LogReader:
     Attributes:
         position: position after the last packet read.
         newest: number of the newest segment at the last read.
+        is_cut: whether the last read stopped at a limit: more packets may be there.
     """
 
     def __init__(self, folder: Path, position: Position = START) -> None:
         self.position = position
         self.newest = position.segment
+        self.is_cut = False
         self._folder = folder
 
     def read(self, most_bytes: int, most_packets: int = sys.maxsize) -> list[tuple[LoggedPacket, Position]]:
@@ -178,17 +180,18 @@ class LogReader:
         """
         found: list[tuple[LoggedPacket, Position]] = []
         segment, start = self.position
-        is_full = False
+        self.is_cut = False
         while True:
             later = [number for number in map(number_of, segments(self._folder)) if number > segment]
             self.newest = max(later, default=segment)
             for entry, offset in read_segment(path_of(self._folder, segment), start):
                 found.append((entry, Position(segment, offset)))
                 most_bytes -= len(entry.packet.payload)
-                if is_full := most_bytes <= 0 or len(found) >= most_packets:
+                self.is_cut = most_bytes <= 0 or len(found) >= most_packets
+                if self.is_cut:
                     break
             # a segment does not grow once it has a successor
-            if is_full or not later:
+            if self.is_cut or not later:
                 self.position = found[-1][1] if found else Position(segment, start)
                 return found
             segment, start = later[0], 0
