@@ -119,7 +119,7 @@ def _end_without_run(why: str, *, as_json: bool, running: bool | None) -> NoRetu
 
 def _running(where: Path, *, as_json: bool, acts: bool) -> Path:
     from afspm.basics.errors import FileError
-    from afspm.client.connect import find_one_run, find_run, others_running, several_run
+    from afspm.client.connect import find_run, others_running, require_no_others, several_run
     from afspm.record.run_json import ENDED, RUN_FILE, read_run_json
     from afspm.record.run_lock import goes_on
 
@@ -136,8 +136,8 @@ def _running(where: Path, *, as_json: bool, acts: bool) -> Path:
         more = f"; {others[-1]} goes on: name its folder" if others else ""
         say_nothing_runs(f"{folder.resolve().name} {how}{more}", as_json=as_json)
     if acts:
-        return find_one_run(where)
-    if others:
+        require_no_others(where, folder, others)
+    elif others:
         typer.echo(f"afspm: {several_run(folder, others)}: this is {folder}", err=True)
     return folder
 

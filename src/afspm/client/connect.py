@@ -188,10 +188,16 @@ def find_one_run(where: Path) -> Path:
         FileError: there is no such run, or it is one of several that go on: another one may be meant.
     """
     folder = find_run(where)
-    if goes_on(folder) and (others := others_running(where, folder)):
-        hint = f"name the folder of the one that you mean, for example {others[0]}"
-        raise FileError(several_run(folder, others), where=str(where), hint=hint)
+    if goes_on(folder):
+        require_no_others(where, folder, others_running(where, folder))
     return folder
+
+
+def require_no_others(where: Path, chosen: Path, others: Sequence[Path]) -> None:
+    """Raise FileError if `where` may mean one of `others` as well as `chosen`."""
+    if others:
+        hint = f"name the folder of the one that you mean, for example {others[0]}"
+        raise FileError(several_run(chosen, others), where=str(where), hint=hint)
 
 
 def others_running(where: Path, chosen: Path) -> list[Path]:
