@@ -1,7 +1,7 @@
 """A request from client through scheduler to translator and back, against REQ, ROUTER/DEALER proxy, REP.
 
-The bare proxy neither reads a request nor keeps it. Ours takes 0.8 ms, and 1.5 ms with its key saved: a hundredth of
-the shortest scan. The targets keep it there.
+The bare proxy neither reads a request nor keeps it. Ours takes 0.8 to 1.1 ms on two cores, and 1.3 to 1.8 ms
+with its key saved: less than a hundredth of a scan of 0.3 s. The targets keep it there.
 """
 
 from __future__ import annotations
