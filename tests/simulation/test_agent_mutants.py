@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from rotation import rotated
 
-from afspm.model import ControlRequest, Grant, Request
+from afspm.model import ControlRequest, Grant, Request, Response
 from afspm.scheduler.control import arbitration
 from afspm.scheduler.control.arbitration import ArbitrationEvent, Rules
 from afspm.scheduler.control.holder_timeout import Lease
@@ -128,6 +128,7 @@ def agent_may_ask_for_anything(patch: Patch) -> None:
 
 def role_is_not_checked(patch: Patch) -> None:
     patch.setattr(GrantChecker, "_refused_by_role", _nothing)
+    patch.setattr(GrantChecker, "_refused_by_number", lambda *_: ("", None))
 
 
 def place_is_not_checked_before_a_scan(patch: Patch) -> None:
@@ -141,14 +142,14 @@ def not_a_number_is_let_through(patch: Patch) -> None:
 def repeated_id_is_not_compared(patch: Patch) -> None:
     real = GrantChecker.refused
 
-    def refused(self: GrantChecker, who: str, request: Request, *rest: Any) -> str:
-        return "" if self._spent(who, request.id) is not None else real(self, who, request, *rest)
+    def refused(self: GrantChecker, who: str, request: Request, *rest: Any) -> Response | None:
+        return None if self._spent(who, request.id) is not None else real(self, who, request, *rest)
 
     patch.setattr(GrantChecker, "refused", refused)
 
 
 def nothing_is_checked_when_it_is_sent(patch: Patch) -> None:
-    patch.setattr(approvals, "_refused", _nothing)
+    patch.setattr(approvals, "refusal", lambda draft, job: None)
 
 
 def agent_has_no_lease(patch: Patch) -> None:

@@ -171,14 +171,18 @@ class Refused(RequestError):
     Args:
         response: the number of the ControlResponse.
         reason: the refusing process's reason, as text for people.
+        again_ns: the experiment time at which a limit on time may allow it; None if time does not lift the refusal.
     """
 
     code = "refused"
 
-    def __init__(self, response: int, reason: str, *, where: str = "", hint: str = "") -> None:
+    def __init__(
+        self, response: int, reason: str, *, where: str = "", hint: str = "", again_ns: int | None = None
+    ) -> None:
         super().__init__(reason, where=where, hint=hint)
         self.response = response
         self.reason = reason
+        self.again_ns = again_ns
 
 
 class NoResponse(RequestError):

@@ -66,6 +66,8 @@ def check(
         if not any(finding.is_error for finding in findings):
             for line in estimate_lines(experiment.planned_work(), experiment.clock().speed, datetime.now(UTC)):
                 console.print(line, markup=False, soft_wrap=True)
+            for line in experiment.waits():
+                console.print(line, markup=False, soft_wrap=True)
     if any(finding.is_error for finding in findings):
         raise typer.Exit(1)
 

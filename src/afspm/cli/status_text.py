@@ -100,6 +100,7 @@ class StatusText:
             self._control(),
             *self._tip(),
             *self._problems(),
+            *self._waits(),
             self._scanning(),
             *self._progress(),
             *self._end(),
@@ -159,6 +160,11 @@ class StatusText:
             if is_routine:
                 line.append(f": {ROUTINE}", "dim")
             yield line
+
+    def _waits(self) -> Iterator[Text]:
+        for entry in self._seen.waits_at(self._now_ns):
+            until = time_of_day(entry.again_ns or 0)
+            yield _label("waits").append(f"{entry.who} until {until}: {entry.reason}", "yellow")
 
     def _microscope(self) -> Text:
         line, status = _label("microscope"), self._seen.status
@@ -279,6 +285,10 @@ class StatusText:
             "by_hand": seen.by_hand or None,
             "tip": None if seen.tip is None else {"engaged": seen.tip.engaged, "feedback_on": seen.tip.feedback_on},
             "problems": problems_as_json(seen),
+            "waits": [
+                {"who": one.who, "what": one.what, "until": _iso(one.again_ns), "reason": one.reason}
+                for one in seen.waits_at(self._now_ns)
+            ],
             "state": seen.status.state.name if seen.status else None,
             "scan": None if running is None else {"part": round(running[0], 4), "remaining_s": _seconds(running[1])},
             "progress": {name: self._progress_json(report) for name, report in seen.progress_at(self._now_ns).items()},

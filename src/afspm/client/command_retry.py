@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable
+from datetime import UTC
 
 from afspm import wire
 from afspm.basics.errors import NoResponse, Refused
+from afspm.basics.formatting import day_and_time
 from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
 from afspm.model import (
@@ -66,6 +69,7 @@ class CommandRetry:
         self._link = link
         self._control = control
         self._logged_reason = ""
+        self._logged_limits: set[str] = set()
 
     def ask(self, kind: ControlRequest, subject: object = None, *, until_s: float | None = None) -> Response:
         """Send a command until it succeeds, inside a block with control; after a loss of control, wait to regain it.
@@ -214,13 +218,13 @@ class CommandRetry:
             self._wait_for_news(link.earlier(RETRY_S, end_s))
 
     def get_over(self, kind: ControlRequest, response: Response, states: int, until_s: float | None) -> None:
-        """Handle a failed response: wait until the microscope is free, or record a loss of control.
+        """Handle a failed response: record a loss of control, or wait for a free microscope or a limit on time.
 
         Args:
             states: number of states published before the request.
 
         Raises:
-            Refused: the response has another cause, which no wait can remove.
+            Refused: the response has another cause, which no wait can remove; or a limit demands a longer wait.
             NoResponse: the microscope was not free by `until_s`.
         """
         if response.code == ControlResponse.NO_RESPONSE:
@@ -231,6 +235,10 @@ class CommandRetry:
             self._log_reason(response.reason)
             with self._link.clock.passing():
                 self._wait_free(states, until_s)
+        elif response.again_ns is not None:
+            self._log_limit(response.again_ns, response.reason)
+            if not self._control.wait_for_limit(response.again_ns, until_s):
+                raise refused(kind, response, self._link.name)
         else:
             raise refused(kind, response, self._link.name)
 
@@ -248,6 +256,13 @@ class CommandRetry:
         if self._link.view.state is ScopeState.FREE and kind != self._logged_reason:
             self._link.log.info("waiting: %s", reason)
             self._logged_reason = kind
+
+    def _log_limit(self, again_ns: int, reason: str) -> None:
+        # once for each limit: a plan of a night may wait before each of its scans
+        kind = _NUMBERS.sub("", reason)
+        level = logging.DEBUG if kind in self._logged_limits else logging.INFO
+        self._link.log.log(level, "waiting until %s: %s", day_and_time(again_ns, UTC), reason)
+        self._logged_limits.add(kind)
 
     def _wait_free(self, states: int, until_s: float | None) -> None:
         # a state later than `states`; with a time limit, in case the state FREE is lost
@@ -277,4 +292,5 @@ def refused(kind: int, response: Response, where: str) -> Refused:
     known = response.code in ControlResponse._value2member_map_
     code = ControlResponse(response.code).name if known else str(response.code)
     what = _ASKED_FOR.get(kind, request_name(kind))
-    return Refused(response.code, f"{what} was refused: {response.reason or code}", where=where, hint=code)
+    why = f"{what} was refused: {response.reason or code}"
+    return Refused(response.code, why, where=where, hint=code, again_ns=response.again_ns)

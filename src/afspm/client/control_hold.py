@@ -44,6 +44,7 @@ class ControlHold:
         self._link = link
         self._problems = problems
         self._wanted: list[int] = []
+        self._keeping = 0  # blocks that keep control while they wait
         self._was_named = False
         self._was_off = False  # the feedback, at the beginning of the outermost block
         self.held = False
@@ -61,9 +62,11 @@ class ControlHold:
 
     @contextmanager
     def hold(
-        self, *, solving: int = Problem.NONE, until_s: float | None = None, unbroken: bool = False
+        self, *, solving: int = Problem.NONE, until_s: float | None = None, unbroken: bool = False, keeps: bool = False
     ) -> Iterator[None]:
         """Hold control in the block; an inner block shares the control of the outer one.
+
+        A block that `keeps` control has it also while a limit on time lets it wait; other blocks give it back then.
 
         If an error, or the stop of this process, ends the outermost block, and the block has switched the feedback off,
         control is not released but lost: the scheduler retracts the tip, since no other component knows of the danger.
@@ -90,7 +93,8 @@ class ControlHold:
             if len(self._wanted) == 1:
                 self._was_off = self._is_off
             self.is_unbroken = was_unbroken or unbroken
-            yield
+            with self.kept() if keeps else nullcontext():
+                yield
         except (ExperimentEnded, StopRequested):
             self._wanted.pop()
             if not self._wanted and self._has_switched_off:
@@ -154,6 +158,36 @@ class ControlHold:
         state = self._link.view.control
         if state is not None and state.holder == self._link.name and not self._wanted and not self.held:
             self._link.send_only(ControlRequest.RELEASE_CTRL)
+
+    @contextmanager
+    def kept(self) -> Iterator[None]:
+        """Keep control in the block, also while a limit on time lets it wait."""
+        self._keeping += 1
+        try:
+            yield
+        finally:
+            self._keeping -= 1
+
+    def wait_for_limit(self, again_ns: int, until_s: float | None) -> bool:
+        """Wait until a limit on time allows a request; return whether it does, or control or a problem ends the wait.
+
+        Control is given back meanwhile, unless a block keeps it. A flagged problem ends a wait without control: its
+        solver may need the microscope for long, and the caller waits for control like all others.
+        """
+        link, view, again_s = self._link, self._link.view, again_ns * 1e-9
+        if not self._keeping:
+            self.leave()
+
+        def is_over() -> bool:
+            flagged = view.control is not None and bool(view.control.problems)
+            return not self.held if self._keeping else flagged and not self._solving
+
+        with link.clock.passing(), link.clock.late(again_s):
+            while not is_over() and (left_s := again_s - link.clock.now_s()) > 0.0:
+                link.wait(is_over, link.earlier(link.clock.real_s(left_s), until_s))
+                if until_s is not None and link.clock.monotonic_s() >= until_s:
+                    return is_over() or link.clock.now_s() >= again_s
+        return True
 
     def leave(self) -> None:
         """Release control, if held, without waiting for the answer."""

@@ -221,7 +221,8 @@ class MeasurementRunner:
         if is_new:
             task.attempt = task.attempt + 1 if task.key is None else self._results.next_attempt(task.attempt)
             self._write_down(task)
-        with link.clock.late():
+        # a wait for a limit keeps control here: others would undo the settings made so far
+        with link.clock.late(), self._control.kept():
             self._setup.prepare(target, task.key or "", until_s, reached)
         states, task.acts_seen = link.view.count("ScopeStateMsg"), link.view.count(ACT_BY_HAND.name)
         watch = task.watch = task.watch or _Watch(

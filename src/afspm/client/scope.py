@@ -201,7 +201,7 @@ class Scope(ExperimentView):
             targets=self._targets, runner=self._runner, results=self._results,
         )  # fmt: skip
         until_s = self._link.until(timeout_s)
-        with self._control.hold(until_s=until_s):
+        with self._control.hold(until_s=until_s, keeps=True):
             try:
                 yield self._each_in_a_call(sweep.points(done, until_s))
             except (ExperimentEnded, StopRequested):
@@ -367,7 +367,8 @@ class Scope(ExperimentView):
                 answer: its outcome is unknown. Inside another block, an unbroken block first waits for control.
         """
         number = Problem.NONE if solving is None else self.problems.number(solving)
-        with self._control.hold(solving=number, until_s=self._link.until(timeout_s), unbroken=unbroken):
+        until_s = self._link.until(timeout_s)
+        with self._control.hold(solving=number, until_s=until_s, unbroken=unbroken, keeps=True):
             yield
 
     @property

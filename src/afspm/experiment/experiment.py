@@ -17,6 +17,7 @@ from afspm.experiment import forms, process_starts
 from afspm.experiment import parts as sorting
 from afspm.experiment.findings import Finding, Findings
 from afspm.experiment.implied_parts import RECORDS
+from afspm.experiment.planned_measurements import further_waits, with_waits
 from afspm.experiment.process_starts import ProcessStart
 from afspm.experiment.toml_lines import Table
 from afspm.experiment.toml_writer import to_toml
@@ -185,14 +186,19 @@ class Experiment:
         ]
         works = {name: plans[name].work if name in plans else None for name in acting}
         estimates = {name: work and work(speed_m_s) for name, work in works.items()}
-        if microscope is None or microscope.sets(names.SCAN_SPEED):
-            return estimates
-        default = f"scan-speed is the simulator's default, {quantity(speed_m_s, 'm/s')}"
-        for name, work in works.items():
-            estimate, without = estimates[name], work and work(None)
-            if estimate is not None and without is not None and estimate.duration_s != without.duration_s:
-                estimates[name] = replace(estimate, why="; ".join(filter(None, (estimate.why, default))))
-        return estimates
+        if microscope is not None and not microscope.sets(names.SCAN_SPEED):
+            default = f"scan-speed is the simulator's default, {quantity(speed_m_s, 'm/s')}"
+            for name, work in works.items():
+                estimate, without = estimates[name], work and work(None)
+                if estimate is not None and without is not None and estimate.duration_s != without.duration_s:
+                    estimates[name] = replace(estimate, why="; ".join(filter(None, (estimate.why, default))))
+        limits = self.resolved.limits
+        return {name: one and with_waits(name, plans[name], one, limits) for name, one in estimates.items()}
+
+    def waits(self) -> list[str]:
+        """Return a sentence for each limit on time that may delay a component, besides those in `planned_work`."""
+        plans = self.resolved.plans.items()
+        return [line for name, plan in plans for line in further_waits(name, plan, self.resolved.limits)]
 
     def clock(self) -> ExperimentClock:
         """Return the clock of a run that begins now, from [clock]."""

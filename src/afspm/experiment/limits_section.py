@@ -47,7 +47,7 @@ from afspm.experiment.validation_messages import name_of, report
 from afspm.model import Parameter, Region, component_of, names
 from afspm.model.instruments import instrument_of
 from afspm.scheduler.safety import rule_language
-from afspm.scheduler.safety.forbidden_states import STATES
+from afspm.scheduler.safety.forbidden_states import NEVER_REFUSED, STATES
 from afspm.scheduler.safety.limits import ExperimentLimits, ForbiddenState, Limit, RoleLimits, bounds, limit_key
 from afspm.scheduler.safety.rule_language import RuleComparison, RuleError, RuleTree
 
@@ -208,7 +208,14 @@ class LimitsReader:
             hint = nearest(name, self._known_actions)
             self.document.error(f"[limits.actions] there is no action {name!r}", *path, hint=hint)
         given = self._table(table, path, _OF_ACTION)
+        if given is not None and "every" in given:
+            self._never_waits(name, *path, "every")
         return None if given is None else self._limit(given, path, None)
+
+    def _never_waits(self, action: str, *path: str | int) -> None:
+        if action in NEVER_REFUSED:
+            what = f"{name_of(path)}: {action} makes the tip safe or stops a measurement, and never waits"
+            self.document.error(what, *path, hint="leave it out")
 
     def _forbid(self, given: object) -> dict[str, ForbiddenState]:
         if isinstance(given, Mapping):
@@ -310,6 +317,8 @@ class LimitsReader:
             if action not in self._known_actions and (self.actions is not None or not action.startswith("x-")):
                 what = f"[{'.'.join(path)}] there is no action {action!r}"
                 self.document.error(what, *path, *place, hint=nearest(action, self._known_actions))
+        for action in given.per_hour or ():
+            self._never_waits(action, *path, "per_hour", action)
         source = str(self.document.place(*path))
         return RoleLimits(
             ExperimentLimits(

@@ -5,15 +5,25 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 from afspm.basics import entry_points
-from afspm.basics.errors import AfspmError
+from afspm.basics.errors import AfspmError, UnitError
 from afspm.basics.formatting import duration_text, lengths_text, quantity
-from afspm.basics.units import si
+from afspm.basics.units import convert, si
 from afspm.client.parameter_text import to_parameter
 from afspm.experiment.toml_lines import Table
-from afspm.model import ControlRequest, Parameter, ProbePosition, Region, Request, ScanParameters, names
+from afspm.model import (
+    ControlRequest,
+    Parameter,
+    ProbePosition,
+    Region,
+    Request,
+    ScanParameters,
+    is_of_instrument,
+    names,
+)
 from afspm.model.geometry import XY
 from afspm.model.planned_work import PlannedWork, path_length_m
 from afspm.model.sweep_plan import SweepPlan
@@ -326,6 +336,74 @@ def too_slow(planned: PlannedMeasurements, usual_m_s: float | None) -> str:
         f"{what} takes about {duration_text(round_s)} at {quantity(speed_m_s, 'm/s')},"
         f" longer than its period of {duration_text(planned.period_s)}"
     )
+
+
+def with_waits(name: str, planned: PlannedMeasurements, work: PlannedWork, limits: ExperimentLimits) -> PlannedWork:
+    """Return the work of a component with the time that it waits for limits on time, and their places in the file.
+
+    The waits between the measurements are least waits: other components count for the same limits.
+    """
+    count = (work.scans or 0) + work.spectra
+    if count < 2:
+        return work
+    each_s = None if work.duration_s is None else work.duration_s / count
+    by_place = [waits for waits in _waits_s(name, planned, work, limits, each_s or 0.0) if sum(waits[1]) > 0.0]
+    between_s = [max(waits) for waits in zip(*(waits for _, waits in by_place), strict=True)]
+    waited_s = sum(max(0.0, wait_s - (each_s or 0.0)) for wait_s in between_s)
+    if not waited_s:
+        return work
+    places = ", ".join(dict.fromkeys(place for place, _ in by_place))
+    why = f"of it at least {duration_text(waited_s)} waiting for limits: {places}"
+    duration_s = None if work.duration_s is None else work.duration_s + waited_s
+    return replace(work, duration_s=duration_s, why="; ".join(filter(None, (work.why, why))))
+
+
+def _waits_s(
+    name: str, planned: PlannedMeasurements, work: PlannedWork, limits: ExperimentLimits, each_s: float
+) -> Iterator[tuple[str, list[float]]]:
+    # the place of each limit, and the least times between the starts of measurements
+    count = (work.scans or 0) + work.spectra
+    for action in _only_start(work):
+        limit, role = limits.actions.get(action), limits.roles.get(name)
+        if limit is not None and limit.interval_s is not None:
+            each_s = max(each_s, limit.interval_s)
+            yield f"{action} every {duration_text(limit.interval_s)} ({limit.source})", [limit.interval_s] * (count - 1)
+        if role is not None and (most := role.per_hour.get(action)):
+            rest_s = 3600.0 - (most - 1) * each_s
+            waits = [rest_s if number % most == 0 else 0.0 for number in range(1, count)]
+            yield f"{most} {action} per hour ({role.source})", waits
+    if planned.sweep is None:
+        return
+    places = planned.sweep.places()
+    for i, axis in enumerate(planned.sweep.axes):
+        limit = limits.parameters.get(axis.name)
+        if limit is None:
+            continue
+        if limit.interval_s is not None:
+            place = f"{axis.name} every {duration_text(limit.interval_s)} ({limit.source})"
+            yield place, [limit.interval_s] * (count - 1)
+        if limit.rate_per_s is not None and not is_of_instrument(axis.name):  # an instrument ramps by itself
+            with suppress(UnitError, ValueError):  # the limits have refused it before
+                values = [convert(float(value), axis.unit or "", limit.unit or "") for value in axis.values]
+                steps = [abs(values[after[i]] - values[before[i]]) for before, after in itertools.pairwise(places)]
+                yield f"the rate of {axis.name} ({limit.source})", [step / limit.rate_per_s for step in steps]
+
+
+def _only_start(work: PlannedWork | None) -> list[str]:
+    # the action that starts all measurements; of work with scans and spectra the order is not known
+    starts = [names.START_SCAN] * bool(work and work.scans) + [names.START_SPEC] * bool(work and work.spectra)
+    return starts if len(starts) == 1 else []
+
+
+def further_waits(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[str]:
+    """Return a sentence for each action with a shortest interval that `with_waits` does not count."""
+    counted = _only_start(planned.work(None) if planned.work else None)
+    intervals = {action: limits.actions[action] for action in planned.needs_actions if action in limits.actions}
+    return [
+        f"{name} may wait up to {duration_text(limit.interval_s)} before each {action} ({limit.source})"
+        for action, limit in intervals.items()
+        if limit.interval_s is not None and action not in counted
+    ]
 
 
 def refused_actions(limits: ExperimentLimits) -> list[tuple[str, str]]:

@@ -102,6 +102,7 @@ class JournalEntry:
         mode: the new mode, for a MODE_CHANGED.
         late: whether the answer came after the client had received a NO_RESPONSE.
         sent_ns: time of forwarding to the translator; None for requests that the scheduler answers.
+        again_ns: the time at which a refusal by a limit on time may be gone; None for other entries.
         key: key of the measurement that the request starts; empty without a key.
         subject: the action, or the parameter to set; empty for other requests.
         value, unit: value and unit of that parameter, as requested.
@@ -120,6 +121,7 @@ class JournalEntry:
     mode: ControlMode | None = None
     late: bool = False
     sent_ns: int | None = None
+    again_ns: int | None = None
     key: str = ""
     subject: str = ""
     value: str = ""
@@ -129,10 +131,12 @@ class JournalEntry:
     def refused(self) -> bool:
         """Return whether a request was refused.
 
-        A request that has to wait, for control or for a busy microscope, and a request without an answer are not. Nor
-        is control given back twice, as a component does at its end after it has lost it: nothing was asked for.
+        A request that has to wait, for control, for a busy microscope or for a limit on time, and a request without an
+        answer are not. Nor is control given back twice, as a component does at its end after it has lost it: nothing
+        was asked for.
         """
         waits = self.request == ControlRequest.REQUEST_CTRL and self.response in WAIT_FOR_CONTROL
+        waits = waits or self.again_ns is not None
         had_none = self.request == ControlRequest.RELEASE_CTRL and self.response == ControlResponse.NOT_IN_CONTROL
         return not (waits or had_none) and self.response not in _NOT_REFUSED
 

@@ -162,6 +162,8 @@ class Response:
         reason: the reason of a failure, for people.
         id: id of the answered request, if it had one.
         detail: further facts for programs.
+        again_ns: the experiment time at which a refusal by a limit on time may be gone; None for other answers. The
+            request may then be sent again, under another id.
     """
 
     code: int
@@ -169,6 +171,7 @@ class Response:
     reason: str = ""
     id: str = ""
     detail: ResponseDetail = ResponseDetail.NONE
+    again_ns: int | None = None
 
     @property
     def ok(self) -> bool:

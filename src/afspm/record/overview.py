@@ -19,6 +19,7 @@ from afspm.model import (
     ControlEvent,
     ControlMode,
     ControlRequest,
+    ControlResponse,
     ControlState,
     Feedback,
     InstrumentReadings,
@@ -191,6 +192,7 @@ class Overview:
         self._approved_ns: dict[str, int] = {}
         self.of_conditions: set[int] = set()
         self.set_ns: dict[str, int] = {}
+        self._limited: dict[str, JournalEntry] = {}
         self.log: deque[LogLine] = deque(maxlen=MOST_LINES)
         self.alarms: deque[CriticalMessage] = deque(maxlen=MOST_ALARMS)
         self.notes: deque[Note] = deque(maxlen=most_entries)
@@ -271,6 +273,10 @@ class Overview:
             name: replace(report, time_ns=report.time_ns + self.manual_ns(report.time_ns, now_ns))
             for name, report in self.progress_reports.items()
         }
+
+    def waits_at(self, now_ns: int) -> list[JournalEntry]:
+        """Return for each component that a limit on time lets wait the refusal with the time of its end."""
+        return [entry for entry in self._limited.values() if (entry.again_ns or 0) > now_ns]
 
     def manual_ns(self, since_ns: int, now_ns: int) -> int:
         """Return the time in MANUAL since `since_ns`: no task goes on then."""
@@ -467,6 +473,10 @@ class Overview:
             who, what, kind = map(sys.intern, (entry.who, entry.what, entry.kind))
             entry = replace(entry, who=who, what=what, kind=kind)
             self.entries.append(entry)
+            if entry.again_ns is not None:
+                self._limited[who] = entry
+            elif entry.subject and entry.response == ControlResponse.SUCCESS:
+                self._limited.pop(who, None)
             if entry.refused:
                 self.refusals.append(entry)
                 continue

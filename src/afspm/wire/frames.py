@@ -162,16 +162,17 @@ def _request_id(frame: Buffer) -> str:
 
 
 def encode_response(response: Response) -> list[bytes]:
-    """Return the frames [number, object, reason, id, detail], without empty frames at the end."""
+    """Return the frames [number, object, reason, id, detail, again], without empty frames at the end."""
     detail = bytes([response.detail]) if response.detail else b""
-    frames = [bytes([response.code]), response.payload, response.reason.encode(), response.id.encode(), detail]
+    again = b"" if response.again_ns is None else encode_time(response.again_ns)
+    frames = [bytes([response.code]), response.payload, response.reason.encode(), response.id.encode(), detail, again]
     while len(frames) > 1 and not frames[-1]:
         frames.pop()
     return frames
 
 
 def decode_response(frames: Sequence[Buffer]) -> Response:
-    """Return a response of one to five frames; frames that a newer peer appends are ignored.
+    """Return a response of one to six frames; frames that a newer peer appends are ignored.
 
     Raises:
         WireError: the frames are no response.
@@ -184,7 +185,8 @@ def decode_response(frames: Sequence[Buffer]) -> Response:
     reason = str(frames[2], "utf-8", "replace") if count > 2 and frames[2] else ""
     request_id = str(frames[3], "utf-8", "replace") if count > 3 else ""
     detail = known(ResponseDetail, frames[4][0]) if count > 4 and frames[4] else ResponseDetail.NONE
-    return Response(frames[0][0], payload, reason, request_id, detail)
+    again_ns = decode_time(frames[5]) if count > 5 and frames[5] else None
+    return Response(frames[0][0], payload, reason, request_id, detail, again_ns)
 
 
 def decode_parameter(payload: Buffer) -> Parameter:

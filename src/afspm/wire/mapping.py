@@ -210,6 +210,7 @@ _JOURNAL_ENTRY = MessageMapping(
     mode=_enum("mode", model.ControlMode, sparse=True),
     late=FieldMapping("late", sparse=True),
     sent_ns=_time("sent"),
+    again_ns=_time("again"),
     key=FieldMapping("key", sparse=True),
     subject=FieldMapping("subject", sparse=True),
     value=FieldMapping("value", sparse=True),

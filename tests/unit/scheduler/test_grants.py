@@ -241,10 +241,12 @@ def test_drift_after_the_approval_refuses_the_next_step_of_a_plan(agent: AgentLa
         Request(kind, subject, agent.lab.codec.encode(subject), f"{AGENT}/1/{kind}")
         for kind, subject in ((PARAM, bias), (SCAN, ScanParameters(HERE)))
     )
-    assert checker.refused(AGENT, first, now_ns, (0.9e-9, 0.0), LimitState()) == ""
+    assert checker.refused(AGENT, first, now_ns, (0.9e-9, 0.0), LimitState()) is None
     checker = checker.sending(AGENT, first, now_ns, (0.9e-9, 0.0)).done(AGENT, first)
-    assert checker.refused(AGENT, second, now_ns, (0.9e-9, 0.0), LimitState()) == ""
-    assert "drifted by 1.1 nm" in checker.refused(AGENT, second, now_ns, (1.1e-9, 0.0), LimitState())
+    assert checker.refused(AGENT, second, now_ns, (0.9e-9, 0.0), LimitState()) is None
+    refusal = checker.refused(AGENT, second, now_ns, (1.1e-9, 0.0), LimitState())
+    assert refusal is not None
+    assert "drifted by 1.1 nm" in refusal.reason
 
 
 @pytest.mark.parametrize("disturb", ["problem", "manual"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -192,10 +193,12 @@ def test_a_response_carries_reason_id_and_detail() -> None:
     plain = Response(ControlResponse.PARAM_ERROR, b"", "tip-bias-voltage: 12 V is above 10 V", "a/1/2")
     assert wire.decode_response(wire.encode_response(plain)) == plain
     assert len(wire.encode_response(plain)) == 4
+    too_soon = replace(plain, again_ns=1_750_000_000_000_000_007)
+    assert wire.decode_response(wire.encode_response(too_soon)) == too_soon
 
 
 def test_frames_appended_by_a_newer_peer_are_ignored() -> None:
-    newer = [b"\1", b"", b"why", b"a/1/2", bytes([200]), b"more"]
+    newer = [b"\1", b"", b"why", b"a/1/2", bytes([200]), b"", b"more"]
     assert wire.decode_response(newer) == Response(ControlResponse.FAILURE, b"", "why", "a/1/2")
 
 

@@ -347,7 +347,9 @@ def _answer(content: Content) -> types.CallToolResult:
 
 def _refusal(error: RefusedRequest) -> types.CallToolResult:
     model = error.model
-    facts = {"code": model.code.value, "may_have_been_done": model.may_have_been_done}
+    facts: dict[str, object] = {"code": model.code.value, "may_have_been_done": model.may_have_been_done}
+    if model.again is not None:
+        facts["again"] = model.again
     text = json.dumps({**facts, **untrusted({"reason": model.reason})})
     return types.CallToolResult(content=[types.TextContent(type="text", text=text)], is_error=True)
 

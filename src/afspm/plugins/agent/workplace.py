@@ -226,7 +226,7 @@ class Workplace:
             for step in plan.steps:
                 run.step += 1
                 self._save(run)
-                await self._step(person, run, step)
+                await self._step_when_allowed(person, run, step)
             run.state = "done"
         except RefusedRequest as error:
             run.state, run.refusal = "failed", error.model.model_dump(mode="json")
@@ -244,6 +244,22 @@ class Workplace:
                 await self.do(person, lambda commands: commands.release_control())
         except RefusedRequest as error:  # control then ends with its lease
             _log.info("%s could not release control: %s", run.who, error.model.reason)
+
+    async def _step_when_allowed(self, person: str, run: PlanRun, step: Step) -> None:
+        # keeps control over the waits for limits: a plan is approved for one run without interruption
+        while True:
+            try:
+                return await self._step(person, run, step)
+            except RefusedRequest as error:
+                if error.again_ns is None:
+                    raise
+                await self._wait_until(person, error.again_ns)
+
+    async def _wait_until(self, person: str, time_ns: int) -> None:
+        clock = self.watch.clock
+        while (left_s := clock.real_s((time_ns - clock.now_ns()) * 1e-9)) > 0.0:
+            await self._renew(person)
+            await asyncio.sleep(min(left_s, RENEW_S))
 
     async def _step(self, person: str, run: PlanRun, step: Step) -> None:
         match step:

@@ -53,7 +53,11 @@ class Lease:
 
     def used(self, now_ns: int) -> Lease:
         """Restart the idle time in experiment time: the microscope began or ended an activity."""
-        return replace(self, idle_since_ns=now_ns)
+        return replace(self, idle_since_ns=max(self.idle_since_ns, now_ns))
+
+    def waiting(self, until_ns: int) -> Lease:
+        """Begin the idle time in experiment time later: a limit lets the holder wait until then."""
+        return replace(self, idle_since_ns=until_ns)
 
     def commanded(self, now_ns: int, now_s: float) -> Lease:
         """Restart both idle times: a command of the holder was sent, or has succeeded."""

@@ -88,6 +88,7 @@ class AnsweredRequest(NamedTuple):
             problem=int(self.request.subject or 0) if self.request.kind in flags else None,
             late=self.late,
             sent_ns=self.sent_ns,
+            again_ns=self.response.again_ns,
             key=key_of(self.who, self.request.id),
             subject=subject,
             value=value,

@@ -56,7 +56,15 @@ def answer_unsent(draft: StateDraft, job: ForwardedRequest, response: Response) 
         draft.idempotency = draft.idempotency.forgotten(job.client, job.request)
         answer_job(draft, job, Response(response.code, b"", response.reason, job.request.id, ResponseDetail.NOT_SENT))
     else:
-        finish(draft, job, Response(response.code, b"", response.reason, job.request.id))
+        finish(draft, job, replace(response, payload=b"", id=job.request.id))
+
+
+def log_refusal(draft: StateDraft, client: str, refusal: Response) -> None:
+    """Log the refusal of a request by a limit, and let a holder wait as long as the limit demands."""
+    # a refusal that time lifts is the normal course of a plan
+    draft.log("WARNING" if refusal.again_ns is None else "INFO", f"refused {client}: {refusal.reason}")
+    if refusal.again_ns is not None and client == draft.control.holder:
+        draft.lease = draft.lease.waiting(refusal.again_ns)
 
 
 def finish(draft: StateDraft, job: ForwardedRequest, response: Response, status: RequestStatus | None = None) -> None:

@@ -78,15 +78,10 @@ def offset_m(draft: StateDraft) -> XY | None:
 
 def refusal(draft: StateDraft, job: ForwardedRequest) -> Response | None:
     """Return the refusal of a command without an approval or outside the limits of its role; None if it may be sent."""
-    why = _refused(draft, job)
-    return Response(int(ControlResponse.PARAM_ERROR), b"", why, job.request.id) if why else None
-
-
-def _refused(draft: StateDraft, job: ForwardedRequest) -> str:
     until_s = draft.lease.asked_until_s()
     # a frozen scheduler finds the request and the end of the lease at the same time
     if draft.env.settings.rules.is_agent(job.client) and until_s is not None and draft.now_s > until_s:
-        return f"the lease of {job.client} has ended"
+        return Response(int(ControlResponse.PARAM_ERROR), b"", f"the lease of {job.client} has ended", job.request.id)
     return draft.grants.refused(job.client, job.request, draft.now_ns, offset_m(draft), draft.limits.state)
 
 

@@ -143,7 +143,7 @@ def _next_order(draft: StateDraft, instrument: str, may_send: MaySend) -> Instru
         refusal = may_send(draft, first.job) or _limit_refusal(draft, first) or approvals.refusal(draft, first.job)
         if refusal is None:
             return _hand_out(draft, instrument, first)
-        draft.log("WARNING", f"refused {first.job.client}: {refusal.reason}")
+        answers.log_refusal(draft, first.job.client, refusal)
         draft.instruments = draft.instruments.settled(instrument, first.job.number)
         answers.answer_unsent(draft, first.job, refusal)
     return None

@@ -378,7 +378,7 @@ def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None
 
 
 def _refuse(draft: StateDraft, job: ForwardedRequest, refusal: Response) -> None:
-    draft.log("WARNING", f"refused {job.client}: {refusal.reason}")
+    answers.log_refusal(draft, job.client, refusal)
     _answer_unsent(draft, job, refusal)
 
 

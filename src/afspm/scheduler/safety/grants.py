@@ -26,6 +26,7 @@ from afspm.model import (
     Approval,
     Approvals,
     ControlRequest,
+    ControlResponse,
     Grant,
     GrantedCount,
     PositionChange,
@@ -34,6 +35,7 @@ from afspm.model import (
     RegionChange,
     RelayedMessage,
     Request,
+    Response,
     ScanParameters,
     component_of,
     names,
@@ -318,15 +320,23 @@ class GrantChecker:
             needed.update(dict.fromkeys(LimitChecker(limits).depends_on(request)))
         return list(needed)
 
-    def refused(self, who: str, request: Request, now_ns: int, offset_m: XY | None, state: LimitState) -> str:
-        """Return the reason why a command may not be sent now; empty if it may.
+    def refused(
+        self, who: str, request: Request, now_ns: int, offset_m: XY | None, state: LimitState
+    ) -> Response | None:
+        """Return the refusal of a command that may not be sent now; None if it may.
 
         Args:
             offset_m: the origin of component coordinates in microscope coordinates; None: both are the same.
             state: the values in force, and the position of the tip in the microscope's coordinates.
         """
-        if why := self._refused_by_role(who, request, now_ns, offset_m, state):
-            return why
+        again_ns = None
+        why = self._refused_by_role(who, request, now_ns, offset_m, state)
+        if not why:
+            why, again_ns = self._refused_by_number(who, request, now_ns)
+        why = why or self._refused_as_agent(who, request, now_ns, offset_m, state)
+        return Response(int(ControlResponse.PARAM_ERROR), b"", why, request.id, again_ns=again_ns) if why else None
+
+    def _refused_as_agent(self, who: str, request: Request, now_ns: int, offset_m: XY | None, state: LimitState) -> str:
         if not self.rules.is_agent(who):
             return ""
         # checked here as well: an approval may have ended while the request waited
@@ -427,15 +437,21 @@ class GrantChecker:
             return ""
         if why := _outside(role.limits, who, request, now_ns, offset_m, state):
             return why
-        if why := not_of_role(role, who, request):
-            return why
+        return not_of_role(role, who, request)
+
+    def _refused_by_number(self, who: str, request: Request, now_ns: int) -> tuple[str, int | None]:
+        # also returns the experiment time of the next use that the number per hour allows; None: never
+        role = self._role(who)
         action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
-        most = role.per_hour.get(action)
-        lately = [use for use in self.book.spent.get(who, ()) if use.action == action and now_ns - use.at_ns < _HOUR_NS]
+        most = None if role is None else role.per_hour.get(action)
         is_repeated = bool(request.id) and self._spent(who, request.id) is not None
-        if most is not None and len(lately) >= most and not is_repeated:
-            return f"{who} has used {action} {len(lately)} times within an hour, {most} are allowed ({role.source})"
-        return ""
+        if role is None or most is None or is_repeated:
+            return "", None
+        lately = [use for use in self.book.spent.get(who, ()) if use.action == action and now_ns - use.at_ns < _HOUR_NS]
+        if len(lately) < most:
+            return "", None
+        why = f"{who} has used {action} {len(lately)} times within an hour, {most} are allowed ({role.source})"
+        return why, lately[-most].at_ns + _HOUR_NS if most else None
 
     def _refused_by_plan(self, held: HeldGrant, request: Request, now_ns: int, offset_m: XY | None) -> str:
         grant = held.grant

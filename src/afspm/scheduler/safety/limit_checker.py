@@ -67,10 +67,11 @@ _OF_TREATMENTS = frozenset(name for parameters in _TREATMENTS.values() for name 
 class _Breach(Exception):
     """The error that a limit is broken; raised and caught in this module alone."""
 
-    def __init__(self, code: ControlResponse, reason: str) -> None:
+    def __init__(self, code: ControlResponse, reason: str, again_ns: int | None = None) -> None:
         super().__init__(reason)
         self.code = code
         self.reason = reason
+        self.again_ns = again_ns
 
 
 class _Use(NamedTuple):
@@ -105,7 +106,7 @@ class LimitChecker:
         try:
             self._check(_Use(who, request.id, now_ns, is_repeated), request, used)
         except _Breach as breach:
-            return Response(int(breach.code), b"", breach.reason, request.id)
+            return Response(int(breach.code), b"", breach.reason, request.id, again_ns=breach.again_ns)
         except (ParameterValueError, InvalidValue) as error:
             return Response(int(ControlResponse.PARAM_ERROR), b"", str(error), request.id)
         return None
@@ -358,7 +359,8 @@ class LimitChecker:
             try:
                 self._check_settings(use, request, used)
             except (_Breach, ParameterValueError, InvalidValue) as breach:
-                raise _Breach(ControlResponse.ACTION_ERROR, f"{action}: {breach}") from breach
+                again_ns = breach.again_ns if isinstance(breach, _Breach) else None
+                raise _Breach(ControlResponse.ACTION_ERROR, f"{action}: {breach}", again_ns) from breach
         else:
             self._check_settings(use, request, used)
 
@@ -401,6 +403,7 @@ class LimitChecker:
             raise _Breach(
                 error,
                 f"{name} was used {ago_s:.3g} s ago, its shortest interval is {limit.interval_s:g} s ({limit.source})",
+                last_ns + math.ceil(limit.interval_s * 1e9),
             )
 
     def _check_range(self, name: str, value: float, limit: Limit, reach: float = _REACH) -> None:
@@ -435,7 +438,8 @@ class LimitChecker:
             ago_s = (now_ns - known.since_ns) / 1e9
             raise _param_error(
                 f"{setting} changes by {text(moved_since)} within {ago_s:.3g} s, allowed is at most {text(allowed, 3)},"
-                f" at {text(limit.rate_per_s)} per second ({limit.source})"
+                f" at {text(limit.rate_per_s)} per second ({limit.source})",
+                known.since_ns + math.ceil(moved_since / limit.rate_per_s * 1e9),
             )
 
     def _check_scan(self, wanted: ScanParameters, reach: float = _REACH) -> None:
@@ -511,8 +515,8 @@ def _action_error(request: Request, breach: _Breach) -> Response:
     return Response(int(ControlResponse.ACTION_ERROR), b"", f"{request.subject}: {breach.reason}", request.id)
 
 
-def _param_error(reason: str) -> _Breach:
-    return _Breach(ControlResponse.PARAM_ERROR, reason)
+def _param_error(reason: str, again_ns: int | None = None) -> _Breach:
+    return _Breach(ControlResponse.PARAM_ERROR, reason, again_ns)
 
 
 def _inside(allowed: Region, xy_m: XY, reach: float) -> bool:

@@ -313,6 +313,11 @@ def status_html(watch: Watch, overview: Overview) -> str:
         *_microscope(overview, now_ns),
     ]
     end_ns = watch.expected_end_ns(overview, now_ns)
+    for entry in overview.waits_at(now_ns):
+        until = _end_text(entry.again_ns or now_ns, now_ns)
+        parts.append(
+            _chip(f"<b>{escape(entry.who)}</b> waits until {until}<small>{escape(entry.reason)}</small>", "wait")
+        )
     for name, report in overview.progress_at(now_ns).items():
         left_ns = report.remaining_ns(now_ns) if report.done < report.of else None
         # the component that decides the end needs no end of its own

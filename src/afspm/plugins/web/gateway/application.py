@@ -7,6 +7,7 @@ import re
 from collections.abc import AsyncIterator, Collection
 from http import HTTPStatus
 from importlib import metadata
+from math import ceil
 
 from fastapi import FastAPI
 from fastapi.exceptions import RequestValidationError
@@ -53,8 +54,16 @@ def application(
         app.include_router(routes.router(), prefix=PREFIX)
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _no_route)
+
+    async def refused(_: Request, error: Exception) -> Response:
+        response = answer(refusal := of_error(error))
+        if refusal.again_ns is not None:
+            clock = services.watch.clock
+            response.headers["Retry-After"] = str(max(1, ceil(clock.real_s(refusal.again_ns * 1e-9 - clock.now_s()))))
+        return response
+
     for error in (RefusedRequest, Exception):
-        app.add_exception_handler(error, _refused)
+        app.add_exception_handler(error, refused)
     # outside of FastAPI: an unauthorised request must not reach a validator
     guarded: AsgiApp = GatewayGuard(app, passwords, host, origins)
     if not origins:
@@ -65,13 +74,9 @@ def application(
         allow_origins=tuple(origins),
         allow_methods=methods,
         allow_headers=headers,
-        expose_headers=("Location",),
+        expose_headers=("Location", "Retry-After"),
     )
     return allowing
-
-
-async def _refused(_: Request, error: Exception) -> Response:
-    return answer(of_error(error))
 
 
 async def _invalid(_: Request, error: Exception) -> Response:

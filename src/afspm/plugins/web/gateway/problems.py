@@ -7,7 +7,7 @@ from http import HTTPStatus
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from afspm.basics import AfspmError, ExperimentEnded, NoResponse
+from afspm.basics import AfspmError, ExperimentEnded, NoResponse, iso_utc
 from afspm.model import HAS_ENDED, ControlResponse, Response, ResponseDetail
 from afspm.processes import StopRequested
 
@@ -30,6 +30,7 @@ class RefusalCode(Enum):
     WRONG_MODE = "wrong-mode"
     PROBLEM_FLAGGED = "problem-flagged"
     NOT_FREE = "not-free"
+    TOO_SOON = "too-soon"
     FORBIDDEN = "forbidden"
     NOT_SUPPORTED = "not-supported"
     PARAMETER_REFUSED = "parameter-refused"
@@ -51,6 +52,7 @@ _STATUS = {
     _C.UNAUTHORIZED: _S.UNAUTHORIZED,
     _C.WRONG_ORIGIN: _S.FORBIDDEN,
     _C.TOO_MANY: _S.TOO_MANY_REQUESTS,
+    _C.TOO_SOON: _S.TOO_MANY_REQUESTS,
     _C.GONE: _S.GONE,
     _C.FORBIDDEN: _S.FORBIDDEN,
     _C.NOT_SUPPORTED: _S.NOT_FOUND,
@@ -75,6 +77,7 @@ _ADVICE = {
     _C.WRONG_MODE: "Wait until a person sets the mode to AUTOMATED.",
     _C.PROBLEM_FLAGGED: "Wait until the problem is cleared, or request control to solve it.",
     _C.NOT_FREE: "Wait until the state is FREE, then send it again.",
+    _C.TOO_SOON: "Wait until the experiment's time `again` (header Retry-After: real seconds), then send it again.",
     _C.FORBIDDEN: "Have the name given the role in [control.roles] of the experiment file.",
     _C.NOT_SUPPORTED: "Use what the microscope has: GET /v1/parameters, GET /v1/actions.",
     _C.PARAMETER_REFUSED: "Change the value: its unit, a limit or the microscope does not allow it.",
@@ -124,14 +127,27 @@ class RefusalModel(BaseModel):
     may_have_been_done: bool = Field(
         default=False, description="no answer came: the microscope may have carried it out"
     )
+    again: str | None = Field(
+        default=None, description="experiment time (ISO 8601) from which on a limit on time may allow it"
+    )
 
 
 class RefusedRequest(Exception):
-    """The error that ends a request with a refusal."""
+    """The error that ends a request with a refusal.
 
-    def __init__(self, code: RefusalCode, reason: str, *, may_have_been_done: bool = False) -> None:
+    Attributes:
+        again_ns: the experiment time from which on a limit on time may allow the request; None for other refusals.
+    """
+
+    def __init__(
+        self, code: RefusalCode, reason: str, *, may_have_been_done: bool = False, again_ns: int | None = None
+    ) -> None:
         super().__init__(reason)
-        self.model = RefusalModel(code=code, reason=reason, advice=_ADVICE[code], may_have_been_done=may_have_been_done)
+        self.again_ns = again_ns
+        self.model = RefusalModel(
+            code=code, reason=reason, advice=_ADVICE[code], may_have_been_done=may_have_been_done,
+            again=None if again_ns is None else iso_utc(again_ns),
+        )  # fmt: skip
 
     @property
     def status(self) -> int:
@@ -142,6 +158,8 @@ def refused(response: Response) -> RefusedRequest:
     """Convert an unsuccessful response to a refusal."""
     if response.detail is ResponseDetail.EXPERIMENT_ENDED:
         return RefusedRequest(_C.EXPERIMENT_ENDED, response.reason)
+    if response.again_ns is not None:
+        return RefusedRequest(_C.TOO_SOON, response.reason, again_ns=response.again_ns)
     is_known = response.code in ControlResponse._value2member_map_
     code = _BY_RESPONSE.get(ControlResponse(response.code), _C.FAILED) if is_known else _C.FAILED
     is_unknown = code is _C.NO_RESPONSE and response.detail is not ResponseDetail.NOT_SENT
