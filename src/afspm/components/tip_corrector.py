@@ -210,6 +210,11 @@ class TipCorrector(Component):
                         self.log.info("the tip is repaired")
                         return
                 why = f"all {self.most_treatments} treatments that are allowed were tried"
+                if refused := len(self._workshop.refused):
+                    done = self.most_treatments - refused
+                    why = (
+                        f"{done} of {self.most_treatments} treatments were done, without effect; {refused} were refused"
+                    )
             except (FileError, _Blind, _OverBudget) as error:
                 why = error.what
         self._restore(region)

@@ -107,6 +107,17 @@ def test_grant_lets_an_agent_measure_within_it(started: Started) -> None:
     run.person("approve", "--revoke", "agent:claude", "", str(run.folder))
 
 
+def test_agent_waits_for_a_limit_on_time(started: Started) -> None:  # contributors K1
+    run = started('\n[limits.actions.start-scan]\nevery = "5 min"\n')
+    run.grant(GRANT)
+
+    async def measure(agent: AgentClient) -> None:
+        runs = [await agent.ended((await agent.call("measure", step=SCAN))["run"]) for _ in range(2)]
+        assert [one["state"] for one in runs] == ["done", "done"]
+
+    run.act(measure)
+
+
 @pytest.mark.parametrize("mode", ["auto", "legacy"])
 def test_stop_ends_a_scan_and_only_a_person_goes_on(started: Started, mode: str) -> None:
     run = started()

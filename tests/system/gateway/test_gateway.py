@@ -30,7 +30,7 @@ Started = Callable[..., GatewayRun]
 
 
 def test_a_night_by_http_alone_is_in_the_record_under_its_name(started: Started) -> None:
-    run = started()
+    run = started('\n[limits.actions.start-spec]\nevery = "1 h"\n')
     ada, looker = run.client("ada"), run.client()
     assert looker.get("/state")["microscope"]["state"] == "FREE"
     speed = looker.get("/parameters/scan-speed")
@@ -77,6 +77,10 @@ def test_a_night_by_http_alone_is_in_the_record_under_its_name(started: Started)
     told = looker.get(f"/spectra/{curve['result']}")
     assert told["position_m"] == pytest.approx([1e-7, 0.0], abs=2e-8)
     assert np.load(io.BytesIO(looker.get("/spectra/newest/values"))).shape[1] == len(told["variables"])
+    soon = ada.ask("POST", "/spectra", {"key": "soon"})  # contributors K1
+    assert (soon.status, soon.code) == (429, "too-soon")
+    assert soon.body["again"] > looker.get("/state")["time"]
+    assert 1 <= int(soon.headers["retry-after"]) <= 3600
 
     ada.done("PUT", "/problems/tip-shape-changed")
     assert {"name": "tip-shape-changed", "flagged": True} in looker.get("/problems")
