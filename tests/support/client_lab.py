@@ -111,6 +111,7 @@ class Lab:
         self.happenings: list[tuple[float, int, Callable[[], object]]] = []
         self._numbers = itertools.count()
         self.inbox: list[Incoming] = []
+        self.lost: list[Any] = []
         self._newest_ns = 0
         self.most_at_once: int | None = None
         self.open = True
@@ -174,6 +175,12 @@ class Lab:
         self.cached[f"{message}-{getattr(thing, 'channel', '')}"] = packet
         self.inbox.append(PacketReceived(packet, SOURCE))
         return packet
+
+    def request_since(self, since_ns: int) -> None:
+        """Bring the lost packets that are newer and kept."""
+        found = [one for one in self.lost if (one.packet.time_ns or 0) > since_ns]
+        self.at(0.01, lambda: self.inbox.extend(found))
+        self.lost.clear()
 
     def answer_now(self, response: Response) -> None:
         """Send an answer that `intercept` withheld."""
@@ -393,6 +400,9 @@ class LabPort:
 
     def publish(self, envelope: str, payload: bytes) -> None:
         self._lab.publish_out(envelope, payload)
+
+    def request_since(self, since_ns: int) -> None:
+        self._lab.request_since(since_ns)
 
     def close(self) -> None:
         self._lab.close()

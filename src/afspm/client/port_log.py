@@ -151,6 +151,9 @@ class RecordedPort:
         with self._call():
             self._port.publish(envelope, payload)
 
+    def request_since(self, since_ns: int) -> None:
+        self._port.request_since(since_ns)
+
     def wake_up(self, incoming: Incoming | None = None) -> None:
         self._port.wake_up(incoming)
 

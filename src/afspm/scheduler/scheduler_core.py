@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from afspm.basics.frozen import replace
@@ -209,6 +209,10 @@ class SchedulerCore:
     def cached(self) -> Iterable[LoggedPacket]:
         """Return the packets in the cache (with `source_ns`), oldest first."""
         return self._env.cache
+
+    def newest(self) -> Mapping[str, int]:
+        """Return the time of the newest cached packet of each envelope."""
+        return self._env.cache.newest()
 
     @property
     def newest_source_ns(self) -> int:

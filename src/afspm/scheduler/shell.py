@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
 
 from afspm import wire
@@ -89,9 +89,11 @@ class ShellSockets(Protocol):
 
     Attributes:
         history: returns the packets that a subscriber lacks when it joins.
+        newest: returns the time of the newest kept packet of each envelope.
     """
 
     history: Callable[[Hashable, tuple[str, ...], int], Iterable[Packet]]
+    newest: Callable[[], Mapping[str, int]]
 
     @property
     def due_s(self) -> float:
@@ -183,7 +185,7 @@ class SchedulerShell:
         self._observer = observer
         if worker is not None:
             worker.wake = sockets.wake_up
-        sockets.history = self._history
+        sockets.history, sockets.newest = self._history, core.newest
 
     def start(self) -> None:
         effects = self._core.start(self._clock.monotonic_s(), self._clock.now_ns())

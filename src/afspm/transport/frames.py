@@ -53,11 +53,14 @@ def send_frames(socket: Socket, frames: Sequence[bytes]) -> bool:
 
 
 def send_packet(socket: Socket, packet: Packet, stamp: bytes | None, *, topic: bytes | None = None) -> None:
-    """Publish a packet; a received payload is sent from its own buffer.
+    """Publish a packet; a received payload is sent from its own buffer. Never blocks.
 
     Args:
         stamp: the third frame, a serialised time; None: the packet has two frames.
         topic: frame before the envelope, for a replay to one subscriber; None: no such frame.
+
+    Raises:
+        zmq.Again: the queue of a subscriber is full, and the socket may not drop packets (XPUB_NODROP).
     """
     payload: Buffer | zmq.Frame = packet.payload
     if isinstance(payload, memoryview):
@@ -65,11 +68,11 @@ def send_packet(socket: Socket, packet: Packet, stamp: bytes | None, *, topic: b
         # copy any other buffer: it may change while ZeroMQ is still sending it
         payload = origin if isinstance(origin, zmq.Frame) and len(origin) == payload.nbytes else payload.tobytes()
     if topic is not None:
-        socket.send(topic, _MORE)
-    socket.send(packet.envelope.encode(), _MORE)
-    socket.send(payload, 0 if stamp is None else _MORE, copy=False)  # libzmq copies small frames all the same
+        socket.send(topic, _NOW | _MORE)
+    socket.send(packet.envelope.encode(), _NOW | _MORE)
+    socket.send(payload, _NOW if stamp is None else _NOW | _MORE, copy=False)  # libzmq copies small frames all the same
     if stamp is not None:
-        socket.send(stamp)
+        socket.send(stamp, _NOW)
 
 
 def descriptor_of(frame: zmq.Frame) -> int:

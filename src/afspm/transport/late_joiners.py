@@ -7,6 +7,10 @@ A subscriber of afspm subscribes to a marker: a topic for this subscriber that a
 The publisher sends the kept packets as `[topic, envelope, message, timestamp]` and finally `[topic]` alone; the topic
 is the first part of the marker, to which only this subscriber is subscribed.
 
+From then on the subscriber also gets a beacon each second, `[\0newest, <envelope> \0 <time_ns> \0 <envelope> …]`: the
+newest kept packet of each envelope. A beacon comes through the same pipe as the packets, after all that were published
+before it. So a packet that it names and that has not arrived was dropped, and is requested by a marker of its own.
+
 The publisher's socket (XPUB in manual mode) subscribes the peer to its topic and its prefixes at once, between two
 packets. So replayed and new packets come through one pipe, in order and without a gap. A snapshot over the request
 socket would have to be joined with the live packets by time, and a replay to all subscribers reaches every component.
@@ -15,16 +19,23 @@ socket would have to be joined with the live packets by time, and a replay to al
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from heapq import nlargest
 from typing import NamedTuple
 
 from afspm.basics.clock import Clock
+from afspm.basics.errors import WireError
 from afspm.model import Packet
 from afspm.wire import Buffer
 
 History = Callable[[Hashable, tuple[str, ...], int], Iterable[Packet]]
 """(subscriber, prefixes, since_ns) -> later packets under these prefixes, oldest first."""
 
+Newest = Callable[[], Mapping[str, int]]
+"""() -> time of the newest kept packet of each envelope, ns."""
+
+BEACON = b"\0newest"
+"""Topic of a publisher's beacon."""
 LONGEST = 8 << 10
 """Longest marker, in bytes."""
 _BEGIN = b"\0replay/"
@@ -32,6 +43,7 @@ _LONGEST_NONCE = 9
 _MOST_PREFIXES = 1000
 _MOST_PACKETS = 1000
 _MOST_BYTES = 256 << 20
+_MOST_IN_BEACON = 64
 
 # An envelope is text, so it begins with one of these bytes. They replace the empty prefix ("everything"), which would
 # also match the replays for other subscribers.
@@ -86,9 +98,31 @@ class Marker(NamedTuple):
         return name, nonce
 
 
-def topic(name: str, nonce: int) -> bytes:
+def topic(name: str, nonce: int | str) -> bytes:
     """Return a topic of the subscriber `name`, different for each request."""
-    return _BEGIN + name.replace("\0", "").encode() + b"/%d" % nonce
+    return _BEGIN + f"{name}/{nonce}".replace("\0", "").encode()
+
+
+def encode_newest(newest: Mapping[str, int]) -> bytes:
+    """Return the content of a beacon: the `_MOST_IN_BEACON` newest of some envelopes, with their times."""
+    # an envelope holds texts of the microscope, such as names of channels, and a NUL would end it here
+    readable = ((time_ns, envelope) for envelope, time_ns in newest.items() if "\0" not in envelope)
+    return "\0".join(f"{envelope}\0{time_ns}" for time_ns, envelope in nlargest(_MOST_IN_BEACON, readable)).encode()
+
+
+def decode_newest(content: bytes) -> dict[str, int]:
+    """Return the times in a beacon, by envelope.
+
+    Raises:
+        WireError: the bytes are no beacon.
+    """
+    if not content:
+        return {}
+    try:
+        parts = content.decode().split("\0")
+        return dict(zip(parts[::2], map(int, parts[1::2]), strict=True))
+    except ValueError as error:
+        raise WireError(f"a beacon can't be read: {error}") from None
 
 
 def is_reserved(subscription: bytes) -> bool:
@@ -145,6 +179,10 @@ class PublishedHistory:
     def last(self, prefixes: tuple[str, ...]) -> list[Packet]:
         """Return the last packet of every envelope under `prefixes`, oldest first."""
         return [packet for envelope, packet in self._last.items() if envelope.startswith(prefixes)]
+
+    def newest(self) -> dict[str, int]:
+        """Return the time of the last packet of each envelope."""
+        return {envelope: packet.time_ns or 0 for envelope, packet in self._last.items()}
 
     def __call__(self, _who: Hashable, prefixes: tuple[str, ...], since_ns: int) -> list[Packet]:
         """Return the kept packets under `prefixes` after `since_ns`, oldest first."""

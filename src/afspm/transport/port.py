@@ -95,6 +95,9 @@ class Port(Protocol):
             ConfigError: the component has no address to publish on.
         """
 
+    def request_since(self, since_ns: int) -> None:
+        """Request all kept packets after `since_ns` again; `poll` returns the new ones. Never blocks."""
+
     def wake_up(self, incoming: Incoming | None = None) -> None:
         """End the present or next `poll`, which returns `incoming` with all other events.
 

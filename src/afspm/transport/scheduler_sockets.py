@@ -12,7 +12,7 @@ from afspm.basics.errors import ConfigError
 from afspm.basics.launch import Launch
 from afspm.model import Packet
 from afspm.transport.frames import receive_frames, send_frames
-from afspm.transport.late_joiners import History
+from afspm.transport.late_joiners import History, Newest
 from afspm.transport.network import CONNECTED, DISCONNECTED, Monitor, Network
 from afspm.transport.polling import Poller, WakeUp
 from afspm.transport.port import Incoming
@@ -132,8 +132,7 @@ class SchedulerSockets:
         self._network = Network.from_launch(launch.name, launch.keys)
         self._wake_up: WakeUp[None] = WakeUp()
         self._clock = clock
-        self._has_ended = False
-        self.publisher = Publisher(self._network, sockets.publish, _nothing, log)
+        self.publisher = Publisher(self._network, sockets.publish, _nothing, dict, log)
         self.router = Router(self._network, sockets.serve, log, clock)
         self.link = TranslatorLink(self._network, sockets.control, log, epoch)
         self.subscriber = Subscriber(
@@ -155,9 +154,18 @@ class SchedulerSockets:
         self.publisher.history = history
 
     @property
+    def newest(self) -> Newest:
+        """Return the time of the newest kept packet of each envelope."""
+        return self.publisher.newest
+
+    @newest.setter
+    def newest(self, newest: Newest) -> None:
+        self.publisher.newest = newest
+
+    @property
     def due_s(self) -> float:
         """Real monotonic time at which `receive` must be called even if no source is ready."""
-        return self.router.due_s
+        return min(self.router.due_s, self.publisher.due_s)
 
     def receive(self, ready: Sequence[Source]) -> Iterator[Sequence[SocketEvent]]:
         """Yield the events of each ready source, and let new subscribers join."""
@@ -172,8 +180,10 @@ class SchedulerSockets:
                 yield self.subscriber.receive()
             elif source is self.subscriber.monitor:
                 self.subscriber.follow()
-            elif self.publisher.serve() and self._has_ended:
-                self.publisher.kill()  # a subscriber that joins now has missed the signal
+            else:
+                self.publisher.serve()
+        if self._clock.monotonic_s() >= self.publisher.due_s:
+            self.publisher.serve()
         if self._clock.monotonic_s() >= self.router.due_s:
             yield self.router.receive()
 
@@ -190,9 +200,7 @@ class SchedulerSockets:
 
     def end(self) -> None:
         """Send the end of the experiment to all subscribers, and to each that joins later."""
-        self.publisher.serve()  # a subscriber that connects at this moment gets the end, too
         self.publisher.kill()
-        self._has_ended = True
 
     def wait(self, timeout_ms: int | None) -> list[Source]:
         """Return the readable sources, after a wait of up to `timeout_ms` (None: without limit).

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import math
+import time
 from collections.abc import Callable, Sequence
 from typing import Generic, TypeVar
 
@@ -38,7 +40,7 @@ class BasePort(Generic[T]):
         self._closed = False
         self._log = RateLimitedLog(logging.getLogger("afspm.transport"), clock)
         if publish is not None:
-            self._publisher = Publisher(network, publish, self._published, self._log)
+            self._publisher = Publisher(network, publish, self._published, self._published.newest, self._log)
             self._poller.register(self._publisher.socket, self._serve)
 
     @property
@@ -51,10 +53,15 @@ class BasePort(Generic[T]):
         return self._publisher.address if self._publisher else None
 
     def poll(self, timeout_s: float | None) -> list[T]:
+        if self._publisher is not None and self._publisher.due_s != math.inf:
+            due_s = self._publisher.due_s - time.monotonic()
+            timeout_s = due_s if timeout_s is None else min(timeout_s, due_s)
         receivers, woken = self._poller.wait(milliseconds(timeout_s))
         found = self._wake_up.take() if woken else []
         for receive in receivers:
             found += receive()
+        if self._publisher is not None and time.monotonic() >= self._publisher.due_s:
+            found += self._serve()
         return found
 
     def wake_up(self, incoming: T | None = None) -> None:
@@ -110,8 +117,8 @@ class ZmqPort(BasePort[Incoming]):
             self._control = ControlClient(network, name, control, self._log)
             self._poller.register(self._control.socket, self._control.receive)
             self._poller.register(self._control.monitor.socket, self._control.follow)
-        for address in subscribe:
-            subscriber = Subscriber(network, name, address, envelopes, self._log)
+        self._subscribers = [Subscriber(network, name, address, envelopes, self._log) for address in subscribe]
+        for subscriber in self._subscribers:
             self._poller.register(subscriber.socket, subscriber.receive)
             self._poller.register(subscriber.monitor.socket, subscriber.follow)
 
@@ -126,6 +133,10 @@ class ZmqPort(BasePort[Incoming]):
         if self._publisher is None:
             raise ConfigError("this component has no address to publish on", where=self._name, hint="publish = address")
         self._publisher.publish(self._published.stamp(envelope, payload))
+
+    def request_since(self, since_ns: int) -> None:
+        for subscriber in self._subscribers:
+            subscriber.request_since(since_ns)
 
 
 def open_port(launch: Launch, clock: Clock) -> ZmqPort:

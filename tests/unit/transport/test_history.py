@@ -51,7 +51,7 @@ def test_a_replay_has_only_packets_newer_than_the_time_in_its_marker(
     """Subscribers drop repeated packets, so only the wire shows a needless replay."""
     published, packets = three
     network = open_(Network())
-    publisher = Publisher(network, "tcp://127.0.0.1:0", published, LOG)
+    publisher = Publisher(network, "tcp://127.0.0.1:0", published, published.newest, LOG)
     subscriber = plain(zmq.XSUB)  # a SUB socket would drop a topic that it has not subscribed to itself
     subscriber.connect(publisher.address)
     topic = late_joiners.topic("Late", 1)

@@ -39,7 +39,7 @@ def publisher(monkeypatch: pytest.MonkeyPatch, open_: Any) -> Any:
     class Lab:
         def __init__(self) -> None:
             self.network = Network()
-            self.publisher = Publisher(self.network, ANY, published, LOG)
+            self.publisher = Publisher(self.network, ANY, published, published.newest, LOG)
             self._monitor = Monitor(self.network, self.publisher.socket, DISCONNECTED)
             self.address = self.publisher.address
 

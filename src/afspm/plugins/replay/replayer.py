@@ -54,7 +54,7 @@ class Replayer:
         self._published = PublishedHistory(clock)
         self._wake_up: WakeUp[None] = WakeUp()
         try:
-            self._publisher = Publisher(self._network, publish, self._published, log)
+            self._publisher = Publisher(self._network, publish, self._published, self._published.newest, log)
             self._router = Router(self._network, serve, log, clock)
         except TransportError:
             self.close()
@@ -63,7 +63,7 @@ class Replayer:
         self._poller.register(self._publisher.socket, self._publisher.serve)
         for socket in (self._router.socket, self._router.monitor.socket):
             self._poller.register(socket, self._answer)
-        self._ended = self._stopping = False
+        self._stopping = False
         self.count = 0
         """The number of packets published."""
 
@@ -88,9 +88,6 @@ class Replayer:
         return self._wake_up.writer_fileno()
 
     def _publish_end(self) -> None:
-        # a subscriber that connects at this moment gets the end, too
-        self._ended = True
-        self._publisher.serve()
         self._publisher.kill()
         until_s = self._clock.monotonic_s() + FAREWELL_S
         while (left_s := until_s - self._clock.monotonic_s()) > 0.0:
@@ -116,14 +113,14 @@ class Replayer:
             self.count += 1
 
     def _serve(self, within_s: float) -> None:
+        within_s = min(within_s, max(0.0, self._publisher.due_s - self._clock.monotonic_s()))
         timeout = None if within_s == math.inf else milliseconds(within_s)
         drains, woken = self._poller.wait(timeout)
         if woken:
             self._wake_up.take()
         for drain in drains:
             drain()
-        if self._ended and self._publisher.serve():
-            self._publisher.kill()
+        self._publisher.serve()
 
     def _answer(self) -> None:
         for event in self._router.receive():

@@ -332,6 +332,9 @@ class ReplayPort:
         """Whether all recorded events are delivered and all recorded outputs are passed."""
         return self._recorded.line is None and not self._pending
 
+    def request_since(self, since_ns: int) -> None:
+        """Do nothing: the record has what came."""
+
     def wake_up(self, incoming: Incoming | None = None) -> None:
         if incoming is not None:
             self._pending.append(incoming)

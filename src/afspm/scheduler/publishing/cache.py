@@ -109,6 +109,10 @@ class PacketCache:
         self._recent.append((packet.time_ns, _NEVER_NS))
         return is_new
 
+    def newest(self) -> dict[str, int]:
+        """Return the time of the newest cached packet of each envelope."""
+        return {envelope: times[-1] for envelope, times in self._times.items()}
+
     def recent(self) -> list[tuple[int, int]]:
         """Return (translator's time, published time) of the last packets, for `remember` after a restart.
 

@@ -289,6 +289,10 @@ class ComponentProcess(BlockingProcess):
         came, self._inbox = self._inbox, []
         return came
 
+    def request_since(self, since_ns: int) -> None:
+        for feed in self._feeds:
+            feed.request_since(since_ns)
+
     def wake(self, incoming: Incoming | None) -> None:
         if incoming is not None:
             self._inbox.append(incoming)
@@ -312,6 +316,9 @@ class MemoryPort:
 
     def publish(self, envelope: str, payload: bytes) -> None:
         self._host.publish(envelope, payload)
+
+    def request_since(self, since_ns: int) -> None:
+        self._host.request_since(since_ns)
 
     def wake_up(self, incoming: Incoming | None = None) -> None:
         self._host.wake(incoming)

@@ -214,6 +214,11 @@ class Feed:
         if self._joined and self._back is not None and packet.envelope.startswith(self._prefixes):
             self._back.send(self._listener.received, self, packet)
 
+    def request_since(self, since_ns: int) -> None:
+        """Ask for the kept packets after `since_ns` again."""
+        if self._there is not None and self._back is not None:
+            self._there.send(self._join, since_ns, self._back)
+
     def kill_signal(self) -> None:
         if self._back is not None:
             self._back.send(self._listener.killed, self)

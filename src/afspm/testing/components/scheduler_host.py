@@ -30,7 +30,7 @@ from afspm.testing.components.memory_network import (
 )
 from afspm.testing.components.simulated_process import Process, ProcessTimer
 from afspm.testing.components.simulated_time import SimulatedTime
-from afspm.transport.late_joiners import History
+from afspm.transport.late_joiners import History, Newest
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.router import PeerAsked, PeerConnected, PeerDisconnected, RouterEvent
@@ -217,7 +217,7 @@ class SimulatedSockets:
     first, then answers and packets of the translator, then the changes of its connection.
 
     Attributes:
-        history: see `afspm.scheduler.shell.ShellSockets`.
+        history, newest: see `afspm.scheduler.shell.ShellSockets`.
         due_s: never.
     """
 
@@ -227,6 +227,7 @@ class SimulatedSockets:
         self, host: SchedulerHost, weather: Weather, messages: Messages, server: LineServer, publisher: PacketSource
     ) -> None:
         self.history: History = lambda subscriber, prefixes, since_ns: ()
+        self.newest: Newest = dict  # lines in memory lose no packet of a connection, and need no beacon
         self._host = host
         self._messages = messages
         self._clients = host.clients
