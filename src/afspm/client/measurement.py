@@ -34,6 +34,9 @@ from afspm.wire.messages import ACT_BY_HAND
 BEGUN_WITHIN_S = 2 * CUT_OFF_SHOWS_WITHIN_S
 """Limit in real time from the accepted action to the published start. The connection may break in between; until a
 break is certain to be detected, a new request might measure twice."""
+FREE_WITHOUT_RESULT_S = CUT_OFF_SHOWS_WITHIN_S
+"""Real time for the results of a microscope that is free. They are published before the state FREE, for which the
+translator waits up to its `result_timeout_s` for them; but a packet that was lost comes after it, or never."""
 STOPPED_WITHIN_S = 10.0  # after an interrupt by the user
 IDLE_AFTER_S = 5.0  # the same, if no start was seen
 MOST_FAILURES = 5  # unexplained ones in a row, before a person has to look
@@ -45,6 +48,7 @@ class _Watch:
     def __init__(self, link: ExperimentLink, target: Target, cycle: Cycle) -> None:
         self._link = link
         self._message = target.message
+        self._since_ns = -1 if link.view.newest_ns is None else link.view.newest_ns
         self.cycle = cycle
         self.close = link.listen(self._take)
 
@@ -58,7 +62,30 @@ class _Watch:
     def wait_over(self, until_s: float | None) -> bool:
         # late from the moment of publication: a drift correction may register the result before it is passed on
         with self._link.clock.late(Publication.RESULTS):
-            return self._link.wait(self.is_over, until_s)
+            while self._link.wait(lambda: self.is_over() or self._is_free, until_s) and not self.is_over():
+                if self._stays_free(until_s):
+                    self._ask_for_result(until_s)
+                elif until_s is not None and self._link.clock.monotonic_s() >= until_s:
+                    break
+        return self.is_over()
+
+    @property
+    def _is_free(self) -> bool:
+        return self.cycle.begun and self._link.view.state is ScopeState.FREE
+
+    def _stays_free(self, until_s: float | None) -> bool:
+        end_s = self._link.clock.monotonic_s() + FREE_WITHOUT_RESULT_S
+        is_in_time = until_s is None or end_s < until_s
+        goes_on = self._link.wait(lambda: self.is_over() or not self._is_free, end_s if is_in_time else until_s)
+        return is_in_time and not goes_on
+
+    def _ask_for_result(self, until_s: float | None) -> None:
+        link = self._link
+        text = "the microscope has been free for %g s, and its %s has not arrived: asking for the newest packets"
+        link.log.warning(text, FREE_WITHOUT_RESULT_S, self._message)
+        link.port.request_since(self._since_ns)
+        if self._stays_free(until_s):
+            self.cycle.on_state(ScopeState.FREE, link.view.newest_ns)  # without a result by now it is lost
 
     def _take(self, packet: Packet, ours: bool) -> None:
         if not ours:

@@ -306,6 +306,52 @@ def test_a_scan_whose_beginning_was_lost_with_the_connection_is_recognised(lab: 
     assert lab.begun_scans == 1
 
 
+def lose_second_channel(lab: Lab) -> None:
+    """Lose the beginning and the second channel of the next scan, whose first one arrives after the state FREE."""
+    go = lab.go
+
+    def late_result() -> None:
+        go(ScopeState.FREE)
+        lab.publish_scan(REGION)
+        lab.lost.append(lab.inbox.pop())
+
+    def without_busy(state: ScopeState) -> None:
+        lab.state = state
+        lab.go = go  # type: ignore[method-assign]
+        lab.at(2.0, late_result)
+
+    lab.intercept = lambda request: (
+        (setattr(lab, "go", without_busy) if request.subject == "start-scan" and not lab.begun_scans else None)
+        or "go on"
+    )
+
+
+def test_lost_result_of_a_free_microscope_is_asked_for(
+    lab: Lab, scope: Scope, caplog: pytest.LogCaptureFixture
+) -> None:
+    # faults 3
+    lose_second_channel(lab)
+    scans = scope.scan(REGION)
+    assert list(scans) == ["Height", "Phase"]
+    assert lab.begun_scans == 1
+    assert lab.clock.passed_s < SCAN_S
+    assert "the microscope has been free for 10 s, and its Scan2d has not arrived" in caplog.text
+
+
+def test_lost_result_of_a_free_microscope_is_not_waited_for_without_end(lab: Lab, scope: Scope) -> None:
+    # faults 3
+    lose_second_channel(lab)
+    lab.request_since = lambda since_ns: None  # type: ignore[method-assign]
+    assert list(scope.scan(REGION)) == ["Height"]
+
+
+def test_time_limit_ends_the_wait_for_a_lost_result(lab: Lab, scope: Scope) -> None:
+    lose_second_channel(lab)
+    with pytest.raises(NoResponse, match="not finished in time"):
+        scope.scan(REGION, timeout_s=8.0)
+    assert lab.clock.passed_s < 9.0
+
+
 def test_scan_is_not_taken_twice_if_the_connection_is_cut_at_its_start(lab: Lab, scope: Scope) -> None:
     publish = lab.publish
 
