@@ -82,6 +82,7 @@ def test_plain_subscribers_that_join_together_share_one_replay(lab: PublisherLab
         for prefix in (b"Scan2d", b"ScopeStateMsg", b"KILL"):
             socket.subscribe(prefix)
         socket.connect(lab.address)
+        lab.poll(0.02)
 
     def all_have_all() -> bool:
         for socket, received in zip(sockets, got, strict=True):

@@ -13,7 +13,7 @@ from afspm.basics.clock import Clock
 from afspm.model import CLOCK_REQUEST, ControlResponse
 from afspm.transport.frames import receive_frames
 from afspm.transport.keys import Keys
-from afspm.transport.late_joiners import LONGEST, Marker
+from afspm.transport.late_joiners import BEACON, LONGEST, Marker
 from afspm.transport.network import ACCEPTED, Monitor, Network
 from afspm.transport.polling import Poller, WakeUp, milliseconds
 
@@ -172,3 +172,6 @@ class ScriptedScheduler:
             for packet in self.cached:
                 self._publisher.send_multipart([marker.topic, *packet])
             self._publisher.send(marker.topic)
+            # a client may ignore it, but must not take it for a packet
+            self._publisher.setsockopt(zmq.SUBSCRIBE, BEACON)
+            self._publisher.send_multipart([BEACON, b""])
