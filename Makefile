@@ -8,7 +8,7 @@ TEST := .venv/.test
 DEV := .venv/.dev
 
 .PHONY: demo demo-drift dev test test-times test-all test-slow test-power-cut test-apart test-lowest mutants test-samples test-matrix test-nion coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
-.PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift bench-guests soak chaos simulate replay-nights power-cut docs release-check test-plug-ins changelog clean
+.PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift bench-guests soak chaos crowd simulate replay-nights power-cut docs release-check test-plug-ins changelog clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml packages/afspm-bench/pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -225,6 +225,11 @@ NIGHTS ?= 20
 CHAOS_SEED ?= $(shell date +%s)
 chaos: $(TEST)
 	@$(BIN)/python -m benchmarks.chaos --nights $(NIGHTS) --seed $(CHAOS_SEED)
+
+## plain subscribers that join and leave in crowds, on a run without keys: make crowd SCANS=40
+SCANS ?= 40
+crowd: $(TEST)
+	@$(BIN)/python -m benchmarks.crowd --scans $(SCANS)
 
 ## a long deterministic simulation: make simulate HOURS=100000 SEED=1
 HOURS ?= 20000
