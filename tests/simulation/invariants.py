@@ -146,6 +146,9 @@ class Invariants:
         if self._losses != host.disk.losses:
             self._losses = host.disk.losses
             self.forgets()
+        # a power cut takes the last moment of the log: these packets may be published at other times
+        while host.disk.forgotten:
+            self._by_source.pop(host.disk.forgotten.pop(), None)
 
     def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:
         """Check the state after a step."""

@@ -14,7 +14,7 @@ from afspm.model import ProcessCondition
 from afspm.scheduler.control.holder_timeout import MOST_RESTARTS
 from tests.simulation import long_run
 from tests.simulation.behaviours import Experiment
-from tests.simulation.night import CAST, FAULTS, FINDERS, PANEL_NIGHTS, Fault, Night, Plan, panel_night, plan
+from tests.simulation.night import CAST, FAULTS, FINDERS, PANEL_NIGHTS, Fault, Night, Plan, bad_night, panel_night, plan
 
 _ALIVE = ProcessCondition.ALIVE
 ALL_SEEDS = [range(first, first + 5) for first in range(0, 150, 5)]
@@ -99,6 +99,11 @@ def test_two_changes_of_control_after_an_outage_are_published_one_by_one() -> No
     cast = tuple(CAST)
     night = Plan(0, hours=2.0, speed=200.0, cast=cast, impostor=False, lease_s=900.0)
     Night(replace(night, faults=(*faults, Fault("cut", "scheduler", 0.0, 40.0)), dies_in_step=0.0, doubles=0.05)).run()
+
+
+def test_packets_that_a_power_cut_took_may_be_published_at_other_times() -> None:
+    """A life publishes four packets and dies before they are synced; the next life publishes a request before them."""
+    Night(bad_night(36)).run()  # faults 16
 
 
 _targets = st.sampled_from(["scheduler", "translator", *CAST])

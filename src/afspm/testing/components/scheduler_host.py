@@ -58,6 +58,8 @@ class SimulatedDisk:
         delay_s: the real time that a write takes; a kill loses the writes under way.
         stale: True while the newest state or packet is not on the disk.
         losses: number of lives that ended with writes under way.
+        forgotten: the translator's times of packets that were published, and that the end of a life took from the disk
+            before they were synced. The saved state does not list them, so a restart publishes them at another time.
     """
 
     state: SavedState | None = None
@@ -66,6 +68,7 @@ class SimulatedDisk:
     delay_s: float = 0.0
     stale: bool = False
     losses: int = 0
+    forgotten: set[int] = field(default_factory=set)
 
     def keep(self, entry: LoggedPacket) -> None:
         """Append a packet; see `afspm.storage.packet_log.cached_packets`."""
@@ -114,9 +117,12 @@ class SimulatedWriteAhead:
             self._host.later(self._last_s - now_s, self._host.guarded, self._arrives)
 
     def end(self) -> None:
-        """Lose the writes under way."""
+        """Lose the writes under way, and the packets that are not synced."""
         self._disk.losses += bool(self._under_way)
         self._under_way.clear()
+        remembered = {source_ns for source_ns, _ in (self._disk.state.recent if self._disk.state else ())}
+        lost = {entry.source_ns for entry in self._unsynced if entry.source_ns is not None}
+        self._disk.forgotten |= lost - remembered
 
     def close(self) -> None:
         """Do nothing: all writes have arrived."""
