@@ -9,7 +9,9 @@ SQLite's own syncs are invisible here: its main file counts as synced when its w
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
+import math
 import os
 import shutil
 import stat
@@ -25,54 +27,61 @@ _fsync, _unlink, _replace, _rename = os.fsync, os.unlink, os.replace, os.rename
 
 
 class Shadow:
-    """The synced state, kept beside the folder: contents by file, and names by folder."""
+    """The synced state, kept beside the folder: contents by file, and names by folder.
+
+    The time of a content is the start of its sync, in monotonic time.
+    """
 
     def __init__(self, folder: str) -> None:
         self._folder = folder
         root = Path(f"{folder}.disk")
         self._files, self._contents, self._names = root / "files", root / "contents", root / "names"
-        self._under_way = root / "under_way"
-        for each in (self._files, self._contents, self._names, self._under_way):
+        self._locks = root / "locks"
+        for each in (self._files, self._contents, self._names, self._locks):
             each.mkdir(parents=True, exist_ok=True)
 
-    def sync(self, descriptor: int) -> None:
+    def sync(self, descriptor: int, began_s: float) -> None:
         """Record the sync of a file or a folder."""
         path = str(Path(f"/proc/self/fd/{descriptor}").readlink())
-        if not f"{path}/".startswith(f"{self._folder}/"):
-            return
         found = os.fstat(descriptor)
+        if not self._watches(path) or not found.st_nlink:
+            return
         if stat.S_ISDIR(found.st_mode):
             self._sync_names(path)
             return
-        self._sync_content(path, found.st_ino)
+        # by the descriptor: the file may get another name meanwhile
+        files = {found.st_ino: f"/proc/self/fd/{descriptor}"}
         if path.endswith(WAL):
             main = path.removesuffix(WAL)
-            self._sync_content(main, os.stat(main).st_ino)  # noqa: PTH116
+            files[os.stat(main).st_ino] = main  # noqa: PTH116
+        self._sync_contents(files, began_s)
+
+    def synced_s(self, suffix: str) -> float:
+        """Return the start of the last sync of the files with a suffix: what was written before it is kept."""
+        names = (json.loads(known.read_text())["names"] for known in self._known())
+        kept = (self._contents / content for one in names for name, content in one.items() if name.endswith(suffix))
+        return max((one.stat().st_mtime for one in kept if one.exists()), default=-math.inf)
+
+    def _watches(self, path: Any) -> bool:
+        return f"{path}/".startswith(f"{self._folder}/")
 
     @contextlib.contextmanager
-    def syncing(self) -> Iterator[None]:
-        """Record a running sync: a copy of the whole file here, which takes far longer than on a disk."""
-        mark = self._under_way / str(uuid.uuid4())
-        mark.write_text(str(time.monotonic()))
-        try:
+    def _locked(self, name: str = "names") -> Iterator[None]:
+        # between threads and processes: an older state recorded over a newer one would be a false loss
+        with (self._locks / name).open("wb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
             yield
-        finally:
-            _unlink(mark)
 
-    def longest_under_way_s(self) -> float:
-        """Return the age of the oldest unfinished sync, and forget all."""
-        now_s, longest_s = time.monotonic(), 0.0
-        for mark in self._under_way.iterdir():
-            began = mark.read_text()
-            longest_s = max(longest_s, now_s - float(began) if began else 0.0)
-            _unlink(mark)
-        return longest_s
-
-    def _sync_content(self, path: str, number: int) -> None:
-        name = self._content_of(number) or self._named(number)
-        aside = self._contents / f".{uuid.uuid4()}"
-        shutil.copyfile(path, aside)
-        _replace(aside, self._contents / name)
+    def _sync_contents(self, files: dict[int, str], began_s: float) -> None:
+        with self._locked(f"content-{min(files)}"):
+            copies = {}
+            for number, path in files.items():
+                copies[number] = self._contents / f".{uuid.uuid4()}"
+                shutil.copyfile(path, copies[number])
+                os.utime(copies[number], (began_s, began_s))
+            # together: a kill between the copies would part SQLite's main file from its log
+            for number, aside in copies.items():
+                _replace(aside, self._contents / (self._content_of(number) or self._named(number)))
 
     def _content_of(self, number: int) -> str:
         with contextlib.suppress(FileNotFoundError):
@@ -93,21 +102,34 @@ class Shadow:
         return name
 
     def _sync_names(self, path: str) -> None:
-        names = {
-            entry.name: self._content_of(entry.inode()) or self._named(entry.inode())
-            for entry in os.scandir(path)
-            if entry.is_file(follow_symlinks=False)
-        }
-        aside = self._names / f".{uuid.uuid4()}"
-        aside.write_text(json.dumps({"folder": path, "names": names}))
-        _replace(aside, self._names / path.replace("/", "%"))
+        with self._locked():
+            names = {
+                entry.name: self._content_of(entry.inode()) or self._named(entry.inode())
+                for entry in os.scandir(path)
+                if entry.is_file(follow_symlinks=False)
+            }
+            aside = self._names / f".{uuid.uuid4()}"
+            aside.write_text(json.dumps({"folder": path, "names": names}))
+            _replace(aside, self._names / path.replace("/", "%"))
 
-    def forget(self, path: Any) -> None:
-        """Forget the file of this name, unless it has another name: its inode number may be reused."""
-        with contextlib.suppress(OSError):
-            found = os.lstat(path)
-            if str(path).startswith(self._folder) and stat.S_ISREG(found.st_mode) and found.st_nlink == 1:
-                _unlink(self._files / str(found.st_ino))
+    @contextlib.contextmanager
+    def removing(self, path: Any) -> Iterator[None]:
+        """Forget the file of this name once it is removed, unless it has another name: its number may be reused."""
+        if not self._watches(path):
+            yield
+            return
+        # no list of names is made meanwhile: it would give the file that is removed a new, empty content
+        with self._locked():
+            found = None
+            with contextlib.suppress(OSError):
+                found = os.lstat(path)
+            yield
+            if found is not None and stat.S_ISREG(found.st_mode) and found.st_nlink == 1:
+                with contextlib.suppress(FileNotFoundError):
+                    _unlink(self._files / str(found.st_ino))
+
+    def _known(self) -> list[Path]:
+        return [known for known in self._names.iterdir() if not known.name.startswith(".")]
 
     def restore(self) -> None:
         """Set the folder to its state after a power cut."""
@@ -122,7 +144,7 @@ class Shadow:
     def copy(self, into: Path) -> list[tuple[Path, str]]:
         """Write the state after a power cut to another folder; return each file with the name of its content."""
         copied = []
-        for known in [known for known in self._names.iterdir() if not known.name.startswith(".")]:
+        for known in self._known():
             told = json.loads(known.read_text())
             folder = into / Path(told["folder"]).relative_to(self._folder)
             folder.mkdir(parents=True, exist_ok=True)
@@ -138,16 +160,16 @@ def watch(shadow: Shadow) -> None:
 
     def syncing(call: Callable[[int], None]) -> Callable[..., None]:
         def called(descriptor: int) -> None:
-            with shadow.syncing():
-                call(descriptor)
-                shadow.sync(descriptor)
+            began_s = time.monotonic()
+            call(descriptor)
+            shadow.sync(descriptor, began_s)
 
         return called
 
     def removing(call: Callable[..., None], which: int) -> Callable[..., None]:
         def called(*arguments: Any, **options: Any) -> None:
-            shadow.forget(arguments[which])
-            call(*arguments, **options)
+            with shadow.removing(arguments[which]):
+                call(*arguments, **options)
 
         return called
 

@@ -33,13 +33,14 @@ from afspm import wire
 from afspm.basics.clock import ExperimentClock
 from afspm.client.connect import connect
 from afspm.model import ControlMode, Packet, ScopeState
+from afspm.storage.segment import SUFFIX
 from afspm.wire import KILL, decode_packet
 
 CLOCK = ExperimentClock.real()
 DEADLINE_S = 480.0
-LOSS_S = 1.5
-"""Packets published in this time before a power cut may be lost. A tenth of a second is guaranteed; the
-rest is for a busy machine. A running sync adds its time: it copies whole files here."""
+LATEST_S = 30.0
+"""A packet seen earlier before a cut must be recorded; later, if it was seen before the last sync of the log began. The
+promise is a tenth of a second, but a sync copies whole files here, and the computer may be busy."""
 LOSSY = Path(__file__).parents[2] / "support" / "lossy_disk"
 LONGEST_LIFE_S = 2.5
 """From the first scan of a life to the cut; in every fourth life, from its first line."""
@@ -58,7 +59,7 @@ live_lines_s = "5 s"
 
 [scheduler]
 component = true
-class = "Scheduler"
+class = "patient_scheduler.PatientScheduler"
 
 [tireless]
 component = true
@@ -177,14 +178,14 @@ class Life:
 
     def __post_init__(self) -> None:
         self._incoming: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-        lossy = {"PYTHONPATH": str(LOSSY), "LOSSY_FOLDER": str(self.folder / "runs")} if self.lossy else {}
+        lossy = {"LOSSY_FOLDER": str(self.folder / "runs")} if self.lossy else {}
         self.process = subprocess.Popen(
             self.command,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             cwd=self.folder,
             start_new_session=True,
-            env={**os.environ, **lossy},
+            env={**os.environ, "PYTHONPATH": str(LOSSY), **lossy},
         )
         threading.Thread(target=self._read, daemon=True).start()
 
@@ -247,7 +248,8 @@ def power_cuts(folder: Path, cuts: int, seed: int, tell: Any = lambda text: None
     (folder / "experiment.toml").write_text(EXPERIMENT.format(seed=seed), encoding="utf-8")
     (folder / "tireless.py").write_text(COMPONENT, encoding="utf-8")
     witness = Witness()
-    cuts_s: list[tuple[float, float]] = []
+    lost_s: list[tuple[float, float]] = []
+    since_s: float | None = None
     command: tuple[str, ...] = (*COMMAND, "experiment.toml")
     try:
         for number in range(cuts + 1):
@@ -256,6 +258,8 @@ def power_cuts(folder: Path, cuts: int, seed: int, tell: Any = lambda text: None
             assert begun is not None, "\n".join(life.lines)
             run = Path(begun.rpartition(", into ")[2])
             facts = json.loads((run / "run.json").read_text(encoding="utf-8"))
+            if since_s is not None:  # up to now it may receive packets that were under way at the cut
+                lost_s.append((since_s, CLOCK.monotonic_s()))
             witness.attend(facts["processes"]["scheduler"]["publish"])
             command = (*COMMAND, "--resume", str(run))
             if number < cuts:
@@ -263,12 +267,10 @@ def power_cuts(folder: Path, cuts: int, seed: int, tell: Any = lambda text: None
                     witness.wait_for_scan()
                 life.wait_for("never said", chance.uniform(0.0, LONGEST_LIFE_S))
                 life.cut()
-                cut_s, loss_s = CLOCK.monotonic_s(), 0.0
                 if lossy:
                     disk = shadow(folder / "runs")
-                    loss_s = LOSS_S + disk.longest_under_way_s()
+                    since_s = max(disk.synced_s(SUFFIX), CLOCK.monotonic_s() - LATEST_S)
                     disk.restore()
-                cuts_s.append((cut_s - loss_s, cut_s))
                 tell(f"cut {number + 1} of {cuts}")
             else:
                 _end(life, run)
@@ -276,7 +278,7 @@ def power_cuts(folder: Path, cuts: int, seed: int, tell: Any = lambda text: None
         if life.process.poll() is None:
             life.cut()
         witness.close()
-    return _verdict(run, witness, cuts_s, most_lost=cuts if lossy else 0)
+    return _verdict(run, witness, lost_s, cuts, most_lost=cuts if lossy else 0)
 
 
 def shadow(folder: Path) -> Any:
@@ -304,10 +306,10 @@ def _end(life: Life, run: Path) -> None:
     assert life.process.wait(DEADLINE_S) == 0, "\n".join(life.lines)
 
 
-def _verdict(run: Path, witness: Witness, cuts_s: list[tuple[float, float]], *, most_lost: int) -> Verdict:
+def _verdict(run: Path, witness: Witness, lost_s: list[tuple[float, float]], cuts: int, *, most_lost: int) -> Verdict:
     with afspm.open_run(run) as record:
-        wrong = list(_wrong(record, witness, cuts_s, most_lost))
-        return Verdict(run, len(cuts_s), len(witness.seen), len(record.scans), len(record.spectra), wrong)
+        wrong = list(_wrong(record, witness, lost_s, most_lost))
+        return Verdict(run, cuts, len(witness.seen), len(record.scans), len(record.spectra), wrong)
 
 
 def _flags(witness: Witness) -> Iterator[tuple[int, str]]:
@@ -320,12 +322,12 @@ def _flags(witness: Witness) -> Iterator[tuple[int, str]]:
         before = problems
 
 
-def _wrong(record: Any, witness: Witness, cuts_s: list[tuple[float, float]], most_lost: int) -> Iterator[str]:
-    # cuts_s: intervals in which packets may be lost, one for each cut; most_lost: measured files that may be lost
+def _wrong(record: Any, witness: Witness, lost_s: list[tuple[float, float]], most_lost: int) -> Iterator[str]:
+    # lost_s: intervals in which packets may be lost, one for each cut; most_lost: measured files that may be lost
     flags = set(_flags(witness))
 
     def may_be_lost(key: tuple[int, str]) -> bool:
-        return key not in flags and any(first <= witness.seen_s[key] <= cut for first, cut in cuts_s)
+        return key not in flags and any(first <= witness.seen_s[key] <= last for first, last in lost_s)
 
     if witness.contradicted:
         yield f"published twice at the same time, and not the same: {witness.contradicted[:3]}"
