@@ -8,6 +8,7 @@ a scan stay NaN. All frames have one contrast: a range that contains the robust 
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
     from afspm.record.overview import DriftPoint
 
+_log = logging.getLogger("afspm.record")
 FORMATS: Final = (".gif", ".mp4")
 WIDTH_PX: Final = 480
 FRAMES_PER_S: Final = 8.0
@@ -153,7 +155,7 @@ class Film:
 def film_of(
     run: RecordedScans, rows: Sequence[ScanRow], channel: str | None = None, drift: Mapping[int, XY] | None = None
 ) -> Film:
-    """Return the film of scans of one place.
+    """Return the film of scans of one place; a scan with a missing or damaged file is left out and logged.
 
     Args:
         rows: the scans, in the order of the film; of interrupted scans, the measured lines are shown.
@@ -161,8 +163,7 @@ def film_of(
         drift: the result of `recorded_drift`; None: read from the run.
 
     Raises:
-        InvalidValue: fewer than two scans, not of one place, or a scan without the channel.
-        FileError: a file is missing or damaged.
+        InvalidValue: fewer than two readable scans, not of one place, or a scan without the channel.
     """
     if len(rows) < 2:
         raise InvalidValue(f"a film needs two scans of one place, not {len(rows)}")
@@ -171,7 +172,12 @@ def film_of(
     for row, place in zip(rows, places, strict=True):
         if not _is_same_place(places[0], place):
             raise InvalidValue(f"scans {rows[0].number} and {row.number} are of different places", hint="choose others")
-    scans = [_scan(run, row, channel or rows[0].channels[0][0]) for row in rows]
+    read = [_scan(run, row, channel or rows[0].channels[0][0]) for row in rows]
+    scans = [scan for scan in read if scan is not None]
+    if len(scans) < 2:
+        raise InvalidValue(f"a film needs two scans of one place, and of {len(read)} only {len(scans)} can be read")
+    places = [place for place, scan in zip(places, read, strict=True) if scan is not None]
+    rows = [row for row, scan in zip(rows, read, strict=True) if scan is not None]
     taken = [np.asarray(scan.values, dtype=np.float64) for scan in scans]
     window, (height, width) = places[0], taken[0].shape
     pixels_m = window.pixels_m((height, width))
@@ -244,8 +250,12 @@ def _is_same_place(first: Region, second: Region) -> bool:
     return max(apart) <= _MOST_OFFSET and max(sizes) <= _SIZE_TOLERANCE and turned <= _TURN_TOLERANCE_RAD
 
 
-def _scan(run: RecordedScans, row: ScanRow, channel: str) -> Scan:
-    scans = run.scan(row)
+def _scan(run: RecordedScans, row: ScanRow, channel: str) -> Scan | None:
+    try:
+        scans = run.scan(row)
+    except FileError as error:
+        _log.warning("scan %d is missing in the film: %s", row.number, error)
+        return None
     if channel not in scans:
         raise InvalidValue(f"scan {row.number} has no channel {channel!r}", hint=f"there are {', '.join(scans)}")
     return scans[channel]

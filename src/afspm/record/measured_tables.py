@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -10,7 +11,7 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from afspm import wire
-from afspm.basics.errors import NoSuchItem, UnitError, WireError
+from afspm.basics.errors import FileError, NoSuchItem, UnitError, WireError
 from afspm.basics.plain_data import from_json
 from afspm.basics.units import convert, si_unit
 from afspm.model import Frame, Parameter, Region, RegistrationOutcome, Spectrum, component_of, names
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from afspm.record.instrument_values import RecordedReadings
     from afspm.record.spectrum_stack import Quantity, SpectrumStack
 
+_log = logging.getLogger("afspm.record")
 R = TypeVar("R", ScanRow, SpectrumRow)
 Row = tuple[Any, ...]
 """A row of a table in SQLite."""
@@ -79,7 +81,7 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
 
         x and y are along the sides of the grid, in m; `angle_rad` and `frame` are in the attributes. z is the swept
         variable: its name and unit are in the attributes of the coordinate. Variables with a retrace ("Current
-        Retrace") have both directions. NaN where nothing was measured.
+        Retrace") have both directions. NaN where nothing was measured, or where a file is missing or damaged.
 
         Args:
             interpolate: resample curves with different sweeps, such as force curves that begin at the surface, to
@@ -87,7 +89,7 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
 
         Raises:
             InvalidValue: these spectra do not form a grid, or were measured differently.
-            FileError: a file is missing or damaged.
+            FileError: no file can be read.
         """
         return self._stacked(interpolate=interpolate).to_xarray()
 
@@ -116,16 +118,29 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
         Raises:
             InvalidValue: these spectra do not form a grid of at least two by two, the quantity was not measured, or
                 `at` is missing or outside the sweep.
-            FileError: a file is missing or damaged.
+            FileError: no file can be read.
         """
         from afspm.record.spectrum_stack import map_of
 
-        return map_of([self._read(row) for row in self._rows], quantity, at, unit, direction, name)
+        return map_of(self._readable(), quantity, at, unit, direction, name)
 
     def _stacked(self, *, interpolate: bool) -> SpectrumStack:
         from afspm.record.spectrum_stack import stacked
 
-        return stacked([self._read(row) for row in self._rows], interpolate=interpolate)
+        return stacked(self._readable(), interpolate=interpolate)
+
+    def _readable(self) -> list[Spectrum]:
+        # a missing or damaged file costs its own point of the grid
+        found, failed = list[Spectrum](), None
+        for row in self._rows:
+            try:
+                found.append(self._read(row))
+            except FileError as error:
+                _log.warning("spectrum %d is left out: %s", row.number, error)
+                failed = error
+        if failed is not None and not found:
+            raise failed
+        return found
 
     def where(self, wanted: Callable[[SpectrumRow], bool]) -> SpectrumTable:
         return self._with(row for row in self._rows if wanted(row))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 Query = Callable[[str, Sequence[object]], list[Row]]
 """A function that runs a query on the journal. Raises FileError if the journal is damaged."""
 
+_log = logging.getLogger("afspm.record")
 _AT_ONCE = 500
 _FILES_KEPT = 4
 _PACKETS_KEPT = 64
@@ -71,14 +74,14 @@ def packets(
     tell: Callable[[str], None] | None,
 ) -> Iterator[Packet]:
     """Yield packets of the scheduler as they were published, oldest first; arguments as of `Run.packets`."""
-    values = _Values(query, folder)
+    values, reasons = _Values(query, folder), set[str]()
     for row in _rows(query, since_ns, messages):
         try:
             found = _packet(row, values)
         except FileError as error:
-            if tell is None:
-                raise
-            tell(str(error))
+            if (why := str(error)) not in reasons:  # once a file, not for each of its packets
+                reasons.add(why)
+                (tell or partial(_log.warning, "packets are left out: %s"))(why)
             continue
         yield found
 

@@ -142,13 +142,14 @@ class Run:
     def film(self, scans: Sequence[ScanRow] | None = None, channel: str | None = None) -> Film:
         """Return scans of one place as a film aligned on the sample: `run.film().save("night.gif")`.
 
+        A scan with a missing or damaged file is left out and logged.
+
         Args:
             scans: rows of `scans`; None: all scans of the place that was scanned most often.
             channel: the shown channel; None: the first.
 
         Raises:
-            InvalidValue: fewer than two scans, not of one place, or a scan without the channel.
-            FileError: a file is missing or damaged.
+            InvalidValue: fewer than two readable scans, not of one place, or a scan without the channel.
         """
         from afspm.record.film import film_of, places, recorded_drift
 
@@ -349,13 +350,11 @@ class Run:
     ) -> Iterator[Packet]:
         """Yield the scheduler's packets newer than `since_ns`, oldest first, as they were published.
 
+        The packets whose values are in a missing or damaged file are left out.
+
         Args:
             messages: names of the wanted messages, e.g. "ControlState"; None: all.
-            tell: called with a message for each packet without a readable file, which is left out. None: raise
-                FileError.
-
-        Raises:
-            FileError: without `tell`: a file is missing or damaged.
+            tell: called with a message for each missing or damaged file; None: log it as a warning.
         """
         yield from packets(self._query, self.folder, since_ns, messages, tell)
 

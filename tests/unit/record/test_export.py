@@ -335,8 +335,6 @@ def test_damaged_file_costs_its_own_measurement_only(run: Run, tmp_path: Path, t
     assert 0 < len(list(export(run, to, tmp_path / "out", tell=told.append))) < whole
     (said,) = told
     assert str(Path(run.scans[1].file)) in said
-    with pytest.raises(FileError, match="damaged"):
-        list(export(run, to, tmp_path / "out"))
 
 
 def test_deleted_file_is_named_in_the_archive_and_costs_nothing_else(run: Run, tmp_path: Path) -> None:
@@ -355,8 +353,6 @@ def test_deleted_file_is_named_in_the_archive_and_costs_nothing_else(run: Run, t
     (experiment,) = (node for node in crate["@graph"] if node.get("genre") == "experiment")
     assert f"missing here</h2><ul><li>{scan}</li><li>{spectrum}</li></ul>" in experiment["text"]
     assert "2 scans and 0 spectra" in experiment["description"]
-    with pytest.raises(FileError, match="can't be read"):
-        list(export(run, "eln", tmp_path / "out"))
 
 
 def test_film_is_made_of_the_files_that_are_there(night: Night, store: RecordStore, tmp_path: Path) -> None:
@@ -375,8 +371,6 @@ def test_packets_of_a_damaged_file_are_left_out_on_request(run: Run, tmp_path: P
     packets = list(run.packets(tell=told.append))
     assert [row.file for row in run.scans if any(str(Path(row.file)) in said for said in told)] == [run.scans[1].file]
     assert len({packet.envelope for packet in packets if packet.envelope.startswith("Scan2d")}) == 2
-    with pytest.raises(FileError):
-        list(run.packets())
 
 
 def test_scan_without_lines_is_reported_and_left_out(night: Night, store: RecordStore, tmp_path: Path) -> None:

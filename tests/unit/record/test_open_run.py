@@ -237,8 +237,7 @@ def test_damaged_or_missing_file_of_a_scan_is_named(
         run.scan(0)
     assert file.name in str(caught.value)
     assert len(run.scan(1)) == 2  # the others are there
-    with pytest.raises(FileError):
-        list(run.packets())
+    assert sum(packet.envelope.startswith("Scan2d") for packet in run.packets()) == 2
 
 
 def test_half_a_file_is_named(night: Night, store: RecordStore, tmp_path: Path) -> None:
@@ -345,8 +344,7 @@ def test_file_of_a_scan_outside_the_folder_of_the_run_is_refused(
         with afspm.open_run(tmp_path) as run:
             with pytest.raises(FileError, match="not in the folder of the run"):
                 run.scan(-1)
-            with pytest.raises(FileError, match="not in the folder of the run"):
-                list(run.packets())
+            assert not [packet for packet in run.packets() if packet.envelope.startswith("Scan2d")]
 
 
 ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i FROM n) SELECT i FROM n"

@@ -32,7 +32,8 @@ def tables(run: Run, scans: Sequence[ScanRow], spectra: Sequence[SpectrumRow]) -
 
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
-    """Yield nothing: the documents point to the files of the record."""
+    """Yield nothing: the documents point to the files of the record. Raises FileError: such a file can't be read."""
+    run.about(row)
     yield from ()
 
 

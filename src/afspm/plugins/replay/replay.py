@@ -55,14 +55,8 @@ def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> 
     with open_run(where) as run:
         guest = _guest(run)
         _check(options.only, run)
-        left_out: set[str] = set()
-
-        def leave_out(why: str) -> None:
-            if why not in left_out:  # log each reason once, not for each channel
-                tell(f"left out: {why}")
-            left_out.add(why)
-
-        recorded = RecordPlayback(run.packets(messages=tuple(options.only) or None, tell=leave_out))
+        found = run.packets(messages=tuple(options.only) or None, tell=lambda why: tell(f"left out: {why}"))
+        recorded = RecordPlayback(found)
         if recorded.next_ns is None:
             raise ConfigError("there is nothing to replay", where=str(run.folder))
         clock = _clock(run, options.speed, recorded.next_ns)

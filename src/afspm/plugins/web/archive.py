@@ -30,6 +30,7 @@ class Archive:
         self._log = logging.getLogger("afspm.plugins.web.dashboard")
         self._lock = threading.Lock()
         self._read: OrderedDict[FrameKey, ChannelFrame] = OrderedDict()
+        self._unread: set[str] = set()
 
     def past(self, problems: ProblemNames) -> Overview | None:
         """Return the overview of the run so far, without log lines; None without a readable record."""
@@ -55,7 +56,7 @@ class Archive:
             try:
                 frame = _find(self._folder, time_ns, channel)
             except (AfspmError, ImportError, KeyError) as error:
-                self._log.debug("a scan can't be read: %s", error)
+                self._name(f"a scan is not shown: {error}")
                 return None
             if frame is not None:
                 self._read[key] = frame
@@ -72,8 +73,14 @@ class Archive:
                 row = next((row for row in reversed(run.spectra) if row.time_ns == time_ns), None)
                 return None if row is None else run.spectrum(row)
         except (AfspmError, ImportError) as error:
-            self._log.debug("a spectrum can't be read: %s", error)
+            self._name(f"a spectrum is not shown: {error}")
             return None
+
+    def _name(self, why: str) -> None:
+        # once each: a page asks again and again
+        if why not in self._unread:
+            self._unread.add(why)
+            self._log.warning("%s", why)
 
 
 def allowed_region(folder: Path) -> Region | None:

@@ -10,6 +10,7 @@ not among `scans` and `spectra`.
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -28,13 +29,14 @@ from afspm.record.tables import ScanRow, SpectrumRow
 __all__ = ["chosen", "export"]
 
 
+_log = logging.getLogger("afspm.record")
 _LEAST_POSITIONS = 4
 """The positions of the smallest grid."""
 Writer = Callable[[Run, ScanRow | SpectrumRow], Iterator[tuple[str, bytes]]]
 
 
 def export(
-    run: Run, to: str, folder: Path, scans: str | None = None, tell: Callable[[str], None] | None = None
+    run: Run, to: str, folder: Path, scans: str | None = None, tell: Callable[[str], None] = _log.warning
 ) -> Iterator[Path]:
     """Write a run in another format, and yield the path of each written file.
 
@@ -42,11 +44,11 @@ def export(
         to: a format that a package declares an exporter for.
         folder: created if it is missing.
         scans: numbers of scans, as for `chosen`, without spectra; None: all scans and spectra.
-        tell: called with a message for each omitted measurement; None: a damaged file of the record is an error.
+        tell: called with a message for each omitted measurement; by default it is logged as a warning.
 
     Raises:
         InvalidValue: there is no such format, or no such scan.
-        FileError: a file can't be read or written.
+        FileError: a file can't be written.
     """
     module = entry_points.load(entry_points.EXPORTERS, to)
     if module is None:
@@ -54,7 +56,7 @@ def export(
         raise InvalidValue(f"there is no format {to!r}", hint=hint)
     wanted = list(run.scans) if scans is None else chosen(list(run.scans), scans)
     for row in wanted:
-        if not row.file and tell is not None:
+        if not row.file:
             tell(f"scan {row.number} was interrupted before anything of it was seen")
     spectra = list(run.spectra) if scans is None else []
     wanted = [row for row in wanted if row.file]
@@ -87,19 +89,17 @@ def unreadable(run: Run, row: ScanRow | SpectrumRow) -> FileError | None:
 Row = TypeVar("Row", ScanRow, SpectrumRow)
 
 
-def _with_files(run: Run, rows: Sequence[Row], tell: Callable[[str], None] | None) -> Iterator[Row]:
+def _with_files(run: Run, rows: Sequence[Row], tell: Callable[[str], None]) -> Iterator[Row]:
     for row in rows:
         error = unreadable(run, row)
         if error is None:
             yield row
-        elif tell is None:
-            raise error
         else:
             tell(str(error))
 
 
 def _write_each(
-    write: Writer, run: Run, rows: Sequence[ScanRow | SpectrumRow], folder: Path, tell: Callable[[str], None] | None
+    write: Writer, run: Run, rows: Sequence[ScanRow | SpectrumRow], folder: Path, tell: Callable[[str], None]
 ) -> Iterator[Path]:
     # a damaged file costs its own measurement, not all others
     for row in rows:
@@ -107,8 +107,6 @@ def _write_each(
             for end, content in write(run, row):
                 yield _written(folder / f"{_stem(row)}{end}", content)
         except FileError as error:
-            if tell is None:
-                raise
             tell(str(error))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from afspm.record.export import file_word
 from afspm.record.film import film_of, places, recorded_drift
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
+
+_log = logging.getLogger("afspm.record")
 
 
 class FilmExporter:
@@ -23,14 +26,18 @@ class FilmExporter:
 
         Raises:
             InvalidValue: no place was scanned twice.
-            FileError: a file can't be read or written.
+            FileError: a file can't be written.
         """
         drift = recorded_drift(run)
         groups = places(scans, drift)
         if not groups:
             raise InvalidValue("a film needs two scans of one place, and there are none", where=str(run.folder))
         for number, rows in enumerate(groups, 1):
-            film = film_of(run, rows, drift=drift)
+            try:
+                film = film_of(run, rows, drift=drift)
+            except InvalidValue as error:  # damaged files of one place cost no other place its film
+                _log.warning("film %d is not made: %s", number, error)
+                continue
             yield film.save(folder / f"film-{number:02}-{file_word(film.channel)}{self._suffix}")
 
 

@@ -35,7 +35,9 @@ def write(folder: str | Path, step: Callable[[str], None] = lambda _: None) -> P
             step("drawing the figures")
             pictures.draw(run, contents, shown)
             step("writing the page")
-            text = page.html(contents, shown, curves.read(run), pictures.of_figures(run.folder))
+            unread = [one.unread for one in shown if one.unread]
+            spectra = curves.read(run, unread)
+            text = page.html(contents, shown, spectra, pictures.of_figures(run.folder), unread)
             replace_file(target, [text.encode()], synced=False)
             if contents.shadow.agreement:
                 replace_file(run.folder / shadow.FILE, [shadow.csv_text(contents.shadow).encode()], synced=False)

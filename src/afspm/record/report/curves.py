@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -25,7 +24,6 @@ MOST_READ = 400
 MOST_SMALL = 100
 _WIDEST_GRID = 12
 _LEAST_AVERAGED = 3
-_log = logging.getLogger("afspm.report")
 
 
 @dataclass(frozen=True)
@@ -84,8 +82,12 @@ class SpectrumGroup:
         return Axis.over(first.names[0], first.units[0], swept), others
 
 
-def read(run: Run) -> list[SpectrumGroup]:
-    """Read the spectra of a run: of each kind, an even selection of at most `MOST_READ`."""
+def read(run: Run, unread: list[str]) -> list[SpectrumGroup]:
+    """Read the spectra of a run: of each kind, an even selection of at most `MOST_READ`.
+
+    Args:
+        unread: gets the reason for each file that can't be read.
+    """
     rows: dict[tuple[object, ...], list[SpectrumRow]] = {}
     for row in run.spectra:
         if len(row.names) > 1:
@@ -93,7 +95,7 @@ def read(run: Run) -> list[SpectrumGroup]:
     groups = []
     for of_kind in rows.values():
         some = np.unique(np.linspace(0, len(of_kind) - 1, MOST_READ).round().astype(int))
-        if measured := list(_read(run, [of_kind[k] for k in some])):
+        if measured := list(_read(run, [of_kind[k] for k in some], unread)):
             groups.append(SpectrumGroup(measured, len(of_kind)))
     return groups
 
@@ -103,12 +105,12 @@ def html(groups: Sequence[SpectrumGroup], clock: PageTimes) -> str:
     return "".join(_group(group, number, clock) for number, group in enumerate(groups, 1))
 
 
-def _read(run: Run, rows: Iterable[SpectrumRow]) -> Iterator[SpectrumCurves]:
+def _read(run: Run, rows: Iterable[SpectrumRow], unread: list[str]) -> Iterator[SpectrumCurves]:
     for row in rows:
         try:
             yield SpectrumCurves(row, run.spectrum(row))
         except AfspmError as error:
-            _log.debug("spectrum %d is not shown: %s", row.number, error)
+            unread.append(f"spectrum {row.number}: {error}")
 
 
 def _group(group: SpectrumGroup, number: int, clock: PageTimes) -> str:

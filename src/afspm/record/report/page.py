@@ -30,6 +30,7 @@ def html(
     shown: Sequence[TopographyPicture],
     spectra: Sequence[SpectrumGroup],
     figures: Sequence[FigurePicture],
+    unread: Sequence[str] = (),
 ) -> str:
     clock = PageTimes(story.start_ns, story.end_ns)
     title = f"{escape(story.name)}, {day(story.start_ns, UTC)}"
@@ -42,6 +43,7 @@ def html(
         section("What afspm would have done", shadow.html(story.shadow, clock)),
         section("Problems and repairs", _problems(story, clock)),
         section("Critical messages", _alarms(story, clock)),
+        section("Files that could not be read", table(["scans and spectra"], [[escape(one)] for one in unread])),
         section("Treatments of the tip", _treatments(story)),
         section("Parameters changed", parameters.html(story.changes, clock)),
         section("Other instruments", _instruments(story)),

@@ -49,6 +49,7 @@ class TopographyPicture:
         thumbnail: the image for the figure of the night; None if the scan has no readable values.
         is_bad: whether the image is drawn with a frame.
         changed_row: the first row with a changed tip, found in the lines of the running scan; None: no change found.
+        unread: why the file of the scan can't be read; empty if it was read, or the scan has no file.
     """
 
     row: ScanRow
@@ -58,6 +59,7 @@ class TopographyPicture:
     thumbnail: Thumbnail | None = None
     is_bad: bool = False
     changed_row: int | None = None
+    unread: str = ""
 
 
 @dataclass(frozen=True)
@@ -117,11 +119,13 @@ def chosen(rows: Sequence[ScanRow], most: int = MOST, kept_ns: Collection[int] =
 
 def _read(run: Run, row: ScanRow) -> tuple[TopographyPicture, Array | None]:
     # without the image, but with its values
+    if not row.file:
+        return TopographyPicture(row), None
     try:
         scans = run.scan(row)
     except AfspmError as error:
-        _log.debug("scan %d has no picture: %s", row.number, error)
-        return TopographyPicture(row), None
+        _log.warning("scan %d has no picture: %s", row.number, error)
+        return TopographyPicture(row, unread=f"scan {row.number}: {error}"), None
     scan = scans[topography(scans)]
     if not np.isfinite(scan.values).any():
         return TopographyPicture(row, scan.channel, scan.unit), None

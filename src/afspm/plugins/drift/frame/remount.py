@@ -11,6 +11,7 @@ overviews need the same calibration.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from afspm import Array, Run
-from afspm.basics import InvalidValue
+from afspm.basics import FileError, InvalidValue
 from afspm.model import XY, Frame, Region, Scan, ScanSet
 from afspm.plugins.drift.estimators.correlation import Correlation
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
@@ -26,6 +27,7 @@ from afspm.plugins.drift.pairs.images import Unusable, prepare
 from afspm.plugins.drift.registration import DriftScan, Registration
 from afspm.record import ScanRow, reduced, topography
 
+_log = logging.getLogger("afspm.drift")
 COARSE_PX = 64
 STEP_RAD = math.radians(2.0)
 """Step between tried angles. The true angle is at most half a step from a tried angle: half a pixel at the border of a
@@ -78,20 +80,24 @@ class Remount:
 
 
 def overview_of(run: Run, number: int | None = None) -> tuple[ScanRow, Scan]:
-    """Return a scan by number, with its topography; without a number, the largest complete scan.
+    """Return a scan by number, with its topography; without a number, the largest complete scan with a readable file.
 
     Raises:
-        InvalidValue: there is no such scan. FileError: the scan's file is missing or damaged.
+        InvalidValue: there is no such scan. FileError: the file of the numbered scan is missing or damaged.
     """
     whole = [row for row in run.scans if row.region is not None and row.file and not row.interrupted]
     if number is not None:
         row = run.numbered(number)
-    elif whole:
-        row = max(whole, key=_area_m2)
-    else:
-        raise InvalidValue(f"the run {run.folder.name} has no whole scan")
-    scans: ScanSet = run.scan(row)
-    return row, scans[topography(scans)]
+        scans: ScanSet = run.scan(row)
+        return row, scans[topography(scans)]
+    for row in sorted(whole, key=_area_m2, reverse=True):
+        try:
+            scans = run.scan(row)
+        except FileError as error:
+            _log.warning("scan %d is passed over: %s", row.number, error)
+            continue
+        return row, scans[topography(scans)]
+    raise InvalidValue(f"the run {run.folder.name} has no whole scan that can be read")
 
 
 def find(earlier: Scan, now: Scan, within_rad: float = math.pi) -> Remount:
