@@ -53,8 +53,7 @@ def replace_file(
     """
     aside = aside or path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        # not its parents: where a drive is not mounted, they would be created on the system disk
-        path.parent.mkdir(exist_ok=True)
+        is_new = _make_folder(path.parent)
         if mode != _ANYONE:
             aside.unlink(missing_ok=True)  # a file left by a killed process keeps its old mode
         with open(aside, "wb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
@@ -65,14 +64,23 @@ def replace_file(
             elif soon:
                 SYNCER.soon(file.fileno())
         _rename(aside, path)
-        if synced:
-            sync_folder(path.parent)
-        elif soon:
-            SYNCER.folder_soon(path.parent)
+        # without its own name a power cut takes a new folder with all that is synced in it
+        for folder in (path.parent, path.parent.parent) if is_new else (path.parent,):
+            if synced:
+                sync_folder(folder)
+            elif soon:
+                SYNCER.folder_soon(folder)
     except OSError:
         with contextlib.suppress(OSError):
             aside.unlink()
         raise
+
+
+def _make_folder(folder: Path) -> bool:
+    # not its parents: where a drive is not mounted, they would be created on the system disk
+    is_new = not folder.exists()
+    folder.mkdir(exist_ok=True)
+    return is_new
 
 
 def _rename(aside: Path, path: Path) -> None:
@@ -117,7 +125,8 @@ class FileBatch:
         Raises:
             OSError: the file can't be written.
         """
-        path.parent.mkdir(exist_ok=True)
+        if _make_folder(path.parent):
+            sync_folder(path.parent.parent)
         aside = path.with_name(path.name + self._suffix)
         with aside.open("wb") as file:
             file.write(data)

@@ -31,6 +31,7 @@ def create(runs: Path, experiment: str, started: datetime) -> Path:
         folder = _new_folder(runs.resolve(), stamp)
         (folder / STATE_DIR).mkdir()
         sync_folder(folder)
+        sync_folder(folder.parent)  # without its name a power cut may take the folder with all that is synced in it
         _point_to(runs, folder.name)
     except OSError as error:
         raise FileError(

@@ -58,8 +58,8 @@ class Shadow:
 
     def synced_s(self, suffix: str) -> float:
         """Return the start of the last sync of the files with a suffix: what was written before it is kept."""
-        names = (json.loads(known.read_text())["names"] for known in self._known())
-        kept = (self._contents / content for one in names for name, content in one.items() if name.endswith(suffix))
+        names = (pair for _, names in self._known() for pair in names.items())
+        kept = (self._contents / content for name, content in names if name.endswith(suffix))
         return max((one.stat().st_mtime for one in kept if one.exists()), default=-math.inf)
 
     def _watches(self, path: Any) -> bool:
@@ -103,13 +103,15 @@ class Shadow:
 
     def _sync_names(self, path: str) -> None:
         with self._locked():
+            entries = list(os.scandir(path))
             names = {
                 entry.name: self._content_of(entry.inode()) or self._named(entry.inode())
-                for entry in os.scandir(path)
+                for entry in entries
                 if entry.is_file(follow_symlinks=False)
             }
+            folders = [entry.name for entry in entries if entry.is_dir(follow_symlinks=False)]
             aside = self._names / f".{uuid.uuid4()}"
-            aside.write_text(json.dumps({"folder": path, "names": names}))
+            aside.write_text(json.dumps({"folder": path, "names": names, "folders": folders}))
             _replace(aside, self._names / path.replace("/", "%"))
 
     @contextlib.contextmanager
@@ -128,8 +130,16 @@ class Shadow:
                 with contextlib.suppress(FileNotFoundError):
                     _unlink(self._files / str(found.st_ino))
 
-    def _known(self) -> list[Path]:
-        return [known for known in self._names.iterdir() if not known.name.startswith(".")]
+    def _known(self) -> Iterator[tuple[str, dict[str, str]]]:
+        # (folder, content by name) of each folder whose own name is synced, too
+        lists = (json.loads(file.read_text()) for file in self._names.iterdir() if not file.name.startswith("."))
+        known = {one["folder"]: one for one in lists}
+        found = set[str]()
+        for path in sorted(known):
+            above, _, name = path.rpartition("/")
+            if path == self._folder or (above in found and name in known[above]["folders"]):
+                found.add(path)
+                yield path, known[path]["names"]
 
     def restore(self) -> None:
         """Set the folder to its state after a power cut."""
@@ -144,11 +154,10 @@ class Shadow:
     def copy(self, into: Path) -> list[tuple[Path, str]]:
         """Write the state after a power cut to another folder; return each file with the name of its content."""
         copied = []
-        for known in self._known():
-            told = json.loads(known.read_text())
-            folder = into / Path(told["folder"]).relative_to(self._folder)
+        for where, names in self._known():
+            folder = into / Path(where).relative_to(self._folder)
             folder.mkdir(parents=True, exist_ok=True)
-            for name, content in told["names"].items():
+            for name, content in names.items():
                 kept, path = self._contents / content, folder / name
                 shutil.copyfile(kept, path) if kept.exists() else path.touch()
                 copied.append((path, content))

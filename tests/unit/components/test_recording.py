@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import logging
-import os
-import runpy
 import sqlite3
 import sys
 import threading
@@ -17,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from deadlines import DEADLINE_S
+from watched_disk import lossy_disk
 
 import afspm
 from afspm import wire
@@ -44,8 +43,6 @@ from afspm.record.store import RecordSettings, RecordStore
 from afspm.storage.packet_log import LogReader, PacketLog, committed, expect_recorder
 from afspm.transport.port import Incoming, ParentGone
 from afspm.transport.process.context import ProcessActivity, ProcessContext
-
-LOSSY = Path(__file__).parents[2] / "support" / "lossy_disk"
 
 
 def control(time_ns: int, holder: str = "series") -> Packet:
@@ -209,11 +206,7 @@ def test_file_whose_packets_a_power_cut_took_is_kept_and_logged(bench: Bench, ca
 def test_committed_packets_are_on_the_disk(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    lossy = runpy.run_path(str(LOSSY / "sitecustomize.py"))
-    for name in ("fsync", "fdatasync", "unlink", "remove", "replace", "rename"):
-        monkeypatch.setattr(os, name, getattr(os, name))  # to be as they were after the test
-    shadow = lossy["Shadow"](str(bench.folder))
-    lossy["watch"](shadow)
+    shadow = lossy_disk(bench.folder, monkeypatch)
     writer = bench.writer()
     for time_ns in range(1, 6):
         bench.publish(control(time_ns))

@@ -6,7 +6,8 @@ import errno
 import json
 import os
 import sqlite3
-from contextlib import closing
+import sys
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from record_lab import ABOUT, REGION, START_NS, Given, Night, same
+from watched_disk import lossy_disk
 
 import afspm
 from afspm import wire
@@ -300,6 +302,33 @@ def test_full_disk_leaves_no_partial_record_and_a_retry_succeeds(
     store.take(given)
     assert same(list(run.packets()), given)
     assert len(run.scan(0)) == 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="what a descriptor is open on is found in /proc")
+def test_journal_on_the_disk_names_no_file_that_is_not(
+    night: Night, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """faults 17: the power may be cut after each sync, also of the first scan, whose folder is new."""
+    (folder := tmp_path / "night").mkdir()
+    disk, named = lossy_disk(folder, monkeypatch), list[int]()
+    real = os.fsync
+
+    def cut(descriptor: int) -> None:
+        real(descriptor)
+        after = tmp_path / f"after-{len(named)}"
+        disk.copy(after)
+        with suppress(FileError), afspm.open_run(after) as run:  # it has no journal yet
+            assert all((after / row.file).is_file() for row in (*run.scans, *run.spectra))
+            named.append(len(run.scans))
+
+    store = RecordStore(folder, ABOUT)
+    store.sync()
+    monkeypatch.setattr(os, "fsync", cut)
+    for number in (1, 2):
+        store.take([*night.whole_scan(number), night.spectrum(number)])
+        store.sync()
+    store.close()
+    assert named[-1] == 2
 
 
 def test_file_written_right_before_a_kill_is_not_duplicated(night: Night, tmp_path: Path) -> None:

@@ -37,6 +37,7 @@ class Disk:
         return path
 
     def after_a_cut(self, into: Path) -> dict[str, bytes]:
+        into.mkdir()
         self.shadow.copy(into)
         return {path.name: path.read_bytes() for path in sorted(into.iterdir())}
 
@@ -106,6 +107,16 @@ def test_list_of_names_is_made_before_or_after_a_replacement(
         aside.replace(path)
     other.end()
     assert disk.after_a_cut(tmp_path / "after") == {"run.json": b"new"}
+
+
+def test_folder_is_lost_with_all_in_it_until_its_name_is_synced(disk: Disk, tmp_path: Path) -> None:
+    (disk.folder / "scans").mkdir()
+    disk.write("scans/scan-1.h5", b"1")
+    disk.sync(disk.folder / "scans")
+    assert disk.after_a_cut(tmp_path / "before") == {}
+    disk.sync(disk.folder)
+    disk.shadow.copy(tmp_path / "after")
+    assert (tmp_path / "after" / "scans" / "scan-1.h5").read_bytes() == b"1"
 
 
 def test_last_sync_of_the_log_is_known(disk: Disk) -> None:

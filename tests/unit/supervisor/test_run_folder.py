@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from watched_disk import lossy_disk
 
 from afspm.basics.errors import FileError
 from afspm.record.run_json import latest_run
@@ -38,6 +39,17 @@ def test_file_names_the_newest_run_if_links_can_not_be_made(tmp_path: Path, monk
     newest = run_folder.create(tmp_path, "night", STARTED)
     assert latest_run(tmp_path) == newest
     assert sorted(path.name for path in tmp_path.iterdir()) == ["latest.txt", newest.name]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="what a descriptor is open on is found in /proc")
+def test_run_folder_outlives_a_power_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """faults 17: a folder with synced files is lost with them if its own name is not synced."""
+    (tmp_path / "runs").mkdir()
+    disk = lossy_disk(tmp_path / "runs", monkeypatch)
+    folder = run_folder.create(tmp_path / "runs", "night", STARTED)
+    run_folder.write_run(folder, {"name": "night"})
+    disk.copy(tmp_path / "after")
+    assert json.loads((tmp_path / "after" / folder.name / "run.json").read_text(encoding="utf-8")) == {"name": "night"}
 
 
 def test_a_name_cannot_lead_out_of_the_folder(tmp_path: Path) -> None:
