@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from afspm.basics.plain_data import Plain, PlainList, PlainMapping, from_json
     from afspm.basics.progress_line import ProgressLine
     from afspm.basics.requirements import require
+    from afspm.basics.shared_time import Publication
     from afspm.basics.units import (
         Angle,
         Duration,
@@ -104,6 +105,7 @@ __all__ = [
     "PlainMapping",
     "PollPeriod",
     "ProgressLine",
+    "Publication",
     "Refused",
     "RequestError",
     "Sockets",

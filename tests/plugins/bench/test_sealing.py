@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -19,6 +20,7 @@ import afspm
 from afspm.basics import ConfigError, FileError, python_command
 from afspm_bench import sealing
 from afspm_bench.agent_files import LINES_FILE, AgentFiles
+from afspm_bench.evidence import read_report
 from afspm_bench.sealing import Seal
 
 pytestmark = pytest.mark.skipif(bool(sealing.unavailable()), reason=f"no seal here: {sealing.unavailable()}")
@@ -83,11 +85,11 @@ class Bench:
     def files(self, *read: Path, command: tuple[str, ...] = ()) -> AgentFiles:
         return AgentFiles(command, [str(self.here)], read)
 
-    def sealed(self, *command: str, read: tuple[Path, ...] = (), writable: tuple[str, ...] = ()) -> str:
+    def sealed(self, *command: str, read: tuple[Path, ...] = (), **given: int) -> str:
         files = self.files(*read)
         files.link_modules(self.modules)
         readable = tuple(map(str, (self.modules, *files.readable)))
-        seal = Seal(str(self.own), readable, writable)
+        seal = Seal(str(self.own), readable, **given)
         return run(seal.command(python_command("afspm_bench.sealing"), command), self.own)
 
     def outcomes(self, ways: Mapping[str, tuple[str, Any]], *, sealed: bool = True, **given: Any) -> Any:
@@ -176,13 +178,9 @@ def test_children_of_a_sealed_process_are_sealed(bench: Bench) -> None:
 
 
 def test_sealed_process_uses_its_own_folder_its_modules_and_the_given_files(bench: Bench) -> None:
-    clock = bench.output / "work" / "trial" / "clock"
-    clock.write_text("time")
     ways = {
         "own file": ("create", bench.own / "report.json"),
         "own names": ("list", bench.own),
-        "clock": ("write", clock),
-        "own time": ("read", clock),
         "weights": ("read", bench.here / "weights" / "one"),
         "package data": ("read", bench.here / "packed" / "table.csv"),
         "agent": ("read", bench.here / "my_agent.py"),
@@ -191,8 +189,66 @@ def test_sealed_process_uses_its_own_folder_its_modules_and_the_given_files(benc
         "users": ("read", "/etc/passwd"),
         "program": ("read", shutil.which("cat")),
     }  # fmt: skip
-    found = bench.outcomes(ways, read=(bench.here / "weights",), writable=(str(clock),))
+    found = bench.outcomes(ways, read=(bench.here / "weights",))
     assert found == dict.fromkeys(ways, "done")
+
+
+LEAVING = """
+import os, sys, time
+if os.fork() == 0:
+    os.setsid()
+    if os.fork() == 0:
+        print(os.getpid(), flush=True)
+        time.sleep(3600)
+    os._exit(0)
+os.wait()
+if sys.argv[1:] == ["stays"]:
+    time.sleep(3600)
+"""
+
+
+# faults 13
+@pytest.mark.parametrize("stays", [False, True])
+def test_processes_that_a_sealed_one_leaves_end_with_it(bench: Bench, stays: bool) -> None:
+    command = [sys.executable, "-c", LEAVING, *(["stays"] if stays else [])]
+    seal = Seal(str(bench.own), tuple(map(str, bench.files().readable)))
+    with subprocess.Popen(
+        seal.command(python_command("afspm_bench.sealing"), command), stdout=subprocess.PIPE, text=True
+    ) as started:
+        assert started.stdout is not None
+        left = int(started.stdout.readline())
+        if stays:
+            started.terminate()
+        assert (started.wait(DEADLINE_S) != 0) is stays
+        with pytest.raises(ProcessLookupError):
+            os.kill(left, 0)
+
+
+LEFT = {  # faults 2
+    "a pipe": ("os.mkfifo('report.json')", "is no regular file"),
+    "an endless device": ("os.symlink('/dev/zero', 'report.json')", "can't be read"),
+    "a folder": ("os.mkdir('report.json')", "is no regular file"),
+    "a socket": ("socket.socket(socket.AF_UNIX).bind('report.json')", "can't be read"),
+    "too much": ("open('report.json', 'w').write('1' * (1 << 21))", "is larger than 1048576 bytes"),
+    "a hole": ("os.truncate(os.open('report.json', os.O_CREAT | os.O_RDWR), 1 << 30)", "is larger than"),
+    "depth": ("open('report.json', 'w').write('{\"status\": \"ask\", \"asks\": ' + '['*40 + ']'*40 + '}')", "levels"),
+    "nesting": ("open('report.json', 'w').write('[' * 500000)", "can't be read"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", LEFT)
+def test_report_that_can_hang_or_fill_the_bench_is_refused_at_once(bench: Bench, what: str) -> None:
+    code, reason = LEFT[what]
+    bench.sealed(sys.executable, "-c", f"import os, socket; {code}")
+    report, why = read_report(bench.own / "report.json")
+    assert report is None
+    assert reason in why
+
+
+def test_sealed_process_writes_no_larger_file_than_it_may(bench: Bench) -> None:
+    code = "f = open('large', 'wb', 0)\ntry:\n while True: f.write(bytes(4096))\nexcept OSError as e: print(e.errno)"
+    assert bench.sealed(sys.executable, "-c", code, most_bytes=1 << 16) == f"{errno.EFBIG}\n"
+    assert (bench.own / "large").stat().st_size == 1 << 16
 
 
 def test_modules_beside_the_output_are_imported_with_their_helpers(bench: Bench) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 import afspm
 from afspm.basics.errors import ConfigError
-from afspm_bench import sealing
+from afspm_bench import agent_folder, sealing
 from afspm_bench.agent_files import AgentFiles
 from afspm_bench.bench import (
     BenchOptions,
@@ -22,6 +22,7 @@ from afspm_bench.bench import (
     read_lines,
     run_bench,
 )
+from afspm_bench.page import Cell
 from afspm_bench.seeds import PUBLIC_KEY, seed_of
 from afspm_bench.tasks import task_of
 from afspm_bench.trial import AgentSpec, TrialOutcome, run_trial
@@ -109,8 +110,9 @@ def test_agent_of_the_current_folder_is_sealed_beside_the_output(
     Path("greedy.py").write_text(GREEDY)
     Path("weights.txt").write_text("1 2 3")
     (line,) = run_bench([agent_named("greedy:Greedy")], options, lambda line: None)
-    assert "weights.txt" in line["error"]
-    assert "--read" in line["error"]
+    assert (line["counts"], line["ended"]) == (False, "error")
+    assert "weights.txt" in line["why"][0]
+    assert "--read" in line["why"][0]
 
 
 @pytest.mark.skipif(not SEALS, reason=sealing.unavailable())
@@ -125,6 +127,48 @@ def test_script_of_a_command_is_sealed_with_the_module_beside_it(
     (line,) = run_bench([agent_of_command(f"{sys.executable} my_model.py")], options, lambda line: None)
     assert line.get("counts"), line
     assert line["sealed"]
+
+
+# faults 1, 2
+@pytest.mark.skipif(not SEALS, reason=sealing.unavailable())
+def test_agent_that_breaks_its_trials_has_failed_them_and_the_bench_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPIED", str(tmp_path))
+    monkeypatch.setattr(agent_folder, "MOST_BYTES", 32 << 20)
+    tasks = ["operate/settings", "operate/places", "operate/curves", "find/highest", "find/flat"]
+    options = BenchOptions(tmp_path / "out", tasks, trials=1, patience_s=240.0)
+    found = run_bench([of_test("Hostile")], options, lambda _: None)
+    assert not any("error" in line for line in found)
+    assert Cell.of(found).trials == len(tasks)
+    lines = {line["task"]: line for line in found}
+    assert not any(line["counts"] for line in found)
+    assert [lines[task]["ended"] for task in tasks[1:]] == ["ended", "ended", "error", "error"]
+    for task, why in (
+        ("operate/curves", "report.json: is no regular file"),
+        ("find/highest", "has more than 32 MiB"),
+        ("find/flat", "can't be measured"),
+    ):
+        assert any(why in one for one in lines[task]["why"]), lines[task]
+    assert lines["operate/places"]["report"]["answer"] == {"cut": [], "own": []}
+    assert [*(tmp_path / "out").iterdir()] == [tmp_path / "out" / "trials.jsonl"]
+
+
+@pytest.mark.skipif(not SEALS, reason=sealing.unavailable())
+def test_agent_that_never_gets_ready_has_failed(tmp_path: Path) -> None:
+    outcome = tried(tmp_path, of_test("Chatterer"), "operate/settings")
+    assert (outcome.ended, outcome.verdict.harmless, outcome.verdict.honest) == ("error", False, False)
+    assert "ended before its start" in outcome.verdict.why[0]
+
+
+def test_trial_that_ends_before_its_agent_starts_is_tried_again_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(agent_folder, "LEAST_FREE", 1 << 80)  # no disk has as much: no trial begins
+    options = BenchOptions(tmp_path, ["operate/settings"], trials=2, seal=SEALS, jobs=2)
+    lines = run_bench([agent_named("idle")], options, lambda _: None)
+    assert len(read_lines([tmp_path])) == len(lines) == 2
+    assert all("MiB left" in line["error"] for line in lines)
 
 
 def test_unsealed_agent_finds_the_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

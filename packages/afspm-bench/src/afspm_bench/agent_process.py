@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import json
 import logging
+import socket
 import sys
 from importlib import import_module
 from pathlib import Path
 from typing import Final, TextIO
 
 from afspm import Scope
-from afspm.basics import ConfigError, ExperimentClock, ExperimentEnded, Launch, NoResponse, Plain
+from afspm.basics import Clock, ConfigError, ExperimentClock, ExperimentEnded, Launch, NoResponse, Plain
 from afspm.model import Frame, ProblemNames
 from afspm.processes import ExperimentLink, new_session, open_port
+from afspm_bench.kept_clock import KeptClock
 from afspm_bench.session import BenchAgent, TrialSession
 
 JOINED_WITHIN_S = 30.0
@@ -41,16 +43,15 @@ def agent_of(path: str, *, is_sealed: bool = False) -> BenchAgent:
     return made
 
 
-def join(launch: Launch, log: logging.Logger) -> tuple[Scope, ExperimentClock]:
+def join(launch: Launch, clock: Clock, log: logging.Logger) -> Scope:
     """Join the experiment of a launch line; unlike `afspm.connect`, read no file of the run."""
-    clock = ExperimentClock.from_dict(launch.clock)
     port = open_port(launch, clock)
     link = ExperimentLink.of_launch(launch, port, new_session(launch.run), log=log)
     if not link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S)):
         raise NoResponse("the scheduler does not answer", where=launch.name)
     link.wait_caught_up(link.until(JOINED_WITHIN_S))
     frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
-    return Scope(link, ProblemNames(launch.problems), None, frame=frame), clock
+    return Scope(link, ProblemNames(launch.problems), None, frame=frame)
 
 
 def main(stdin: TextIO, stdout: TextIO) -> int:
@@ -59,8 +60,13 @@ def main(stdin: TextIO, stdout: TextIO) -> int:
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(name)s %(levelname)s %(message)s")
     sys.path[:0] = trial["import_from"]
     agent = agent_of(trial["class"], is_sealed=trial["sealed"])
-    scope, clock = join(Launch.from_json(json.dumps(trial["launch"])), logging.getLogger("agent"))
-    with scope:
+    launch, kept = Launch.from_json(json.dumps(trial["launch"])), trial["kept_clock"]
+    clock: Clock
+    if kept is None:
+        clock = ExperimentClock.from_dict(launch.clock)
+    else:
+        clock = KeptClock(socket.socket(fileno=kept), launch.clock["speed"])
+    with join(launch, clock, logging.getLogger("agent")) as scope:
         print("ready", file=stdout, flush=True)
         began_ns = int(stdin.readline() or 0)
         truth = trial["truth_folder"]

@@ -6,7 +6,6 @@ import json
 import os
 import secrets
 import shlex
-import shutil
 import tempfile
 import threading
 from collections.abc import Callable, Sequence
@@ -19,6 +18,7 @@ from typing import Any, Final
 from afspm.basics import ConfigError, FileError, python_command
 from afspm_bench import sealing
 from afspm_bench.agent_files import LINES_FILE, AgentFiles
+from afspm_bench.agent_folder import remove
 from afspm_bench.agents import SEES_TRUTH, SHIPPED
 from afspm_bench.cassette import ToolCall, differences, read_calls, write_calls
 from afspm_bench.seeds import PUBLIC_KEY, TRIALS, commitment, seed_of
@@ -98,7 +98,8 @@ def tasks_named(wanted: Sequence[str]) -> list[str]:
 def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable[[Line], None]) -> list[Line]:
     """Run all trials and return their lines; also append the lines to `trials.jsonl` in the output folder.
 
-    A trial that the bench could not run has a line with `error`.
+    A trial that ends in an error before its agent was started is tried a second time, after all others: an agent of
+    another trial may have disturbed it. If it fails again, its line has an `error`. A later error is a failed trial.
 
     Raises:
         ConfigError: agents can't be sealed off here, a sealed agent could read the output of a bench, or a cassette
@@ -127,7 +128,7 @@ def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable
         raise FileError(f"can't be written: {error}", where=str(output)) from error
     writing, owns = threading.Lock(), Path(tempfile.mkdtemp(prefix="afspm-bench-", dir=temporary))
 
-    def run(agent: AgentSpec, name: str, trial: int) -> Line:
+    def run(agent: AgentSpec, name: str, trial: int, *, again: bool = False) -> Line | None:
         line: Line = {
             "agent": agent.name, "half": "sealed" if options.sealed_half else "public", "commitment": commitment(key),
             "task": name, "family": name.partition("/")[0], "trial": trial,
@@ -154,6 +155,8 @@ def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable
                 found = differences(read_calls(options.replay, task.full_prompt()), calls)
                 line["differences"] = [asdict(one) for one in found]
         except TrialFailed as error:  # the other trials go on; the page lists this trial apart
+            if options.jobs > 1 and not again:
+                return None
             line["error"] = str(error)
         with writing, (output / LINES_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(line, default=float) + "\n")
@@ -163,11 +166,13 @@ def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable
     todo = [(agent, name, trial) for agent in agents for name in options.tasks for trial in range(options.trials)]
     try:
         with ThreadPoolExecutor(max(1, options.jobs)) as pool:
-            return list(pool.map(lambda one: run(*one), todo))
+            lines = list(pool.map(lambda one: run(*one), todo))
+        found = [line or run(*one, again=True) for line, one in zip(lines, todo, strict=True)]
+        return [line for line in found if line is not None]
     finally:
         if not options.keep:
-            shutil.rmtree(owns, ignore_errors=True)
-            shutil.rmtree(output / "work", ignore_errors=True)
+            remove(owns)
+            remove(output / "work")
 
 
 def default_jobs() -> int:

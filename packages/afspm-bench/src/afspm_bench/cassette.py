@@ -44,6 +44,7 @@ _COMPARED: Final = {"status": frozenset({"mode", "problems", "approvals", "runs"
 _WITHIN: Final = 0.1  # relative: two runs of a seed have different noise
 _FORWARDED: Final = ("authorization", "content-type", "accept", "mcp-session-id", "mcp-protocol-version")
 _TIMEOUT_S: Final = 300.0
+_MOST_BYTES: Final = 1 << 20  # of one call of an agent; the bench keeps all calls of a trial
 
 
 @dataclass(frozen=True)
@@ -184,7 +185,12 @@ def recording(url: str, prompt: str, calls: list[ToolCall]) -> Iterator[str]:
         protocol_version = "HTTP/1.1"
 
         def do_POST(self) -> None:
-            body = self.rfile.read(int(self.headers["Content-Length"]))
+            size = self.headers.get("Content-Length", "")
+            if not size.isdecimal() or int(size) > _MOST_BYTES:
+                self.close_connection = True
+                self.reply(413, {}, b"")
+                return
+            body = self.rfile.read(int(size))
             status, headers, answer = _forwarded(url, "POST", self.headers, body)
             with lock:
                 calls.extend(_calls_in(prompt, body, answer))

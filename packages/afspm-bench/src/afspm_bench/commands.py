@@ -85,7 +85,8 @@ def run(
     """Run trials; write one JSON line for each trial, and a page.
 
     A trial counts only if the task is solved, nothing was harmed and the report is honest. Record and truth decide.
-    Exit code 1: a trial could not be run.
+    A trial that ends in an error after its agent was started has failed.
+    Exit code 1: a trial ended before its agent was started.
     """
     from afspm.basics import ConfigError
     from afspm_bench import bench
@@ -153,18 +154,26 @@ def tasks(
 def _shown(line: dict[str, object]) -> str:
     name = f"{line['agent']}  {line['task']}  {line['trial']}"
     if "error" in line:
-        return f"{name}  not run: {line['error']}"
+        return f"{name}  not run: {_printable(line['error'])}"
     reasons = line["why"] if isinstance(line["why"], tuple | list) else ()
-    shown = [f"{name}  {'counts' if line['counts'] else 'does not count: ' + '; '.join(map(str, reasons))}"]
+    shown = [f"{name}  {'counts' if line['counts'] else 'does not count: ' + '; '.join(map(_printable, reasons))}"]
     if "recorded" in line:
         shown.append(f"  {line['recorded']} calls recorded, the report among them")
     places = line.get("differences")
     if isinstance(places, list):
         shown += [
-            f"  call {one['call']}, {one['tool']}: {one['path']} was {one['recorded']}, is {one['replayed']}"
+            _printable(
+                f"  call {one['call']}, {one['tool']}: {one['path']} was {one['recorded']}, is {one['replayed']}"
+            )
             for one in places
         ] or ["  all answers as recorded"]
     return "\n".join(shown)
+
+
+def _printable(text: object) -> str:
+    from afspm.basics import escaped  # agents' texts are among the reasons
+
+    return "\n".join(map(escaped, str(text).splitlines()))
 
 
 def _show(lines: list[dict[str, object]]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -19,8 +19,11 @@ from afspm.basics import AfspmError, InvalidValue, Plain, PlainMapping
 from afspm.emulation import World
 from afspm.model import ControlMode, ControlRequest, ControlResponse, JournalEntry, Region, Scan, Spectrum
 from afspm.record import ScanRow, SpectrumRow
+from afspm_bench.agent_folder import read_left
 
 STATUSES: Final = ("done", "cannot", "ask")
+MOST_REPORT_BYTES: Final = 1 << 20
+_MOST_LEVELS: Final = 32
 _LIMITED: Final = frozenset(
     {
         ControlResponse.PARAM_ERROR,
@@ -46,6 +49,7 @@ class Report:
         cites: times of the measurements that support the answer, in ns since the Unix epoch.
         asks: names of facts missing from the prompt.
         usage: resources that the agent used, such as tokens; for the line of the trial, never judged.
+        handed_in: the JSON object as the agent wrote it.
     """
 
     status: str
@@ -53,18 +57,21 @@ class Report:
     cites: tuple[int, ...] = ()
     asks: tuple[str, ...] = ()
     usage: PlainMapping = field(default_factory=dict)
+    handed_in: PlainMapping = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def from_plain(cls, plain: object) -> Report:
         """Return the report described by a JSON object.
 
         Raises:
-            InvalidValue: a field is unknown or of the wrong type.
+            InvalidValue: a field is unknown or of the wrong type, or the object has more than 32 levels.
         """
         if not isinstance(plain, dict) or plain.get("status") not in STATUSES:
             raise InvalidValue(f"a report needs a status of {', '.join(STATUSES)}")
         if unknown := sorted(set(plain) - {"status", "answer", "cites", "asks", "usage"}):
             raise InvalidValue(f"a report has no field {unknown[0]!r}")
+        if _levels(plain) > _MOST_LEVELS:  # more would end the functions that copy and compare it
+            raise InvalidValue(f"a report has {_MOST_LEVELS} levels at most, of objects and lists within another")
         answer, cites, asks = plain.get("answer", {}), plain.get("cites", []), plain.get("asks", [])
         usage = plain.get("usage", {})
         # an id over HTTP is a text, since it has more digits than a JSON number holds in some languages
@@ -76,7 +83,7 @@ class Report:
             times = tuple(int(one) for one in cites)
         except (TypeError, ValueError, OverflowError) as error:  # OverflowError: infinity, which Python's JSON reads
             raise InvalidValue(f"cites are times in ns: {error}") from error
-        return cls(str(plain["status"]), answer, times, tuple(map(str, asks)), usage)
+        return cls(str(plain["status"]), answer, times, tuple(map(str, asks)), usage, plain)
 
     def as_plain(self) -> dict[str, object]:
         """Return the report as a dict for the line of the trial, without its cites."""
@@ -225,13 +232,23 @@ def true_heights(world: World, region: Region, pixels: int) -> NDArray[np.float6
 def read_report(file: Path) -> tuple[Report | None, str]:
     """Return the report in a file and ""; None and the reason if there is no valid report."""
     try:
-        if file.stat().st_size > 1 << 20:
-            return None, "the report is larger than 1 MiB"
-        return Report.from_plain(json.loads(file.read_bytes())), ""
+        return Report.from_plain(json.loads(read_left(file, MOST_REPORT_BYTES))), ""
     except FileNotFoundError:
         return None, "no report"
-    except (OSError, ValueError, RecursionError, AfspmError) as error:
+    except (ValueError, RecursionError, AfspmError) as error:
         return None, f"the report can't be read: {error}"
+
+
+def _levels(plain: object) -> int:
+    levels, level = 0, [plain]
+    while level:
+        levels += 1
+        level = [inner for one in level if isinstance(one, dict | list) for inner in _inner(one)]
+    return levels
+
+
+def _inner(one: dict[str, object] | list[object]) -> Iterable[object]:
+    return one.values() if isinstance(one, dict) else one
 
 
 def times_of(rows: list[ScanRow] | list[SpectrumRow]) -> Iterator[float]:

@@ -49,9 +49,9 @@ class Cell:
     """Counts of one agent's trials in one family, or in all families.
 
     Attributes:
-        trials: judged trials, without `errors`.
+        trials: trials whose agent was started, without `errors`.
         tasks: number of tasks; once, always: tasks with at least one, or with all, of their trials counting.
-        errors: trials that the bench could not run.
+        errors: trials that ended before their agent was started.
     """
 
     trials: int
@@ -173,7 +173,7 @@ def write_page(folder: Path, lines: Sequence[Line]) -> Path:
     published = [["published", "number", "comparable?"], *map(list, PUBLISHED)]
     body += section("Published numbers", _html(published) + f"<p>{escape(_CAVEAT)}</p>")
     target = folder / PAGE_FILE
-    replace_file(target, [document("AFMBench-Sim", body).encode()], synced=False)
+    replace_file(target, [document("AFMBench-Sim", body).encode(errors="backslashreplace")], synced=False)
     return target
 
 

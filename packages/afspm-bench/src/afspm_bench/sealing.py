@@ -7,6 +7,9 @@ operating system, the interpreter and the agent's own modules to read and to exe
 processes inherit the restriction. The memory of other processes is denied, too, and where the kernel can, signals to
 them. Not denied: connections to sockets, the environment of other processes, which must therefore hold no secret, and
 sizes and permissions of files whose path is known.
+
+The process that was started stays outside the seal, and attends to the sealed one: the kernel gives it the processes
+that the sealed one leaves behind, in sessions of their own, too, and it kills them at the end. SIGTERM ends all.
 """
 
 from __future__ import annotations
@@ -15,13 +18,14 @@ import contextlib
 import ctypes
 import json
 import os
+import signal
 import struct
 import sys
 import sysconfig
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NoReturn
 
 from afspm.basics import AfspmError
 
@@ -29,6 +33,7 @@ _CREATE, _ADD, _RESTRICT = 444, 445, 446  # system calls, the same on all archit
 _VERSION_FLAG: Final = 1
 _BENEATH: Final = 1
 _NO_NEW_PRIVS: Final = 38
+_CHILD_SUBREAPER: Final = 36
 _EXECUTE, _WRITE, _READ_FILE, _LIST = (1 << bit for bit in range(4))
 _TRUNCATE: Final = 1 << 14
 _READ: Final = _EXECUTE | _READ_FILE | _LIST
@@ -59,12 +64,12 @@ class Seal:
     Attributes:
         own: folder in which the process may do everything.
         readable: files and folders to read and execute.
-        writable: files to read and write.
+        most_bytes: size of the largest file that it may write.
     """
 
     own: str
     readable: tuple[str, ...]
-    writable: tuple[str, ...] = ()
+    most_bytes: int = 1 << 30
 
     def command(self, python: Sequence[str], command: Sequence[str]) -> tuple[str, ...]:
         """Return the command that starts `command` sealed.
@@ -117,8 +122,7 @@ def _allowed(given: Seal, rights: int) -> Iterator[tuple[str, int]]:
     yield given.own, rights & ~(_DEVICES | _IOCTL)
     for path in (*_SYSTEM, *_LINKED, *_SOURCES, *given.readable):
         yield path, _READ
-    for path in ("/dev/null", *given.writable):
-        yield path, _READ_FILE | _WRITE | _TRUNCATE
+    yield "/dev/null", _READ_FILE | _WRITE | _TRUNCATE
 
 
 def _allow(libc: ctypes.CDLL, rules: int, path: str, allowed: int) -> None:
@@ -146,13 +150,29 @@ def _libc() -> ctypes.CDLL:
     return ctypes.CDLL(None, use_errno=True)
 
 
-def main(arguments: Sequence[str]) -> None:
-    """Seal this process, then replace it by the command; without arguments, print the folders of the interpreter."""
+def main(arguments: Sequence[str]) -> int:
+    """Run a command sealed; return its exit code once no process of it lives.
+
+    Without arguments, print the folders of the interpreter.
+    """
     if not arguments:
         sys.stdout.write(json.dumps(interpreter_folders()))
-        return
+        return 0
     given, *command = arguments
-    seal(Seal(**json.loads(given)))
+    signal.signal(signal.SIGTERM, lambda *_: _kill_children())
+    _require(_libc().prctl(_CHILD_SUBREAPER, 1, 0, 0, 0), "attend to the processes of a sealed one")
+    if (child := os.fork()) == 0:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        _replace(Seal(**json.loads(given)), command)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the sealed one, too, and the bench
+    return _attended(child)
+
+
+def _replace(given: Seal, command: list[str]) -> NoReturn:
+    import resource  # not on Windows, where this module is imported, too
+
+    resource.setrlimit(resource.RLIMIT_FSIZE, (given.most_bytes, given.most_bytes))
+    seal(given)
     try:
         os.execvp(command[0], command)
     except OSError as error:
@@ -162,5 +182,25 @@ def main(arguments: Sequence[str]) -> None:
         )
 
 
+def _attended(child: int) -> int:
+    code = None
+    with contextlib.suppress(ChildProcessError):  # none is left
+        while True:
+            ended, status = os.wait()
+            if ended == child:
+                code = os.waitstatus_to_exitcode(status)
+            if code is not None:
+                _kill_children()  # processes whose parent has ended since the last look are children of this one now
+    return 1 if code is None or code < 0 else code
+
+
+def _kill_children() -> None:
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            parent = (process / "stat").read_bytes().rpartition(b")")[2].split()[1]
+            if int(parent) == os.getpid():
+                os.kill(int(process.name), signal.SIGKILL)
+
+
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(main(sys.argv[1:]))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Protocol
 
 from afspm import Scope, write_atomic
-from afspm.basics import ExperimentClock, PlainMapping
+from afspm.basics import Clock, PlainMapping
 from afspm.emulation import World
 from afspm_bench.evidence import Report
 
@@ -45,7 +45,7 @@ class TrialSession:
     prompt: str
     given: PlainMapping
     documents: Mapping[str, str]
-    clock: ExperimentClock
+    clock: Clock
     began_ns: int
     minutes: float
     seed: int

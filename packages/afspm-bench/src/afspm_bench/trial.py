@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import secrets
-import shutil
 import socket
 import subprocess
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
@@ -26,9 +27,11 @@ from afspm.model import ControlMode, ScopeState, names
 from afspm.processes import FreePorts, toml_text
 from afspm.record import latest_run
 from afspm_bench.agent_files import AgentFiles
+from afspm_bench.agent_folder import MOST_BYTES, remove, require_bounds, watched
 from afspm_bench.cassette import REPORT_CALL, ToolCall, recording
-from afspm_bench.evidence import Evidence, read_report
+from afspm_bench.evidence import Evidence, Report, read_report
 from afspm_bench.judging import TrialVerdict, judge
+from afspm_bench.kept_clock import keeping
 from afspm_bench.sealing import Seal
 from afspm_bench.session import REPORT_FILE
 from afspm_bench.tasks import BenchTask
@@ -37,16 +40,28 @@ AGENT: Final = "agent"
 MCP: Final = "mcp"
 JOINED_WITHIN_S: Final = 60.0
 RETRY_S: Final = 0.05
+KILLED_WITHIN_S: Final = 10.0
+_LAST_WORDS_S: Final = 2.0
+_LAST_LINES, _LAST_BYTES, _LONGEST_LINE = 3, 500, 64
 ENDED_WITHIN_S: Final = 60.0
 GRANT_MARGIN_S: Final = 3600.0
 """Experiment time added to the duration of a grant, for the start and end of the processes."""
 _FINAL: Final = (names.SCAN_SPEED, names.TIP_BIAS_VOLTAGE, names.ZCTRL_SETPOINT)
 
 
+_log = logging.getLogger(__name__)
+
+
 class TrialFailed(AfspmError):
-    """Error: the bench could not run a trial, through no fault of the agent."""
+    """Error: a trial could not be run: it ended before the agent's process was started."""
 
     code = "trial-failed"
+
+
+class AgentFailed(AfspmError):
+    """Error: an agent's process did not get ready for its task."""
+
+    code = "agent-failed"
 
 
 @dataclass(frozen=True)
@@ -73,7 +88,8 @@ class TrialOutcome:
     """Verdict and circumstances of one finished trial.
 
     Attributes:
-        ended: end of the agent's process: "ended", "failed" (exit code not 0), or "time" if it was stopped.
+        ended: end of the agent's process: "ended", "failed" (exit code not 0), or "time" if it was stopped; "error" if
+            the trial ended in an error afterwards, so that it is not judged, but has failed.
         sealed: whether the agent's process could open only the files that it needs.
     """
 
@@ -106,14 +122,14 @@ def run_trial(
         calls: receives the agent's tool calls over MCP, and its report as the last entry.
 
     Raises:
-        TrialFailed: the experiment or the agent did not start, the experiment did not end, or its record can't be
-            judged.
+        TrialFailed: the trial ended before the agent's process was started.
     """
     modules = own.parent / f"{own.name}-modules"
-    for made in (folder, own):
-        made.mkdir(parents=True, mode=0o700)
-    started_s = time.monotonic()
+    started_s, agent_started = time.monotonic(), threading.Event()
     try:
+        for made in (folder, own):
+            made.mkdir(parents=True, mode=0o700)
+        require_bounds(own)
         if files is not None:
             files.link_modules(modules)
         with _experiment(task, agent, folder) as running, contextlib.ExitStack() as proxy:
@@ -122,16 +138,26 @@ def run_trial(
                 await_listener(running.mcp_url, JOINED_WITHIN_S)
                 running.mcp_url = proxy.enter_context(recording(running.mcp_url, task.full_prompt(), calls))
             allowed = None if files is None else _Allowed(files, modules)
-            ended = _with_agent(running, task, agent, own, allowed=allowed, patience_s=patience_s)
+            ended = _with_agent(running, task, agent, own, agent_started, allowed=allowed, patience_s=patience_s)
         verdict, report, end_ns = _judged(task, running, own)
-        if calls is not None and report:
-            handed_in = json.loads((own / REPORT_FILE).read_bytes())
-            calls.append(ToolCall(task.full_prompt(), REPORT_CALL, answer=handed_in))
+        if calls is not None and report is not None:
+            calls.append(ToolCall(task.full_prompt(), REPORT_CALL, answer=report.handed_in))
+        plain = {} if report is None else report.as_plain()
         real_s, experiment_s = time.monotonic() - started_s, (end_ns - running.began_ns) * 1e-9
-        return TrialOutcome(verdict, ended, files is not None, real_s, experiment_s, report)
+        return TrialOutcome(verdict, ended, files is not None, real_s, experiment_s, plain)
+    except Exception as error:  # an agent may cause any error after its start, and no error spares it a failed trial
+        if not agent_started.is_set():
+            if isinstance(error, OSError | AfspmError) and not isinstance(error, TrialFailed):
+                raise TrialFailed(str(error)) from error
+            raise
+        if not isinstance(error, AfspmError):
+            _log.exception("%s ended in an error of the bench, and counts as failed", task.name)
+        why = f"the trial ended in an error: {type(error).__name__}: {error}"
+        verdict = TrialVerdict(solved=False, harmless=False, honest=False, why=(why,))
+        return TrialOutcome(verdict, "error", files is not None, time.monotonic() - started_s, 0.0)
     finally:
         for made in (modules,) if keep else (folder, own, modules):
-            shutil.rmtree(made, ignore_errors=True)
+            remove(made)
 
 
 @dataclass(frozen=True)
@@ -198,10 +224,10 @@ def _experiment(task: BenchTask, agent: AgentSpec, folder: Path) -> Iterator[_Ru
     # without a process for `name`: the bench itself joins under this name
     command = [*python_command("afspm"), "run", str(file), "--no-report", "--runs", str(runs), "--without", name]
     process = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=folder,
-        env={**os.environ, **python_environment()},
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, cwd=folder,
+        encoding="utf-8", errors="replace", env={**os.environ, **python_environment()},
     )  # fmt: skip
-    lines: list[str] = []
+    lines: deque[str] = deque(maxlen=_LAST_LINES)
     rest: threading.Thread | None = None
     try:
         run = _run_folder(process, runs, lines)
@@ -221,7 +247,7 @@ def _experiment(task: BenchTask, agent: AgentSpec, folder: Path) -> Iterator[_Ru
     except subprocess.TimeoutExpired as error:
         raise TrialFailed(f"the experiment did not end within {ENDED_WITHIN_S:g} s", where=str(folder)) from error
     except AfspmError as error:
-        last = " | ".join(line.strip() for line in lines[-3:])
+        last = " | ".join(line.strip() for line in lines)
         raise TrialFailed(f"{task.name}: {error}; the run wrote: {last}", where=str(folder)) from error
     finally:
         if process.poll() is None:  # its own children end with it
@@ -236,7 +262,7 @@ def _experiment(task: BenchTask, agent: AgentSpec, folder: Path) -> Iterator[_Ru
             process.stdout.close()
 
 
-def _run_folder(process: subprocess.Popen[str], runs: Path, lines: list[str]) -> Path:
+def _run_folder(process: subprocess.Popen[str], runs: Path, lines: deque[str]) -> Path:
     # the folder is whole before the run writes its first line
     assert process.stdout is not None
     for line in process.stdout:
@@ -246,7 +272,7 @@ def _run_folder(process: subprocess.Popen[str], runs: Path, lines: list[str]) ->
     raise TrialFailed("the experiment did not start", where=str(runs))
 
 
-def _drain(stream: IO[str] | None, lines: list[str]) -> None:
+def _drain(stream: IO[str] | None, lines: deque[str]) -> None:
     for line in stream or ():
         lines.append(line)
 
@@ -280,7 +306,14 @@ def await_listener(url: str, within_s: float) -> None:
 
 
 def _with_agent(
-    running: _Running, task: BenchTask, agent: AgentSpec, own: Path, *, allowed: _Allowed | None, patience_s: float
+    running: _Running,
+    task: BenchTask,
+    agent: AgentSpec,
+    own: Path,
+    started: threading.Event,
+    *,
+    allowed: _Allowed | None,
+    patience_s: float,
 ) -> str:
     for file, text in task.documents.items():
         (own / file).write_text(text, encoding="utf-8")
@@ -289,11 +322,11 @@ def _with_agent(
         await_listener(url, JOINED_WITHIN_S)
     _approve(running, task)
     with (
-        (own / "output.txt").open("wb") as output,
-        _agent_process(running, task, agent, own, output, allowed) as process,
+        (own / "output.txt").open("w+b") as output,
+        _agent_process(running, task, agent, own, output, started, allowed=allowed) as process,
     ):
         if agent.python:
-            _await_ready(process, own, patience_s)
+            _await_ready(process, output, patience_s)
         running.began_ns = running.clock.now_ns()
         running.hold.release()
         if process.stdin is not None:
@@ -321,7 +354,14 @@ def _approve(running: _Running, task: BenchTask) -> None:
 
 @contextlib.contextmanager
 def _agent_process(
-    running: _Running, task: BenchTask, agent: AgentSpec, own: Path, output: IO[bytes], allowed: _Allowed | None
+    running: _Running,
+    task: BenchTask,
+    agent: AgentSpec,
+    own: Path,
+    output: IO[bytes],
+    started: threading.Event,
+    *,
+    allowed: _Allowed | None,
 ) -> Iterator[subprocess.Popen[str]]:
     command: tuple[str, ...] = agent.command or python_command("afspm_bench.agent_process")
     launch = guest_of(running.run, AGENT)
@@ -332,9 +372,8 @@ def _agent_process(
         import_from = (str(allowed.modules),)
         if agent.command:
             environment["PYTHONPATH"] = os.pathsep.join([*import_from, *filter(None, [os.environ.get("PYTHONPATH")])])
-        clock = (str(path),) if (path := launch.clock.get("waits")) else ()
         readable = tuple(map(str, (allowed.modules, *allowed.files.readable)))
-        command = Seal(str(own), readable, clock).command(python_command("afspm_bench.sealing"), command)
+        command = Seal(str(own), readable, MOST_BYTES).command(python_command("afspm_bench.sealing"), command)
     facts = {
         "task": task.name, "prompt": task.full_prompt(), "given": task.given, "documents": dict(task.documents),
         "minutes": task.minutes, "seed": secrets.randbits(31),
@@ -346,43 +385,58 @@ def _agent_process(
         if running.mcp_url:
             # without `people` a name is the whole token, and this computer alone is served
             environment |= {"AFSPM_BENCH_MCP_URL": running.mcp_url, "AFSPM_BENCH_MCP_TOKEN": f"{AGENT}:"}
-    process = subprocess.Popen(
-        command, stdin=subprocess.PIPE if agent.python else subprocess.DEVNULL,
-        stdout=subprocess.PIPE if agent.python else output, stderr=output, text=True, cwd=own, env=environment,
-    )  # fmt: skip
-    try:
-        if process.stdin is not None:
-            trial = {
-                **facts, "launch": plain, "class": agent.python, "import_from": list(import_from),
-                "sealed": allowed is not None,
-                "truth_folder": str(running.run) if agent.sees_truth else None,
-            }  # fmt: skip
-            process.stdin.write(json.dumps(trial) + "\n")
-            process.stdin.flush()
-        yield process
-    finally:
-        if process.poll() is None:
+    with contextlib.ExitStack() as kept:
+        clock = None
+        if allowed is not None and agent.python:
+            clock = kept.enter_context(keeping(running.clock)).fileno()
+            plain["clock"] = {"speed": running.clock.speed}
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE if agent.python else subprocess.DEVNULL,
+            stdout=subprocess.PIPE if agent.python else output, stderr=output, text=True, cwd=own, env=environment,
+            pass_fds=() if clock is None else (clock,),
+        )  # fmt: skip
+        started.set()
+        # all processes of a sealed agent end with it
+        end = process.kill if allowed is None else process.terminate
+        try:
+            if process.stdin is not None:
+                trial = {
+                    **facts, "launch": plain, "class": agent.python, "import_from": list(import_from),
+                    "sealed": allowed is not None, "kept_clock": clock,
+                    "truth_folder": str(running.run) if agent.sees_truth else None,
+                }  # fmt: skip
+                process.stdin.write(json.dumps(trial) + "\n")
+                process.stdin.flush()
+            with watched(own, end):
+                yield process
+        finally:
+            end()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(KILLED_WITHIN_S)
             process.kill()
-        process.wait()
-        for pipe in (process.stdin, process.stdout):
-            if pipe is not None:
-                with contextlib.suppress(OSError):
-                    pipe.close()
+            process.wait()
+            for pipe in (process.stdin, process.stdout):
+                if pipe is not None:
+                    with contextlib.suppress(OSError):
+                        pipe.close()
 
 
-def _await_ready(process: subprocess.Popen[str], own: Path, patience_s: float) -> None:
+def _await_ready(process: subprocess.Popen[str], output: IO[bytes], patience_s: float) -> None:
     said: SimpleQueue[str] = SimpleQueue()
     stdout = process.stdout
     assert stdout is not None
-    threading.Thread(target=lambda: said.put(stdout.readline()), name="ready", daemon=True).start()
+    threading.Thread(target=lambda: said.put(stdout.readline(_LONGEST_LINE)), name="ready", daemon=True).start()
     try:
         line = said.get(timeout=patience_s)
     except Empty:
-        raise TrialFailed(f"the agent did not start within {patience_s:g} s") from None
+        raise AgentFailed(f"the agent did not start within {patience_s:g} s") from None
     if line.strip() != "ready":
-        process.wait()  # so that its last words are there
-        wrote = (own / "output.txt").read_text(encoding="utf-8", errors="replace").strip()
-        raise TrialFailed(f"the agent ended before its start: {wrote[-500:]}")
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_LAST_WORDS_S)  # so that its last words are there
+        # by the bench's own descriptor: under the name of the file the agent may have left anything
+        output.seek(max(0, output.seek(0, os.SEEK_END) - _LAST_BYTES))
+        wrote = output.read(_LAST_BYTES).decode(errors="replace")
+        raise AgentFailed(f"the agent ended before its start: {wrote.strip()}")
 
 
 def _followed(process: subprocess.Popen[str], running: _Running, task: BenchTask, patience_s: float) -> int | None:
@@ -404,16 +458,12 @@ def _followed(process: subprocess.Popen[str], running: _Running, task: BenchTask
     return None
 
 
-def _judged(task: BenchTask, running: _Running, own: Path) -> tuple[TrialVerdict, PlainMapping, int]:
+def _judged(task: BenchTask, running: _Running, own: Path) -> tuple[TrialVerdict, Report | None, int]:
     report, why = read_report(own / REPORT_FILE)
     evidence = Evidence(running.run, running.name, report, running.began_ns, running.final)
-    try:
-        with evidence.run:
-            verdict = judge(task, evidence)
-            end_ns = evidence.run.newest_ns
-    except (OSError, AfspmError) as error:
-        raise TrialFailed(f"the record can't be judged: {error}", where=str(running.run)) from error
+    with evidence.run:
+        verdict = judge(task, evidence)
+        end_ns = evidence.run.newest_ns
     if why:
         verdict = replace(verdict, why=(*verdict.why, why))
-    plain = {} if report is None else report.as_plain()
-    return verdict, plain, end_ns
+    return verdict, report, end_ns
