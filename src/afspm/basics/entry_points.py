@@ -9,12 +9,14 @@ One line declares one class::
 | comes in | the metadata of all installed packages, read once per process, since reading takes milliseconds |
 | goes out | names, paths of classes, loaded objects, and for `afspm doctor` an inventory |
 | always holds | nothing is imported until its name is used; a name declared for different objects is refused |
+| | a package that can't be read or imported costs its own names alone |
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+import os
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -43,14 +45,18 @@ PAGES = "afspm.pages"  # `afspm run --dashboard`: a module with the functions of
 CLASSES = (COMPONENTS, SCHEDULERS, DRIVERS, EMULATORS)
 """Groups whose classes an experiment file may name without a module."""
 _FILE = "entry_points.txt"
+_OWN = "afspm"
+_IN_FILES = (*CLASSES, ESTIMATORS, TRACKERS)
+"""Groups whose names stand in experiment files: another package's object would change what the file means."""
 GROUPS = (*CLASSES, READERS, EXPORTERS, ESTIMATORS, TRACKERS, FIGURES, DISPLAYS, FUNCTIONS, FORMS, COMMANDS, PAGES)
 
 
 @dataclass(frozen=True)
 class DeclaredName:
-    """A name that an installed package declares as an entry point.
+    """A name that an installed package declares as an entry point, or a package whose names can't be read.
 
     Attributes:
+        group, name: empty for a package whose names can't be read.
         package: name and version of the package.
         problem: reason why the name can't be used; empty if usable or not tried.
     """
@@ -69,11 +75,15 @@ def names(*groups: str) -> tuple[str, ...]:
 def find(name: str, *groups: str) -> EntryPoint | None:
     """Return the entry point with this name in one of the groups; None if no package declares the name.
 
+    Outside experiment files a name of afspm stays afspm's, so that no package takes a reader or a command away.
+
     Raises:
         ConfigError: the name is declared for different objects.
     """
     # by value: two packages may declare the same object
     found = {point.value: point for point in _points(groups) if point.name == name}
+    if len(found) > 1 and not {*groups} & {*_IN_FILES}:
+        found = {value: point for value, point in found.items() if _package(point) == _OWN} or found
     if len(found) > 1:
         packages = sorted({_package(point) for point in found.values()})
         raise ConfigError(
@@ -142,13 +152,14 @@ def folder(group: str, name: str) -> Path | None:
 def inventory(taken_commands: Collection[str] = ()) -> tuple[DeclaredName, ...]:
     """Load the declared objects; return all declared names, each with the reason if it can't be used.
 
-    Names in unknown groups and names of afspm's own commands are not loaded.
+    The packages whose names can't be read come first. Names in unknown groups and names that afspm uses itself are not
+    loaded.
 
     Args:
         taken_commands: afspm's own commands, which no package can replace.
     """
-    found = []
-    for group, points in sorted(_installed().items(), key=lambda item: (item[0] not in GROUPS, item[0])):
+    found = [*unreadable()]
+    for group, points in sorted(_installed().points.items(), key=lambda item: (item[0] not in GROUPS, item[0])):
         for point in sorted(points, key=lambda point: (_package(point), point.name)):
             problem = ""
             try:
@@ -157,28 +168,64 @@ def inventory(taken_commands: Collection[str] = ()) -> tuple[DeclaredName, ...]:
                 elif group == COMMANDS and point.name in taken_commands:
                     problem = "afspm has a command of this name"
                 else:
-                    find(point.name, *(CLASSES if group in CLASSES else (group,)))
-                    _loaded(point)
+                    used = find(point.name, *(CLASSES if group in CLASSES else (group,)))
+                    if used is not None and used.value != point.value:
+                        problem = "afspm declares this name, too, and uses its own"
+                    else:
+                        _loaded(point)
             except ConfigError as error:
                 problem = error.what
             found.append(DeclaredName(group, point.name, _package(point, with_version=True), problem))
     return tuple(found)
 
 
+def unreadable() -> tuple[DeclaredName, ...]:
+    """Return the installed packages whose names, or some of them, can't be read."""
+    return tuple(_installed().unreadable)
+
+
+@dataclass(frozen=True)
+class _Installed:
+    points: dict[str, list[EntryPoint]] = field(default_factory=dict)
+    unreadable: list[DeclaredName] = field(default_factory=list)
+
+
 @cache
-def _installed() -> Mapping[str, Sequence[EntryPoint]]:
+def _installed() -> _Installed:
     from importlib import metadata  # imported late: it imports 40 modules, and most processes look up no name
 
     # metadata.entry_points() parses the entry points of all packages: 8 ms with 150 of them, this takes 2 ms
-    found: dict[str, list[EntryPoint]] = {}
+    found = _Installed()
     for package in metadata.distributions():
-        declared = package.read_text(_FILE) or ""
-        if "[afspm." not in declared or not _is_first(package, declared):
-            continue
-        for point in package.entry_points:
-            if point.group.startswith("afspm."):
-                found.setdefault(point.group, []).append(point)
+        try:
+            _add(package, found)
+        except Exception as error:  # malformed metadata raises errors of many types in the standard library
+            problem = f"its metadata can't be read: {type(error).__name__}: {error}"
+            found.unreadable.append(DeclaredName("", "", _place(package), problem))
+            # pydantic reads the metadata of all packages at its first model, and fails with such a package among them
+            os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")
     return found
+
+
+def _add(package: Distribution, found: _Installed) -> None:
+    declared = package.read_text(_FILE) or ""
+    for line in map(str.strip, declared.splitlines()):
+        if line and "=" not in line and not line.startswith(("[", "#")):
+            raise ValueError(f"the line {line!r} of {_FILE} is not of the form name = module:object")
+    if "[afspm." not in declared or not _is_first(package, declared):
+        return
+    of_afspm = [point for point in package.entry_points if point.group.startswith("afspm.")]
+    for point in of_afspm:
+        if point.pattern.match(point.value) is None:
+            problem = f"{point.value!r} is not of the form module:object"
+            found.unreadable.append(DeclaredName(point.group, point.name, _package(point), problem))
+        else:
+            found.points.setdefault(point.group, []).append(point)
+
+
+def _place(package: Distribution) -> str:
+    # the folder of the metadata: the name may be what can't be read
+    return str(getattr(package, "_path", package.locate_file("")))
 
 
 def _is_first(package: Distribution, declared: str) -> bool:
@@ -194,13 +241,15 @@ def forget() -> None:
 
 
 def _points(groups: Iterable[str]) -> Iterable[EntryPoint]:
-    return (point for group in groups for point in _installed().get(group, ()))
+    return (point for group in groups for point in _installed().points.get(group, ()))
 
 
 def _loaded(point: EntryPoint) -> Any:
     try:
         return point.load()
-    except Exception as error:  # a module may raise anything while it is imported
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # a module may raise anything while it is imported, also SystemExit
         raise ConfigError(
             f"{point.name!r} of the package {_package(point)} can't be loaded: {type(error).__name__}: {error}",
             where=point.group,

@@ -98,10 +98,18 @@ app.command("emulate", rich_help_panel=MICROSCOPES)(developing.emulate)
 def _declared(name: str) -> Command | None:
     try:
         found = entry_points.load(entry_points.COMMANDS, name)
+        if found is None:
+            return None
+        command = _command(name, found)
     except ConfigError as error:  # raised when the command is called: the help must list all others
-        found = _unloadable(error)
-    if found is None:
-        return None
+        command = _command(name, _unloadable(error))
+    except Exception as error:  # typer raises many kinds where a package's function can't be a command
+        what = f"the command {name} of a package can't be used: {type(error).__name__}: {error}"
+        command = _command(name, _unloadable(ConfigError(what, where=entry_points.COMMANDS)))
+    return command
+
+
+def _command(name: str, found: typer.Typer | Callable[..., object]) -> Command:
     if not isinstance(found, typer.Typer):
         function, found = found, typer.Typer(rich_markup_mode=None)
         found.command()(function)

@@ -83,7 +83,7 @@ def _finding_as_json(finding: Finding) -> Plain:
 def _explain(experiment: Experiment, console: Console) -> None:
     from afspm.experiment.forms import all_forms
 
-    for form in all_forms():
+    for form in all_forms()[0]:
         for place, line, became in form.explained(experiment.resolved):
             console.print(f"{place}: {line}: {became}", markup=False, emoji=False, soft_wrap=True)
         typer.echo(form.short(experiment.resolved), nl=False)

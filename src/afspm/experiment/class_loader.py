@@ -108,6 +108,8 @@ def full_path(name: str) -> str:
         raise Unloadable(error.what, error.hint) from error
     if path is None:
         hint = nearest(name, entry_points.names(*entry_points.CLASSES)) or 'write it as "module.Name"'
+        for one in entry_points.unreadable():
+            hint += f"; or it is of the package {one.package}: {one.problem}"
         raise Unloadable(f"there is no ready-made class {name!r}", hint)
     return path
 

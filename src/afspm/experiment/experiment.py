@@ -34,7 +34,8 @@ class Experiment:
     def __init__(self, document: documents.Document) -> None:
         self._document = document
         self._unreadable = () if document.is_whole else tuple(document.findings.found)
-        self.parts = sorting.sort(document, forms.all_forms())
+        installed, self._unusable_forms = forms.all_forms()
+        self.parts = sorting.sort(document, installed)
 
     @property
     def name(self) -> str:
@@ -84,7 +85,8 @@ class Experiment:
     def check(self, only: Collection[str] = (), without: Collection[str] = ()) -> list[Finding]:
         """Return all errors and warnings: errors first, then by file and line. No process is started.
 
-        If a file can't be read, only that is returned: the other files may use names that it defines.
+        If a file can't be read, only that is returned: the other files may use names that it defines. With errors, a
+        form of files that can't be loaded is a warning: the file may be of this form.
 
         Args:
             only, without: as for `launches`; classes of processes started elsewhere need not be installed here.
@@ -98,7 +100,12 @@ class Experiment:
             return Findings(list(self._unreadable)).ordered()
         chosen = process_starts.chosen_names(self.resolved, only, without)
         missing = process_starts.not_installed(self.resolved, chosen)
-        return Findings([*self._document.findings.found, *missing, *shared_files(self.resolved, chosen)]).ordered()
+        findings = Findings([*self._document.findings.found, *missing, *shared_files(self.resolved, chosen)])
+        if any(one.is_error for one in findings.found):
+            for error in self._unusable_forms:
+                hint = "if the file is of this form, mend the package"
+                findings.warning(error.what, self._document.place(), hint)
+        return findings.ordered()
 
     @cached_property
     def resolved(self) -> ResolvedExperiment:

@@ -6,6 +6,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Protocol
 
 from afspm.basics import entry_points
+from afspm.basics.errors import ConfigError
 from afspm.experiment.parts import Converter
 
 if TYPE_CHECKING:
@@ -24,6 +25,12 @@ class FileForm(Converter, Protocol):
 
 
 @cache
-def all_forms() -> tuple[FileForm, ...]:
-    """Return all installed forms. Raises ConfigError if a form can't be loaded."""
-    return tuple(entry_points.load(entry_points.FORMS, name) for name in entry_points.names(entry_points.FORMS))
+def all_forms() -> tuple[tuple[FileForm, ...], tuple[ConfigError, ...]]:
+    """Return all installed forms, and an error for each form that can't be loaded."""
+    forms, errors = [], []
+    for name in entry_points.names(entry_points.FORMS):
+        try:
+            forms.append(entry_points.load(entry_points.FORMS, name))
+        except ConfigError as error:  # most files need no form but afspm's own
+            errors.append(error)
+    return tuple(forms), tuple(errors)

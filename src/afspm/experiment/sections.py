@@ -13,6 +13,7 @@ from typing import Annotated, ClassVar, Final, Literal, TypeVar, get_args, get_o
 import pydantic
 from pydantic import Field, StrictBool
 
+from afspm.basics import entry_points
 from afspm.basics.plain_data import file_key
 from afspm.basics.units import Duration, Period, PositiveDuration
 from afspm.experiment.document import Document
@@ -38,6 +39,9 @@ def _checked_orcid(text: str) -> str:
 
 
 Orcid = Annotated[str, pydantic.AfterValidator(_checked_orcid)]
+
+
+entry_points.unreadable()  # before the first model, which fails with an unreadable package unless it is found here
 
 
 class Section(pydantic.BaseModel):

@@ -82,7 +82,7 @@ def of_packages(declared: Iterable[DeclaredName]) -> Iterator[Diagnosis]:
     usable: dict[tuple[str, str], list[str]] = {}
     for one in declared:
         if one.problem:
-            what = f"{one.group} {one.name}: {one.problem}"
+            what = f"{one.group} {one.name}: {one.problem}" if one.name else one.problem
             yield Diagnosis("package", Severity.WARNING, one.package, what, "mend or uninstall the package")
         else:
             usable.setdefault((one.package, one.group.removeprefix("afspm.")), []).append(one.name)

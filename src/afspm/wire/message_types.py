@@ -43,9 +43,11 @@ def register_all(sources: Iterable[str]) -> None:
 def _imported(name: str) -> ModuleType:
     try:
         return named_imports.import_named(name)
-    except Exception as error:  # importing runs the user's code, which may raise anything
+    except (Exception, SystemExit) as error:  # importing runs the user's code, which may raise anything, even exit
         raise ConfigError(
-            f"can't be imported: {error}", where=name, hint="is it on the Python path, or beside the experiment file?"
+            f"can't be imported: {type(error).__name__}: {error}",
+            where=name,
+            hint="is it on the Python path, or beside the experiment file?",
         ) from error
 
 

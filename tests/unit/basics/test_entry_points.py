@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
@@ -206,22 +207,87 @@ def test_metadata_of_the_installed_packages_is_read_once(monkeypatch: pytest.Mon
 
 def test_suffix_of_several_makers_is_read_by_the_reader_that_knows_the_file(site: Path, tmp_path: Path) -> None:
     install(EXAMPLE_MAKER, site)
-    entry_points.forget()
+    declare(site, "[afspm.readers]\nnc.0 = missing:read\n")  # faults 5: it can't be loaded, and comes first
     file = tmp_path / "scan.nc"
     file.write_bytes(netcdf.encoded({}, {"program": "Acme", "version": "1"}))
     assert read(file).header["version"] == "1"
     file.write_bytes(netcdf.encoded({}, {"program": "another"}))
+    with pytest.raises(FileError, match=r"'nc\.0' of the package other-plugin can't be loaded"):
+        read(file)
+    shutil.rmtree(site / "other_plugin-1.0.dist-info")
+    entry_points.forget()
     with pytest.raises(FileError, match="neither by GXSM nor"):
         read(file)
 
 
-def declare(site: Path, lines: str) -> None:
+METADATA = "Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n"
+
+
+def declare(site: Path, lines: str | bytes, name: str = "other-plugin", metadata: str | None = METADATA) -> None:
     """Install a package that only declares names."""
-    info = site / "other_plugin-1.0.dist-info"
+    info = site / f"{name.replace('-', '_')}-1.0.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other-plugin\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(lines)
+    if metadata is not None:
+        (info / "METADATA").write_text(metadata.format(name=name))
+    (info / "entry_points.txt").write_bytes(lines if isinstance(lines, bytes) else lines.encode())
     entry_points.forget()
+
+
+@pytest.fixture
+def ill(site: Path) -> Path:
+    """A folder with packages that can't be imported or read."""
+    (site / "leaving.py").write_text("raise SystemExit(7)\n")
+    (site / "raising.py").write_text("raise RuntimeError('no form today')\n")
+    declare(site, "[afspm.commands]\nleave = leaving:app\nnumber = math:pi\n", "leaving")
+    declare(site, "[afspm.forms]\nform = raising:FORM\n", "raising")
+    declare(site, "[afspm.components]\nLine without a value\n", "half-a-line")
+    declare(site, "[afspm.components]\nOdd = no module!\nGood = example_plugin.counter:ExampleCounter\n", "odd-value")
+    declare(site, "[afspm.readers]\nx = leaving:read\n", "without-metadata", metadata=None)
+    declare(site, "[afspm.readers]\nx = leaving:read\n", "without-name", metadata="Metadata-Version: 2.1\n")
+    declare(site, b"[afspm.readers]\n\xff = leaving:read\n", "latin")
+    declare(site, "[afspm.readers]\nsxm = leaving:read\n", "second-reader")
+    return site
+
+
+# faults 5
+def test_packages_that_cannot_be_used_are_named_and_all_else_goes_on(ill: Path, tmp_path: Path) -> None:
+    (tmp_path / "experiment.toml").write_text(EXPERIMENT.replace("ExampleCounter", "Good"))
+    shown = afspm(ill, "--help")
+    assert shown.returncode == 0, shown.stdout + shown.stderr
+    assert "example-hello" in shown.stdout
+    left = afspm(ill, "leave")
+    assert left.returncode == 1
+    assert "'leave' of the package leaving can't be loaded: SystemExit: 7" in left.stderr
+    checked = afspm(ill, "check", "experiment.toml", "--json", cwd=tmp_path)
+    assert (checked.returncode, json.loads(checked.stdout)) == (0, []), checked.stdout + checked.stderr
+
+    done = afspm(ill, "doctor", "--json")
+    found = json.loads(done.stdout)["found"]
+    problems = {Path(one["where"]).name: one["what"] for one in found if one["severity"] == "warning"}
+    expected = {
+        "leaving 1.0": "SystemExit: 7", "raising 1.0": "RuntimeError: no form today",
+        "half_a_line-1.0.dist-info": "its metadata can't be read", "odd-value": "'no module!' is not of the form",
+        "without_metadata-1.0.dist-info": "its metadata can't be read",
+        "without_name-1.0.dist-info": "its metadata can't be read",
+        "latin-1.0.dist-info": "UnicodeDecodeError", "second-reader 1.0": "afspm declares this name, too",
+    }  # fmt: skip
+    assert {name: words for name, words in expected.items() if words not in problems.get(name, "")} == {}
+    assert done.returncode == 0
+
+
+def test_experiment_that_may_need_an_unusable_package_names_it(ill: Path, tmp_path: Path) -> None:
+    (tmp_path / "experiment.toml").write_text(EXPERIMENT.replace("ExampleCounter", "Odd"))
+    checked = afspm(ill, "check", "experiment.toml", "--json", cwd=tmp_path)
+    found = json.loads(checked.stdout)
+    assert checked.returncode == 1
+    assert [one["level"] for one in found] == ["error", "warning"]
+    assert "there is no ready-made class 'Odd'" in found[0]["what"]
+    assert "the package odd-value: 'no module!' is not of the form module:object" in found[0]["hint"]
+    assert "'form' of the package raising can't be loaded" in found[1]["what"]
+
+
+def test_second_reader_of_a_suffix_leaves_afspms_in_use(ill: Path) -> None:
+    assert entry_points.load(entry_points.READERS, "sxm").__module__.startswith("afspm.")
 
 
 def test_of_two_versions_of_a_package_the_first_in_the_path_is_used(

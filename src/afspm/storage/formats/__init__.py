@@ -21,7 +21,7 @@ from pathlib import Path
 
 from afspm.basics import entry_points
 from afspm.basics.argument_checks import PATH, checked
-from afspm.basics.errors import FileError
+from afspm.basics.errors import ConfigError, FileError
 from afspm.storage.formats.content import FileContent, OtherFormat
 
 __all__ = ["FileContent", "OtherFormat", "read", "suffixes"]
@@ -72,22 +72,25 @@ def _first_that_reads(path: Path, zone: tzinfo | None) -> FileContent:
     # OtherFormat. A question beforehand ("is it yours?") would open the file twice.
     own = _readers(path.suffix.lower().removeprefix("."))
     refusals: list[OtherFormat] = []
+    unusable: list[ConfigError] = []
     for name in (*own, *_readers(_ANY)):
         try:
-            return _read(name, path, zone)
+            reader: Reader = entry_points.load(entry_points.READERS, name)
+        except ConfigError as error:  # a broken package, or two with one name: the other readers of the suffix go on
+            unusable.append(error)
+            continue
+        try:
+            return reader(path, zone)
         except OtherFormat as error:
             refusals.append(error)
+    if unusable:  # the file may be of this reader
+        raise FileError(unusable[0].what, hint=unusable[0].hint or "mend or uninstall the package")
     # what the last reader of the suffix says is closer to the truth than what a converter says
     raise refusals[max(len(own) - 1, 0)]
 
 
 def _readers(suffix: str) -> list[str]:
     return [name for name in entry_points.names(entry_points.READERS) if name.partition(".")[0] == suffix]
-
-
-def _read(name: str, path: Path, zone: tzinfo | None) -> FileContent:
-    reader: Reader = entry_points.load(entry_points.READERS, name)
-    return reader(path, zone)
 
 
 def _with_unique_channels(content: FileContent) -> FileContent:
