@@ -392,8 +392,8 @@ def _agent_process(
             plain["clock"] = {"speed": running.clock.speed}
         process = subprocess.Popen(
             command, stdin=subprocess.PIPE if agent.python else subprocess.DEVNULL,
-            stdout=subprocess.PIPE if agent.python else output, stderr=output, text=True, cwd=own, env=environment,
-            pass_fds=() if clock is None else (clock,),
+            stdout=subprocess.PIPE if agent.python else output, stderr=output, cwd=own, env=environment,
+            encoding="utf-8", errors="replace", pass_fds=() if clock is None else (clock,),
         )  # fmt: skip
         started.set()
         # all processes of a sealed agent end with it
