@@ -176,8 +176,9 @@ def test_a_number_without_its_unit_is_not_sent(night: Night, page: Any) -> None:
     fill(page, "scan-speed", "8")
     fill(page, "tip-bias-voltage", "1 V")
     press(page, "Set")
-    said(page, "Nothing was set.")
-    assert "write the unit as well" in page.inner_text(".outcomes")
+    said(page, "Nothing was set. Refused: scan-speed.")
+    page.wait_for_selector(".q-field--error:has-text('write the unit as well')")
+    assert read(page, "tip-bias-voltage") == "1 V", "the clear value stays in its field, to be sent with the next Set"
     seen(night)
     entries = list(night.follower.overview.entries)[after:]
     asked = [one for one in entries if one.request == ControlRequest.PARAM and one.value]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
+from urllib.parse import urljoin
 
 import numpy as np
 import pytest
@@ -22,7 +23,11 @@ TURNED = Region((0.4e-6, -0.3e-6), (0.8e-6, 0.5e-6), 0.4)
 def scan(night: Night) -> Iterator[Scan]:
     """A rotated scan of many pixels, longer than wide: every mirror image of it differs."""
     with afspm.connect(night.folder, "tester") as scope:
-        yield scope.scan(TURNED, shape=(48, 72), timeout_s=60.0).first
+        with scope.control():  # a person may have set others before
+            scope.set("tip-bias-voltage", "100 mV")
+            scope.set("scan-speed", "4 um/s")
+            taken = scope.scan(TURNED, shape=(48, 72), timeout_s=60.0).first
+        yield taken
 
 
 def shown(page: Any, scan: Scan) -> Any:
@@ -279,7 +284,7 @@ def test_scans_of_different_sizes_at_one_place_are_pictures_on_the_map(
         page.wait_for_selector(f".map polygon[data-time='{one.time_ns}']", state="attached")
         picture = page.locator(f".map image[href*='/{one.time_ns}?']")
         assert picture.count() == 1
-        answer = page.request.get(night.url + picture.get_attribute("href"))
+        answer = page.request.get(urljoin(page.url, picture.get_attribute("href")))
         assert (answer.status, answer.headers["content-type"]) == (200, "image/png")
         assert answer.body().startswith(b"\x89PNG")
     page.wait_for_selector(f".strip img[data-time='{taken[-1].time_ns}']")

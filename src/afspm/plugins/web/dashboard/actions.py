@@ -136,18 +136,19 @@ class Actions:
     def set(self, wanted: Mapping[str, str], shown: Mapping[str, str]) -> ActionResult:
         """Set parameters, one request each, to quantities written by a person: "0.5 V", "2 um/s", "12".
 
-        Nothing is sent if a quantity is ambiguous.
+        Nothing is sent if a quantity is ambiguous. Reasons of refusals are in `each` alone: the form shows each of them
+        below its field.
 
         Args:
             shown: the values that the person saw, with their units.
         """
         checked = {name: unclear(name, text, shown.get(name, "")) for name, text in wanted.items()}
         if wrong := {name: ActionResult(why, ok=False) for name, why in checked.items() if why}:
-            text = " ".join(("Nothing was set.", *(one.text for one in wrong.values())))
-            return ActionResult(text, ok=False, each=wrong)
+            return ActionResult(f"Nothing was set. Refused: {', '.join(wrong)}.", ok=False, each=wrong)
         each = {name: self._set(name, text.strip()) for name, text in wanted.items()}
-        refused = [one.text for one in each.values() if not one.ok]
-        return ActionResult(" ".join(refused or [one.text for one in each.values()]), ok=not refused, each=each)
+        if refused := [name for name, one in each.items() if not one.ok]:
+            return ActionResult(f"Refused: {', '.join(refused)}.", ok=False, each=each)
+        return ActionResult(" ".join(one.text for one in each.values()), each=each)
 
     def scan(self, region: Region | None = None, shape: tuple[int, int] | None = None) -> ActionResult:
         """Begin a scan, and return once the microscope has accepted it; None keeps the present `region` or `shape`."""

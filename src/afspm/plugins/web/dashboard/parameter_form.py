@@ -86,9 +86,7 @@ class ParameterForm:
         result = await self._session.carry_out(lambda a: a.set(wanted, shown))
         if self._rows.is_deleted:
             return
-        refused = [name for name, one in result.each.items() if not one.ok]
-        # each reason is below its field
-        self._session.say(ActionResult(f"Refused: {', '.join(refused)}.", ok=False) if refused else result)
+        self._session.say(result)
         for name, one in result.each.items():
             if not one.ok:
                 self._fields[name].props("error").props["error-message"] = one.text
