@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from deadlines import DEADLINE_S
-from tests.ui.ui_lab import SCREENSHOTS, Night, Opened
+from tests.ui.ui_lab import DEADLINE_S, FOR_ALL, PUMP, SCREENSHOTS, Night, Opened
 
 sys.path.insert(0, str(Path(__file__).parents[2]))  # `benchmarks` has a stage to publish on, which serves here too
 
@@ -21,18 +20,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         later = [item for item in items if item.path.is_relative_to(here) and item.path.name != "test_smoke.py"]
         config.hook.pytest_deselected(items=later)
         items[:] = [item for item in items if item not in later]
-    for item in items:
-        if item.path.is_relative_to(here):  # one browser, one experiment: one after the other
-            item.add_marker(pytest.mark.xdist_group("ui"))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def night(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
-    """A running experiment, one for all tests of a module.
+    """A running experiment, one for all tests of a process: each test leaves it as it was.
 
-    It starts after the browser: without a browser no experiment is started.
+    It starts after the browser: without a browser no experiment is started. Its series takes one scan and no other: the
+    next one would come between the scans of the tests.
     """
-    one = Night(tmp_path_factory.mktemp("night"))
+    folder = tmp_path_factory.mktemp("night")
+    (folder / "pump.py").write_text(PUMP, encoding="utf-8")
+    one = Night(folder, more=FOR_ALL, every="4000 h")
     yield one
     one.close()
 

@@ -9,32 +9,12 @@ from typing import Any
 
 import httpx2
 import pytest
-from deadlines import DEADLINE_S
 from mcp import Client
 from mcp.client.streamable_http import streamable_http_client
 from tests.system.agent.agent_lab import SCAN, AgentClient
-from tests.ui.ui_lab import Night, Opened
+from tests.ui.ui_lab import DEADLINE_S, Night, Opened
 
-AGENT = """
-[agent]
-component = true
-class = "Agent"
-port = 0
-
-[limits.roles.agent]
-actions = ["start-scan", "start-spec"]
-parameters = { tip-bias-voltage = ["-1 V", "1 V"], scan-speed = ["0.1 um/s", "50 um/s"] }
-region = { x = ["-2 um", "2 um"], y = ["-2 um", "2 um"] }
-per_hour = { start-scan = 30 }
-"""
 PLAN = {"title": "look", "steps": [{"do": "set", "parameter": "tip-bias-voltage", "value": "0.5 V"}, SCAN]}
-
-
-@pytest.fixture(scope="module")
-def night(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
-    one = Night(tmp_path_factory.mktemp("night"), more=AGENT)
-    yield one
-    one.close()
 
 
 @pytest.fixture
@@ -42,6 +22,15 @@ def page(night: Night, opened: Opened) -> Any:
     page = opened(night.url, person="Ada")
     page.wait_for_selector("button:has-text('Give an agent a grant')")
     return page
+
+
+@pytest.fixture
+def no_approval_afterwards(night: Night, opened: Opened) -> Iterator[None]:
+    """Revoke what the agent may do: it is given for hours."""
+    yield
+    page = opened(night.url, person="Ada")
+    page.click(".approval button:has-text('Revoke')")
+    night.until(lambda: not approvals(night))
 
 
 def act(night: Night, doing: Callable[[AgentClient], Awaitable[Any]]) -> Any:
@@ -133,6 +122,7 @@ def test_place_of_a_grant_is_drawn_in_the_picture(night: Night, page: Any, keep:
     night.until(lambda: not approvals(night))
 
 
+@pytest.mark.usefixtures("no_approval_afterwards")
 def test_waiting_proposal_is_readable_on_a_phone_and_approved_there(night: Night, opened: Opened, keep: Any) -> None:
     async def propose(agent: AgentClient) -> str:
         proposed = await agent.call("propose", plan=PLAN)

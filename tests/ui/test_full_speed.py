@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from benchmarks.dashboard import latency_ms, open_page
 from benchmarks.stage import REGION, Stage, picture
-from deadlines import DEADLINE_S
+from tests.ui.ui_lab import DEADLINE_S
 
 from afspm.model import LogLine, ScanLines, ScopeState, ScopeStatus
 from afspm.model.events import LogLines

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from benchmarks.dashboard import open_page
 from benchmarks.stage import REGION, Stage
-from deadlines import DEADLINE_S
+from tests.ui.ui_lab import DEADLINE_S
 
 from afspm.components.tip_verdict import OF_LINES, LineVerdict, line_verdict_message
 from afspm.model import InstrumentReading, InstrumentReadings, Scan, ScanLines, ScopeState, ScopeStatus

@@ -5,14 +5,24 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
+import pytest
 from afspm_process import AFSPM
-from deadlines import DEADLINE_S
-from tests.ui.ui_lab import EXPERIMENT, Night, Opened
+from tests.ui.ui_lab import DEADLINE_S, EXPERIMENT, Night, Opened
 
 from afspm.model import ProcessCondition
+
+
+@pytest.fixture(scope="module")
+def night(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
+    """A night of these tests alone: they kill its processes, and end it."""
+    one = Night(tmp_path_factory.mktemp("lost"))
+    yield one
+    one.close()
 
 
 def pid_of(night: Night, name: str) -> int:

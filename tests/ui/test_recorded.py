@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from deadlines import DEADLINE_S
-from tests.ui.ui_lab import Night, Opened
+from tests.ui.ui_lab import DEADLINE_S, Night, Opened
 
 import afspm
 from afspm.record.run import Run

@@ -13,6 +13,10 @@ HIDE = """hidden => {
   Object.defineProperty(document, "hidden", { configurable: true, get: () => hidden });
   document.dispatchEvent(new Event("visibilitychange"));
 }"""
+SIGN_ABOVE_MODE = """() => {
+  const [sign, mode] = [".who", "[data-part=mode]"].map((one) => document.querySelector(one)?.getBoundingClientRect());
+  return sign?.height && mode?.height && sign.bottom <= mode.top + 1;
+}"""
 
 
 def test_page_works_on_a_path_of_its_own_behind_a_proxy(night: Night, opened: Opened) -> None:
@@ -79,8 +83,7 @@ def test_nothing_is_cut_or_covered_on_a_screen(
     cut = "one => one.parentElement.scrollWidth > one.parentElement.clientWidth + 1"
     assert not page.locator(hint).evaluate(cut)
     if width < 500:
-        sign, mode = page.locator(".who").bounding_box(), page.locator("[data-part=mode]").bounding_box()
-        assert sign["y"] + sign["height"] <= mode["y"] + 1, "signing in or out is above the chips of the state"
+        page.wait_for_function(SIGN_ABOVE_MODE)
         page.click("[data-tab=steer]")
     field = page.locator(".parameters input").first
     field.fill("50 V")

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from afspm_process import AfspmProcess
-from deadlines import DEADLINE_S
 
 from afspm import wire
 from afspm.cli.follower import Follower
-from afspm.model import ControlState, JournalEntry, Role, ScopeState
+from afspm.model import ControlState, JournalEntry, LogLine, Role, ScopeState
 
 Opened = Callable[..., Any]
+DEADLINE_S = 240.0
+"""As long is a page waited for: half of the deadline of other tests, so that a red test is sooner red."""
 SCREENSHOTS = Path(__file__).parents[2] / "build" / "screenshots"
 
 EXPERIMENT = """
@@ -65,6 +66,42 @@ port = 0
 """
 
 
+FOR_ALL = """
+[agent]
+component = true
+class = "Agent"
+port = 0
+
+[limits.roles.agent]
+actions = ["start-scan", "start-spec"]
+parameters = { tip-bias-voltage = ["-1 V", "1 V"], scan-speed = ["0.1 um/s", "50 um/s"] }
+region = { x = ["-2 um", "2 um"], y = ["-2 um", "2 um"] }
+per_hour = { start-scan = 30 }
+
+[pump]
+component = true
+class = "pump.Pump"
+"""
+"""What some tests need in the night that all tests share."""
+PUMP = """
+from afspm import Component
+
+
+class Pump(Component):
+    period_s = 0.1
+    period_time = "real"
+
+    def on_tick(self):
+        is_on = not (self.run_dir / "pump-off").exists()
+        if is_on != self.memory.get("is_on", True):
+            self.memory["is_on"] = is_on
+            if is_on:
+                self.log.info("the pump runs; no longer true: the pump is off")
+            else:
+                self.log.critical("the pump is off: <no current>")
+"""
+
+
 class Night(AfspmProcess):
     """`afspm run` of an experiment with a dashboard, as a process of its own."""
 
@@ -104,6 +141,11 @@ class Night(AfspmProcess):
             assert not self.follower.ended
             self.follower.pump(end_s - time.monotonic())
         return found
+
+    def errors(self) -> list[LogLine]:
+        """Return the log's lines of level ERROR so far."""
+        self.follower.pump(0.0)
+        return [line for line in self.follower.overview.log if line.level == "ERROR"]
 
     def control(self) -> ControlState:
         """The control state last published by the scheduler."""
