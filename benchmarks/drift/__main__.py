@@ -1,7 +1,8 @@
 """`python -m benchmarks.drift`: accuracy of drift estimation, beside the bound and the methods of features.
 
 Prints tables, writes build/bench-drift.json (the lines with a target, in the form of build/bench.json) and
-build/bench-drift.txt (all printed text). Returns 1 if a target was missed.
+build/bench-drift.txt (all printed text). Returns 1 if a target was missed; with `--quick` it judges none, and shows
+only that the benchmark works.
 """
 
 from __future__ import annotations
@@ -54,17 +55,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if "sizes" in asked.parts:
         rows += sizes.costs(plan)
     console.print(_targets(rows))
-    console.print(f"seed {plan.seed}{', quick' * plan.quick}; {time.perf_counter() - began_s:.0f} s")
+    console.print(f"seed {plan.seed}{', an eighth of the pairs' * plan.quick}; {time.perf_counter() - began_s:.0f} s")
     RESULT.parent.mkdir(exist_ok=True)
     RESULT.write_text(json.dumps([row.to_json() for row in rows], indent=1) + "\n", encoding="utf-8")
     RESULT.with_suffix(".txt").write_text(console.export_text(), encoding="utf-8")
-    return 0 if all(row.met for row in rows) else 1
+    # so few pairs judge no target: a share of six pairs has steps of 17 %
+    return 0 if plan.quick or all(row.met for row in rows) else 1
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.drift", description=__doc__)
     parser.add_argument("--seed", type=int, default=secrets.randbelow(10**6) * 1000, help="default: a fresh one")
-    parser.add_argument("--quick", action="store_true", help="an eighth of the pairs")
+    parser.add_argument("--quick", action="store_true", help="an eighth of the pairs, without a verdict")
     parser.add_argument("--parts", nargs="+", choices=(*PARTS, *ON_REQUEST), default=list(PARTS))
     parser.add_argument("--estimators", nargs="+", default=[DEFAULT, *(n for n in NAMES if n != DEFAULT)],
                         help="names; the first is held against the targets")  # fmt: skip
