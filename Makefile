@@ -76,11 +76,12 @@ test-power-cut: $(COLLECTED)
 	@$(PYTEST) $(POWER_CUT)
 
 ## the page, the gateway, clients in other languages, the installed wheel, and each row of the benchmark once
-SPEED := tests/ui/test_full_speed.py
-APART := tests/ui $(addprefix tests/system/,gateway clients install benchmarks)
+UI := tests/ui
+UI_TESTS = $(PYTEST) -n 2 --dist loadfile $(UI)
+APART := $(UI) $(addprefix tests/system/,gateway clients install benchmarks)
 test-apart: $(COLLECTED)
-	@$(PYTEST) -n 4 --dist worksteal --ignore $(SPEED) $(APART)
-	@$(PYTEST) $(SPEED)
+	@$(PYTEST) -n 4 --dist worksteal $(filter-out $(UI),$(APART))
+	@$(UI_TESTS)
 
 # asserts are rewritten once, not by each of the processes that run tests; what can't be collected fails there
 $(COLLECTED): $(TEST) $(shell find tests -name '*.py')
@@ -121,10 +122,12 @@ coverage: $(TEST)
 	@$(PYTEST) -n 2 --dist worksteal -m "not slow" --cov=afspm --cov=afspm_bench --cov-report=html:build/coverage --cov-report=term:skip-covered \
 	  tests/unit tests/simulation tests/plugins
 
-## the dashboard in a real browser (Debian's chromium, or another: AFSPM_CHROMIUM=/path); screenshots in build/screenshots
+## the dashboard in a real browser (Debian's chromium, or another: AFSPM_CHROMIUM=/path); screenshots in build/screenshots.
+## Where all pass, tests/ui/last_green.txt says so to .ci/run, which then runs them only after a change (tools/page_sources.py)
 test-ui: $(TEST)
 	@$(PYTHON) tools/bootstrap.py browser
-	@$(BIN)/pytest --must-run tests/ui
+	@$(UI_TESTS) --must-run
+	@$(BIN)/python tools/page_sources.py --green
 
 ## the gateway: against its own OpenAPI description (schemathesis, 25 MB), in several languages, with twenty clients
 test-gateway: $(TEST)

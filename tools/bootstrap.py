@@ -1,9 +1,9 @@
 """Make the environment .venv from the lock file, with nothing but Python 3.11 or later.
 
 Run by the Makefile: `python3 tools/bootstrap.py demo` (what a plain install holds), `test` (and what the tests need),
-`all` (and the tools of `make check`), `browser` (what drives one), `gateway` (its judge), `coverage` or `release` (what
-judges the distributions). Each adds to what is there. The name of a package of `packages/` makes an environment of its
-own in the package's folder, with what its tests need.
+`all` (and the tools of `make check`), `browser` (what drives one, and as root on Debian chromium itself), `gateway`
+(its judge), `coverage` or `release` (what judges the distributions). Each adds to what is there. The name of a package
+of `packages/` makes an environment of its own in the package's folder, with what its tests need.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def main(wanted: str) -> None:
     if is_new or wanted == "demo":
         _compile()
     if wanted != "demo":
-        if wanted == "browser" and not _has_browser():
+        if wanted == "browser" and not (_has_browser() or (_apt_installs("chromium") and _has_browser())):
             sys.exit("no chromium is found: `apt install chromium`, or AFSPM_CHROMIUM=/path says where one is")
         groups = ["test", *(["browser"] if _has_browser() else []), *(["check"] if wanted == "all" else [])]
         groups += [wanted] if wanted in ("coverage", "gateway", "release") else []
@@ -109,12 +109,19 @@ def _make_venv() -> None:
         return
     # Debian keeps what venv needs in a package of its own
     package = f"python{sys.version_info.major}.{sys.version_info.minor}-venv"
-    if shutil.which("apt-get") and hasattr(os, "geteuid") and os.geteuid() == 0:
-        subprocess.run(["apt-get", "update", "-qq"], check=False)
-        subprocess.run(["apt-get", "install", "-y", "-qq", package], check=True)
-        subprocess.run([sys.executable, "-m", "venv", "--clear", str(TOOLS)], check=True)
-        return
-    sys.exit(f"Python's venv module is incomplete here; on Debian: apt install {package}")
+    if not _apt_installs(package):
+        sys.exit(f"Python's venv module is incomplete here; on Debian: apt install {package}")
+    subprocess.run([sys.executable, "-m", "venv", "--clear", str(TOOLS)], check=True)
+
+
+def _apt_installs(package: str) -> bool:
+    """Return whether this process may install packages of Debian, and has installed this one."""
+    if not (shutil.which("apt-get") and hasattr(os, "geteuid") and os.geteuid() == 0):
+        return False
+    subprocess.run(["apt-get", "update", "-qq"], check=False)
+    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+    install = ["apt-get", "install", "-y", "-qq", package]
+    return subprocess.run(install, env=environment, check=False).returncode == 0
 
 
 def _wanted(arguments: list[str]) -> str:

@@ -28,14 +28,14 @@ def main(arguments: list[str]) -> int:
         return _check_bounds()
     programs = FOLDER / ("Scripts" if os.name == "nt" else "bin")
     uv = bootstrap.find_uv()
+    environment = {**os.environ, "UV_PYTHON_DOWNLOADS": "never"}
+    if subprocess.run([uv, "python", "find", "--quiet", PYTHON], env=environment, check=False).returncode != 0:
+        sys.stdout.write(f"nothing was tried: there is no Python {PYTHON} on this computer\n")
+        return 0 if os.environ.get("AFSPM_LACKING") == "passes" else 1
     sys.stdout.write(f"Setting up {FOLDER}: 700 MB …\n")
     sys.stdout.flush()
     # made again each time: an installed version that is high enough would not be lowered
-    subprocess.run(
-        [uv, "venv", "--quiet", "--clear", "--python", PYTHON, FOLDER],
-        env={**os.environ, "UV_PYTHON_DOWNLOADS": "never"},
-        check=True,
-    )
+    subprocess.run([uv, "venv", "--quiet", "--clear", "--python", PYTHON, FOLDER], env=environment, check=True)
     install = (uv, "pip", "install", "--quiet", "--python", programs / "python")
     extras = ",".join(bootstrap.extras())
     subprocess.run([*install, "--resolution", "lowest-direct", "-e", f".[{extras}]"], cwd=bootstrap.ROOT, check=True)

