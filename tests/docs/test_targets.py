@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import re
+import shutil
+import subprocess
 from pathlib import Path
 from types import ModuleType
 
@@ -55,3 +57,12 @@ def test_each_target_has_its_turn(tool: ModuleType) -> None:
     found = {tool.in_turn(number) for number in range(len(tool.IN_TURN))}
     assert {one.partition(" ")[0] for one in found} == set(tool.IN_TURN)
     assert "chaos NIGHTS=4" in found
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="no make is found")
+@pytest.mark.parametrize(("setting", "is_quick"), [("", False), ("EIGHTH=1", True)])
+def test_drift_is_judged_by_all_pairs_unless_an_eighth_is_asked_for(setting: str, is_quick: bool) -> None:  # claims F13
+    command = ["make", "--dry-run", "bench-drift", *setting.split()]
+    printed = subprocess.run(command, cwd=ROOT, capture_output=True, encoding="utf-8", check=True).stdout
+    assert "benchmarks.drift" in printed
+    assert ("--quick" in printed) == is_quick
