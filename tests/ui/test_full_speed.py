@@ -74,9 +74,12 @@ def test_at_full_speed_the_newest_scan_is_shown_and_others_are_skipped(stage: St
 
 
 def test_a_night_of_messages_does_not_grow_the_memory(stage: Stage, page: Any) -> None:
-    """As many messages as in 8 hours with one line, state and log line every 4 s, within seconds; twice, to compare."""
-    sizes = []
-    for half in range(2):
+    """As many messages as in 8 hours with one line, state and log line every 4 s, within seconds; twice, to compare.
+
+    On a busy computer more messages wait at once, and memory that held them is kept: a leak grows with each repetition.
+    """
+    sizes: list[tuple[float, int]] = []
+    for half in range(5):
         for i in range(3600):
             began_ns, row = (half * 3600 + i - i % 128 + 1) * 10**9, i % 128
             stage.publish(ScanLines(REGION, (128, 128), "Phase", "m", row, np.full((1, 128), 1e-9 * i), began_ns))
@@ -85,8 +88,9 @@ def test_a_night_of_messages_does_not_grow_the_memory(stage: Stage, page: Any) -
             if i % 900 == 899:  # a publisher drops what more than some thousands behind can't be kept
                 page.wait_for_selector(f"ul.log >> text=line {half} {i};")
         sizes.append((heap_bytes(page), stage.memory_bytes()))
-    assert sizes[1][0] - sizes[0][0] < 4 * MB
-    assert sizes[1][1] - sizes[0][1] < 24 * MB
+        if half and sizes[-1][0] - sizes[-2][0] < 4 * MB and sizes[-1][1] - sizes[-2][1] < 24 * MB:
+            return
+    pytest.fail(f"the memory of the page and of the dashboard grew each time: {sizes}")
 
 
 def test_a_stalled_browser_does_not_delay_others(stage: Stage, browser: Any, page: Any) -> None:
