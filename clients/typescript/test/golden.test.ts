@@ -17,8 +17,9 @@ interface Golden {
 
 const golden = JSON.parse(readFileSync(new URL("../../../../proto/golden.json", import.meta.url), "utf8")) as Golden;
 const registry = createRegistry(
-  wire.file_analysis, wire.file_control, wire.file_drift, wire.file_feedback, wire.file_geometry, wire.file_grants,
-  wire.file_instruments, wire.file_journal, wire.file_lines, wire.file_scan, wire.file_spectroscopy,
+  wire.file_analysis, wire.file_channels, wire.file_control, wire.file_drift, wire.file_feedback, wire.file_geometry,
+  wire.file_grants, wire.file_instruments, wire.file_journal, wire.file_lines, wire.file_panel, wire.file_scan,
+  wire.file_spectroscopy,
 );
 const bytes = (hex: string) => Buffer.from(hex, "hex");
 const hex = (frames: Uint8Array[]) => frames.map((frame) => Buffer.from(frame).toString("hex"));

@@ -12,20 +12,22 @@ import com.google.protobuf.Descriptors.FileDescriptor;
 import com.google.protobuf.DynamicMessage;
 import com.google.protobuf.Message;
 import com.google.protobuf.Timestamp;
+import java.io.IOException;
 import java.math.BigDecimal;
+import java.nio.file.Files;
+import java.nio.file.Path;
+import java.nio.file.Paths;
 import java.time.Instant;
-import java.util.Arrays;
+import java.util.ArrayList;
 import java.util.Base64;
 import java.util.List;
+import java.util.Locale;
 import java.util.Map;
+import java.util.stream.Stream;
 
 /** Messages in protobuf's JSON mapping. The mapping of protobuf-java-util takes minus zero for zero. */
 final class JsonMapping {
-    private static final List<FileDescriptor> FILES = Arrays.asList(
-            afspm.Analysis.getDescriptor(), afspm.Control.getDescriptor(), afspm.Drift.getDescriptor(), afspm.Feedback.getDescriptor(),
-            afspm.Geometry.getDescriptor(), afspm.Grants.getDescriptor(), afspm.Instruments.getDescriptor(),
-            afspm.Journal.getDescriptor(), afspm.Lines.getDescriptor(), afspm.Scan.getDescriptor(),
-            afspm.Spectroscopy.getDescriptor());
+    private static final List<FileDescriptor> FILES = files();
 
     private JsonMapping() {
     }
@@ -119,6 +121,21 @@ final class JsonMapping {
                 return isTimestamp(field) ? new JsonPrimitive(instant((Message) value).toString()) : json((Message) value);
             default:
                 return new JsonPrimitive((String) value);
+        }
+    }
+
+    /** Return the descriptor of each file of `proto`, so that a new file's messages are known here. */
+    private static List<FileDescriptor> files() {
+        try (Stream<Path> listed = Files.list(Paths.get("..", "..", "proto"))) {
+            List<FileDescriptor> files = new ArrayList<>();
+            for (Path file : (Iterable<Path>) listed.filter(path -> path.toString().endsWith(".proto"))::iterator) {
+                String name = file.getFileName().toString().replace(".proto", "");
+                Class<?> generated = Class.forName("afspm." + name.substring(0, 1).toUpperCase(Locale.ROOT) + name.substring(1));
+                files.add((FileDescriptor) generated.getMethod("getDescriptor").invoke(null));
+            }
+            return files;
+        } catch (IOException | ReflectiveOperationException error) {
+            throw new AssertionError(error);
         }
     }
 
