@@ -29,7 +29,7 @@ class GxsmEntry:
         low, high: limits of accepted values, in the unit of `value`.
         unit: unit that `gets` shows, replaced by the user's unit for lengths.
         shown: format of the number in `gets`.
-        zero: value that replaces 0.
+        step: smallest value above zero, which replaces 0 and all values between.
         whole: True for numbers of points.
         on_change: called with each new value.
     """
@@ -39,7 +39,7 @@ class GxsmEntry:
     high: float = math.inf
     unit: str = ""
     shown: str = "{:.6g}"
-    zero: float = 0.0
+    step: float = 0.0
     whole: bool = False
     on_change: Callable[[float], None] | None = None
 
@@ -84,7 +84,8 @@ class GxsmEntries:
         if entry is None:
             return 0
         value = self._atof(text) * self._factor(entry)
-        value = (float(np.trunc(value)) if entry.whole else value) or entry.zero
+        value = float(np.trunc(value)) if entry.whole else value
+        value = entry.step if 0.0 <= value < entry.step else value
         # GXSM keeps the old value, returns 0, and shows a dialog on the screen
         if not entry.low <= value <= entry.high:
             self._dialogs(f"Valid Range of {ref}: {entry.low} to {entry.high}")

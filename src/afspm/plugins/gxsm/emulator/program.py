@@ -176,11 +176,12 @@ class GxsmProgram:
         return lambda value: self.panel.subscan.__setitem__(place, int(value))
 
     def _go_elsewhere(self) -> None:
-        # The hardware moves at once: the lines that follow are scanned in the new frame.
+        # The hardware moves at once: the lines that follow are scanned at the new place. Range and points belong to the
+        # next scan, so that the size of the running scan stays.
         now_s, rig, scan = self.clock.now_s(), self.rig, self.scan.activity
         if scan is None or not self.scan.runs or not scan.running(now_s):
             return
-        moved = replace(scan, region=self._scanned(self.frame()))
+        moved = replace(scan, region=replace(self._scanned(self.frame()), size_m=scan.region.size_m))
         rig.drawing.wait()
         rig.drawing.rewind()
         rig.drawing.start(moved, rig.drawing.prepared(moved, engaged=rig.engaged))
