@@ -22,19 +22,29 @@ class RunningClock(FakeClock):
         return self.t_s
 
 
+def studio(clock: FakeClock, folder: Path) -> StudioProgram:
+    rig = SimulatedInstrument({}, 1, clock.t_s)
+    faults = Faults([], NanosurfEmulator.all_faults(), clock.t_s)
+    return StudioProgram(rig, faults, clock, folder, logging.getLogger(), start_s=0.0, file_s=0.0)
+
+
+def test_curves_with_an_impossible_setpoint_end_as_if_stopped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    # faults 18
+    clock = FakeClock()
+    program = studio(clock, tmp_path)
+    program.put("z_control.setpoint", -1.0)
+    program.start_curves(clock.t_s)
+    for _ in range(5):
+        program.advance(clock.t_s)
+        clock.t_s += 1.0
+    assert not program.measuring_curve
+    assert "the curves were interrupted: feedback: a setpoint is above zero, not -1" in caplog.text
+
+
 @pytest.mark.parametrize("direction", [0, 1])
 def test_buffered_lines_are_complete_while_the_next_line_ends(direction: int, tmp_path: Path) -> None:
     clock = RunningClock()
-    rig = SimulatedInstrument({}, 1, clock.t_s)
-    program = StudioProgram(
-        rig,
-        Faults([], NanosurfEmulator.all_faults(), clock.t_s),
-        clock,
-        tmp_path,
-        logging.getLogger(),
-        start_s=0.0,
-        file_s=0.0,
-    )
+    program = studio(clock, tmp_path)
     for path, value in (("lines_per_frame", 8), ("points_per_line", 4), ("slow_axis_scan_direction", direction)):
         program.put(f"imaging.{path}", value)
     program.start_scan(clock.t_s)

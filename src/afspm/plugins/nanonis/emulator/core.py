@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass, field
 from typing import Final
@@ -27,6 +28,7 @@ class NanonisCore:
     Attributes:
         range_m: range of the scanner in x, y and z, from end to end.
         release: release of the software.
+        log: of the experiment.
         client: values stored for the client whose request is being answered.
         opened: names of the modules that clients have opened.
     """
@@ -37,6 +39,7 @@ class NanonisCore:
     session: SessionFolder
     range_m: tuple[float, float, float]
     release: int
+    log: logging.Logger
     registers: Registers = field(default_factory=Registers)
     client: Plain = field(default_factory=dict)
     opened: set[str] = field(default_factory=set)

@@ -9,7 +9,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from afspm.emulation import MOST_PIXELS, RETRACE, ScanActivity
+from afspm.basics import InvalidValue
+from afspm.emulation import MOST_PIXELS, RETRACE, InstrumentBusy, ScanActivity
 from afspm.model import Region
 from afspm.plugins.nanonis.emulator import files
 from afspm.plugins.nanonis.emulator.core import NanonisCore
@@ -153,13 +154,13 @@ class ScanModule:
             self._core.rig.stop_scan(now_s)
         if self._delayed_start is not None and now_s >= self._delayed_start[0]:
             (_, upwards), self._delayed_start = self._delayed_start, None
-            self.start(upwards)
+            self._start_without_client(upwards)
         if self.running is not None and not self.running.scan.running(now_s):
             self._end(self.running, now_s)
         return None if self._delayed_start is None else self._delayed_start[0]
 
     def start(self, upwards: bool) -> None:
-        """Start a scan at once. Raises InstrumentBusy."""
+        """Start a scan at once. Raises InstrumentBusy; InvalidValue: no scan is possible with these settings."""
         x, y, width, height, clockwise_deg = self.frame
         rig = self._core.rig
         size_m = (width * (self.pixels - 1) / self.pixels, height * max(self.lines - 1, 1) / self.lines)
@@ -198,6 +199,13 @@ class ScanModule:
         elif not self._core.faults.strikes("no-start", now_s):
             self.start(upwards)
 
+    def _start_without_client(self, upwards: bool) -> None:
+        # No request is open that could be refused, and FrameSet accepts frames that can't be scanned.
+        try:
+            self.start(upwards)
+        except (InstrumentBusy, InvalidValue) as error:
+            self._core.log.warning("the scan does not begin: %s", error)
+
     def _end(self, ended: StartedScan, now_s: float) -> None:
         self.running = None
         finished = ended.scan.stopped_s is None
@@ -206,7 +214,7 @@ class ScanModule:
             path = self._last_end[1]
         self.ends, self._last_end = self.ends + 1, (ended.scan.end_s, path)
         if finished and self.properties.continuous:
-            self.start(ended.scan.upwards != self.properties.bouncy)
+            self._start_without_client(ended.scan.upwards != self.properties.bouncy)
 
     def _saves(self, now_s: float) -> bool:
         if self.properties.autosave == "off" or self._core.faults.lasts("autosave-off", now_s):

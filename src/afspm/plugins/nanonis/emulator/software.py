@@ -48,7 +48,7 @@ class NanonisSoftware:
         log: logging.Logger,
     ) -> None:
         session = SessionFolder(folder, session_path, faults, log)
-        self.core = NanonisCore(rig, faults, clock, session, (range_m, range_m, _RANGE_Z_M), release)
+        self.core = NanonisCore(rig, faults, clock, session, (range_m, range_m, _RANGE_Z_M), release, log)
         self.signals = Signals(self.core)
         self.scans = ScanModule(self.core, self.signals, rows_as_recorded=rows_as_recorded)
         self.spectra = SpectroscopyModules(self.core, self.signals)

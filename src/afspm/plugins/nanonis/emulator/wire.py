@@ -226,7 +226,8 @@ def _packed(code: str, value: Any, encoding: str) -> bytes:
         raw = b"".join(_packed("S", one, encoding) for one in value)
         return struct.pack(">ii", len(raw), len(value)) + raw
     if code == "2f":
-        array = np.asarray(value, dtype=">f4")
+        with np.errstate(over="ignore"):  # infinite, like a single value
+            array = np.asarray(value, dtype=">f4")
         return struct.pack(">ii", *array.shape) + array.tobytes()
     if code == "2S":
         rows, columns = len(value), max(map(len, value), default=0)

@@ -401,7 +401,12 @@ class StudioProgram(MakerProgram):
         while grid is not None and not self.rig.busy(now_s):
             if grid.at_point:
                 grid.at_point = False
-                grid.curves.append(self.rig.start_spectrum("force", self.now_s))
+                try:
+                    grid.curves.append(self.rig.start_spectrum("force", self.now_s))
+                except InvalidValue as error:  # no command is open that could be refused
+                    self._log.warning("the curves were interrupted: %s", error)
+                    self._grid = None
+                    return
             elif grid.points_m:
                 self.rig.setup.move_speed_m_s = self.values["scanner.move_speed_xy_on_surface"]
                 self.rig.move_probe(grid.points_m.pop(0), self.now_s)
