@@ -38,7 +38,7 @@ from afspm.simulation.activities import RETRACE, Move, Occupied, ScanActivity, S
 from afspm.simulation.feedback import FeedbackSettings
 from afspm.simulation.ledger import DamageCounter, DamageLedger, Note, ScannedPlace
 from afspm.simulation.measuring import Adjustment
-from afspm.simulation.scan_drawing import RunWork, ScanDrawing, run_at_once
+from afspm.simulation.scan_drawing import FARTHEST_M, RunWork, ScanDrawing, run_at_once
 from afspm.simulation.world import World
 
 Doing = ScanActivity | SpectrumActivity | Occupied
@@ -329,9 +329,10 @@ class SimulatedInstrument:
             way_m: path length of a frame that moves at the same time.
 
         Raises:
-            InstrumentBusy: during another activity. InvalidValue: the position is not finite.
+            InstrumentBusy: during another activity. InvalidValue: the position is farther than any scanner reaches.
         """
-        _finite("the position of the probe", *xy_m)
+        if not all(abs(along_m) <= FARTHEST_M for along_m in xy_m):
+            raise InvalidValue(f"the position of the probe: {xy_m} m", hint=f"at most {FARTHEST_M:g} m")
         if self.doing(now_s) != "move":
             self._check_free(now_s)
         from_m, self._probe_m = self.probe_at(now_s), (float(xy_m[0]), float(xy_m[1]))

@@ -16,6 +16,8 @@ from afspm.simulation.feedback import Loop
 from afspm.simulation.world import World
 
 _SMALLEST_M, _LARGEST_M, _LONGEST_PIXEL = 1e-12, 200e-6, 1e4
+FARTHEST_M = 1.0
+"""Largest x and y: no stage goes as far, and the surface's cells are counted in 64 bits."""
 
 RunWork = Callable[[Callable[[], None]], None]
 """Runs a function: at once, or in another thread."""
@@ -128,6 +130,8 @@ def _check_scannable(scan: ScanActivity) -> None:
     # no scanner has such a frame; simulating it would take minutes, or more memory than a computer has
     pixels = [size_m / count for size_m, count in zip(scan.region.size_m, scan.shape[::-1], strict=True)]
     reach = all(_SMALLEST_M <= size_m <= _LARGEST_M for size_m in scan.region.size_m)
+    if not all(abs(along_m) <= FARTHEST_M for along_m in scan.region.center_m):
+        raise InvalidValue(f"a frame at {scan.region.center_m} m can't be simulated", hint=f"at most {FARTHEST_M:g} m")
     if not (reach and max(pixels) <= _LONGEST_PIXEL * min(pixels)):
         raise InvalidValue(
             f"a frame of {scan.region.size_m} m with {scan.shape[1]} x {scan.shape[0]} pixels can't be simulated",

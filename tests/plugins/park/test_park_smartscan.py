@@ -62,6 +62,13 @@ def scanned(smartscan: SmartScan) -> np.ndarray:
     return np.asarray(smartscan.rig.scan.channels()["Height"][1])
 
 
+@pytest.mark.parametrize("wanted", [1.0, None, "1 um", []])
+def test_geometry_that_is_no_object_is_refused(smartscan: SmartScan, wanted: object) -> None:
+    # faults 18: random calls, seed 1, call 55
+    with pytest.raises(InvalidValue, match="is no object"):
+        smartscan.call("scan.setScanGeometry", wanted)
+
+
 # --- z ---
 
 

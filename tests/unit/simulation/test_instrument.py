@@ -336,6 +336,7 @@ def test_invalid_setup_is_refused_before_any_activity(rig: SimulatedInstrument, 
         {"region": Region((0.0, 0.0), (1e-38, 1e-6))},
         {"region": Region((0.0, 0.0), (1.0, 1.0))},
         {"region": Region((0.0, 0.0), (1e-11, 1e-4))},
+        {"region": Region((0.0, -3e38), (1e-6, 1e-6))},  # faults 18: its cells overflow
     ):
         before = {name: getattr(rig.setup, name) for name in change}
         for name, value in change.items():
@@ -346,7 +347,8 @@ def test_invalid_setup_is_refused_before_any_activity(rig: SimulatedInstrument, 
             setattr(rig.setup, name, value)
     rig.engaged = False
     for begin in (
-        lambda: rig.move_probe((math.nan, 0.0), clock.t_s),
+        lambda: rig.move_probe((0.0, math.nan), clock.t_s),
+        lambda: rig.move_probe((3e38, 0.0), clock.t_s),  # faults 18
         lambda: rig.pulse(1.0, math.nan, clock.t_s),
         lambda: rig.crash(1e-9, 0.0, clock.t_s),
         lambda: rig.follow((1.0, 0.0), clock.t_s),

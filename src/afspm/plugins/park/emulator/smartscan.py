@@ -193,7 +193,9 @@ class SmartScanProgram(MakerProgram):
         self._values[path] = value
         self._apply()
 
-    def _set_geometry(self, wanted: Plain) -> None:
+    def _set_geometry(self, wanted: object) -> None:
+        if not isinstance(wanted, dict):
+            raise InvalidValue(f"the geometry: {wanted!r} is no object")
         for name, (kind, low, high) in GEOMETRY.items():
             _number(name, wanted.get(name, self.geometry[name]), low, high, whole=kind is int)
         self.geometry |= {name: wanted[name] for name in GEOMETRY if name in wanted}
