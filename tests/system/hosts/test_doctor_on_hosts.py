@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import pytest
 from tests.system.hosts.hosts_lab import AFSPM, TILERS, HostsLab
 from tests.system.hosts.namespaced_host import interrupt
 
@@ -38,7 +37,6 @@ def removed(hosts: HostsLab, name: str) -> Iterator[None]:
     shutil.move(file.with_suffix(".away"), file)
 
 
-@pytest.mark.timeout(240)
 def test_each_fault_is_named(lab: Lab) -> None:
     hosts = lab(scans=1000, clocks_ahead_s={"right": 3600.0})
     assert codes(hosts) == {"refused"}  # nothing has been started
