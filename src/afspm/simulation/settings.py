@@ -17,6 +17,7 @@ from afspm.basics.errors import ConfigError, ErrorCollector, individual_errors
 from afspm.basics.type_aliases import unaliased
 
 T = TypeVar("T")
+_LONGEST_M = 1e-3
 
 
 def build(cls: type[T], settings: object, where: str) -> T:
@@ -72,7 +73,8 @@ def one_of(value: str, choices: Iterable[str], where: str) -> str:
 def check(settings: object, *, above_zero: str = "", from_zero: str = "", fraction: str = "") -> None:
     """Check the named attributes (separated by spaces) of a dataclass in its `__post_init__`.
 
-    A fraction lies in [0, 1].
+    A fraction lies in [0, 1], and a length, whose name ends in "_m", is at most a millimetre: metres in place of
+    nanometres would take more time and memory than a computer has.
 
     Raises:
         ConfigError: invalid attributes, all at once, each named in `where`.
@@ -88,6 +90,8 @@ def check(settings: object, *, above_zero: str = "", from_zero: str = "", fracti
             value = getattr(settings, name)
             if not holds(value):
                 errors.add(ConfigError(f"{value!r} is not {wanted}", where=name))
+            elif name.endswith("_m") and not name.endswith("_per_m") and value > _LONGEST_M:
+                errors.add(ConfigError(f"{value!r} m is longer than a millimetre", where=name, hint="lengths are in m"))
     errors.raise_all()
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from afspm.basics.errors import ConfigError
 from afspm.simulation import chance
 from afspm.simulation.settings import check, one_of
 from afspm.simulation.tip_answers import ANSWER_KINDS, TipAnswers, answers_of
@@ -72,6 +73,8 @@ class TipSettings:
     def __post_init__(self) -> None:
         check(self, above_zero="radius_m half_angle_deg blunt_radii second_distance_radii", fraction="spread")
         check(self, from_zero="second_below_radii debris_radii length_jump_radii")
+        if not self.half_angle_deg < 90.0:
+            raise ConfigError(f"{self.half_angle_deg!r} is not below 90", where="half_angle_deg")
         one_of(self.condition, CONDITIONS, "condition")
 
 

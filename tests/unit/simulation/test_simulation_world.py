@@ -269,6 +269,8 @@ def test_settings_are_refused_with_place_and_nearest_name() -> None:
         ({"noise": {"white_m": "much"}}, "expected float"),
         ({"noise": {"white_m": float("nan")}}, "finite"),
         ({"noise": 3}, "expected a table"),
+        ({"tip": {"radius_m": 8.0}}, "lengths are in m"),  # faults 18: it was accepted, and took all memory
+        ({"tip": {"half_angle_deg": 90.0}}, "below 90"),
         ({"tip": {"condition": "blund"}}, "did you mean 'blunt'"),
         ({"tip_changes": {"schedule": [[1.0, "dubble"]]}}, "did you mean 'double'"),
         ({"tip_changes": {"schedule": [[1.0]]}}, "expected 2 values"),

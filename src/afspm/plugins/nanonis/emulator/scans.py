@@ -303,10 +303,12 @@ class ScanModule:
         # The real controller rounds the pixels of a line to multiples of 16.
         if not all(0 <= channel < 128 for channel in channels) or not 1 <= pixels <= MOST_PIXELS or lines < 0:
             raise FunctionRefused("no such channel or number of pixels")
-        ratio = self.lines / self.pixels
-        self.channels = channels or self.channels
-        self.pixels = max(_PIXELS_AT_ONCE, round(pixels / _PIXELS_AT_ONCE) * _PIXELS_AT_ONCE)
-        self.lines = lines or max(1, round(self.pixels * ratio))
+        pixels = max(_PIXELS_AT_ONCE, round(pixels / _PIXELS_AT_ONCE) * _PIXELS_AT_ONCE)
+        lines = lines or max(1, round(pixels * self.lines / self.pixels))
+        # (!) The real controller's limit is unknown; without one, FrameDataGrab would need more memory than there is.
+        if pixels * lines > MOST_PIXELS:
+            raise FunctionRefused(f"{lines} lines of {pixels} pixels are more than {MOST_PIXELS} pixels")
+        self.channels, self.pixels, self.lines = channels or self.channels, pixels, lines
         return ()
 
     @answers("Scan.BufferGet")
