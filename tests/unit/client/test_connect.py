@@ -113,7 +113,7 @@ def test_module_that_a_run_folder_names_is_imported_only_if_the_caller_names_it(
     assert "beside_the_run" not in caplog.text
     afspm.connect(folder)
     assert "messages of beside_the_run are not read" in caplog.text
-    with pytest.raises(SystemExit, match="it was run"):
+    with pytest.raises(ConfigError, match="it was run"):
         afspm.connect(folder, messages=["beside_the_run"])
 
 
