@@ -114,7 +114,9 @@ class CommandRetry:
 
     def read(self, kind: ControlRequest, subject: object, until_s: float | None) -> Response:
         """Send a read-only request, and return the answer; take control first if the scheduler demands control."""
-        response = self.send(kind, subject, until_s=until_s)
+        # without a response control was lost meanwhile, as by a controller that comes up late
+        while (response := self.send(kind, subject, until_s=until_s)).code == ControlResponse.NO_RESPONSE:
+            self._control.regain(until_s)
         if response.code != ControlResponse.NOT_IN_CONTROL:
             return response
         with self._control.hold(until_s=until_s):

@@ -450,6 +450,16 @@ def test_unseen_scan_during_lost_control_is_not_taken_again(lab: Lab, scope: Sco
     assert len({request.id for request in lab.requests if request.subject == "start-scan"}) == 1
 
 
+def test_value_is_read_again_once_lost_control_is_back(lab: Lab, scope: Scope) -> None:
+    silent = Response(ControlResponse.NO_RESPONSE, reason="not sent: the controller has not started yet")
+    lab.intercept = lambda request: silent if request.kind == ControlRequest.PARAM else "go on"
+    lab.at(5.0, lambda: lab.flag(TIP))
+    lab.at(20.0, lambda: setattr(lab, "intercept", lambda request: "go on"))
+    lab.at(30.0, lambda: lab.clear(TIP))
+    with scope.control():
+        assert scope.get("tip-bias-voltage") == 0.5
+
+
 def test_scan_not_begun_before_lost_control_is_requested_with_the_same_id(lab: Lab, scope: Scope) -> None:
     lab.intercept = lambda request: (
         Response(ControlResponse.NO_RESPONSE)
