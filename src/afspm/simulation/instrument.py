@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -243,9 +243,10 @@ class SimulatedInstrument:
             setup.slope,
         )
         draw = self.drawing.prepared(scan, engaged=self.engaged)
+        self._change_tip_in(scan)
         self.drawing.keep_world()
         self._counts["scan"] = number
-        self.note(now_s, "scan starts", {"number": number})
+        self.note(now_s, "scan starts", {"number": number, "setup": _setup_of(scan)})
         self.scan = self._doing = scan
         if self.engaged:
             self.damage.scan_starts(scan, now_s)
@@ -274,6 +275,11 @@ class SimulatedInstrument:
         if self._scans and self.scan is not None and self.scan.running(now_s):
             self.drawing.rewind()
             self._redraw(self.scan.adjusted)
+
+    def _change_tip_in(self, scan: ScanActivity) -> None:
+        for at, condition in self.world.settings.tip_changes.in_scans:
+            if int(at) == scan.number:
+                self.world.change_tip(condition, scan.start_s + (at - scan.number) * (scan.end_s - scan.start_s))
 
     @property
     def _scans(self) -> bool:
@@ -309,8 +315,8 @@ class SimulatedInstrument:
         self.spectrum = SpectrumActivity(number, kind, self._probe_m, now_s, end_s, names, units, values)
         self._doing = self.spectrum
         self.damage.spectrum_starts(self.spectrum if self.engaged else None)
-        truth = self.world.property_truth(self._probe_m, now_s)
-        self.note(now_s, "spectrum starts", {"number": number, "kind": kind, **truth})
+        facts = {"number": number, "kind": kind, "position_m": self._probe_m, "bias_v": self.setup.bias_v}
+        self.note(now_s, "spectrum starts", {**facts, **self.world.property_truth(self._probe_m, now_s)})
         return self.spectrum
 
     def stop_spectrum(self, now_s: float) -> None:
@@ -522,6 +528,7 @@ class SimulatedInstrument:
         self.damage.restore(found.ledger, found.scanned, (found.scan or found.spectrum) if found.engaged else None)
         # the values are not saved: the world at the start of the scan gives the same values again
         if self.scan is not None:
+            self._change_tip_in(self.scan)
             self._redraw(self.scan.adjusted)
 
     def count_on(self, *, scans: int, spectra: int) -> None:
@@ -548,6 +555,21 @@ class SimulatedInstrument:
 def busy_with(doing: str) -> InstrumentBusy:
     """Return the error for a request during an activity, such as a scan or an approach."""
     return InstrumentBusy(f"the instrument is busy with {'an' if doing[0] in 'aeiou' else 'a'} {doing}")
+
+
+def _setup_of(scan: ScanActivity) -> Plain:
+    # everything that the true values of a scan depend on, beside the world
+    return {
+        "center_m": scan.region.center_m,
+        "size_m": scan.region.size_m,
+        "angle_rad": scan.region.angle_rad,
+        "shape": scan.shape,
+        "line_s": scan.line_s,
+        "upwards": scan.upwards,
+        "feedback": asdict(scan.feedback),
+        "bias_v": scan.bias_v,
+        "slope": scan.slope,
+    }
 
 
 def _finite(what: str, *values: float) -> None:

@@ -130,6 +130,7 @@ class TipChangeSettings(TipRepairSettings):
         hardness_exponent: both rates grow as (force / force at a gentle setpoint) to this power.
         blunt_weight, double_weight, contaminated_weight: relative probabilities of the flaws.
         schedule: pairs of seconds after the start and a condition: changes at fixed times.
+        in_scans: pairs of a scan's number and a condition: 4 at the start of the fourth scan, 4.5 in its middle.
         wear_m_per_m: growth of the radius per metre scanned at a gentle setpoint.
     """
 
@@ -140,6 +141,7 @@ class TipChangeSettings(TipRepairSettings):
     double_weight: float = 1.0
     contaminated_weight: float = 1.0
     schedule: tuple[tuple[float, str], ...] = field(default_factory=tuple)
+    in_scans: tuple[tuple[float, str], ...] = field(default_factory=tuple)
     wear_m_per_m: float = 0.0
 
     def __post_init__(self) -> None:
@@ -148,6 +150,8 @@ class TipChangeSettings(TipRepairSettings):
         check(self, from_zero="wear_m_per_m")
         for _, condition in self.schedule:
             one_of(condition, CONDITIONS, "schedule")
+        for _, condition in self.in_scans:
+            one_of(condition, CONDITIONS, "in_scans")
         object.__setattr__(self, "schedule", tuple(sorted(self.schedule)))
 
 

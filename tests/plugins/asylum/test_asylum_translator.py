@@ -57,6 +57,19 @@ def test_scan_has_exactly_the_frame_that_was_set(bench: Make) -> None:
     assert scans["PhaseTrace"].unit == "deg"
 
 
+def test_amplitude_at_the_setpoint_is_the_setpoint_by_the_calibration_of_the_panel(bench: Make) -> None:
+    # paper F3: with another calibration in the files than in the loop every gain seemed wrong
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    amplitude = scanned(peer)["AmplitudeTrace"]
+    values = made.emulator.controller.values
+    sensitivity = made.emulator.rig.world.settings.feedback.sensitivity_m_per_v
+    assert values.get("AmpInvOLS") == sensitivity
+    assert values.get("AmplitudeSetpointMeters") == pytest.approx(0.7 * sensitivity)
+    assert np.median(amplitude.values) == pytest.approx(0.7 * sensitivity, rel=0.02)
+
+
 def test_scan_has_the_set_frame_to_the_last_digit(bench: Make) -> None:
     made = bench()
     peer = made.start()

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from afspm.basics.errors import InvalidValue
+from afspm.basics.plain_data import Plain
 from afspm.model import Region
 from afspm.simulation import World
 from afspm.simulation.background import in_background
@@ -426,6 +427,46 @@ def test_feedback_set_during_a_scan_is_in_force_from_the_next_line_on(rig: Simul
     assert np.array_equal(before[:4], after[:4])
     assert np.median(after[4:]) == pytest.approx(0.3, abs=0.05)
     assert np.median(before[4:]) == pytest.approx(0.7, abs=0.05)
+
+
+def test_setup_of_a_scan_and_place_of_a_spectrum_are_noted(clock: Any) -> None:
+    noted: dict[str, Mapping[str, Any]] = {}
+    rig = SimulatedInstrument({}, 3, clock.t_s, note=lambda _, event, facts: noted.update({event: facts}))
+    rig.setup.region, rig.setup.shape, rig.setup.line_s = Region((1e-7, 2e-7), (3e-7, 4e-7), 0.5), (4, 6), 0.25
+    rig.setup.feedback = replace(rig.setup.feedback, integral_gain=77.0)
+    rig.start_scan(1000.0)
+    rig.stop_scan(1001.0)
+    rig.move_probe((5e-8, -6e-8), 1002.0)
+    rig.start_spectrum("force", 1003.0)
+    setup, curve = noted["scan starts"]["setup"], noted["spectrum starts"]
+    assert (setup["center_m"], setup["size_m"], setup["angle_rad"]) == ((1e-7, 2e-7), (3e-7, 4e-7), 0.5)
+    assert (setup["shape"], setup["line_s"], setup["feedback"]["integral_gain"]) == ((4, 6), 0.25, 77.0)
+    assert (curve["position_m"], curve["kind"]) == ((5e-8, -6e-8), "force")
+
+
+@pytest.mark.parametrize("is_restored", [False, True])
+def test_tip_changes_in_the_scan_with_a_number(clock: Any, *, is_restored: bool) -> None:
+    settings: Plain = {"tip_changes": {"in_scans": [[2, "double"], [3.5, "blunt"]]}}
+    rig = SimulatedInstrument(settings, 3, clock.t_s)
+    rig.setup.shape, rig.setup.line_s = (4, 4), 0.5
+
+    def flaws_of_scan(start_s: float) -> list[tuple[float, list[str]]]:
+        nonlocal rig
+        scan = rig.start_scan(start_s)
+        if is_restored:
+            kept, setup = json.loads(json.dumps(rig.state())), rig.setup
+            rig = SimulatedInstrument(settings, 3, clock.t_s)
+            rig.setup = setup
+            rig.restore(kept)
+            assert rig.scan is not None
+            scan = rig.scan
+        tips: Any = scan.truth["tips"]
+        rig.ended(scan.end_s)
+        return [(one["t_s"] - start_s, list(one["flaws"])) for one in tips]
+
+    assert flaws_of_scan(1000.0) == [(0.0, [])]
+    assert flaws_of_scan(1010.0)[-1] == (0.0, ["double"])
+    assert flaws_of_scan(1020.0) == [(0.0, ["double"]), (1.0, ["blunt", "double"])]
 
 
 def test_events_are_noted_with_the_truth(clock: Any) -> None:

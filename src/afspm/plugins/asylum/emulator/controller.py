@@ -83,6 +83,10 @@ class AsylumController:
         self._curve_running = self._engages = False
         # as after a scan whose image is still open: the first spot is in the middle of the image
         self._image = self._frame()
+        # the panel knows the detector's calibration, as after a thermal tune
+        metres_per_volt = rig.world.settings.feedback.sensitivity_m_per_v
+        values.put("AmpInvOLS", metres_per_volt)
+        values.put("AmplitudeSetpointMeters", metres_per_volt * values.get("AmplitudeSetpointVolts"))
         fast, slow = values.size()
         self.spots_m: list[tuple[float, float]] = [(fast / 2, slow / 2)]
 

@@ -13,7 +13,6 @@ import numpy as np
 from afspm.emulation import ScanActivity, SpectrumActivity
 from afspm.plugins.asylum.emulator.values import IgorValues
 
-AMPLITUDE_M_PER_V = 1e-7
 _SINCE_1904_S: Final = 2_082_844_800
 _LABEL: Final = 32
 _FLOAT32: Final = 2
@@ -31,7 +30,7 @@ def image(name: str, scan: ScanActivity, values: IgorValues, now_s: float) -> by
         quantity, _, back = channel.partition(" ")
         labels.append(f"{quantity.replace(' ', '')}{back or 'Trace'}")
         # real files have amplitudes as lengths
-        layers.append((found * AMPLITUDE_M_PER_V if (quantity, unit) == ("Amplitude", "V") else found).T)
+        layers.append((found * values.get("AmpInvOLS") if (quantity, unit) == ("Amplitude", "V") else found).T)
     rows, columns = scan.shape
     width, height = scan.region.size_m
     steps = [(width / (columns - 1), "m"), (height / (rows - 1), "m")]
