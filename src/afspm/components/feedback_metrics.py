@@ -15,6 +15,7 @@ from afspm.model.arrays import Array
 _SMALLEST_CURRENT = 0.01  # of the setpoint: smaller values are noise, and may have no logarithm
 _SIGNIFICANT = 4.0  # standard deviations of white noise
 _CLOSE = 1.1  # ratio of two gains below which the search ends
+_SAME_MIDDLE = 0.1  # relative difference of two medians that count as equal
 _SWING = 0.2  # least slope of height on error for an oscillation
 
 
@@ -43,12 +44,14 @@ class FeedbackError:
             slow.
         swing: slope of the height's changes on the error's, both in m: one or more if the tip oscillates above the
             sample, zero or less if it lags behind.
+        middle: median of the error signal.
     """
 
     over: float
     under: float
     missed: float = 0.0
     swing: float = 0.0
+    middle: float = 0.0
 
     @property
     def share(self) -> float:
@@ -74,6 +77,16 @@ class FeedbackLimits:
             return FeedbackQuality.WELL if worst <= 0.5 else FeedbackQuality.BARELY
         is_swinging = error.swing > _SWING and error.share > self.pixels
         return FeedbackQuality.OSCILLATES if is_swinging else FeedbackQuality.TOO_SLOW
+
+    def is_held_elsewhere(self, error: FeedbackError, at_lower_gain: FeedbackError) -> bool:
+        """Return whether the feedback holds the signal, but at another value than the setpoint.
+
+        An integral gain leaves no constant error, and a higher one leaves less. So the setpoint and the channel are
+        calibrated differently if the height follows while the same error stays at a higher gain.
+        """
+        both = (error, at_lower_gain)
+        is_off = all(max(one.over, one.under) > 0.5 and 0.0 < one.missed <= self.relief for one in both)
+        return is_off and math.isclose(error.middle, at_lower_gain.middle, rel_tol=_SAME_MIDDLE)
 
 
 def relative_error(signal: Array, setpoint: float | None, exponential: bool) -> Array:
@@ -116,16 +129,17 @@ def feedback_error(error: Array, threshold: float, height_m: Array | None = None
     """
     there = error[np.isfinite(error)]
     over, under = float(np.mean(there > threshold)), float(np.mean(there < -threshold))
+    middle = float(np.median(there))
     if height_m is None or gap_m == 0.0:
-        return FeedbackError(over, under)
+        return FeedbackError(over, under, middle=middle)
     complete = np.isfinite(error).all(axis=1) & np.isfinite(height_m).all(axis=1)
     gap, height = error[complete] * gap_m, height_m[complete]
     if gap.shape[0] < 1 or gap.shape[1] < 4:
-        return FeedbackError(over, under)
+        return FeedbackError(over, under, middle=middle)
     missed = math.sqrt(_smooth_variance(gap) / max(_smooth_variance(height), np.finfo(float).tiny))
     moves, of_error = np.diff(height, axis=1), np.diff(gap, axis=1)
     swing = float((moves * of_error).sum() / max((of_error**2).sum(), np.finfo(float).tiny))
-    return FeedbackError(over, under, missed, swing)
+    return FeedbackError(over, under, missed, swing, middle)
 
 
 def _smooth_variance(values: Array) -> float:
@@ -142,8 +156,8 @@ def gain_search(
 ) -> Generator[float, FeedbackQuality | None, float | None]:
     """Search for a gain at which the feedback follows well: higher while too slow, lower while oscillating.
 
-    Yields gains to try, `start` first. The caller sends the quality at each gain, or None if the gain was refused. The
-    returned value is the gain to keep, or None if no gain was good.
+    Yields gains to try, `start` first. The caller sends the quality at each gain, or None if the gain was refused: that
+    gain, and any beyond it, is not tried again. The returned value is the gain to keep, or None if no gain was good.
 
     Args:
         start: within the bounds.
@@ -154,12 +168,14 @@ def gain_search(
     """
     gain, slow, fast = start, 0.0, math.inf  # highest gain known too low, lowest known too high
     well = barely = None
-    comes_from_above = False
+    comes_from_above = is_bound = False
     for _ in range(most_tries):
         following = yield gain
-        if following is None or following is FeedbackQuality.OSCILLATES:
-            fast, wanted = gain, gain / factor
-            comes_from_above = following is FeedbackQuality.OSCILLATES and well is None
+        if following is None:
+            # between an allowed gain and a refused one lies a bound that is not known: no step towards it
+            fast, wanted, is_bound, comes_from_above = gain, gain / factor, True, False
+        elif following is FeedbackQuality.OSCILLATES:
+            fast, wanted, is_bound, comes_from_above = gain, gain / factor, False, well is None
         elif following is FeedbackQuality.TOO_SLOW:
             slow, wanted, comes_from_above = gain, gain * factor, False
         elif following is FeedbackQuality.BARELY:
@@ -168,9 +184,10 @@ def gain_search(
             well, wanted, comes_from_above = gain, gain / factor, False
         else:
             return gain
-        at, gain = gain, min(max(wanted, lowest), highest)
+        # three digits: a gain that the controller takes as a whole number stays one
+        at, gain = gain, min(max(float(f"{wanted:.3g}"), lowest), highest)
         if gain == at or not slow < gain < fast:
-            if well or barely or not _CLOSE * slow < fast < math.inf or slow == 0.0:
+            if well or barely or is_bound or not _CLOSE * slow < fast < math.inf or slow == 0.0:
                 break
-            gain = math.sqrt(slow * fast)
+            gain = float(f"{math.sqrt(slow * fast):.3g}")
     return well or barely

@@ -6,9 +6,9 @@ from contextlib import suppress
 from typing import Any, ClassVar
 
 from afspm.basics.errors import ConfigError, ControlLost, InvalidValue, Refused, RequestError
-from afspm.components.feedback_metrics import FeedbackQuality, gain_search
+from afspm.components.feedback_metrics import FeedbackError, FeedbackQuality, gain_search
 from afspm.components.feedback_signal import FeedbackObserver
-from afspm.model import Problem, names
+from afspm.model import Parameter, Problem, names
 
 # interval of attempts to restore the gain, while a person or another component holds control
 BACK_WITHIN_S = 60.0
@@ -19,9 +19,13 @@ class FeedbackTuner(FeedbackObserver):
 
     The component raises the gain while the feedback is too slow, and lowers the gain while the feedback oscillates. If
     no gain is good, the component restores the original gain, says so at CRITICAL, and clears the flag, so that the
-    experiment continues as before. After a failed scan, a loss of control or a kill, it sets the last good gain of the
-    search, or the original gain if none was good. If that gain is refused, the component flags `device-malfunction`, so
-    that nothing is scanned until a person has set a gain.
+    experiment continues as before. The same happens if the signal stays at one distance from the setpoint while the
+    height follows: then the setpoint and the channel are calibrated differently, which no gain changes. After a failed
+    scan, a loss of control or a kill, it sets the last good gain of the search, or the original gain if none was good.
+    If that gain is refused, the component flags `device-malfunction`, so that nothing is scanned until a person has set
+    a gain.
+
+    `afspm check` compares the bounds with those of the microscope and of `[limits]`, so that no gain beyond is set.
 
     Args:
         lowest_gain, highest_gain: bounds of the integral gain.
@@ -46,6 +50,9 @@ class FeedbackTuner(FeedbackObserver):
         if not (0.0 < lowest_gain < highest_gain and factor > 1.0 and most_tries >= 2):
             raise ConfigError("needs 0 < lowest_gain < highest_gain, factor > 1, most_tries >= 2")
         self.lowest, self.highest, self.factor, self.most_tries = lowest_gain, highest_gain, factor, most_tries
+        bounds = {"lowest_gain": lowest_gain, "highest_gain": highest_gain}
+        self.planned_parameters = {name: (Parameter(names.ZCTRL_IGAIN, str(gain)),) for name, gain in bounds.items()}
+        self._slow: FeedbackError | None = None  # of the gain before, if that was too low
 
     def run(self) -> None:
         while True:
@@ -83,12 +90,13 @@ class FeedbackTuner(FeedbackObserver):
             raise
         if found is not None:
             self._keep(found)
-        self._finish("" if found is not None else "no gain is good")
+        none = f"no gain is good from {self.lowest:g} to {self.highest:g}"
+        self._finish("" if found is not None else none)
 
     def _search(self, start: float) -> float | None:
         # a good gain is saved at once: a kill afterwards must not lose it
         search = gain_search(start, self.factor, self.lowest, self.highest, self.most_tries)
-        gain = next(search)
+        gain, self._slow = next(search), None
         try:
             while True:
                 following = self._try(gain)
@@ -116,6 +124,12 @@ class FeedbackTuner(FeedbackObserver):
         error = self.signal.error(scans[held], scans.get(self.height), setpoint, self.scope)
         following = self.limits.judge(error)
         self.log.info("integral gain %g: the feedback %s: %s", gain, following.value, error)
+        slow, self._slow = self._slow, error if following is FeedbackQuality.TOO_SLOW else None
+        if slow is not None and self._slow is not None and self.limits.is_held_elsewhere(error, slow):
+            what = f"{scans[held].channel} stays {error.middle:+.0%} off the setpoint while the height follows, so that"
+            raise InvalidValue(
+                f"{what} both are calibrated differently (set `sensitivity` to the calibration in force)"
+            )
         return following
 
     def _keep(self, gain: float) -> None:

@@ -166,6 +166,21 @@ def test_between_a_gain_too_low_and_one_too_high_the_steps_get_smaller() -> None
     assert 110.0 < kept < 130.0
 
 
+def test_no_step_goes_towards_a_refused_gain() -> None:
+    def follows(gain: float) -> FeedbackQuality | None:
+        return None if gain > 200.0 else FeedbackQuality.TOO_SLOW
+
+    # paper F3: 212 and 178 were requested after 300 was refused
+    assert found(follows, 150.0, highest=1000.0) == (None, [150.0, 300.0])
+    assert found(follows, 150.0, highest=200.0) == (None, [150.0, 200.0])
+
+
+def test_gain_of_a_step_has_three_digits() -> None:
+    # a controller with whole numbers refuses 1414.21
+    kept, tried = found(by(1000.0, 2000.0), 1000.0)
+    assert (kept, tried) == (1410.0, [1000.0, 2000.0, 1410.0])
+
+
 def test_a_gain_just_below_the_oscillation_is_kept_only_if_no_lower_one_is_as_good() -> None:
     assert found(by(10.0, 110.0), 200.0)[0] == 50.0
     assert found(by(60.0, 110.0), 200.0)[0] == 100.0

@@ -38,7 +38,7 @@ class Rig(Lab):
 
     def __init__(self, amplitude: Callable[[float], np.ndarray], setpoint: float = SETPOINT, on: bool = True) -> None:
         super().__init__("tuner")
-        self.amplitude, self.setpoint = amplitude, setpoint
+        self.amplitude, self.setpoint, self.height = amplitude, setpoint, HEIGHT
         self.values[names.ZCTRL_SETPOINT] = str(setpoint)
         self.publish(Feedback(on=on, integral_gain=BEFORE))
         self.flag(Problem.FEEDBACK_NON_OPTIMAL)
@@ -62,7 +62,7 @@ class Rig(Lab):
     def publish_scan(self, region: Region, shape: tuple[int, int] = (8, 8)) -> None:
         self.scanned += 1
         self.publish(Scan(region, "Amplitude", "V", self.amplitude(self.gains[-1]), self.clock.now_ns()))
-        self.publish(Scan(region, "Height", "m", HEIGHT, self.clock.now_ns()))
+        self.publish(Scan(region, "Height", "m", self.height, self.clock.now_ns()))
 
 
 def tuner(**settings: Any) -> FeedbackTuner:
@@ -96,7 +96,7 @@ def test_original_gain_is_restored_if_none_is_good_and_the_experiment_goes_on(
     assert max(lab.gains) == 10.0
     assert lab.gains[-1] == BEFORE
     assert lab.problems == ()
-    (record,) = [one for one in caplog.records if "can't be improved: no gain is good" in one.message]
+    (record,) = [one for one in caplog.records if "no gain is good from 0.1 to 10" in one.message]
     assert record.levelname == "CRITICAL", "[notify] sends it"
 
 
@@ -122,9 +122,17 @@ def test_refused_gain_ends_the_search_there() -> None:
 
     lab.intercept = refuse
     tuned(lab)
-    assert 2.0 in lab.gains
-    assert 10.0 not in lab.gains
-    assert lab.gains[-1] == BEFORE
+    assert lab.gains == [1.0, 2.0, 4.0, BEFORE]  # paper F3: nothing beyond the bound after the first refusal
+
+
+def test_signal_held_beside_the_setpoint_is_named_before_the_tip_oscillates(caplog: pytest.LogCaptureFixture) -> None:
+    # paper F3: a wrong sensitivity was taken for a slow feedback, up to an oscillation
+    relief = 20e-9 * np.sin(np.linspace(0.0, 12.0, 64)) * np.ones((32, 1))
+    lab = Rig(lambda gain: 1.4 * SETPOINT - 0.05 / gain * relief / 50e-9)
+    lab.height = relief
+    tuned(lab)
+    assert lab.gains == [1.0, 2.0, BEFORE]
+    assert "Amplitude stays +40% off the setpoint while the height follows, so that both are calibrated" in caplog.text
 
 
 @pytest.mark.parametrize("good", [False, True])

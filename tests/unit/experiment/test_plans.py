@@ -250,6 +250,23 @@ def test_a_kind_of_spectra_that_the_microscope_lacks_is_an_error(write: Write, p
 
 
 @pytest.mark.parametrize(
+    ("bound", "limit", "what"),
+    [
+        ("2e6", "", "what its microscope refuses: zctrl-igain: 2e+06 is outside 0 to 1e+06"),
+        ("900.0", "[limits.zctrl-igain]\nmax = 500.0\n", "zctrl-igain = 900 is above the highest allowed, 500"),
+    ],
+)
+def test_gain_of_the_tuner_beyond_a_bound_is_an_error_of_its_line(
+    write: Write, bound: str, limit: str, what: str
+) -> None:
+    # paper F3: the tuner requested gains beyond the bound of the microscope, each of them refused
+    tuner = f'[tuner]\ncomponent = true\nclass = "FeedbackTuner"\nlowest_gain = 1.0\nhighest_gain = {bound}\n'
+    error = only_error(write(tuner + limit, frame=SIMULATED))
+    assert what in error.what
+    assert error.place.line == 5
+
+
+@pytest.mark.parametrize(
     ("limit", "what"),
     [
         ("[limits]\nmost_pixels = 40_000\n", "256 x 256 pixels is above the highest number allowed, 40000 pixels"),
