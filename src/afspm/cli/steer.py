@@ -28,14 +28,18 @@ def pause(where: Where = RUNS) -> None:
 
 def go_on(
     where: Where = RUNS,
+    feedback_off: Annotated[
+        bool, typer.Option("--feedback-off", help="The z feedback is off because you want it so.")
+    ] = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Don't ask.")] = False,
 ) -> None:
     """Let a paused experiment continue: AUTOMATED, also after a person has acted at the microscope.
 
     Shows why it is paused and how the tip is, and then asks. It is refused while the tip is withdrawn, or the feedback
-    off, by hand. The experiment must be running: after a kill or a power cut use `afspm run --resume RUN`.
+    off, by hand; `--feedback-off` lets it measure without feedback, until a request of the run or a person switches it
+    on. The experiment must be running: after a kill or a power cut use `afspm run --resume RUN`.
     """
-    from afspm.model import ControlMode, TipStatus
+    from afspm.model import ControlMode, TipStatus, names
 
     with looking(where, acts=True) as follower:
         seen = follower.overview
@@ -43,6 +47,9 @@ def go_on(
         typer.echo(f"{seen.by_hand}; now {(seen.tip or TipStatus()).to_continue_with}")
         if not yes:
             typer.confirm("Let the run continue?", abort=True)
+    if feedback_off:
+        with acting(where) as scope:
+            scope.action(names.FEEDBACK_MAY_BE_OFF)
     _set_mode(where, ControlMode.AUTOMATED, "the experiment goes on (AUTOMATED)")
 
 

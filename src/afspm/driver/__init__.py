@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from afspm.translator.driver import Driver
     from afspm.translator.driver_base import ControllerLost, action, connected
     from afspm.translator.folder_files import FolderFiles
+    from afspm.translator.judge import Stated
     from afspm.translator.long_call import ANSWERS_S, LongCall
     from afspm.translator.parameters import FEEDBACK_ON, Value
     from afspm.translator.result_files import (
@@ -87,6 +88,7 @@ __all__ = [
     "ScriptedDriver",
     "SettingsGroup",
     "ShadowDriver",
+    "Stated",
     "TcpConnection",
     "TipWay",
     "Value",

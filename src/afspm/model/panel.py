@@ -7,6 +7,7 @@ from enum import StrEnum
 from typing import Final
 
 from afspm.basics.formatting import quantity
+from afspm.model.requests import Parameter
 
 _DIGITS: Final = 7
 """As many as single precision has: many controllers keep their settings in it."""
@@ -30,6 +31,8 @@ class PanelAct(StrEnum):
     """The z feedback was switched off with the tip at the sample."""
     VALUES = "values"
     """Settings were changed."""
+    CONTRADICTION = "contradiction"
+    """Two results in a row were not what they stand for, for the same reason."""
 
 
 _IN_WORDS = {
@@ -40,6 +43,7 @@ _IN_WORDS = {
     PanelAct.WITHDRAW: "the tip was withdrawn",
     PanelAct.FEEDBACK_OFF: "the z feedback was switched off",
     PanelAct.VALUES: "settings were changed",
+    PanelAct.CONTRADICTION: "two measurements in a row are not what they stand for",
 }
 
 
@@ -90,6 +94,8 @@ class ActByHand:
     def __str__(self) -> str:
         if self.act is PanelAct.VALUES:
             return f"set at the microscope: {', '.join(map(str, self.changes))}"
+        if self.act is PanelAct.CONTRADICTION:
+            return f"{_IN_WORDS[self.act]}: {self.evidence}"
         why = f" ({self.evidence})" if self.evidence else ""
         return f"{_IN_WORDS[self.act]} at the microscope{why}"
 
@@ -136,11 +142,16 @@ class TipStatus:
 
 @dataclass(frozen=True, slots=True)
 class MeasurementConditions:
-    """The tip at the begin and at the end of a scan or spectrum, and what was done by hand meanwhile.
+    """What a scan or spectrum stands for, and what was in force at its begin and at its end.
 
     Attributes:
         time_ns, filename: of the scan or spectrum.
-        begin, end: None: not known, for example after a restart of the translator.
+        begin, end: the tip; None: not known, for example after a restart of the translator.
+        acts: what was done by hand meanwhile.
+        began_ns: None: not known.
+        holder: the component whose request began it; empty: it was begun at the microscope, or that is not known.
+        begin_values, end_values: the settings that the run has set for this measurement.
+        unproved: what the controller could have shown of it and did not, in words.
     """
 
     time_ns: int
@@ -148,3 +159,8 @@ class MeasurementConditions:
     begin: TipStatus | None = None
     end: TipStatus | None = None
     acts: tuple[ActByHand, ...] = ()
+    began_ns: int | None = None
+    holder: str = ""
+    begin_values: tuple[Parameter, ...] = ()
+    end_values: tuple[Parameter, ...] = ()
+    unproved: tuple[str, ...] = ()

@@ -17,6 +17,9 @@ CRASH: Final = "x-crash"
 RETRACT: Final = "x-retract"
 ENGAGE: Final = "x-engage"
 
+FEEDBACK_MAY_BE_OFF: Final = "x-feedback-may-be-off"
+"""A person says that the z feedback is off by intention; every translator takes it, in the mode MANUAL alone."""
+
 EXTENSION_ACTIONS: Final = (PULSE, CRASH, RETRACT, ENGAGE)
 
 TREATMENTS: Final = (PULSE, CRASH)

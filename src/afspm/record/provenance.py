@@ -18,6 +18,7 @@ from afspm.model import (
     ControlState,
     Feedback,
     MeasurementConditions,
+    Parameter,
     ProblemNames,
     ScopeState,
     ScopeStatus,
@@ -69,7 +70,8 @@ def control_at_start(
         doing: the state of the microscope during the measurement.
         measured_ns: the end of the measurement; a later start counts as unknown.
     """
-    began_ns = _began(journal, time_ns, doing)
+    told = None if measured_ns is None else _conditions(journal, time_ns, (), measured_ns)
+    began_ns = _began(journal, time_ns, doing) if told is None or told.began_ns is None else told.began_ns
     if began_ns is not None and measured_ns is not None and began_ns > measured_ns:
         began_ns = None  # the start was not observed: a restarted translator published the state later
     at_ns = time_ns if began_ns is None else began_ns
@@ -79,6 +81,21 @@ def control_at_start(
         control if isinstance(control, ControlState) else None,
         feedback if isinstance(feedback, Feedback) else None,
     )
+
+
+def _conditions(
+    journal: sqlite3.Connection, time_ns: int, filenames: Collection[str], measured_ns: int
+) -> MeasurementConditions | None:
+    rows = journal.execute(
+        "SELECT payload FROM packets WHERE message = 'MeasurementConditions' AND time_ns <= ?"
+        f" ORDER BY time_ns DESC LIMIT {_BACK}",
+        (time_ns,),
+    )
+    for (payload,) in rows:
+        one = _decoded("MeasurementConditions", payload)
+        if isinstance(one, MeasurementConditions) and (one.time_ns == measured_ns or one.filename in filenames):
+            return one
+    return None
 
 
 def drift(journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filenames: Collection[str]) -> Plain | None:
@@ -145,20 +162,18 @@ def tip(
         measured_ns: the end of the measurement.
 
     Returns:
-        "begin", "end" and "by_hand", each only if known.
+        "begin", "end" and "by_hand", "settings" of the run for it at begin and end, "asked_by" and "unproved", each
+        only if known.
     """
     found: Plain = {}
-    rows = journal.execute(
-        "SELECT payload FROM packets WHERE message = 'MeasurementConditions' AND time_ns <= ?"
-        f" ORDER BY time_ns DESC LIMIT {_BACK}",
-        (time_ns,),
-    )
-    for (payload,) in rows:
-        one = _decoded("MeasurementConditions", payload)
-        if isinstance(one, MeasurementConditions) and (one.time_ns == measured_ns or one.filename in filenames):
-            ends = {"begin": one.begin, "end": one.end}
-            found = {name: _tip_facts(status) for name, status in ends.items() if status not in (None, TipStatus())}
-            break
+    if (one := _conditions(journal, time_ns, filenames, measured_ns)) is not None:
+        ends = {"begin": one.begin, "end": one.end}
+        found = {name: _tip_facts(status) for name, status in ends.items() if status not in (None, TipStatus())}
+        values = {"begin": one.begin_values, "end": one.end_values}
+        in_force = {name: {each.name: _text(each) for each in given} for name, given in values.items() if given}
+        found |= {"settings": in_force} if in_force else {}
+        found |= {"asked_by": one.holder} if one.holder else {}
+        found |= {"unproved": list(one.unproved)} if one.unproved else {}
     if since_ns is not None:
         acts = journal.execute(
             "SELECT payload FROM packets WHERE message = 'ActByHand' AND time_ns BETWEEN ? AND ? ORDER BY time_ns",
@@ -167,6 +182,10 @@ def tip(
         told = [str(one) for (payload,) in acts if isinstance(one := _decoded("ActByHand", payload), ActByHand)]
         found |= {"by_hand": told} if told else {}
     return found
+
+
+def _text(one: Parameter) -> str:
+    return " ".join(filter(None, (one.value, one.unit)))
 
 
 def _tip_facts(status: TipStatus | None) -> Plain:

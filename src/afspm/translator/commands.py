@@ -14,7 +14,7 @@ from typing import Any
 from afspm.basics import units
 from afspm.basics.errors import AfspmError, ConfigError, Refused
 from afspm.basics.plain_data import PlainMapping
-from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, request_name
+from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, names, request_name
 from afspm.model.microscope_status import STARTS
 from afspm.translator.driver_base import LOST, Action, DriverBase
 from afspm.translator.panel_watch import PanelWatch
@@ -50,6 +50,7 @@ class Commands:
         panel: knows of a tip that a person has withdrawn.
         sequence: decides whether the microscope is free, and the order of published states.
         about_to_act: called after all checks, right before the first change.
+        is_set: called with the values that a request has set, as read back.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class Commands:
         temporary: TemporarySettings,
         panel: PanelWatch,
         about_to_act: Callable[[Request], None],
+        is_set: Callable[[Mapping[str, Value]], None],
         log: logging.Logger,
     ) -> None:
         self._driver = driver
@@ -66,9 +68,12 @@ class Commands:
         self._temporary = temporary
         self._panel = panel
         self._about_to_act = about_to_act
+        self._is_set = is_set
         self._log = log
         driver.for_a_while = temporary.begin
         self.actions = driver.own_actions() | self._added_actions(driver.common.actions)
+        if names.FEEDBACK_ON in driver.table and not driver.only_reads:
+            self.actions[names.FEEDBACK_MAY_BE_OFF] = Action(names.FEEDBACK_MAY_BE_OFF, panel.may_be_off)
 
     def do(self, request: Request) -> CommandOutcome:
         """Execute a request; errors of the controller or its driver become the response.
@@ -122,6 +127,7 @@ class Commands:
         driver = self._driver
         self._refuse_if_busy(all(name in driver.adjustable or driver.table[name].while_busy for name in values))
         read_back = apply(driver, values, lambda: self._about_to_act(request)) if values else {}
+        self._is_set({name: read_back[name] for name in values})
         steps = self._sequence.begin(ScopeState.MOVING) if MOVES & values.keys() else []
         done = self._success(request, read_back)
         done.steps = steps
@@ -154,6 +160,8 @@ class Commands:
         tip = self._panel.tip
         if tip.remedy:
             raise Refused(ControlResponse.NOT_FREE, f"{tip.by_hand}; {tip.remedy}")
+        if why_not := self._panel.feedback.why_not():
+            raise Refused(ControlResponse.NOT_FREE, why_not)
         if tip.engaged is False and not self._driver.start_engages:
             if not self._panel.was_engaged and not self._driver.withdrew_tip():
                 # a person has begun the run so, for example to commission the controller
@@ -181,16 +189,22 @@ class Commands:
         added = {}
         for name, what in given.items():
             where = f"actions.{name}"
-            is_table = isinstance(what, Mapping) and set(what) <= {"set", "command", "for"} and len(what) > 0
-            if not is_table or set(what) == {"for"} or not isinstance(what.get("set", {}), Mapping):
-                hint = '{ set = { "<parameter>" = <value> }, command = "<text>", for = "<time>" }, or parts of it'
+            does = isinstance(what, Mapping) and not {"set", "command"}.isdisjoint(what)
+            known = {"set", "command", "for", "switches_feedback"}
+            if not does or not set(what) <= known or not isinstance(what.get("set", {}), Mapping):
+                hint = (
+                    '{ set = { "<parameter>" = <value> }, command = "<text>", for = "<time>",'
+                    " switches_feedback = true }, or parts of it"
+                )
                 raise ConfigError(f"{what!r} is not an action", where=where, hint=hint)
             values = self._driver.table.written(what.get("set", {}), where=where)
             command = str(what["command"]) if "command" in what else None
             for_s = _duration_s(what["for"], f"{where}.for") if "for" in what else None
             moves = ScopeState.MOVING if MOVES & values.keys() else None
             state = moves if for_s is None else state_for(values)
-            added[name] = Action(name, partial(self._run_added_action, values, command, for_s), state)
+            switches = bool(what.get("switches_feedback")) or (for_s is None and names.FEEDBACK_ON in values)
+            do = partial(self._run_added_action, values, command, for_s)
+            added[name] = Action(name, do, state, switches_feedback=switches)
         return added
 
     def _run_added_action(self, values: Mapping[str, Value], command: str | None, for_s: float | None) -> None:

@@ -16,6 +16,7 @@ from afspm.basics.errors import AfspmError, ConfigError, InvalidValue, Refused
 from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.basics.units import Duration, PollPeriod
 from afspm.model import ChannelRoles, ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.translator.judge import Stated
 from afspm.translator.parameters import ParameterTable, Value
 from afspm.translator.polling import EAGER_S
 from afspm.translator.setting_groups import SettingsGroup
@@ -57,6 +58,7 @@ class Action:
             is published.
         while_busy: True if the action is accepted even while the microscope is not free.
         interrupts: the states that the action interrupts.
+        switches_feedback: True if the action may switch the z feedback on or off by itself, and leave it so.
     """
 
     name: str
@@ -64,6 +66,7 @@ class Action:
     state: ScopeState | None = None
     while_busy: bool = False
     interrupts: frozenset[ScopeState] = frozenset()
+    switches_feedback: bool = False
 
     @property
     def only_stops(self) -> bool:
@@ -95,7 +98,9 @@ _KNOWN = {
 Method = TypeVar("Method", bound=Callable[[Any], None])
 
 
-def action(name: str, *, state: ScopeState | None = None, while_busy: bool | None = None) -> Callable[[Method], Method]:
+def action(
+    name: str, *, state: ScopeState | None = None, while_busy: bool | None = None, switches_feedback: bool = False
+) -> Callable[[Method], Method]:
     """Mark a method of a `Driver` as the generic action `name`.
 
     Args:
@@ -103,12 +108,15 @@ def action(name: str, *, state: ScopeState | None = None, while_busy: bool | Non
             unchanged for other actions.
         while_busy: True if the action is accepted even while the microscope is not free; None: as for the base action
             of this name, or False for other actions.
+        switches_feedback: True if the action may switch the z feedback by itself, and leave it so: its state
+            after it counts as wished. Otherwise a feedback found off is a person's doing.
     """
     known = _KNOWN.get(name, Action(name, _not_implemented))
     mark = replace(
         known,
         state=known.state if state is None else state,
         while_busy=known.while_busy if while_busy is None else while_busy,
+        switches_feedback=switches_feedback,
     )
 
     def marked(method: Method) -> Method:
@@ -167,7 +175,7 @@ class DriverBase(ABC):
         actions: generic actions added by the experiment file: `{name = {set = {<parameter> = <value>}}}` sets
             parameters, `{name = {command = "<text>"}}` sends a text to the controller (`command`); an action may have
             both keys. With `for = "50 ms"` the microscope is busy for this time, and then the former values are
-            restored.
+            restored. An action that may leave the z feedback switched says `switches_feedback = true`.
         poll_period_s: time between two polls of the controller while nothing is due, in real seconds; the state is read
             more often when a measurement is about to end, as learned from earlier measurements.
         result_timeout_s: longest time from the end of a scan or spectrum to its complete file, in experiment seconds;
@@ -224,6 +232,13 @@ class DriverBase(ABC):
 
     start_engages: ClassVar[bool] = False
     """True if the start of a scan brings a withdrawn tip to the sample."""
+
+    settles_s: ClassVar[float] = 0.5
+    """Experiment seconds after a spectrum or an action in which the controller may still hold the z feedback, or values
+    that it changed by itself: a reading within them proves nothing."""
+
+    only_reads: ClassVar[bool] = False
+    """True for a shadow, which only reads the controller."""
 
     program_s: ClassVar[float] = 0.0
     """Real seconds that the controller's program may need for work beside measuring, such as saving a file. They do not
@@ -352,6 +367,10 @@ class DriverBase(ABC):
         Raises:
             FileError: the file is incomplete; `load` is called again until `result_timeout_s` is over.
         """
+
+    def stated(self, result: str) -> Stated:
+        """Return what the files of a result say of their measurement. Override where they state times."""
+        return Stated()
 
     def followed(self) -> bool | None:
         """Return the outcome of a measurement whose end `status` missed, because the next followed at once.

@@ -9,6 +9,7 @@ from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import AfspmError, FileError
 from afspm.basics.plain_data import PlainMapping
 from afspm.model import Scan, Spectrum
+from afspm.storage.formats import FileContent
 from afspm.translator.result_files import (
     NEW_FRAME,
     SCAN,
@@ -110,7 +111,7 @@ class FolderFiles(ResultFiles):
         for path, written_ns in files:
             if modified_ns(path) != written_ns:
                 raise FileError("was overwritten or deleted", where=str(path))
-        return self._content_of([path for path, _ in files], entry)
+        return self._as_set([self.content_of(path) for path, _ in files], entry)
 
     # --- to be overridden for a controller with other files ---
 
@@ -121,6 +122,9 @@ class FolderFiles(ResultFiles):
         """Return the files of a measurement with their modification times in ns; empty if files are missing."""
         path = self._file(measured)
         return [] if path is None else [(str(path), modified_ns(path))]
+
+    def content_of(self, path: Path) -> FileContent:
+        return read_result(path)
 
     def check(self, path: Path, one: Scan | Spectrum, measured: Entry) -> None:
         """Check the first scan or spectrum of a new file; by default there is no check."""
@@ -140,7 +144,8 @@ class FolderFiles(ResultFiles):
         files = self.files_of(measured)
         paths = [Path(name) for name, _ in files]
         try:
-            content = self._content_of(paths, measured) if paths else ()
+            contents = [self.content_of(path) for path in paths]
+            content = self._as_set(contents, measured) if paths else ()
         except (AfspmError, OSError):
             return False  # still being written
         # a file that changed while it was read is still being written
@@ -155,7 +160,7 @@ class FolderFiles(ResultFiles):
             return True
         self.check(paths[0], content[0], measured)
         self.newest_ns(Path(measured["folder"]), paths)
-        self._add(self.result_name(paths[0]), measured, {"files": [list(one) for one in files]}, content)
+        self._add(self.result_name(paths[0]), measured, {"files": [list(one) for one in files]}, content, contents)
         return True
 
     def _file(self, measured: Entry) -> Path | None:
@@ -164,9 +169,9 @@ class FolderFiles(ResultFiles):
     def _files(self, folder: Path) -> list[Path]:
         return list(folder.glob(self.pattern)) if folder.is_dir() else []
 
-    def _content_of(self, paths: Sequence[Path], measured: Entry) -> Content:
+    def _as_set(self, files: Sequence[FileContent], measured: Entry) -> Content:
         is_scan = measured["what"] == SCAN
-        found = [one for path in paths for one in read_result(path) if isinstance(one, Scan) is is_scan]
+        found = [one for file in files for one in file if isinstance(one, Scan) is is_scan]
         if not found:
-            raise FileError(f"holds no {measured['what']}", where=str(paths[0]))
+            raise FileError(f"the files hold no {measured['what']}")
         return [self.precision.as_set(one, measured) for one in found]

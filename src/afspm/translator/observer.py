@@ -30,7 +30,8 @@ from afspm.model.microscope_status import feedback_of
 from afspm.model.state import FeedbackUnits
 from afspm.storage.disk import is_full
 from afspm.translator import setting_groups
-from afspm.translator.driver_base import LOST, MEASURING, DriverBase
+from afspm.translator.claims import Claims
+from afspm.translator.driver_base import LOST, MEASURING, Action, DriverBase
 from afspm.translator.outbox import Outbox, Outgoing
 from afspm.translator.panel_watch import EXTRA, PanelWatch
 from afspm.translator.parameters import FEEDBACK_ON, Value
@@ -38,8 +39,11 @@ from afspm.translator.polling import AdaptivePolling, OverdueScan
 from afspm.translator.sequence import DiscardResults, LogError, PublishResults, PublishStatus, SequenceStep
 from afspm.translator.state import TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
+from afspm.translator.wished_feedback import FeedbackLevel, WishedFeedback
 from afspm.transport.port import ServerPort
 
+_AGAIN_S = 0.1
+"""Real time until the feedback is read again, once it was found off though on is wished."""
 _ROUNDING_S = 1e-5
 """More than the rounding of an experiment time, which has 16 digits since 1970."""
 
@@ -50,6 +54,7 @@ class Observer:
     Attributes:
         values: values at the last reading.
         panel: what was done at the microscope by hand.
+        claims: what the running measurement stands for.
     """
 
     def __init__(
@@ -70,9 +75,14 @@ class Observer:
         self._polling = AdaptivePolling(driver.common.poll_period_s, driver.eager_poll_s)
         self._live = LiveLines(driver)
         self.values: dict[str, Value] = {}
-        self.panel = PanelWatch(state.kept, driver.table, driver.is_last_written)
+        # of real time at least, for an emulated controller
+        settles_s = max(driver.settles_s, driver.settles_s / self._clock.real_s(1.0))
+        feedback = WishedFeedback(state.kept, settles_s, follows=driver.only_reads)
+        self.panel = PanelWatch(state.kept, driver.table, driver.is_last_written, feedback)
+        self.claims = Claims(driver, state.kept)
+        self._unproved: Sequence[str] = ()
+        self._is_after_spectrum = False
         self._published_last: dict[type, object] = {}
-        self._began_with: TipStatus | None = None
         self._acts: list[ActByHand] = []
         self._others_told = False
         self._polled_for = ScopeState.UNDEFINED
@@ -93,10 +103,10 @@ class Observer:
             self._state.save()
         self._temporary.end()  # impossible before a kill, or while the controller was lost
         self.panel.lost()
-        self._began_with = None
         self._take_in(self._read())
-        self.panel.read({}, self.values, ScopeState.UNDEFINED, self._clock.now_ns())
+        acts = self.panel.read({}, self.values, ScopeState.UNDEFINED, self._clock.now_ns(), self._driver.withdrew_tip())
         self.publish_all()
+        self._tell(acts)
 
     def look(self) -> None:
         """Read the controller, and publish the changes since the last reading."""
@@ -128,6 +138,8 @@ class Observer:
         real_now_s, now_s = self._clock.monotonic_s(), self._clock.now_s()
         polling_s = self._polling.wait_s(real_now_s, end_is_reported=self._driver.reports_end())
         wait_s = min(polling_s, self._all_at_s - real_now_s)
+        if self.panel.feedback.is_in_question:
+            wait_s = min(wait_s, _AGAIN_S)
         sequence_s = self._state.sequence.deadline_s()
         for at_s in (self._driver.next_change_s(), sequence_s, self._live.due_s, self._temporary.until_s):
             if at_s is not None:
@@ -154,7 +166,7 @@ class Observer:
         The time may be some microseconds early; it has passed if a look may do something now.
         """
         waits_for = (self._state.sequence.deadline_s(), self._temporary.until_s, self._result_since_s)
-        if waits_for != (None, None, None):
+        if waits_for != (None, None, None) or self.panel.feedback.is_in_question:
             return -math.inf
         due_s = self._live.due_s
         lines_s = math.inf if due_s is None else self.real_time_s(due_s)
@@ -185,25 +197,31 @@ class Observer:
         is_over = sequence.published.state in MEASURING and status.state not in MEASURING
         if is_over:
             self._polling.over(self._clock.monotonic_s())
+        gives_back = self._is_after_spectrum and status.state is ScopeState.FREE
+        if is_over or gives_back:
             # after the state: the tip may have been withdrawn between the reading of the values and the end
             if self._tip_has_changed():
                 self._observe_values(())
-                values = True
+            values = True
         if values:
             withdrew = self._driver.withdrew_tip()
             acts = self.panel.read(before, self.values, status.state, self._clock.now_ns(), withdrew)
             if self._result_since_s is not None and any(map(self._spoils, acts)):
                 self._publish_earlier_scan()
             self._tell(acts)
+            self._judge_feedback()
+        if gives_back and self.panel.feedback.level is FeedbackLevel.HELD:
+            return  # what follows would move a tip without feedback: the microscope is free once it is given back
         was, is_requested = sequence.published, sequence.is_requested
         # a fast simulated clock waits here: otherwise much experiment time would pass before the results are published
         with self._clock.late() if is_over else nullcontext():
             results = self._outbox.look()
             is_whole = True if self._is_of_earlier_scan(status, results) else self._driver.followed()
             steps = [] if is_whole is None else self._state.sequence.follow(is_whole=is_whole)
+            is_followed = bool(steps)
             steps += sequence.observe(status, results and not steps, self._clock.now_s())
             self._tell(self._acts_shown_by(steps, was, is_requested=is_requested))
-            self.play(self._without_spoiled(steps))
+            self.play(self._without_spoiled(steps, is_at_end=not is_followed))
             if is_over and sequence.published.state not in MEASURING:
                 self._clock.published(Publication.RESULTS)
         # only now: a free microscope whose result is awaited, or whose scan this look shows to have ended, is no proof
@@ -227,20 +245,50 @@ class Observer:
         sequence, running = self._state.sequence, self._state.sequence.published
         self._result_since_s = None
         steps = [*sequence.follow(is_whole=True), *sequence.observe(running, results=False, now_s=self._clock.now_s())]
-        self.play(self._without_spoiled(steps))
+        self.play(self._without_spoiled(steps, is_at_end=False))
 
-    def asked(self, request: Request) -> None:
-        """Note that a request of the run is about to change something."""
-        action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
+    def asked(self, request: Request, action: Action | None) -> None:
+        """Note that a request of the run is about to change something.
+
+        Args:
+            action: the action that it asks for, if it asks for one.
+        """
         sets: Sequence[str] | None = setting_groups.FRAME if request.kind == ControlRequest.SET_SCAN_PARAMS else None
         if isinstance(request.subject, Parameter):
             sets = (request.subject.name,)
-        self.panel.asked(action, sets=sets, sets_feedback=feedback_of(request) is not None)
+        name = "" if action is None else action.name
+        self.panel.asked(name, sets=sets)
+        feedback = feedback_of(request)
+        switches = action.switches_feedback if action else feedback is not None and feedback.on is not None
+        self.panel.feedback.asked(name, self._clock.now_s(), switches=switches)
         self._others_told = False
 
-    def look_before_start(self) -> None:
+    def look_before_start(self, request: Request) -> None:
         """Publish all changes, and what a person has just done to the tip, before a measurement is begun."""
-        self.observe(values=self._tip_has_changed())
+        before, is_changed = self.values, self._tip_has_changed()
+        self.observe(values=is_changed)
+        if not is_changed:  # the same reading again is a second one
+            acts = self.panel.read(before, self.values, self._state.sequence.published.state, self._clock.now_ns())
+            self._tell(acts)
+        self.claims.look(request)
+
+    def _judge_feedback(self) -> None:
+        # of a measurement of the run: what a person measures by hand is his own
+        feedback = self.panel.feedback
+        if feedback.news:
+            self._log.warning("%s", feedback.news)
+            feedback.news = ""
+        if not self.claims.is_by_run or self._state.kept.get("spoiled"):
+            return
+        if feedback.level in (FeedbackLevel.OFF, FeedbackLevel.BY_HAND):
+            self._spoil(f"the z feedback was found off{feedback.hint}")
+        elif feedback.level is FeedbackLevel.ON:
+            self._spoil("the z feedback was found on, and the run had switched it off")
+
+    def _spoil(self, why: str) -> None:
+        self._state.kept["spoiled"] = why
+        self._live.end()
+        self._state.save()
 
     def _acts_shown_by(self, steps: Sequence[SequenceStep], was: ScopeStatus, *, is_requested: bool) -> list[ActByHand]:
         # only changes of state that no request caused: the steps of a request are played apart
@@ -260,14 +308,27 @@ class Observer:
             acts.append(ActByHand(now_ns, PanelAct.SCAN if begun is ScopeState.SCANNING else PanelAct.SPECTRUM))
         return acts
 
-    def _without_spoiled(self, steps: Sequence[SequenceStep]) -> list[SequenceStep]:
+    def _without_spoiled(self, steps: Sequence[SequenceStep], *, is_at_end: bool) -> list[SequenceStep]:
         # what was measured while a person withdrew the tip, or switched the feedback off, is never complete
-        spoiled = self._state.kept.get("spoiled")
-        if not spoiled or not any(isinstance(step, PublishResults) for step in steps):
+        if not any(isinstance(step, PublishResults) for step in steps):
             return list(steps)
-        reason = LogError(f"the measurement is not published: {spoiled} while it ran")
-        interrupted = PublishStatus(ScopeStatus(ScopeState.INTERRUPTED))
-        instead: list[SequenceStep] = [reason, interrupted, DiscardResults()]
+        spoiled = self._state.kept.get("spoiled")
+        if not spoiled:
+            # the next scan had begun when the end of this one was seen: the present settings belong to that one
+            tip = self.panel.tip if is_at_end else None
+            if tip is not None and self._driver.withdrew_tip():  # a controller may withdraw it after each scan
+                tip = replace(tip, engaged=None)
+            verdict = self.claims.verdict(tip, self._outbox.stated())
+            self._unproved, spoiled = verdict.unproved, verdict.sentence
+        if not spoiled:
+            return list(steps)
+        instead: list[SequenceStep] = [
+            LogError(f"the measurement is not published: {spoiled}"),
+            PublishStatus(ScopeStatus(ScopeState.INTERRUPTED)),
+            DiscardResults(),
+        ]
+        if self.claims.repeated:
+            self._tell([ActByHand(self._clock.now_ns(), PanelAct.CONTRADICTION, self.claims.repeated)])
         return [one for step in steps for one in (instead if isinstance(step, PublishResults) else [step])]
 
     def _tell(self, acts: Sequence[ActByHand]) -> None:
@@ -276,8 +337,7 @@ class Observer:
             if self._state.sequence.published.state in MEASURING:
                 self._acts.append(act)
                 if self._spoils(act):
-                    self._state.kept["spoiled"] = str(act)
-                    self._live.end()
+                    self._spoil(str(act))
         if acts:
             self._state.save()
         for act in acts:
@@ -315,7 +375,7 @@ class Observer:
         return any(self.values.get(name) != value for name, value in self._driver.in_force(shown).items())
 
     def _conditions(self, time_ns: int, filename: str) -> MeasurementConditions:
-        return MeasurementConditions(time_ns, filename, self._began_with, self.panel.tip, tuple(self._acts))
+        return self.claims.conditions(time_ns, filename, self._acts, self._unproved)
 
     def play(self, steps: Sequence[SequenceStep]) -> None:
         """Carry out the steps of a status sequence: save all their changes at once, then publish.
@@ -329,7 +389,8 @@ class Observer:
         packets: list[Outgoing] = []
         for step in steps:
             if isinstance(step, PublishStatus):
-                packets.append(self._packet(step.status))
+                packets.append(packet := self._packet(step.status))
+                self._note_state(step.status.state, packet.time_ns)
             elif isinstance(step, PublishResults):
                 packets += self._outbox.take(self._conditions)
             elif isinstance(step, DiscardResults):
@@ -343,13 +404,16 @@ class Observer:
         for step in steps:
             if isinstance(step, PublishStatus):
                 self._adapt_polling(step.status.state)
-                self._begin_conditions(step.status.state)
 
-    def _begin_conditions(self, state: ScopeState) -> None:
-        if state in MEASURING or state is ScopeState.FREE:
-            self._began_with, self._acts = self.panel.tip if state in MEASURING else None, []
-            if self._state.kept.pop("spoiled", None):
-                self._state.save()
+    def _note_state(self, state: ScopeState, time_ns: int) -> None:
+        if state in MEASURING and self.claims.running is None:
+            self.claims.begin(time_ns, self.panel.tip, is_requested=self._state.sequence.is_requested)
+            self._is_after_spectrum = state is ScopeState.SPEC
+            self._acts = []
+        elif state is ScopeState.FREE:
+            self.claims.end()
+            self._state.kept.pop("spoiled", None)
+            self._is_after_spectrum, self._acts = False, []
 
     def publish_all(self) -> None:
         """Publish the present settings and the published state again, for a newly connected scheduler."""
@@ -393,6 +457,8 @@ class Observer:
 
     def _plan_reading(self) -> None:
         wait_s, next_s = self._driver.common.poll_period_s, self._driver.next_change_s()
+        if self.panel.feedback.is_in_question:
+            wait_s = min(wait_s, _AGAIN_S)
         if next_s is not None:
             wait_s = min(wait_s, max(0.0, self._clock.real_s(next_s - self._clock.now_s())))
         self._all_at_s = self._clock.monotonic_s() + wait_s

@@ -14,6 +14,7 @@ from afspm.basics.errors import AfspmError
 from afspm.basics.plain_data import Plain
 from afspm.model import MeasurementConditions, Scan, Spectrum
 from afspm.translator.driver_base import DriverBase
+from afspm.translator.judge import Stated
 from afspm.wire import encode
 from afspm.wire.messages import CONDITIONS
 
@@ -93,6 +94,10 @@ class Outbox:
             if result not in self._read and (loaded := self._load(result)) is not None:
                 self._read[result] = loaded
         return bool(self._read)
+
+    def stated(self) -> list[Stated]:
+        """Return what the new results say of their measurements."""
+        return [self._microscope.stated(result) for result in self._read]
 
     def take(self, conditions: Callable[[int, str], MeasurementConditions]) -> list[Outgoing]:
         """Return the packets of the new results; save the memory before publishing them.

@@ -8,28 +8,29 @@
 
 The client repeats an unknown one within bounds, as after a fault. So an act counts as done by hand only if two
 successive readings of the controller differ, the microscope was free or scanning at both, and no request and no
-restored setting of the run lies between them. For the tip, a start of a measurement may lie between them.
+restored setting of the run lies between them. For the tip, a start of a measurement may lie between them. The feedback
+is compared with what the run wishes (`WishedFeedback`), at every reading.
 
-During a spectrum the controller itself changes the bias, and may hold the feedback. So a reading of after a spectrum is
-compared with the last one of before it, once two readings in a row show the microscope at rest or scanning again: by
-then the controller has put back what it changed. A request in between makes the settings uncertain, but not the
-feedback, which no request but its own switches off.
+During a spectrum the controller itself changes the bias. So a reading of after a spectrum is compared with the last one
+of before it, once two readings in a row show the microscope at rest or scanning again: by then the controller has put
+back what it changed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from typing import Final
 
+from afspm.basics.clock import NS_PER_S
 from afspm.model import ActByHand, ChangedValue, PanelAct, ScopeState, TipStatus, names
 from afspm.model.microscope_status import STARTS
 from afspm.translator.parameters import FEEDBACK_ON, ParameterTable, Value
 from afspm.translator.setting_groups import FRAME, POSITION
 from afspm.translator.state import Kept
+from afspm.translator.wished_feedback import CALM, SINCE_BEFORE, FeedbackLevel, WishedFeedback
 
-_CALM: Final = frozenset({ScopeState.FREE, ScopeState.SCANNING})
-"""States in which the controller itself changes neither settings nor the feedback."""
-_STILL: Final = _CALM | {ScopeState.SPEC}
+_STILL: Final = CALM | {ScopeState.SPEC}
 """States in which the controller does not move the tip away in the course of its work."""
 _STARTED: Final = {names.START_SCAN: ScopeState.FREE, names.START_SPEC: ScopeState.SPEC}
 """The state from which the tip is watched after a start: spectra may switch the feedback off."""
@@ -51,6 +52,7 @@ class PanelWatch:
     Args:
         kept: JSON values that outlive a kill: what a person did to the tip that keeps afspm from measuring.
         written: returns whether the run itself has set a parameter to this value last.
+        feedback: the z feedback as wished.
 
     Attributes:
         is_certain: whether a change of state now is certainly no effect of the run: the controller has answered all the
@@ -58,7 +60,14 @@ class PanelWatch:
         tip: the tip and its feedback at the last reading.
     """
 
-    def __init__(self, kept: Kept, table: ParameterTable, written: Callable[[str, Value], bool]) -> None:
+    def __init__(
+        self,
+        kept: Kept,
+        table: ParameterTable,
+        written: Callable[[str, Value], bool],
+        feedback: WishedFeedback,
+    ) -> None:
+        self.feedback = feedback
         self._kept = kept
         self._table = table
         self._written = written
@@ -68,6 +77,8 @@ class PanelWatch:
         self._before_spectrum: dict[str, Value] = {}
         self._by_hand: dict[str, Value] = {}
         self.is_certain = False
+        # a withdrawal while no translator ran is seen at the first reading
+        self._was_left_at_sample = kept.get("engaged") is True and not kept.get("tip_is_moved")
         self.tip = TipStatus(by_hand=kept.get("tip_by_hand", ""))
 
     @property
@@ -75,14 +86,13 @@ class PanelWatch:
         """Whether the tip was at the sample at any reading of this run."""
         return bool(self._kept.get("was_engaged"))
 
-    def asked(self, action: str = "", *, sets: Collection[str] | None = None, sets_feedback: bool = False) -> None:
+    def asked(self, action: str = "", *, sets: Collection[str] | None = None) -> None:
         """Note that the run changes something: what the next reading shows may be its doing.
 
         Args:
             action: the action that it asks for, if it asks for one. Its effect on the tip may show later, but not after
                 a measurement has begun.
             sets: the settings that it sets; None: not known.
-            sets_feedback: whether it switches the z feedback.
         """
         # the tip is looked at right before each start
         self._last, self._still = None, _STARTED.get(action)
@@ -94,13 +104,19 @@ class PanelWatch:
             kept = set() if sets is None else self._by_hand.keys() - set(sets)
             self._by_hand = {name: self._by_hand[name] for name in kept}
         if action != names.START_SPEC:
-            stays = FEEDBACK_ON in self._before_spectrum and not (self._tip_is_moved or sets_feedback)
-            self._before_spectrum = {FEEDBACK_ON: self._before_spectrum[FEEDBACK_ON]} if stays else {}
+            self._before_spectrum = {}
+
+    def may_be_off(self) -> None:
+        """Note that a person says that the z feedback is off by intention."""
+        self.feedback.may_be_off()
+        self._kept["tip_by_hand"] = ""
+        self.tip = replace(self.tip, by_hand="")
 
     def lost(self) -> None:
         """Note a restart or a lost controller: until the microscope is free, nothing is certain."""
         self._last, self._still, self.is_certain = None, None, False
         self._before_spectrum, self._by_hand = {}, {}
+        self.feedback.lost()
 
     def read(
         self, before: Mapping[str, Value], now: Mapping[str, Value], state: ScopeState, now_ns: int, withdrew: str = ""
@@ -116,44 +132,50 @@ class PanelWatch:
         acts = []
         if state is ScopeState.SPEC:
             self._before_spectrum = {**before, **self._before_spectrum}
-        is_calm = still in _CALM and state in _CALM
+        is_calm = still in CALM and state in CALM
         is_after_spectrum = is_calm and bool(self._before_spectrum)
         if is_calm:
             before, self._before_spectrum = {**before, **self._before_spectrum}, {}
         # a withdrawal takes time, and the controller may show it as a state of its own until it is over
-        if still is not None and not withdrew:
-            act = self._tip_act(before, now, now_ns, is_calm=is_calm)
-            acts += [] if act is None else [act]
+        was_engaged = (before.get(names.ENGAGED) is True and still is not None) or self._was_left_at_sample
+        self._was_left_at_sample = False
+        if was_engaged and now.get(names.ENGAGED) is False and not withdrew and not self._tip_is_moved:
+            acts.append(self._tip_act(PanelAct.WITHDRAW, now_ns))
+        acts += self._feedback_acts(now, state, now_ns, withdrew)
         # a running scan moves the tip, and a spectrum may
         watched = _SETTINGS if state is ScopeState.SCANNING or is_after_spectrum else _SETTINGS | set(POSITION)
-        if last in _CALM and state in _CALM and (changes := self._changes(before, now, watched)):
+        if last in CALM and state in CALM and (changes := self._changes(before, now, watched)):
             acts.append(ActByHand(now_ns, PanelAct.VALUES, changes=tuple(changes.values())))
             self._by_hand |= {name: now[name] for name in changes if name in _SETTINGS}
         self._see_tip(now)
         return acts
 
-    def _tip_act(
-        self, before: Mapping[str, Value], now: Mapping[str, Value], now_ns: int, *, is_calm: bool
-    ) -> ActByHand | None:
-        if self._tip_is_moved:
-            return None
-        if before.get(names.ENGAGED) is True and now.get(names.ENGAGED) is False:
-            act = ActByHand(now_ns, PanelAct.WITHDRAW, f"the controller reports it, {_NOT_ASKED}")
-        elif is_calm and before.get(FEEDBACK_ON) is True and _off_at_the_sample(now):
-            act = ActByHand(now_ns, PanelAct.FEEDBACK_OFF, f"the controller reports it, {_NOT_ASKED}")
-        else:
-            return None
+    def _feedback_acts(
+        self, now: Mapping[str, Value], state: ScopeState, now_ns: int, withdrew: str
+    ) -> list[ActByHand]:
+        engaged, on = now.get(names.ENGAGED), now.get(FEEDBACK_ON)
+        level = self.feedback.read(_known(engaged), _known(on), state, now_ns / NS_PER_S)
+        if level is FeedbackLevel.OFF and self.feedback.wished is None:
+            self._kept["tip_by_hand"] = SINCE_BEFORE
+        is_told = bool(self._kept.get("tip_by_hand"))
+        if level is not FeedbackLevel.BY_HAND or withdrew or is_told:
+            return []
+        return [self._tip_act(PanelAct.FEEDBACK_OFF, now_ns, self.feedback.hint)]
+
+    def _tip_act(self, what: PanelAct, now_ns: int, hint: str = "") -> ActByHand:
+        act = ActByHand(now_ns, what, f"the controller reports it, {_NOT_ASKED}{hint}")
         self._kept["tip_by_hand"] = str(act)
         return act
 
     def _see_tip(self, now: Mapping[str, Value]) -> None:
         engaged, on = now.get(names.ENGAGED), now.get(FEEDBACK_ON)
+        self._kept |= {"engaged": engaged, "tip_is_moved": self._tip_is_moved}
         if engaged:
             self._kept["was_engaged"] = True
         if engaged is not False and on is not False:
             self._kept["tip_by_hand"] = ""
         by_hand = str(self._kept.get("tip_by_hand") or "")
-        self.tip = TipStatus(None if engaged is None else bool(engaged), None if on is None else bool(on), by_hand)
+        self.tip = TipStatus(_known(engaged), _known(on), by_hand)
 
     def _changes(
         self, before: Mapping[str, Value], now: Mapping[str, Value], watched: Collection[str]
@@ -173,6 +195,5 @@ class PanelWatch:
         return ChangedValue(name, old, new, unit)
 
 
-def _off_at_the_sample(values: Mapping[str, Value]) -> bool:
-    # a withdrawal switches the feedback off as well, which is no act of its own
-    return values.get(FEEDBACK_ON) is False and values.get(names.ENGAGED) is not False
+def _known(value: Value | None) -> bool | None:
+    return None if value is None else bool(value)

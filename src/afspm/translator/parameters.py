@@ -48,6 +48,7 @@ class ParameterSpec:
         while_busy: the parameter may be set during a scan or a move.
         sign: -1 where the controller's sign is opposite (an axis pointing down, angles clockwise).
         resolution: smaller differences are ignored (rounding by the controller, noise of a read-back), in SI.
+        measured: a reading is a measured value, and not the setting: no measurement stands for it.
         where: the place where `range` was set; empty without a range.
     """
 
@@ -61,6 +62,7 @@ class ParameterSpec:
     while_busy: bool = False
     sign: float = 1.0
     resolution: float = 0.0
+    measured: bool = False
     where: str = ""
 
     @property

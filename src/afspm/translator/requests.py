@@ -24,7 +24,7 @@ from afspm.model import (
 )
 from afspm.model.fencing import Epoch, SchedulerFence
 from afspm.model.idempotency_cache import TOO_OLD, Floors
-from afspm.model.microscope_status import STARTS
+from afspm.model.microscope_status import STARTS, feedback_of
 from afspm.model.sessions import number_of, run_of
 from afspm.translator.commands import Commands
 from afspm.translator.connection import Connection
@@ -70,7 +70,8 @@ class RequestHandler:
         self._is_connected = is_connected
         self._reply = reply
         self._outcomes = RequestOutcomes(state.kept, all_or_nothing=driver.memory_is_all)
-        self.commands = Commands(driver, state.sequence, temporary, observer.panel, self._record_begin, log)
+        is_set = observer.claims.is_set
+        self.commands = Commands(driver, state.sequence, temporary, observer.panel, self._record_begin, is_set, log)
         self._acting: Request | None = None
         self._commander = b""
         self._last_refusal = ""
@@ -121,7 +122,8 @@ class RequestHandler:
         # the last look may be old: the microscope must be free now
         if connection.stands and not (_is_read_only(request) or self._is_kept(request)):
             starts = request.kind == ControlRequest.ACTION and request.subject in STARTS
-            connection.guarded(observer.look_before_start if starts else partial(observer.observe, values=False))
+            look = partial(observer.look_before_start, request) if starts else partial(observer.observe, values=False)
+            connection.guarded(look)
         if request.subject != names.RETRACT:
             connection.require()
         elif request.kind == ControlRequest.ACTION:  # the question whether there is such an action needs no controller
@@ -131,6 +133,8 @@ class RequestHandler:
             done = self.commands.do(request)
         finally:
             TRACE.command("")
+        if done.response.ok and (feedback := feedback_of(request)) is not None:
+            observer.panel.feedback.is_set(feedback.on)
         if request.kind == ControlRequest.ACTION and done.response.ok and not done.steps:
             # before the answer, so that the peer then knows the settings changed by its action
             connection.guarded(observer.observe)
@@ -148,7 +152,8 @@ class RequestHandler:
         self._driver.prove()
         self._acting = request
         TRACE.command(f"{request_name(request.kind)} {request.subject}")
-        self._observer.asked(request)
+        action = self.commands.actions.get(str(request.subject)) if request.kind == ControlRequest.ACTION else None
+        self._observer.asked(request, action)
         in_doubt = self._state.feedback.may_switch(request)
         self._outcomes.begin(request)
         # saved before: after a kill a setting may be written again, but an action must not be repeated

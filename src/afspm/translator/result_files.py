@@ -19,6 +19,7 @@ from afspm.basics.errors import FileError
 from afspm.basics.plain_data import Plain
 from afspm.model import Region, Scan, Spectrum
 from afspm.storage.formats import FileContent, read
+from afspm.translator.judge import Stated
 from afspm.translator.trace import TRACE
 
 SCAN: Final = "scan"
@@ -26,6 +27,7 @@ SCAN: Final = "scan"
 NEW_FRAME: Final = "its frame was changed at the panel while it ran"
 _LISTED: Final = 16
 _OF_A_RESULT: Final = ("what", "frame", "position", "end_ns")
+_MOST_STARTS: Final = 500
 
 Content = Sequence[Scan | Spectrum]
 Entry = Plain
@@ -37,7 +39,8 @@ class ResultFiles(ABC):
 
     Args:
         kept: a JSON dict on disk: "running" and "ended" are an `Entry` or None; "results" is a list of entries, each
-            with the name of the result as "result".
+            with the name of the result as "result"; "started" has start and end of the newest results, the start in the
+            clock of the files.
 
     Attributes:
         broken_off: True if the ended measurement was interrupted at the controller; until the next `results`.
@@ -52,7 +55,7 @@ class ResultFiles(ABC):
         self._log = log
         self._content: dict[str, Content] = {}
         self.broken_off, self.missing = False, ""
-        for key, empty in (("running", None), ("ended", None), ("results", [])):
+        for key, empty in (("running", None), ("ended", None), ("results", []), ("started", [])):
             kept.setdefault(key, empty)
 
     @abstractmethod
@@ -131,9 +134,30 @@ class ResultFiles(ABC):
     def _ends(self, facts: Mapping[str, object]) -> None:
         self._kept["running"], self._kept["ended"] = None, {**self._kept["running"], **facts}
 
-    def _add(self, result: str, measured: Entry, facts: Mapping[str, object], content: Content) -> None:
-        taken = {key: measured[key] for key in _OF_A_RESULT if key in measured}
-        self._kept["results"] = [*self._kept["results"], {"result": result, **taken, **facts}][-_LISTED:]
+    def stated(self, result: str) -> Stated:
+        """Return what the files of a result say of their measurement; nothing of one that is not among the last."""
+        nothing: Entry = {}
+        entry = next((one for one in self._kept["results"] if one["result"] == result), nothing)
+        began_ns, ended_ns = entry.get("stated", ((), ()))
+        earlier = {start_ns: end_ns for start_ns, end_ns, of in self._kept["started"] if of != result}
+        return Stated(tuple(began_ns), tuple(ended_ns), earlier)
+
+    def _add(
+        self,
+        result: str,
+        measured: Entry,
+        facts: Mapping[str, object],
+        content: Content,
+        files: Iterable[FileContent] = (),
+    ) -> None:
+        files = tuple(files)
+        began_ns = [one.start_ns for one in files if one.start_ns is not None]
+        stated = [began_ns, [one.end_ns for one in files if one.end_ns is not None]]
+        taken: Entry = {key: measured[key] for key in _OF_A_RESULT if key in measured}
+        entry: Entry = {"result": result} | taken | dict(facts) | {"stated": stated}
+        self._kept["results"] = [*self._kept["results"], entry][-_LISTED:]
+        started = [[start_ns, measured["end_ns"], result] for start_ns in {*began_ns}]
+        self._kept["started"] = [*self._kept["started"], *started][-_MOST_STARTS:]
         self._content = {result: content}
 
     def _listed(self) -> list[str]:

@@ -10,6 +10,7 @@ from afspm.translator.activity import Activity
 from afspm.translator.driver import Driver
 from afspm.translator.driver_base import connected
 from afspm.translator.folder_files import FolderFiles
+from afspm.translator.judge import Stated
 from afspm.translator.parameters import Value
 
 
@@ -81,6 +82,9 @@ class ScriptedDriver(Driver, Generic[S, A]):
 
     def stopped_by_hand(self) -> str:
         return self.activity.why_ended()
+
+    def stated(self, result: str) -> Stated:
+        return self._files.stated(result)
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         return self._files.load(result)

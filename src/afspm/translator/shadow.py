@@ -29,6 +29,7 @@ class ShadowDriver(DriverBase):
     Write it before the maker's driver: `class MineShadow(ShadowDriver, Mine)`.
     """
 
+    only_reads = True
     watches: ClassVar[type[DriverBase]]
     """The maker's driver, with all that a run could ask of it."""
 

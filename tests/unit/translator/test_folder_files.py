@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from afspm.model import Region, Scan
+from afspm.storage.formats import FileContent
 from afspm.translator.folder_files import FolderFiles
-from afspm.translator.result_files import SCAN, Content, Entry, FilePrecision, as_list
+from afspm.translator.result_files import SCAN, FilePrecision, as_list
 
 FRAME = Region((0.0, 0.0), (1e-6, 1e-6), 0.0)
 TAKEN = {"frame": as_list(FRAME)}
@@ -25,9 +25,9 @@ class OneRowFiles(FolderFiles):
 
     precision = FilePrecision(part=1e-9, angle_rad=1e-9)
 
-    def _content_of(self, paths: Sequence[Path], measured: Entry) -> Content:
-        values = np.zeros((1, int(paths[0].read_text(encoding="utf-8"))))
-        return [Scan(FRAME, "Z", "m", values, filename=str(path)) for path in paths]
+    def content_of(self, path: Path) -> FileContent:
+        values = np.zeros((1, int(path.read_text(encoding="utf-8"))))
+        return FileContent("test", (Scan(FRAME, "Z", "m", values, filename=str(path)),))
 
 
 @pytest.fixture

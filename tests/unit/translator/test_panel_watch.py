@@ -261,6 +261,9 @@ def test_feedback_switched_off_by_the_run_is_no_act_by_hand(bench: Any, scan: An
 def test_feedback_switched_off_at_the_panel_is_an_act_until_it_is_on_again(bench: Any) -> None:
     bench.microscope.values["Loop"] = False
     bench.look()
+    assert acts(bench) == [], "one reading is no proof"
+    assert bench.ask(ACTION, names.START_SCAN).code == ControlResponse.NOT_FREE
+    bench.look()
     assert acts(bench) == [PanelAct.FEEDBACK_OFF]
     refused = bench.ask(ACTION, names.START_SCAN)
     assert refused.code == ControlResponse.NOT_FREE

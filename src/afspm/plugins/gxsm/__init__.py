@@ -32,6 +32,7 @@ from afspm.driver import (
     Driver,
     Introduction,
     KeptSettings,
+    Stated,
     Value,
     action,
     connected,
@@ -281,6 +282,9 @@ class Gxsm(Driver):
 
     def stopped_by_hand(self) -> str:
         return self._files.stopped_by_hand()
+
+    def stated(self, result: str) -> Stated:
+        return self._files.stated(result)
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         return self._files.load(result)

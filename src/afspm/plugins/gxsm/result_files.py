@@ -196,11 +196,13 @@ class GxsmFiles(ResultFiles):
             before: rows of the previous scan, for `is_whole` None; without rows the scan has no result.
             near_end: True if a scan that is followed by the next at once was last seen in its last rows.
         """
+        channels = list(channels)
         order = [next(iter(endings([Path(path)])), "") for path in channels]
         now_s = now_ns / NS_PER_S
         self._hurry(now_s)
         awaited = {"soon_s": now_s + self._soon_s, "until_s": now_s + self._patience_s}
-        facts = {"channels": order, "before": before, "is_whole": is_whole, "near_end": near_end}
+        named = [Path(path).name for path in channels]
+        facts = {"channels": order, "named": named, "before": before, "is_whole": is_whole, "near_end": near_end}
         self._ends({"end_ns": end_ns, **awaited, **facts})
         ended = self._kept["ended"]
         if folder is not None and str(folder) != ended["folder"]:  # old scans there are recognised by their start
@@ -314,10 +316,14 @@ class GxsmFiles(ResultFiles):
                 except (AfspmError, OSError):
                     continue  # incomplete: GXSM is still writing it
             content = self._whole.get(file)
-            if content is not None and not self._is_of_before(content, ended["begun_ns"]):
+            if content is None or _is_half(content):
+                continue
+            if not self._is_of_before(content, ended["begun_ns"]):
                 found[file] = content
-        if ended["what"] == SCAN:  # one file for each channel: a person may save the scan again
-            return {file: found[file] for file in endings(found).values()}
+        if ended["what"] == SCAN:  # one file for each channel: a person may save the scan again, under any name
+            named = [file for file in found if file.name in ended.get("named", ())]
+            ours = {**endings(found), **endings(named)}
+            return {file: found[file] for file in ours.values()}
         return {file: found[file] for file in sorted(found, key=lambda file: file.stat().st_mtime_ns)[-1:]}
 
     def _is_of_before(self, content: FileContent, begun_ns: int) -> bool:
@@ -402,10 +408,16 @@ class GxsmFiles(ResultFiles):
         names = [str(file) for file in files]
         # the end time makes the name unique: SRanger overwrites files of spectra
         content = [_PRECISION.as_set(one, ended) for file in files.values() for one in file]
-        self._add(f"{names[0]} ({ended['end_ns']})", ended, {"files": names}, content)
+        self._add(f"{names[0]} ({ended['end_ns']})", ended, {"files": names}, content, files.values())
         self._kept["ended"] = None
         if "names" in ended:
             self._outcome = True
+
+
+def _is_half(content: FileContent) -> bool:
+    # a scan that a person saves while it runs has no end, or the end of the scan before
+    start_ns, end_ns = content.start_ns, content.end_ns
+    return bool(content.scans) and start_ns is not None and (end_ns is None or end_ns < start_ns)
 
 
 def endings(files: Iterable[Path]) -> dict[str, Path]:

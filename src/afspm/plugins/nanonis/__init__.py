@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.basics import ConfigError, Duration, FileError, Refused
-from afspm.driver import FRAME, SCAN, Driver, Entry, KeptSettings, Value, action, as_region, connected, frame
+from afspm.driver import FRAME, SCAN, Driver, Entry, KeptSettings, Stated, Value, action, as_region, connected, frame
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.nanonis import fetched, geometry, parameter_groups, protocol, z_controller
 from afspm.plugins.nanonis.activity import SAFE_TIP, WITHDRAWING, NanonisActivity
@@ -192,6 +192,9 @@ class Nanonis(Driver):
     def withdrew_tip(self) -> str:
         # who withdraws it shows only at the end
         return SAFE_TIP if self._tip.is_safe else WITHDRAWING if self._tip.is_undecided else ""
+
+    def stated(self, result: str) -> Stated:
+        return self._files.stated(result)
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         return self._files.load(result)

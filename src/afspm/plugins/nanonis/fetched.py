@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -77,7 +77,30 @@ def images(ask: Ask, how: Grabbing) -> list[Image]:
             upwards = direction == _UP
             values = how.image(raw, upwards=upwards, backward=number == _BACKWARD)
             found.append(Image(f"{name.replace(' ', '_')} {way}", unit, values, upwards))
-    return found
+    return unscanned_as_nan(found)
+
+
+def unscanned_as_nan(found: list[Image]) -> list[Image]:
+    """Return images in which rows not yet scanned are NaN: of real instruments both NaN and zeros are reported.
+
+    Zeros in all channels and both directions are not scanned where they reach the end of the scan, if another row is
+    not zero: a flat frame stays as it is, and one without any value is wholly NaN.
+    """
+    if not found or len({(image.values.shape, image.upwards) for image in found}) > 1:
+        return found  # the channels are fetched one after the other, and a person may have changed the frame
+    upwards = found[0].upwards
+    stack = np.stack([image.values if upwards else image.values[::-1] for image in found])  # rows in scanning order
+    empty = (np.nan_to_num(stack) == 0.0).all(axis=(0, 2))
+    if empty.all():
+        return found
+    last = int(np.flatnonzero(~empty)[-1])
+    stack[:, last + 1 :] = np.nan
+    for way in ("Forward", "Backward"):  # of the row that is being scanned, the rest is zero too
+        of_way = [k for k, image in enumerate(found) if image.name.endswith(way)]
+        rest = (stack[of_way, last] == 0.0).all(axis=0) & (last + 1 < len(empty))
+        stack[of_way, last] = np.where(rest, np.nan, stack[of_way, last])
+    stack = stack if upwards else stack[:, ::-1]
+    return [replace(image, values=values) for image, values in zip(found, stack, strict=True)]
 
 
 def new_lines(found: Sequence[Image], region: Region, start: int) -> list[ScanLines]:
@@ -85,6 +108,8 @@ def new_lines(found: Sequence[Image], region: Region, start: int) -> list[ScanLi
     lines = []
     # Lines not yet scanned are NaN; the channels, fetched one after the other, may differ by the present line.
     done = min((int(np.isfinite(image.values).all(axis=1).sum()) for image in found), default=0)
+    if not any(image.values.any() for image in found):
+        return []  # zeros alone: no line is scanned yet
     for image in found if done > start else ():
         shape = (image.values.shape[0], image.values.shape[1])
         first = start if image.upwards else shape[0] - done

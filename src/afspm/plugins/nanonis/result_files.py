@@ -16,6 +16,7 @@ from afspm.driver import (
     SCAN,
     Content,
     Entry,
+    FileContent,
     FilePrecision,
     ResultFiles,
     lines_missing,
@@ -161,7 +162,7 @@ class NanonisFiles(ResultFiles):
             self._take_followed(followed, now_s)
         elif ended is not None:
             file = self._file(ended)
-            if file is not None and (content := self._whole(file, ended)) is not None:
+            if file is not None and (content := self._whole(file)) is not None:
                 if ended.get("new_frame"):
                     self._log.error("%s is not published: %s", file, NEW_FRAME)
                     self._kept["ended"], self.broken_off = None, True
@@ -177,7 +178,7 @@ class NanonisFiles(ResultFiles):
         return self._listed()
 
     def read(self, entry: Entry) -> Content:
-        return _content(Path(entry["result"]), entry)
+        return _as_set(read_result(Path(entry["result"])), entry)
 
     def _fetch(self, fetch: Fetch, ended: Entry, file: Path | None) -> None:
         missed, missing = str(file or ended["reported"] or f"in {ended['folder']}"), ""
@@ -207,28 +208,28 @@ class NanonisFiles(ResultFiles):
         self._kept["fetched"] += 1
         path = self._own_folder / f"nanonis-{self._kept['fetched']:04d}.nc"
         fetched.write(path, content, ended["end_ns"])
-        self._take(path, ended, _content(path, ended))
+        self._take(path, ended, read_result(path))
 
     def _take_followed(self, followed: Entry, now_s: float) -> None:
         file = self._file(followed)
         if followed.get("new_frame"):
             self._kept["followed"] = None
             self._log.error("the scan before the present one is not published: %s", NEW_FRAME)
-        elif file is not None and (content := self._whole(file, followed)) is not None:
-            self._add(str(file), followed, {}, content)
+        elif file is not None and (content := self._whole(file)) is not None:
+            self._add(str(file), followed, {}, _as_set(content, followed), [content])
             self._kept["followed"], self._has_followed = None, True
         elif now_s >= followed["fetch_at_s"]:
             self._kept["followed"] = None
             self._log.error("the scan before the present one is lost: its file %s is incomplete", followed["reported"])
 
-    def _take(self, file: Path, ended: Entry, content: Content) -> None:
+    def _take(self, file: Path, ended: Entry, content: FileContent) -> None:
         self.newest_ns(Path(ended["folder"]), [file] if file.parent != self._own_folder else [], ended["what"])
-        self._add(str(file), ended, {}, content)
+        self._add(str(file), ended, {}, _as_set(content, ended), [content])
         self._kept["ended"] = None
 
-    def _whole(self, file: Path, ended: Entry) -> Content | None:
+    def _whole(self, file: Path) -> FileContent | None:
         try:
-            content = _content(file, ended)
+            content = read_result(file)
         except (AfspmError, OSError):
             return None  # incomplete: Nanonis is still writing it
         return None if lines_missing(content) else content
@@ -248,8 +249,8 @@ def _files(folder: Path, what: str) -> list[Path]:
     return list(folder.glob("*.sxm" if what == SCAN else "*.dat")) if folder.is_dir() else []
 
 
-def _content(path: Path, entry: Entry) -> Content:
-    return [_PRECISION.as_set(one, entry) for one in read_result(path)]
+def _as_set(content: FileContent, entry: Entry) -> Content:
+    return [_PRECISION.as_set(one, entry) for one in content]
 
 
 def _points_missing(content: Content) -> str:

@@ -46,7 +46,7 @@ class PanelState:
             stopped, changed: the settings `stopped_by_hand` and `changed_by_hand`.
         """
         match act.act:
-            case PanelAct.WITHDRAW | PanelAct.FEEDBACK_OFF:
+            case PanelAct.WITHDRAW | PanelAct.FEEDBACK_OFF | PanelAct.CONTRADICTION:
                 return True
             case PanelAct.STOP:
                 return stopped == "pause"

@@ -1,0 +1,131 @@
+"""`Claims`: what the running measurement stands for, from the request that begins it to the verdict on its result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from afspm.model import ActByHand, MeasurementConditions, Parameter, Request, TipStatus, names
+from afspm.translator.driver_base import DriverBase
+from afspm.translator.judge import Claim, Stated, Verdict, Witness, judge
+from afspm.translator.parameters import FEEDBACK_ON, Value
+from afspm.translator.setting_groups import FRAME, POSITION
+from afspm.translator.state import Kept
+
+_PROVED_ELSEWHERE = frozenset((*FRAME, *POSITION, FEEDBACK_ON))
+"""The frame and the place are compared with the file, and the feedback with the wish of the run."""
+
+
+class Claims:
+    """The claim of the running measurement, and the settings that the run makes for the next one.
+
+    Args:
+        kept: JSON values that outlive a kill.
+
+    Attributes:
+        repeated: the sentence of a contradiction that came twice in a row, until it is taken; empty: none.
+    """
+
+    def __init__(self, driver: DriverBase, kept: Kept) -> None:
+        self._driver = driver
+        self._kept = kept.setdefault("claims", {"next": {}, "running": None, "contradicted": ""})
+        self._holder = ""
+        self._begin: dict[str, Value] = {}
+        self._end: dict[str, Value] = {}
+        self._tip: TipStatus | None = None
+        self.repeated = ""
+
+    @property
+    def running(self) -> Claim | None:
+        """The claim of the running measurement; None without a measurement."""
+        kept = self._kept["running"]
+        return None if kept is None else Claim.of(kept)
+
+    @property
+    def is_by_run(self) -> bool:
+        """Whether a measurement runs that the run has asked for."""
+        return bool(self._kept["running"] and self._kept["running"]["holder"])
+
+    def is_set(self, read_back: Mapping[str, Value]) -> None:
+        """Note settings that a request has made: the next measurement stands for them."""
+        coming = self._kept["next"]
+        if not read_back.keys().isdisjoint(FRAME):
+            coming.pop(names.SCAN_SPEED, None)  # at a controller with a line rate the frame changes it
+        table = self._driver.table
+        own = {
+            name: value
+            for name, value in read_back.items()
+            if name not in _PROVED_ELSEWHERE and not table[name].measured
+        }
+        coming |= own
+        if self._kept["running"] is not None:  # the run itself changes its running measurement
+            for name in own:
+                self._kept["running"]["values"].pop(name, None)
+
+    def look(self, request: Request) -> None:
+        """Read the settings in force right before a measurement begins."""
+        self._holder = request.id.partition("/")[0] or "a program without a name"
+        self._begin = self._read(self._kept["next"])
+
+    def begin(self, began_ns: int, tip: TipStatus, *, is_requested: bool) -> None:
+        """Note that a measurement has begun; one that is paused goes on with its claim."""
+        if self._kept["running"] is not None:
+            return
+        claim = Claim(began_ns, tip=tip)
+        if is_requested:
+            claim = Claim(began_ns, self._holder, tip, self._kept["next"], self._begin)
+            self._kept["next"], self._begin = {}, {}
+        self._kept["running"] = claim.kept()
+
+    def end(self) -> None:
+        """Note that no measurement runs any more."""
+        self._kept["running"] = None
+
+    def verdict(self, tip: TipStatus | None, stated: Sequence[Stated]) -> Verdict:
+        """Return the verdict on the results of the measurement that has ended.
+
+        Args:
+            tip: at its end; None: its end was not seen, and the present settings prove nothing.
+        """
+        claim = self.running or Claim(0)
+        self._tip, self._end = tip, {} if tip is None else self._read(claim.values)
+        witness = Witness(tip, self._differences(claim, self._end))
+        verdicts = [judge(claim, witness, one) for one in stated or [Stated()]]
+        found = next((one for one in verdicts if one.rule), verdicts[0])
+        # by the rule alone, not by its numbers: a person who turns a knob gives another value each time
+        again = bool(found.rule) and self._kept["contradicted"] == found.rule
+        self.repeated, self._kept["contradicted"] = (found.sentence, "") if again else ("", found.rule)
+        return found
+
+    def conditions(
+        self, time_ns: int, filename: str, acts: Sequence[ActByHand], unproved: Sequence[str]
+    ) -> MeasurementConditions:
+        """Return the conditions to publish beside a result, after its verdict."""
+        claim = self.running or Claim(0)
+        return MeasurementConditions(
+            time_ns,
+            filename,
+            claim.tip,
+            self._tip,
+            tuple(acts),
+            claim.began_ns or None,
+            claim.holder,
+            self._parameters({name: claim.begin.get(name, value) for name, value in claim.values.items()}),
+            self._parameters(self._end),
+            tuple(unproved),
+        )
+
+    def _read(self, wanted: Mapping[str, Value]) -> dict[str, Value]:
+        return self._driver.in_force(list(wanted)) if wanted else {}
+
+    def _differences(self, claim: Claim, at_end: Mapping[str, Value]) -> dict[str, str]:
+        found: dict[str, str] = {}
+        for when, values in (("end", at_end), ("begin", claim.begin)):
+            for name, value in claim.values.items():
+                if name in values and not self._driver.same(name, values[name], value, values):
+                    made, asked = (self._driver.table[name].quantity(one) for one in (values[name], value))
+                    found[name] = f"{name} was {made} at its {when}, and the run had set it to {asked}"
+        return found
+
+    def _parameters(self, values: Mapping[str, Value]) -> tuple[Parameter, ...]:
+        table = self._driver.table
+        return tuple(Parameter(name, *table[name].for_peer(value)) for name, value in values.items())

@@ -1,0 +1,149 @@
+"""`judge`: whether a result is what it stands for. Pure, and the same for all makers.
+
+| | is | comes from |
+| --- | --- | --- |
+| claim | what it stands for: who asked for it, the run's settings for it, the tip | its begin, kept on disk |
+| witness | what the controller shows at its end | the driver |
+| stated | what the files say of themselves | the reader of the maker's files |
+| verdict | a contradiction, or the facts left unproved | `judge` |
+
+A contradicted result is not complete. An unproved one is published, and says what its maker could have shown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from afspm.basics.clock import NS_PER_S
+from afspm.model import TipStatus
+from afspm.translator.parameters import Value
+
+RESOLUTION_NS: Final = 2 * NS_PER_S
+"""Of times in files, which have whole seconds, with a margin."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What a measurement stands for.
+
+    Attributes:
+        began_ns: when its start was published.
+        holder: the component that asked for it; empty: it was begun at the microscope.
+        tip: at its begin; None: not read.
+        values: the settings that the run has set for it, as read back then, in SI.
+        begin: the same settings at its begin.
+    """
+
+    began_ns: int
+    holder: str = ""
+    tip: TipStatus | None = None
+    values: Mapping[str, Value] = field(default_factory=dict)
+    begin: Mapping[str, Value] = field(default_factory=dict)
+
+    def kept(self) -> dict[str, Any]:
+        tip = None if self.tip is None else [self.tip.engaged, self.tip.feedback_on]
+        return {
+            "began_ns": self.began_ns,
+            "holder": self.holder,
+            "tip": tip,
+            "values": dict(self.values),
+            "begin": dict(self.begin),
+        }
+
+    @classmethod
+    def of(cls, kept: Mapping[str, Any]) -> Claim:
+        tip = None if kept["tip"] is None else TipStatus(*kept["tip"])
+        return cls(kept["began_ns"], kept["holder"], tip, kept["values"], kept["begin"])
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What the files of a result say of their measurement, as far as their maker writes it.
+
+    Attributes:
+        began_ns, ended_ns: start and end by each file, in the clock of the files.
+        earlier: the starts of earlier results in the same clock, each with the end of its measurement in ours.
+        unproved: what these files could have shown and do not, in words.
+    """
+
+    began_ns: tuple[int, ...] = ()
+    ended_ns: tuple[int, ...] = ()
+    earlier: Mapping[int, int] = field(default_factory=dict)
+    unproved: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict on a result.
+
+    Attributes:
+        rule: the name of the rule that contradicts it; empty: none does.
+        sentence: why it is not what it stands for.
+        unproved: what its maker could have shown, and did not.
+    """
+
+    rule: str = ""
+    sentence: str = ""
+    unproved: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Witness:
+    """What the controller shows at the end of a measurement.
+
+    Attributes:
+        tip: None: not read.
+        differs: for each setting of the claim that was not in force at begin or end, the sentence that says so.
+    """
+
+    tip: TipStatus | None = None
+    differs: Mapping[str, str] = field(default_factory=dict)
+
+
+def judge(claim: Claim, witness: Witness, stated: Stated) -> Verdict:
+    """Return the verdict on a result: the first rule that contradicts it."""
+    for name, rule in RULES.items():
+        if sentence := rule(claim, witness, stated):
+            return Verdict(name, sentence, stated.unproved)
+    return Verdict(unproved=stated.unproved)
+
+
+def _one_start(claim: Claim, witness: Witness, stated: Stated) -> str:
+    off_ns = max(stated.began_ns, default=0) - min(stated.began_ns, default=0)
+    if off_ns <= RESOLUTION_NS:
+        return ""
+    return f"its channels state starts {off_ns / NS_PER_S:.0f} s apart: a part of it is of another measurement"
+
+
+def _new_start(claim: Claim, witness: Witness, stated: Stated) -> str:
+    # two short measurements may have begun in one second
+    ends_ns = [stated.earlier[one] for one in stated.began_ns if one in stated.earlier]
+    is_old = any(claim.began_ns - one > RESOLUTION_NS for one in ends_ns)
+    return "its file states the start of an earlier measurement" if is_old else ""
+
+
+def _end_after_start(claim: Claim, witness: Witness, stated: Stated) -> str:
+    is_half = bool(stated.began_ns) and any(one < max(stated.began_ns) for one in stated.ended_ns)
+    return "its file was saved before the measurement had ended" if is_half else ""
+
+
+def _tip_at_sample(claim: Claim, witness: Witness, stated: Stated) -> str:
+    was, is_now = claim.tip, witness.tip
+    withdrawn = was is not None and is_now is not None and was.engaged is True and is_now.engaged is False
+    return "the tip was at the sample at its begin, and is withdrawn at its end" if withdrawn else ""
+
+
+def _values_in_force(claim: Claim, witness: Witness, stated: Stated) -> str:
+    return "; ".join(witness.differs.values())
+
+
+RULES: Mapping[str, Callable[[Claim, Witness, Stated], str]] = {
+    "one start": _one_start,
+    "new start": _new_start,
+    "end after start": _end_after_start,
+    "tip at the sample": _tip_at_sample,
+    "values in force": _values_in_force,
+}
+"""Each rule returns why a result is not what it stands for; empty: it does not say so."""

@@ -1,0 +1,206 @@
+"""What is published as complete is what it stands for: tip, feedback and settings in force, over kills."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from afspm.model import (
+    ActByHand,
+    ControlRequest,
+    ControlResponse,
+    Feedback,
+    MeasurementConditions,
+    PanelAct,
+    Parameter,
+    ScopeState,
+    Spectrum,
+    names,
+)
+from afspm.translator.judge import RULES, Claim, Stated, Witness, judge
+
+OK, NOT_FREE = ControlResponse.SUCCESS, ControlResponse.NOT_FREE
+ACTION, PARAM = ControlRequest.ACTION, ControlRequest.PARAM
+WITH_TIP = {"x-engaged": {"vendor": "Engaged", "type": "bool", "read_only": True}}
+BIAS = Parameter("tip-bias-voltage", "0.2", "V")
+
+
+@pytest.fixture
+def bench(make_bench: Any) -> Any:
+    made = make_bench({"parameters": WITH_TIP})
+    made.look()
+    made.heard()
+    made.beside.clear()
+    return made
+
+
+def acts(bench: Any) -> list[PanelAct]:
+    bench.heard()
+    return [one.act for one in bench.beside if isinstance(one, ActByHand)]
+
+
+def scan_it(bench: Any, scan: Any, name: str, during: dict[str, Any] | None = None) -> list[str]:
+    """Take a scan with values changed meanwhile, and return what is published from its begin on."""
+    bench.heard()
+    assert bench.ask(ACTION, names.START_SCAN, f"series/1-2/{name}").code == OK
+    bench.microscope.values |= during or {}
+    bench.microscope.files[name] = [scan()]
+    bench.microscope.state = ScopeState.FREE
+    bench.look()
+    return list(bench.heard())
+
+
+def curve(bench: Any, name: str) -> None:
+    bench.microscope.files[name] = [Spectrum((0.0, 0.0), "IV", ("V", "I"), ("V", "A"), np.ones((4, 2)))]
+    bench.microscope.state = ScopeState.FREE
+
+
+def test_a_result_has_its_begin_its_holder_and_its_settings(bench: Any, scan: Any) -> None:
+    assert bench.ask(PARAM, BIAS).code == OK
+    assert scan_it(bench, scan, "1")[-2:] == ["Scan2d", "FREE"]
+    (found,) = [one for one in bench.beside if isinstance(one, MeasurementConditions)]
+    assert (found.holder, found.began_ns is not None) == ("series", True)
+    assert [(one.name, float(one.value or "")) for one in (*found.begin_values, *found.end_values)] == [
+        ("tip-bias-voltage", 0.2)
+    ] * 2
+
+
+# results C1: 78 of 78 curves without feedback were complete
+@pytest.mark.parametrize("off_at", ["begin", "during"])
+def test_series_of_curves_stops_once_the_feedback_is_off(bench: Any, off_at: str) -> None:
+    assert bench.ask(ACTION, names.START_SPEC).code == OK
+    bench.microscope.values["Loop"] = False
+    curve(bench, "a")
+    bench.look()
+    assert "FREE" not in bench.heard(), "the controller may hold the feedback still"
+    for _ in range(7):
+        bench.look()
+    assert bench.heard() == ["INTERRUPTED", "FREE"]
+    assert acts(bench) == [PanelAct.FEEDBACK_OFF]
+    assert bench.ask(ACTION, names.START_SPEC).code == NOT_FREE
+
+
+def test_curve_is_complete_if_the_controller_gives_the_feedback_back_late(bench: Any) -> None:
+    assert bench.ask(ACTION, names.START_SPEC).code == OK
+    bench.microscope.values["Loop"] = False
+    curve(bench, "a")
+    bench.look()
+    bench.look(0.2)
+    assert "FREE" not in bench.heard()
+    bench.microscope.values["Loop"] = True
+    bench.look()
+    assert bench.heard()[-2:] == ["Spec1d", "FREE"]
+    assert acts(bench) == []
+
+
+# results M1
+@pytest.mark.parametrize("name", ["Loop", "Engaged"])
+def test_scan_is_not_complete_if_the_tip_was_changed_while_no_translator_ran(bench: Any, scan: Any, name: str) -> None:
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+    bench.microscope.values[name] = False
+    bench.start()
+    bench.look()
+    bench.heard()
+    bench.microscope.files["a"] = [scan()]
+    bench.microscope.state = ScopeState.FREE
+    bench.look()
+    assert bench.heard()[-2:] == ["INTERRUPTED", "FREE"]
+    bench.look()
+    act = {"Loop": PanelAct.FEEDBACK_OFF, "Engaged": PanelAct.WITHDRAW}[name]
+    assert acts(bench) == [act]
+    assert bench.ask(ACTION, names.START_SCAN).code == NOT_FREE
+
+
+# results C3
+@pytest.mark.parametrize("when", ["before the start", "in the scan"])
+def test_value_set_for_a_scan_and_changed_by_a_person_is_measured_again_once(bench: Any, scan: Any, when: str) -> None:
+    for n in range(2):
+        assert bench.ask(PARAM, BIAS).code == OK
+        changed = {"Bias": 1000.0 + n}
+        if when == "before the start":
+            bench.microscope.values |= changed
+        assert scan_it(bench, scan, str(n), changed)[-2:] == ["INTERRUPTED", "FREE"]
+    assert PanelAct.CONTRADICTION in acts(bench)
+    bench.heard()
+    # not set again: it stays the person's
+    assert scan_it(bench, scan, "9")[-2:] == ["Scan2d", "FREE"]
+
+
+def test_value_that_the_run_changes_in_its_own_scan_is_no_contradiction(bench: Any, scan: Any) -> None:
+    assert bench.ask(PARAM, BIAS).code == OK
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+    assert bench.ask(PARAM, Parameter("tip-bias-voltage", "0.4", "V")).code == OK
+    bench.microscope.files["a"] = [scan()]
+    bench.microscope.state = ScopeState.FREE
+    bench.look()
+    assert bench.heard()[-2:] == ["Scan2d", "FREE"]
+
+
+def test_person_who_works_at_constant_height_all_night_is_not_stopped(make_bench: Any, scan: Any, caplog: Any) -> None:
+    bench = make_bench({"parameters": WITH_TIP})
+    (bench.folder / "translator.json").unlink(missing_ok=True)
+    bench.microscope.values["Loop"] = False
+    bench.start()
+    for n in range(3):
+        assert scan_it(bench, scan, str(n))[-2:] == ["Scan2d", "FREE"]
+    assert acts(bench) == []
+    assert "off since before this run" in caplog.text
+
+
+def test_feedback_off_before_a_run_forbids_a_start_where_the_tip_is_not_shown(make_bench: Any) -> None:
+    bench = make_bench()
+    (bench.folder / "translator.json").unlink(missing_ok=True)
+    bench.microscope.values["Loop"] = False
+    bench.start()
+    bench.look()
+    refused = bench.ask(ACTION, names.START_SCAN)
+    assert refused.code == NOT_FREE
+    assert "off since before this run" in refused.reason
+    assert bench.ask(ACTION, names.FEEDBACK_MAY_BE_OFF).code == OK
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+
+
+@pytest.mark.parametrize("says", [True, False])
+def test_action_that_leaves_the_feedback_off_says_so(make_bench: Any, scan: Any, says: bool) -> None:
+    lift = {"command": "lift"} | ({"switches_feedback": True} if says else {})
+    bench = make_bench({"parameters": WITH_TIP, "actions": {"x-lift": lift}})
+    bench.look()
+    bench.heard()
+    assert bench.ask(ACTION, "x-lift").code == OK
+    bench.microscope.values["Loop"] = False
+    for _ in range(8):
+        bench.look()
+    found = [one for one in bench.beside if isinstance(one, ActByHand)]
+    bench.heard()
+    if says:
+        assert scan_it(bench, scan, "1")[-2:] == ["Scan2d", "FREE"]
+        assert found == []
+    else:
+        assert "perhaps by x-lift, which does not say `switches_feedback`" in bench.ask(ACTION, "start-scan").reason
+        assert acts(bench) == [PanelAct.FEEDBACK_OFF]
+
+
+def test_scan_at_constant_height_with_the_feedback_found_on_is_not_complete(bench: Any, scan: Any) -> None:
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False)).code == OK
+    assert scan_it(bench, scan, "1", {"Loop": True})[-2:] == ["INTERRUPTED", "FREE"]
+    assert acts(bench) == []
+
+
+S = 1_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("rule", "stated"),
+    [
+        ("one start", Stated((10 * S, 40 * S))),
+        ("new start", Stated((10 * S,), earlier={10 * S: 20 * S})),
+        ("end after start", Stated((10 * S,), (5 * S,))),
+        ("", Stated((10 * S, 10 * S), (30 * S,), {5 * S: 20 * S})),
+        ("", Stated((10 * S, 10 * S), (10 * S,), {10 * S: 99 * S})),  # short scans of one second
+    ],
+)
+def test_file_that_does_not_prove_itself_is_no_result(rule: str, stated: Stated) -> None:
+    assert judge(Claim(100 * S, "series"), Witness(), stated).rule == rule
+    assert rule in {"", *RULES}
