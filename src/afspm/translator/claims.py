@@ -80,15 +80,16 @@ class Claims:
         """Note that no measurement runs any more."""
         self._kept["running"] = None
 
-    def verdict(self, tip: TipStatus | None, stated: Sequence[Stated]) -> Verdict:
+    def verdict(self, tip: TipStatus | None, stated: Sequence[Stated], withdrew: str = "") -> Verdict:
         """Return the verdict on the results of the measurement that has ended.
 
         Args:
             tip: at its end; None: its end was not seen, and the present settings prove nothing.
+            withdrew: why the controller itself has withdrawn the tip, as it may after each scan; empty: it has not.
         """
         claim = self.running or Claim(0)
         self._tip, self._end = tip, {} if tip is None else self._read(claim.values)
-        witness = Witness(tip, self._differences(claim, self._end))
+        witness = Witness(None if withdrew else tip, self._differences(claim, self._end))
         verdicts = [judge(claim, witness, one) for one in stated or [Stated()]]
         found = next((one for one in verdicts if one.rule), verdicts[0])
         # by the rule alone, not by its numbers: a person who turns a knob gives another value each time

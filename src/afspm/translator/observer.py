@@ -316,9 +316,7 @@ class Observer:
         if not spoiled:
             # the next scan had begun when the end of this one was seen: the present settings belong to that one
             tip = self.panel.tip if is_at_end else None
-            if tip is not None and self._driver.withdrew_tip():  # a controller may withdraw it after each scan
-                tip = replace(tip, engaged=None)
-            verdict = self.claims.verdict(tip, self._outbox.stated())
+            verdict = self.claims.verdict(tip, self._outbox.stated(), withdrew=self._driver.withdrew_tip())
             self._unproved, spoiled = verdict.unproved, verdict.sentence
         if not spoiled:
             return list(steps)
