@@ -190,6 +190,38 @@ def test_client_stops_a_scan_which_ends_the_wait(client: Any) -> None:
     assert ask(client, "Scan_StatusGet") == [0]
 
 
+@pytest.mark.parametrize("reads", ["off", "on"])
+@pytest.mark.parametrize("module", ["BiasSpectr", "ZSpectr"])
+def test_z_controller_is_held_until_after_the_end_of_a_spectrum(tmp_path: Path, module: str, reads: str) -> None:
+    held = [0], [3]
+    if reads == "on":
+        held = [1], [2]
+    with connected(tmp_path, 100.0, feedback={"hold_s": 100.0, "hold_reads": reads}) as client:
+
+        def switch() -> tuple[list[Any], list[Any]]:
+            return ask(client, "ZCtrl_OnOffGet"), ask(client, "ZCtrl_StatusGet")
+
+        assert switch() == ([1], [2])
+        ask(client, f"{module}_Open")
+        ask(client, f"{module}_Start", 0, "curve")
+        assert switch() == held
+        ask(client, f"{module}_Stop")
+        ask(client, f"{module}_Start", 1, "curve")  # answered at the reported end
+        assert switch() == held
+        deadline_s = time.monotonic() + DEADLINE_S
+        while switch() != ([1], [2]):
+            assert time.monotonic() < deadline_s
+
+
+def test_z_controller_switched_off_in_the_hold_stays_off(tmp_path: Path) -> None:
+    with connected(tmp_path, 100.0, feedback={"hold_s": 20.0, "hold_reads": "on"}) as client:
+        ask(client, "BiasSpectr_Open")
+        ask(client, "BiasSpectr_Start", 1, "curve")
+        ask(client, "ZCtrl_OnOffSet", 0)
+        ask(client, "BiasSpectr_Start", 1, "curve")
+        assert (ask(client, "ZCtrl_OnOffGet"), ask(client, "ZCtrl_StatusGet")) == ([0], [1])
+
+
 @pytest.mark.parametrize(("module", "first"), [("BiasSpectr", "Bias calc (V)"), ("ZSpectr", "Z rel (m)")])
 def test_client_takes_a_spectrum_with_a_row_for_each_channel(client: Any, module: str, first: str) -> None:
     # As in the client's examples.
