@@ -72,11 +72,15 @@ class Cycle:
             without = CycleOutcome.VANISHED if self.other is None else CycleOutcome.ANOTHER
             self.outcome = CycleOutcome.COMPLETED if self.results else without
 
-    def on_result(self, result: object, time_ns: int | None) -> None:
-        """Process a published channel of a scan, or a spectrum."""
+    def on_result(self, result: object, time_ns: int | None, *, is_ours: bool = True) -> None:
+        """Process a published channel of a scan, or a spectrum.
+
+        Args:
+            is_ours: False if the translator says that another has asked for it, or a person at the microscope.
+        """
         if self.outcome is not None or self._is_old(time_ns):
             return
-        if self._fits(result):
+        if is_ours and self._fits(result):
             self.begun = True
             self.results.append(result)
         elif self.begun and self.other is None:
