@@ -100,8 +100,9 @@ test-lowest:
 test-matrix: $(COLLECTED)
 	@rm -rf build/matrix
 	@$(PYTHON) tools/bootstrap.py afspm-nion
-	@AFSPM_MATRIX=$(CURDIR)/build/matrix $(PYTEST) -n 3 --dist worksteal tests/system/matrix -k job_is_done
-	@AFSPM_MATRIX=$(CURDIR)/build/matrix $(NION)/.venv/bin/pytest -n 3 tests/system/matrix -k "job_is_done and nion"
+	@AFSPM_MATRIX=$(CURDIR)/build/matrix $(PYTEST) -n 3 --dist worksteal tests/system/matrix -k recorded_outcome || \
+	  AFSPM_MATRIX=$(CURDIR)/build/matrix $(PYTEST) --last-failed --last-failed-no-failures none tests/system/matrix -k recorded_outcome
+	@AFSPM_MATRIX=$(CURDIR)/build/matrix $(NION)/.venv/bin/pytest -n 3 tests/system/matrix -k "recorded_outcome and nion"
 	@$(BIN)/python tools/matrix.py build/matrix
 	@$(BIN)/python tools/docs.py
 
