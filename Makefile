@@ -243,7 +243,7 @@ simulate: $(TEST)
 	@$(BIN)/python -m tests.simulation.long_run --hours $(HOURS) --seed $(SEED)
 
 ## nights with kills, replayed by what-if without a change: NIGHTS=200 SEED=0
-NIGHTS ?= 200
+replay-nights: NIGHTS = 200
 replay-nights: $(TEST)
 	@PYTHONPATH=tests/support $(BIN)/python -m tests.simulation.replayed_nights --nights $(NIGHTS) --seed $(SEED)
 
