@@ -243,9 +243,9 @@ simulate: $(TEST)
 	@$(BIN)/python -m tests.simulation.long_run --hours $(HOURS) --seed $(SEED)
 
 ## nights with kills, replayed by what-if without a change: NIGHTS=200 SEED=0
-replay-nights: NIGHTS = 200
 replay-nights: $(TEST)
 	@PYTHONPATH=tests/support $(BIN)/python -m tests.simulation.replayed_nights --nights $(NIGHTS) --seed $(SEED)
+replay-nights: NIGHTS = 200
 
 ## a recorded run that loses its power, with all that was not synced, and is resumed, again and again: CUTS=100 SEED=1
 CUTS ?= 100
