@@ -252,10 +252,10 @@ class SimulatedInstrument:
             tuple(later),
         )
         draw = self.drawing.prepared(scan, engaged=self.engaged)
-        self._change_tip_in(scan)
+        changes = self._change_tip_in(scan)
         self.drawing.keep_world()
         self._counts["scan"] = number
-        self.note(now_s, "scan starts", {"number": number, "setup": _setup_of(scan)})
+        self.note(now_s, "scan starts", {"number": number, "setup": _setup_of(scan), "changes_in_scan": changes})
         self.scan = self._doing = scan
         if self.engaged:
             self.damage.scan_starts(scan, now_s)
@@ -286,10 +286,15 @@ class SimulatedInstrument:
             self.drawing.rewind()
             self._redraw(self.scan.adjusted)
 
-    def _change_tip_in(self, scan: ScanActivity) -> None:
-        for at, condition in self.world.settings.tip_changes.in_scans:
-            if int(at) == scan.number:
-                self.world.change_tip(condition, scan.start_s + (at - scan.number) * (scan.end_s - scan.start_s))
+    def _change_tip_in(self, scan: ScanActivity) -> list[tuple[float, str]]:
+        changes = [
+            (scan.start_s + (at - scan.number) * (scan.end_s - scan.start_s), condition)
+            for at, condition in self.world.settings.tip_changes.in_scans
+            if int(at) == scan.number
+        ]
+        for t_s, condition in changes:
+            self.world.change_tip(condition, t_s)
+        return changes
 
     @property
     def _scans(self) -> bool:
