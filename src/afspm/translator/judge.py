@@ -75,7 +75,7 @@ class Stated:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ResultVerdict:
     """The verdict on a result.
 
     Attributes:
@@ -102,12 +102,12 @@ class Witness:
     differs: Mapping[str, str] = field(default_factory=dict)
 
 
-def judge(claim: Claim, witness: Witness, stated: Stated) -> Verdict:
+def judge(claim: Claim, witness: Witness, stated: Stated) -> ResultVerdict:
     """Return the verdict on a result: the first rule that contradicts it."""
     for name, rule in RULES.items():
         if sentence := rule(claim, witness, stated):
-            return Verdict(name, sentence, stated.unproved)
-    return Verdict(unproved=stated.unproved)
+            return ResultVerdict(name, sentence, stated.unproved)
+    return ResultVerdict(unproved=stated.unproved)
 
 
 def _one_start(claim: Claim, witness: Witness, stated: Stated) -> str:
