@@ -24,7 +24,7 @@ from afspm.driver import (
 from afspm.model import Region
 from afspm.plugins.gxsm.scan_memory import Rows, has_old_columns, in_files, is_unfinished
 
-_NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+\.nc)$")
+_NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+(?<!\.nc)\.nc)$")  # not ".nc.nc", which a person has typed
 _PRECISION: Final = FilePrecision(part=1e-5, angle_rad=1e-6)
 _CLOCK_NS: Final = 2 * NS_PER_S
 """Resolution of the start times in files, which have whole seconds, with a margin."""
@@ -33,6 +33,7 @@ LATE_S: Final = 20.0
 SOON_S: Final = 1.0
 """Longest wait for the file of a channel that the previous scan did not save either; measured: up to 0.3 s."""
 
+_JUMP: Final = "its start: GXSM's clock was set since the scan before"
 _STOPPED: Final = "GXSM ended the scan before its last row, and no request had stopped it"
 OLD_COLUMNS: Final = (
     "its first or last columns still hold the previous scan: is SubScan on at GXSM's panel? Then switch it off"
@@ -66,7 +67,8 @@ class GxsmFiles(ResultFiles):
         self._ends_early = ends_early
         self._by_hand = ""
         self._sizes: dict[Path, tuple[int, int]] = {}
-        self._before: set[int] = set()
+        self._before: dict[Path, FileContent] = {}
+        self._half: set[Path] = set()
         self._whole: dict[Path, FileContent] = {}
         self._outcome: bool | None = None  # of a measurement directly followed by the next
         self.upwards = False
@@ -208,7 +210,7 @@ class GxsmFiles(ResultFiles):
         if folder is not None and str(folder) != ended["folder"]:  # old scans there are recognised by their start
             ended["folder"] = str(folder)
             ended["begun_ns"] = ended["begun_ns"] or end_ns
-        self._sizes, self._whole, self._before = {}, {}, set()
+        self._sizes, self._whole, self._before, self._half = {}, {}, {}, set()
         if is_whole is False:
             why = "it was stopped or never began: GXSM's first or last row still holds the previous scan"
             self._give_up(why, has_second_row=has_second_row)
@@ -316,9 +318,14 @@ class GxsmFiles(ResultFiles):
                 except (AfspmError, OSError):
                     continue  # incomplete: GXSM is still writing it
             content = self._whole.get(file)
-            if content is None or _is_half(content):
+            self._half.discard(file)
+            if content is None:
                 continue
-            if not self._is_of_before(content, ended["begun_ns"]):
+            if _is_half(content):
+                self._half.add(file)
+            elif self._is_of_before(content, ended["begun_ns"]):
+                self._before[file] = content
+            else:
                 found[file] = content
         if ended["what"] == SCAN:  # one file for each channel: a person may save the scan again, under any name
             named = [file for file in found if file.name in ended.get("named", ())]
@@ -334,14 +341,29 @@ class GxsmFiles(ResultFiles):
         if start_ns is None:
             return False
         if start_ns in known:
-            is_of_before = True
-        elif known and start_ns < max(known):
-            is_of_before = False  # the clock was set back
-        else:
-            is_of_before = start_ns < begun_ns - self._kept["behind_ns"] - (self._late_ns if known else _CLOCK_NS)
-        if is_of_before:
-            self._before.add(start_ns)
-        return is_of_before
+            return True
+        if known and start_ns < max(known):
+            return False  # the clock was set back, or the picture of another scan was opened: see `_facts`
+        return start_ns + int(self._kept["behind_ns"]) < begun_ns - (self._late_ns if known else _CLOCK_NS)
+
+    def _before_named(self, ended: Entry) -> dict[Path, FileContent]:
+        # files of this scan, by their names, with the start of an earlier one: its picture was opened in the channel
+        return {file: content for file, content in self._before.items() if file.name in ended.get("named", ())}
+
+    def _facts(self, ended: Entry, files: Mapping[Path, FileContent]) -> dict[str, object]:
+        # A picture that a person opens in the window of a channel during a scan takes its place, with its start and the
+        # end of the scan. After a jump of GXSM's clock start and end are as far apart as they should be.
+        starts = [one.start_ns for one in files.values() if one.start_ns]
+        ends = [one.end_ns for one in files.values() if one.end_ns]
+        facts: dict[str, object] = {"pictures": max(len(one.scans) for one in files.values())}
+        begun_ns = ended["begun_ns"]
+        if not (self._kept["starts"] and starts and ends and begun_ns):
+            return facts
+        if abs(min(starts) + self._kept["behind_ns"] - begun_ns) > self._late_ns:
+            at_most_ns = ended["end_ns"] - begun_ns
+            is_jump = max(ends) - min(starts) <= at_most_ns + _CLOCK_NS
+            facts |= {"at_most_ns": at_most_ns, "unproved": [_JUMP] if is_jump else []}
+        return facts
 
     def _saw(self, ended: Entry, starts: set[int]) -> None:
         self._kept["starts"] = sorted(starts)
@@ -351,7 +373,7 @@ class GxsmFiles(ResultFiles):
         # A channel that the previous scan did not save either is awaited for a short time only.
         if "names" in ended:
             return all(Path(name) in self._whole for name in ended["names"])
-        missing = set(ended["channels"]) - endings(files).keys() - {""}
+        missing = set(ended["channels"]) - endings(files).keys() - endings(self._before_named(ended)).keys() - {""}
         return not missing or (missing <= set(self._kept["absent"]) and now_s >= ended["soon_s"])
 
     def _missing(self, ended: Entry) -> str:
@@ -368,6 +390,8 @@ class GxsmFiles(ResultFiles):
             return f"its folder {folder} does not exist on this computer: set scan_dir and probe_dir"
         if self._before:
             return f"GXSM saved an earlier scan in {folder}: check that this one began"
+        if self._half:
+            return f"{min(self._half)} was saved before the scan had ended, and GXSM has not saved it again"
         if ended["what"] == SCAN:
             return (
                 f"no new file in {folder} belongs to it: close GXSM's dialog if one is open, and check that a channel "
@@ -383,22 +407,26 @@ class GxsmFiles(ResultFiles):
             self._by_hand = _STOPPED
         self._log.error("the %s has no result: %s", ended["what"], why)
         if self._before:
-            self._saw(ended, self._before)
+            self._saw(ended, {content.start_ns for content in self._before.values() if content.start_ns})
         if "names" in ended:
             self._outcome = False
         else:
             self.broken_off = True
 
     def _take(self, ended: Entry, files: Mapping[Path, FileContent]) -> None:
+        facts, of_another = self._facts(ended, files), self._before_named(ended)
         if ended["what"] == SCAN:
-            absent = sorted(set(ended["channels"]) - endings(files).keys() - {""})
+            for file in sorted(self._half):
+                self._log.warning("%s is left out: it was saved before the scan had ended", file)
+            absent = sorted(set(ended["channels"]) - endings({**files, **of_another}).keys() - {""})
             if set(absent) - set(self._kept["absent"]):
                 self._log.warning(
                     "GXSM did not save %s; from now on the translator waits for it for a short time only",
                     ", ".join(absent),
                 )
             self._kept["absent"] = absent
-            self._saw(ended, {content.start_ns for content in files.values() if content.start_ns})
+            if facts.get("at_most_ns") is None or facts["unproved"]:
+                self._saw(ended, {content.start_ns for content in files.values() if content.start_ns})
             self.upwards = any(content.upwards for content in files.values())
             for ending, file in endings(files).items():
                 scan, header = files[file].scans[0], files[file].header
@@ -408,7 +436,8 @@ class GxsmFiles(ResultFiles):
         names = [str(file) for file in files]
         # the end time makes the name unique: SRanger overwrites files of spectra
         content = [_PRECISION.as_set(one, ended) for file in files.values() for one in file]
-        self._add(f"{names[0]} ({ended['end_ns']})", ended, {"files": names}, content, files.values())
+        stating = [*files.values(), *of_another.values()]
+        self._add(f"{names[0]} ({ended['end_ns']})", ended, {"files": names, **facts}, content, stating)
         self._kept["ended"] = None
         if "names" in ended:
             self._outcome = True

@@ -70,7 +70,7 @@ def in_files(files: Mapping[int, FileContent], like: Rows) -> Rows:
         columns=like["columns"],
         digests={
             channel: {
-                row: _digests(_stored(files[int(channel)])[int(row)][: like["columns"]])
+                row: _digests(stored(files[int(channel)])[int(row)][: like["columns"]])
                 for row in rows
                 if int(row) < len(files[int(channel)].scans[0].values)
             }
@@ -80,7 +80,8 @@ def in_files(files: Mapping[int, FileContent], like: Rows) -> Rows:
     )
 
 
-def _stored(file: FileContent) -> np.ndarray:
+def stored(file: FileContent) -> np.ndarray:
+    """Return the values of a file as in GXSM's memory: rows from the top, without its factor `dz`."""
     scan, dz = file.scans[0], float(str(file.header["dz"]))
     return scan.values[::-1] / (ANGSTROM_M if scan.unit == "m" else 1.0) / dz
 
