@@ -136,7 +136,7 @@ def _end_after_start(claim: Claim, witness: Witness, stated: Stated) -> str:
 def _one_picture(claim: Claim, witness: Witness, stated: Stated) -> str:
     if stated.pictures <= 1:
         return ""
-    return f"its file has {stated.pictures} pictures of a channel: a part of it is of another measurement"
+    return f"its file has {stated.pictures} pictures of a channel: only one is of this measurement"
 
 
 def _own_start(claim: Claim, witness: Witness, stated: Stated) -> str:

@@ -34,6 +34,7 @@ SOON_S: Final = 1.0
 """Longest wait for the file of a channel that the previous scan did not save either; measured: up to 0.3 s."""
 
 _JUMP: Final = "its start: GXSM's clock was set since the scan before"
+_REPLACED: Final = "another scan was begun at GXSM's panel before this one was saved: is Repeat on?"
 _STOPPED: Final = "GXSM ended the scan before its last row, and no request had stopped it"
 OLD_COLUMNS: Final = (
     "its first or last columns still hold the previous scan: is SubScan on at GXSM's panel? Then switch it off"
@@ -47,7 +48,7 @@ class GxsmFiles(ResultFiles):
         patience_s: longest wait for all files, experiment time.
         soon_s: longest wait for files of channels that the previous scan did not save, experiment time.
         late_s: longest difference between the start delays of two scans (`LATE_S`), experiment time.
-        ends_early: True if GXSM's hardware may end a scan after its first line by itself.
+        ends_early: True if GXSM's hardware may end a scan by itself, after its first line or in the second.
     """
 
     def __init__(
@@ -157,13 +158,13 @@ class GxsmFiles(ResultFiles):
             own: True if the translator started the measurement.
             by_gxsm: True if GXSM saves by itself: files may appear before the end, and be written again.
         """
+        self._by_hand = ""
         self._hurry(begun_ns / NS_PER_S)
         followed = self._kept["ended"]
         newest = self.newest_ns(folder, _files(folder, what), what)
         place = None if folder is None else str(folder)
         facts = {"folder": place, "newest_ns": newest, "begun_ns": begun_ns, "before": None, "spoiled": ""}
         self._begins(what, {**facts, "own": own, "by_gxsm": by_gxsm, "ran": False, **taken})
-        self._by_hand = ""
         if followed is not None:
             # GXSM saves a scan before it starts the next: all new files belong to the ended scan
             there = _files(_folder(followed), followed["what"])
@@ -183,7 +184,7 @@ class GxsmFiles(ResultFiles):
         folder: Path | None = None,
         *,
         is_whole: bool | None = True,
-        has_second_row: bool = False,
+        has_third_row: bool = False,
         before: Rows | None = None,
         near_end: bool = False,
     ) -> None:
@@ -194,7 +195,7 @@ class GxsmFiles(ResultFiles):
             folder: folder of the files, which may have changed since the start.
             is_whole: True if a scan reached its last row; False: the scan has no result; None: unknown until its files
                 are compared with `before`.
-            has_second_row: True if an interrupted scan has scanned a second row.
+            has_third_row: True if an interrupted scan has scanned a third row.
             before: rows of the previous scan, for `is_whole` None; without rows the scan has no result.
             near_end: True if a scan that is followed by the next at once was last seen in its last rows.
         """
@@ -213,7 +214,7 @@ class GxsmFiles(ResultFiles):
         self._sizes, self._whole, self._before, self._half = {}, {}, {}, set()
         if is_whole is False:
             why = "it was stopped or never began: GXSM's first or last row still holds the previous scan"
-            self._give_up(why, has_second_row=has_second_row)
+            self._give_up(why, has_third_row=has_third_row)
 
     def _hurry(self, now_s: float) -> None:
         # The next measurement overwrites GXSM's memory and may overwrite files: read them now, or never.
@@ -265,14 +266,14 @@ class GxsmFiles(ResultFiles):
             is_followed = "names" in ended
             over = now_s >= ended["until_s"] or (is_followed and not ended["names"])
             gaps = [file for file, content in files.items() if lines_missing(content)]
-            has_second_row = any(
-                lines_missing(content) < len(scan.values) - 1 for content in files.values() for scan in content.scans
+            has_third_row = any(
+                lines_missing(content) < len(scan.values) - 2 for content in files.values() for scan in content.scans
             )
             if not any(scan.values.any() for content in files.values() for scan in content.scans):
                 gaps = [file for file in files if ended["what"] == SCAN]  # stopped in its first line
-                has_second_row = False
+                has_third_row = False
             if gaps and (over or is_followed or not ended["by_gxsm"]):
-                self._give_up(f"it was stopped: {gaps[0]} lacks lines", has_second_row=has_second_row)
+                self._give_up(f"it was stopped: {gaps[0]} lacks lines", has_third_row=has_third_row)
             elif files and not gaps and (over or self._all(ended, files, now_s)):
                 why = self._why_unfinished(ended, files) if ended["is_whole"] is None else ""
                 if why:
@@ -399,12 +400,12 @@ class GxsmFiles(ResultFiles):
             )
         return f"no new .vpdata in {folder}: switch on Auto Save of probes in GXSM, and set probe_dir to its folder"
 
-    def _give_up(self, why: str, *, has_second_row: bool | None = None) -> None:
-        # `has_second_row`: None if the scan does not lack rows
+    def _give_up(self, why: str, *, has_third_row: bool | None = None) -> None:
+        # `has_third_row`: None if the scan does not lack rows
         ended, self._kept["ended"] = self._kept["ended"], None
-        is_by_hand = has_second_row or (has_second_row is False and not self._ends_early)
-        if is_by_hand and ended["what"] == SCAN and ended["own"] and ended["ran"]:
-            self._by_hand = _STOPPED
+        is_stopped = has_third_row or (has_third_row is False and not self._ends_early)
+        if (is_stopped or "names" in ended) and ended["what"] == SCAN and ended["own"] and ended["ran"]:
+            self._by_hand = ended["spoiled"] or (_REPLACED if "names" in ended else _STOPPED)
         self._log.error("the %s has no result: %s", ended["what"], why)
         if self._before:
             self._saw(ended, {content.start_ns for content in self._before.values() if content.start_ns})

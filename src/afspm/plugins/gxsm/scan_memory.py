@@ -64,6 +64,12 @@ def looked_at(ask: Asking, channels: int, rows: Collection[int], columns: int) -
     )
 
 
+def has_layers(ask: Asking) -> bool:
+    """Return whether the first channel has several layers, as *Multi Layer* makes them."""
+    shape = ask.call("get_dimensions", 0)
+    return isinstance(shape, tuple | list) and _is_shape(shape) and shape[2] > 1
+
+
 def in_files(files: Mapping[int, FileContent], like: Rows) -> Rows:
     """Return the digests of the rows and channels in `like`, from files by channel number."""
     return Rows(

@@ -74,6 +74,7 @@ class GxsmPanel:
     Attributes:
         auto_save, probe_auto_save: automatic saving of scans, of spectra.
         repeats: True if each complete scan is followed by another scan.
+        layers: number of scans that *Multi Layer* makes of one; they are saved together, after the last.
         behind_s: lag of the clock of GXSM's computer, whose times are in files; that clock may be set at any time.
         original: path of the file that was opened last; empty: none since the start of GXSM.
         subscan: first column, columns, first row and rows of *SubScan*; zeros: off.
@@ -83,6 +84,7 @@ class GxsmPanel:
     auto_save: bool
     probe_auto_save: bool
     repeats: bool = False
+    layers: int = 1
     behind_s: float = 0.0
     original: str = ""
     subscan: list[int] = field(default_factory=lambda: [0, 0, 0, 0])
@@ -101,6 +103,7 @@ class GxsmScan:
         shows_s: delay of the scanning bit after the start of the scan.
         next_follows: True if another scan is due to start.
         follows: True if the due scan is a repetition, which shows at once in the scanning bit and the file names.
+        layer: number of the layer, see `GxsmPanel`.
         number, own: number in the scan's file names; paths of its files, empty until they are saved.
         before: file names of the previous scan, reported at first; None: own file names from the start.
         y_before: line reported until the first line of the scan is complete.
@@ -119,6 +122,7 @@ class GxsmScan:
     shows_s: float = SHOWS_S
     next_follows: bool = False
     follows: bool = False
+    layer: int = 0
     number: int = 0
     before: list[Path] | None = None
     y_before: int = 0
@@ -261,9 +265,11 @@ class GxsmProgram:
             self.rig.stop_scan(now_s)
         if self.scan.runs and self.scan.activity is not None and not self.scan.activity.running(now_s):
             self.scan.runs, self.scan.ended_s = False, self.scan.activity.end_s - self.panel.behind_s
-            if self.panel.auto_save:
+            is_whole = self.scan.activity.stopped_s is None
+            self.scan.layer = (self.scan.layer + 1) % self.panel.layers if is_whole else 0
+            if self.panel.auto_save and not self.scan.layer:
                 self.save(now_s, finished=True)
-            self.scan.next_follows = self.scan.follows = self.panel.repeats and self.scan.activity.stopped_s is None
+            self.scan.next_follows = self.scan.follows = is_whole and (self.panel.repeats or self.scan.layer > 0)
         if self.curve is not None and not self.curve.running(now_s):
             curve, self.curve = self.curve, None
             if self.panel.probe_auto_save:
@@ -277,7 +283,7 @@ class GxsmProgram:
     def is_between_repeats(self) -> bool:
         """True during and between repeated scans, so that GXSM's scanning bit stays set."""
         is_whole = self.scan.activity is not None and self.scan.activity.stopped_s is None
-        return self.panel.repeats and is_whole and (self.scan.runs or self.scan.next_follows)
+        return (self.panel.repeats or self.panel.layers > 1) and is_whole and (self.scan.runs or self.scan.next_follows)
 
     def stop_scan(self) -> None:
         """Stop the running scan, and cancel the scan that is due to start."""
