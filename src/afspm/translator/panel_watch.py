@@ -147,7 +147,8 @@ class PanelWatch:
         if last in CALM and state in CALM and (changes := self._changes(before, now, watched)):
             acts.append(ActByHand(now_ns, PanelAct.VALUES, changes=tuple(changes.values())))
             self._by_hand |= {name: now[name] for name in changes if name in _SETTINGS}
-        self._see_tip(now)
+        is_held = state is ScopeState.SPEC or self.feedback.level is FeedbackLevel.HELD
+        self._see_tip({**now, FEEDBACK_ON: True} if is_held and self.feedback.wished and FEEDBACK_ON in now else now)
         return acts
 
     def _feedback_acts(

@@ -77,7 +77,7 @@ def test_series_of_curves_stops_once_the_feedback_is_off(bench: Any, off_at: str
     assert "FREE" not in bench.heard(), "the controller may hold the feedback still"
     for _ in range(7):
         bench.look()
-    assert bench.heard() == ["INTERRUPTED", "FREE"]
+    assert bench.heard() == ["INTERRUPTED", "FREE", "ZCtrlParameters"]
     assert acts(bench) == [PanelAct.FEEDBACK_OFF]
     assert bench.ask(ACTION, names.START_SPEC).code == NOT_FREE
 
