@@ -100,8 +100,9 @@ test-lowest:
 test-matrix: $(COLLECTED)
 	@rm -rf build/matrix
 	@$(PYTHON) tools/bootstrap.py afspm-nion
-	@AFSPM_MATRIX=$(CURDIR)/build/matrix $(PYTEST) -n 3 --dist worksteal tests/system/matrix -k job_is_done
-	@AFSPM_MATRIX=$(CURDIR)/build/matrix $(NION)/.venv/bin/pytest -n 3 tests/system/matrix -k "job_is_done and nion"
+	@AFSPM_MATRIX=$(CURDIR)/build/matrix $(PYTEST) -n 3 --dist worksteal tests/system/matrix -k recorded_outcome || \
+	  AFSPM_MATRIX=$(CURDIR)/build/matrix $(PYTEST) --last-failed --last-failed-no-failures none tests/system/matrix -k recorded_outcome
+	@AFSPM_MATRIX=$(CURDIR)/build/matrix $(NION)/.venv/bin/pytest -n 3 tests/system/matrix -k "recorded_outcome and nion"
 	@$(BIN)/python tools/matrix.py build/matrix
 	@$(BIN)/python tools/docs.py
 
@@ -242,9 +243,9 @@ simulate: $(TEST)
 	@$(BIN)/python -m tests.simulation.long_run --hours $(HOURS) --seed $(SEED)
 
 ## nights with kills, replayed by what-if without a change: NIGHTS=200 SEED=0
-NIGHTS ?= 200
 replay-nights: $(TEST)
 	@PYTHONPATH=tests/support $(BIN)/python -m tests.simulation.replayed_nights --nights $(NIGHTS) --seed $(SEED)
+replay-nights: NIGHTS = 200
 
 ## a recorded run that loses its power, with all that was not synced, and is resumed, again and again: CUTS=100 SEED=1
 CUTS ?= 100

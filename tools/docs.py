@@ -104,11 +104,14 @@ def channels() -> str:
 def matrix() -> str:
     """The table of what runs on what, from the record of `make test-matrix`."""
     jobs = tomllib.loads((ROOT / "tests/system/matrix/matrix.toml").read_text(encoding="utf-8"))
-    instruments = list(next(iter(jobs.values()))["on"])
+    rows = sorted((component, on) for job in jobs.values() for component, on in job.items())
+    instruments = list(rows[0][1])
     lines = ["| component | " + " | ".join(instruments) + " |", "| --- " * (len(instruments) + 1) + "|"]
-    for component, on in sorted((component, one["on"]) for one in jobs.values() for component in one["components"]):
-        cells = [on[name] if on[name] == "done" else f"not possible: {on[name]}" for name in instruments]
-        lines.append("| " + " | ".join([f"`{component}`", *cells]) + " |")
+    for component, on in rows:
+        name, _, of = component.partition(" ")
+        # what is wrong stands out
+        cells = [re.sub("^(wrong|measures nothing)", r"**\1**", on[instrument]) for instrument in instruments]
+        lines.append("| " + " | ".join([f"`{name}` {of}".rstrip(), *cells]) + " |")
     return "\n".join(lines) + "\n"
 
 

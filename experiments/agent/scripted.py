@@ -108,8 +108,10 @@ class ScriptedPerson(Component):
 
 
 def highest(numbers):
-    """Return x and y, in m, of the middle of the highest block of the first channel."""
-    blocks = numbers["numbers"][0]["blocks"]
+    """Return x and y, in m, of the middle of the highest block of the first channel with heights."""
+    # another microscope may publish an amplitude before the height
+    heights = next(n for n, channel in enumerate(numbers["untrusted"]["channels"]) if channel.endswith(" (m)"))
+    blocks = numbers["numbers"][heights]["blocks"]
     rows, columns = len(blocks), len(blocks[0])
     row, column = max(((r, c) for r in range(rows) for c in range(columns)), key=lambda at: blocks[at[0]][at[1]])
     (x_m, y_m), (width_m, height_m) = numbers["center_m"], numbers["size_m"]

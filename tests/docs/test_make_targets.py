@@ -35,6 +35,12 @@ def run_by(file: str) -> set[str]:
     return named | {part for target in named for part in prerequisites(target)}
 
 
+def commands(*arguments: str) -> str:
+    """Return the commands that make would run."""
+    command = ["make", "--dry-run", *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, encoding="utf-8", check=True).stdout
+
+
 def test_each_target_runs_somewhere_or_says_why_not(tool: ModuleType) -> None:
     targets = {one for line in re.findall(r"^\.PHONY: (.*)$", text("Makefile"), re.MULTILINE) for one in line.split()}
     declared = set(re.findall(r"^([a-z][a-z-]*):(?!=)", text("Makefile"), re.MULTILINE))
@@ -62,7 +68,13 @@ def test_each_target_has_its_turn(tool: ModuleType) -> None:
 @pytest.mark.skipif(shutil.which("make") is None, reason="no make is found")
 @pytest.mark.parametrize(("setting", "is_quick"), [("", False), ("EIGHTH=1", True)])
 def test_drift_is_judged_by_all_pairs_unless_an_eighth_is_asked_for(setting: str, is_quick: bool) -> None:  # claims F13
-    command = ["make", "--dry-run", "bench-drift", *setting.split()]
-    printed = subprocess.run(command, cwd=ROOT, capture_output=True, encoding="utf-8", check=True).stdout
+    printed = commands("bench-drift", *setting.split())
     assert "benchmarks.drift" in printed
     assert ("--quick" in printed) == is_quick
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="no make is found")
+def test_nights_are_replayed_by_their_own_number() -> None:
+    assert "--nights 200 " in commands("replay-nights")
+    assert "--nights 40 " in commands("replay-nights", "NIGHTS=40")
+    assert "--nights 20 " in commands("chaos")

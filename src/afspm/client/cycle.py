@@ -79,11 +79,15 @@ class Cycle:
         if self.outcome is None and not self.results and not self._is_old(time_ns):
             self.conditions = conditions
 
-    def on_result(self, result: object, time_ns: int | None) -> None:
-        """Process a published channel of a scan, or a spectrum."""
+    def on_result(self, result: object, time_ns: int | None, *, is_ours: bool = True) -> None:
+        """Process a published channel of a scan, or a spectrum.
+
+        Args:
+            is_ours: False if the translator says that another has asked for it, or a person at the microscope.
+        """
         if self.outcome is not None or self._is_old(time_ns):
             return
-        if self._fits(result):
+        if is_ours and self._fits(result):
             self.begun = True
             self.results.append(result)
         elif self.begun and self.other is None:

@@ -36,6 +36,7 @@ from afspm.model import (
     Response,
     Scan,
     ScopeState,
+    Spectrum,
 )
 from afspm.model.sessions import KEYED
 from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
@@ -59,6 +60,7 @@ class _Watch:
         self._link = link
         self._message = target.message
         self._since_ns = -1 if link.view.newest_ns is None else link.view.newest_ns
+        self._conditions: MeasurementConditions | None = None
         self.cycle = cycle
         self.close = link.listen(self._take)
 
@@ -104,13 +106,20 @@ class _Watch:
             name = wire.message_of(packet.envelope)
             if name == "ScopeStateMsg":
                 self.cycle.on_state(self._link.view.state, packet.time_ns)
-            elif name == CONDITIONS.name:
-                self.cycle.on_conditions(wire.decode(name, packet.payload), packet.time_ns)
+            elif name == CONDITIONS.name:  # just before its result
+                self._conditions = conditions = wire.decode(name, packet.payload)
+                self.cycle.on_conditions(conditions, packet.time_ns)
             elif name == self._message:
                 found = self._link.view.with_roles(wire.decode(name, packet.payload))
-                self.cycle.on_result(found, packet.time_ns)
+                self.cycle.on_result(found, packet.time_ns, is_ours=self._is_ours(found))
         except WireError as error:
             self._link.log.warning("a %s can't be read: %s", packet.envelope, error)
+
+    def _is_ours(self, found: Scan | Spectrum) -> bool:
+        # a person may scan the same frame; a translator that does not say who asked is believed
+        told = self._conditions
+        is_told = told is not None and told.began_ns is not None and told.time_ns == found.time_ns
+        return told is None or not is_told or told.holder == self._link.name
 
 
 @dataclass

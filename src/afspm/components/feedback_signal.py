@@ -58,6 +58,8 @@ class FeedbackSignal:
                 self._reasons[signal.unit] = self._reason(signal, scope)
             if reason := self._reasons[signal.unit]:
                 raise InvalidValue(f"{signal.channel} can't be compared with the setpoint: {reason}")
+            if (unit := scope.feedback_units.setpoint) and same_kind(unit, signal.unit):
+                setpoint = convert(setpoint, unit, signal.unit)  # a file may have nA where the setpoint is in A
         is_current = same_kind(signal.unit, "A")
         error = relative_error(signal.values, setpoint, is_current)
         threshold = self._threshold or (_CURRENT_THRESHOLD if is_current else _THRESHOLD)

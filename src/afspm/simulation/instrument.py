@@ -19,6 +19,9 @@ Lengths in m in tip coordinates, angles in rad counter-clockwise, times in exper
 There is one instrument for driver and emulators, since with two of them a fault, or the correction of an error, was
 missing in the other. A spectrum is computed at its start: if it is stopped, the random numbers that follow are the
 same.
+
+During a spectrum the controller holds the z feedback, and gives it back some time after the end (`feedback.hold_s`).
+The switch in `setup.feedback` is a person's: it stays as set, and decides whether the feedback comes back.
 """
 
 from __future__ import annotations
@@ -94,6 +97,7 @@ class InstrumentState:
     occupied: Occupied | None
     ledger: DamageLedger
     scanned: list[ScannedPlace]
+    held_until_s: float | None = None
 
 
 class SimulatedInstrument:
@@ -138,6 +142,7 @@ class SimulatedInstrument:
         self._counts = {"scan": 0, "spectrum": 0}
         self._noise = np.random.default_rng((seed, 3))
         self._signals: Mapping[str, float] = {}
+        self._held_until_s = -math.inf
         self._note = note
         self.damage = DamageCounter(self.world, start_s, note)
 
@@ -166,9 +171,9 @@ class SimulatedInstrument:
         return doing.end_s
 
     def next_change_s(self, now_s: float) -> float | None:
-        """Return the time at which the instrument becomes free; None if free, paused, or waiting for a computation."""
-        ends_s = self.ends_s
-        return None if ends_s is None or ends_s <= now_s else ends_s
+        """Return the time at which the instrument becomes free, or gives the feedback back; None if that is unknown."""
+        times = (self.ends_s, self._held_until_s if self.is_held(now_s) else None)
+        return min((at_s for at_s in times if at_s is not None and at_s > now_s), default=None)
 
     def ended(self, now_s: float) -> Doing | None:
         """Return the activity that has ended since the last call; None without one."""
@@ -231,6 +236,9 @@ class SimulatedInstrument:
         self._check_free(now_s)
         setup = self.setup
         number = self._counts["scan"] + 1
+        in_force, *later = self._adjustments(now_s)
+        if later:
+            self.world.hold(self._surface_z_m(now_s))
         scan = ScanActivity(
             number,
             setup.region,
@@ -238,15 +246,16 @@ class SimulatedInstrument:
             now_s,
             setup.line_s,
             setup.upwards,
-            setup.feedback,
+            in_force.feedback,
             setup.bias_v,
             setup.slope,
+            tuple(later),
         )
         draw = self.drawing.prepared(scan, engaged=self.engaged)
-        self._change_tip_in(scan)
+        changes = self._change_tip_in(scan)
         self.drawing.keep_world()
         self._counts["scan"] = number
-        self.note(now_s, "scan starts", {"number": number, "setup": _setup_of(scan)})
+        self.note(now_s, "scan starts", {"number": number, "setup": _setup_of(scan), "changes_in_scan": changes})
         self.scan = self._doing = scan
         if self.engaged:
             self.damage.scan_starts(scan, now_s)
@@ -265,7 +274,8 @@ class SimulatedInstrument:
         if self._scans and self.scan is not None and self.scan.running(now_s):
             self.drawing.wait()
             self.drawing.rewind()
-            self._redraw((*self.scan.adjusted, Adjustment(now_s, self.setup.feedback, self.setup.bias_v)))
+            before = (one for one in self.scan.adjusted if one.t_s <= now_s)
+            self._redraw((*before, *self._adjustments(now_s)))
 
     def change_tip(self, condition: str, now_s: float) -> None:
         """Change the tip, also during a scan: "sharp", "blunt", "double" or "contaminated"."""
@@ -276,10 +286,15 @@ class SimulatedInstrument:
             self.drawing.rewind()
             self._redraw(self.scan.adjusted)
 
-    def _change_tip_in(self, scan: ScanActivity) -> None:
-        for at, condition in self.world.settings.tip_changes.in_scans:
-            if int(at) == scan.number:
-                self.world.change_tip(condition, scan.start_s + (at - scan.number) * (scan.end_s - scan.start_s))
+    def _change_tip_in(self, scan: ScanActivity) -> list[tuple[float, str]]:
+        changes = [
+            (scan.start_s + (at - scan.number) * (scan.end_s - scan.start_s), condition)
+            for at, condition in self.world.settings.tip_changes.in_scans
+            if int(at) == scan.number
+        ]
+        for t_s, condition in changes:
+            self.world.change_tip(condition, t_s)
+        return changes
 
     @property
     def _scans(self) -> bool:
@@ -314,6 +329,8 @@ class SimulatedInstrument:
         end_s = now_s + sweeps * self.world.spectrum_s(kind)
         self.spectrum = SpectrumActivity(number, kind, self._probe_m, now_s, end_s, names, units, values)
         self._doing = self.spectrum
+        if self.engaged:
+            self._held_until_s = end_s + self._hold_s
         self.damage.spectrum_starts(self.spectrum if self.engaged else None)
         facts = {"number": number, "kind": kind, "position_m": self._probe_m, "bias_v": self.setup.bias_v}
         self.note(now_s, "spectrum starts", {**facts, **self.world.property_truth(self._probe_m, now_s)})
@@ -323,6 +340,7 @@ class SimulatedInstrument:
         """Interrupt and discard a running spectrum."""
         if isinstance(self._doing, SpectrumActivity) and self._doing.running(now_s):
             self._doing = self.spectrum = None
+            self._held_until_s = min(self._held_until_s, now_s + self._hold_s)
             self.damage.spectrum_starts(None)
             self.note(now_s, "spectrum stopped", {})
 
@@ -390,6 +408,36 @@ class SimulatedInstrument:
         self.account(now_s)
         self.setup.feedback = replace(self.setup.feedback, on=on)
 
+    def is_held(self, now_s: float) -> bool:
+        """Return whether the controller holds the feedback, in a spectrum or after it, and will give it back."""
+        return self.engaged and bool(self.setup.feedback.on) and now_s < self._held_until_s
+
+    def feedback_reads(self, now_s: float) -> bool:
+        """Return what the controller's switch of the feedback reads."""
+        is_hidden = self.is_held(now_s) and self.world.settings.feedback.hold_reads == "off"
+        return bool(self.setup.feedback.on) and not is_hidden
+
+    @property
+    def _hold_s(self) -> float:
+        return self.world.settings.feedback.hold_s
+
+    def _adjustments(self, now_s: float) -> list[Adjustment]:
+        # the settings in force now, and from the moment at which a held feedback is given back
+        setup = self.setup
+        if not self.is_held(now_s):
+            return [Adjustment(now_s, setup.feedback, setup.bias_v)]
+        held = replace(setup.feedback, on=False)
+        return [
+            Adjustment(now_s, held, setup.bias_v),
+            Adjustment(self._held_until_s, setup.feedback, setup.bias_v),
+        ]
+
+    def _surface_z_m(self, now_s: float) -> float:
+        # with random numbers of its own: those of the signals stay the same
+        random = np.random.default_rng((self.seed, 4, self._counts["spectrum"]))
+        at_rest = self.world.at_rest(self.probe_at(now_s), now_s, self.setup.feedback, self.setup.bias_v, random=random)
+        return at_rest["Height"]
+
     # -- the tip
 
     def pulse(self, voltage_v: float, duration_s: float, now_s: float) -> str:
@@ -447,7 +495,7 @@ class SimulatedInstrument:
         self.stop_scan(now_s)
         self.stop_spectrum(now_s)
         self.account(now_s)
-        self._doing, self.engaged = None, False
+        self._doing, self.engaged, self._held_until_s = None, False, -math.inf
         self.occupy("approach", self.setup.approach_s, now_s)
 
     # -- anything else
@@ -466,6 +514,7 @@ class SimulatedInstrument:
     def abandon(self, now_s: float) -> None:
         """Drop the activity; complete lines of a scan remain."""
         self.stop_scan(now_s)
+        self.stop_spectrum(now_s)
         self._doing = None
 
     # -- the damage
@@ -484,6 +533,7 @@ class SimulatedInstrument:
 
     @property
     def _is_feedback_off(self) -> bool:
+        # a feedback that the controller itself holds is no danger
         return self.engaged and self.setup.feedback.on is False
 
     def _add_damage(self, now_s: float, cause: str, ledger: DamageLedger) -> None:
@@ -510,6 +560,7 @@ class SimulatedInstrument:
             occupied=doing if isinstance(doing, Occupied) and not isinstance(doing, Move) else None,
             ledger=self.ledger,
             scanned=self.damage.scanned,
+            held_until_s=self._held_until_s if math.isfinite(self._held_until_s) else None,
         )
         return {"world": world, "instrument": snapshot(state, "instrument", _STATE_VERSION, lists=True)}
 
@@ -524,6 +575,7 @@ class SimulatedInstrument:
         self.engaged, self._probe_m = found.engaged, found.probe_m
         self._counts = {"scan": found.last_scan, "spectrum": found.spectra}
         self.scan, self.spectrum = found.scan, found.spectrum
+        self._held_until_s = -math.inf if found.held_until_s is None else found.held_until_s
         self._doing = found.scan or found.spectrum or found.move or found.occupied
         self.damage.restore(found.ledger, found.scanned, (found.scan or found.spectrum) if found.engaged else None)
         # the values are not saved: the world at the start of the scan gives the same values again

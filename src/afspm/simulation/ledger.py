@@ -35,7 +35,7 @@ class DamageLedger:
         pressed_scans, pressed_m: number of scans whose mean indentation was at least `PRESSED_FROM_M`, and the sum of
             these indentations.
         saturated_s: time that the preamplifier was saturated in scans and spectra.
-        feedback_off_s: time that the tip was engaged with the feedback off, spectra excluded.
+        feedback_off_s: time that the tip was engaged with the feedback switched off, without a controller's own hold.
         stage_moves: moves of the coarse stage while the tip was engaged.
         until_s: the experiment time up to which the feedback's time is counted.
     """

@@ -163,7 +163,7 @@ class Adjustment:
     """A change during a scan: its time, and the new settings."""
 
     t_s: float
-    feedback: Feedback | None
+    feedback: Feedback
     bias_v: float
 
 

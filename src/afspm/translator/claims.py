@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from afspm.model import ActByHand, MeasurementConditions, Parameter, Request, TipStatus, names
 from afspm.translator.driver_base import DriverBase
@@ -27,9 +28,7 @@ class Claims:
 
     def __init__(self, driver: DriverBase, kept: Kept) -> None:
         self._driver = driver
-        self._kept = kept.setdefault("claims", {"next": {}, "running": None, "contradicted": ""})
-        self._holder = ""
-        self._begin: dict[str, Value] = {}
+        self._kept = kept.setdefault("claims", {"next": {}, "asked": None, "running": None, "contradicted": ""})
         self._end: dict[str, Value] = {}
         self._tip: TipStatus | None = None
         self.repeated = ""
@@ -61,19 +60,23 @@ class Claims:
             for name in own:
                 self._kept["running"]["values"].pop(name, None)
 
-    def look(self, request: Request) -> None:
-        """Read the settings in force right before a measurement begins."""
-        self._holder = request.id.partition("/")[0] or "a program without a name"
-        self._begin = self._read(self._kept["next"])
+    def asks(self, request: Request) -> None:
+        """Read the settings in force right before a measurement is asked for."""
+        holder = request.id.partition("/")[0] or "a program without a name"
+        coming = dict(self._kept["next"])
+        self._kept["asked"] = Claim(0, holder, values=coming, begin=self._read(coming)).kept()
 
-    def begin(self, began_ns: int, tip: TipStatus, *, is_requested: bool) -> None:
-        """Note that a measurement has begun; one that is paused goes on with its claim."""
-        if self._kept["running"] is not None:
-            return
+    def is_refused(self) -> None:
+        """Note that the measurement asked for was not begun."""
+        self._kept["asked"] = None
+
+    def begin(self, began_ns: int, tip: TipStatus) -> None:
+        """Note that a measurement has begun, perhaps asked for by an earlier process of this translator."""
+        asked, self._kept["asked"] = self._kept["asked"], None
         claim = Claim(began_ns, tip=tip)
-        if is_requested:
-            claim = Claim(began_ns, self._holder, tip, self._kept["next"], self._begin)
-            self._kept["next"], self._begin = {}, {}
+        if asked is not None:
+            claim = replace(Claim.of(asked), began_ns=began_ns, tip=tip)
+            self._kept["next"] = {}
         self._kept["running"] = claim.kept()
 
     def end(self) -> None:

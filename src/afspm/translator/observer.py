@@ -103,6 +103,9 @@ class Observer:
             self._state.save()
         self._temporary.end()  # impossible before a kill, or while the controller was lost
         self.panel.lost()
+        if self._state.sequence.published.state is ScopeState.SPEC:  # it may have ended meanwhile
+            self._is_after_spectrum = True
+            self.panel.feedback.held(self._clock.now_s())
         self._take_in(self._read())
         acts = self.panel.read({}, self.values, ScopeState.UNDEFINED, self._clock.now_ns(), self._driver.withdrew_tip())
         self.publish_all()
@@ -270,7 +273,7 @@ class Observer:
         if not is_changed:  # the same reading again is a second one
             acts = self.panel.read(before, self.values, self._state.sequence.published.state, self._clock.now_ns())
             self._tell(acts)
-        self.claims.look(request)
+        self.claims.asks(request)
 
     def _judge_feedback(self) -> None:
         # of a measurement of the run: what a person measures by hand is his own
@@ -405,7 +408,7 @@ class Observer:
 
     def _note_state(self, state: ScopeState, time_ns: int) -> None:
         if state in MEASURING and self.claims.running is None:
-            self.claims.begin(time_ns, self.panel.tip, is_requested=self._state.sequence.is_requested)
+            self.claims.begin(time_ns, self.panel.tip)
             self._is_after_spectrum = state is ScopeState.SPEC
             self._acts = []
         elif state is ScopeState.FREE:

@@ -73,7 +73,7 @@ class PanelWatch:
         self._written = written
         self._last: ScopeState | None = None
         self._still: ScopeState | None = None
-        self._tip_is_moved = False
+        self._tip_is_moved = self._is_lost = False
         self._before_spectrum: dict[str, Value] = {}
         self._by_hand: dict[str, Value] = {}
         self.is_certain = False
@@ -114,7 +114,7 @@ class PanelWatch:
 
     def lost(self) -> None:
         """Note a restart or a lost controller: until the microscope is free, nothing is certain."""
-        self._last, self._still, self.is_certain = None, None, False
+        self._last, self._still, self.is_certain, self._is_lost = None, None, False, True
         self._before_spectrum, self._by_hand = {}, {}
         self.feedback.lost()
 
@@ -137,8 +137,8 @@ class PanelWatch:
         if is_calm:
             before, self._before_spectrum = {**before, **self._before_spectrum}, {}
         # a withdrawal takes time, and the controller may show it as a state of its own until it is over
-        was_engaged = (before.get(names.ENGAGED) is True and still is not None) or self._was_left_at_sample
-        self._was_left_at_sample = False
+        was_engaged = (before.get(names.ENGAGED) is True and not self._is_lost) or self._was_left_at_sample
+        self._was_left_at_sample = self._is_lost = False
         if was_engaged and now.get(names.ENGAGED) is False and not withdrew and not self._tip_is_moved:
             acts.append(self._tip_act(PanelAct.WITHDRAW, now_ns))
         acts += self._feedback_acts(now, state, now_ns, withdrew)

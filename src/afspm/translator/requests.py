@@ -163,6 +163,9 @@ class RequestHandler:
 
     def _finish(self, request: Request, response: Response) -> None:
         # saved before the answer is sent: a retry after a kill gets the same answer
+        is_unknown = response.code == ControlResponse.NO_RESPONSE and self._acting is request
+        if request.kind == ControlRequest.ACTION and request.subject in STARTS and not (response.ok or is_unknown):
+            self._observer.claims.is_refused()
         if self._acting is request:
             self._acting = None
             if request.subject == names.RETRACT and response.ok:

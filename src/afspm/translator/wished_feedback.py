@@ -127,8 +127,10 @@ class WishedFeedback:
 
     def _level(self, engaged: bool | None, on: bool | None, now_s: float, *, is_calm: bool) -> FeedbackLevel:
         kept = self._kept
+        if engaged is False:  # an approach may switch it on a little later
+            kept["is_away"] = True
+            self.held(now_s)
         if on is None or engaged is False:
-            kept["is_away"] = kept["is_away"] or engaged is False
             return FeedbackLevel.AS_WISHED
         if on:
             self._is_on(now_s)

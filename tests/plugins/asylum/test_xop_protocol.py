@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from tests.plugins.asylum.igor_test_functions import WithTestFunctions
 
 from afspm.basics import ExperimentClock
 from afspm.plugins.asylum import xop
+from afspm.plugins.asylum.emulator import AsylumEmulator
 from afspm.simulation.faults import Fault
 
 CALLS = json.loads(Path(__file__).with_name("xop_calls.json").read_text())
@@ -354,3 +356,27 @@ def test_files_are_read_by_igor2(tmp_path: Path) -> None:
     assert b"SlowScanSize: 5e-07" in note
     assert b"StartHeadTemp: 32.125 \xb0C" in note, "which is not UTF-8, as in real files"
     np.testing.assert_allclose(wave["wave_header"]["sfA"][:2], [1e-6 / 15, 0.5e-6 / 7])
+
+
+@pytest.mark.parametrize("reads", ["off", "on"])
+def test_feedback_is_held_until_after_the_end_of_a_force_curve(tmp_path: Path, reads: str) -> None:
+    emulator = AsylumEmulator(port=0, feedback={"hold_s": 20.0, "hold_reads": reads})
+    clock = ExperimentClock.starting_now(speed=20.0)
+    with emulator.running(tmp_path, clock) as address, closing(Client(address)) as client:
+
+        def number(name: str) -> int:
+            return int(client.call(name)["result"]["value"])
+
+        def until(holds: Callable[[], bool]) -> None:
+            deadline_s = clock.monotonic_s() + DEADLINE_S
+            while not holds():
+                assert clock.monotonic_s() < deadline_s
+
+        assert number("AfspmFeedbackOn")
+        client.call("DoForceFunc", "SingleForce_0")
+        assert number("ARGetStatus") & 0x10
+        until(lambda: not number("ARGetStatus") & 0x10)
+        assert number("AfspmFeedbackOn") == (reads == "on")
+        assert emulator.rig.is_held(clock.now_s())
+        until(lambda: not emulator.rig.is_held(clock.now_s()))
+        assert number("AfspmFeedbackOn")

@@ -36,15 +36,15 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_scan_during_which_correction_was_switched_on_belongs_to_no_part() -> None:
-    told = [TabledScan(str(k), k >= 3) for k in range(6)]
+    told = [TabledScan(str(k), k >= 3, 60.0 * k) for k in range(6)]
     assert parts(told) == [("off", 0, 3), ("on", 4, 6)]
-    assert parts([TabledScan("0", True), TabledScan("1", True)]) == [("on", 0, 2)]
-    assert parts([TabledScan("0", False)]) == [("off", 0, 1)]
+    assert parts([TabledScan("0", True, 0.0), TabledScan("1", True, 60.0)]) == [("on", 0, 2)]
+    assert parts([TabledScan("0", False, 0.0)]) == [("off", 0, 1)]
     assert parts([]) == []
 
 
 @cache
-def scanned() -> list[tuple[bytes, Region, float]]:
+def scanned(*, with_speed: bool = True) -> list[tuple[bytes, Region, float]]:
     """Return nine scans, from the fourth on in a frame that follows the sample: as saved, where, and when."""
     world = World.from_settings(SETTINGS, seed=1, start_s=0.0)
     found = []
@@ -53,16 +53,16 @@ def scanned() -> list[tuple[bytes, Region, float]]:
         x, y, _ = world.drift_m(middle_s) - world.drift_m(PIXELS / 2)
         region = Region((float(x), float(y)) if k >= SWITCHED_ON else (0.0, 0.0), (1e-6, 1e-6))
         scan = world.scan(region, (PIXELS, PIXELS), 1.0, EVERY_S * k)
-        measured = FileFacts(int(scan.end_s * 1e9), {"scan-speed [m/s]": 2e-6})
+        measured = FileFacts(int(scan.end_s * 1e9), {"scan-speed [m/s]": 2e-6} if with_speed else {})
         found.append((encode_scan(region, scan.channels(), measured), region, middle_s))
     return found
 
 
-def saved(folder: Path) -> list[tuple[Path, Region, float]]:
+def saved(folder: Path, *, with_speed: bool = True) -> list[tuple[Path, Region, float]]:
     """The files of the scans, and their truth."""
     (folder / "scans").mkdir()
     found = []
-    for k, (content, region, middle_s) in enumerate(scanned()):
+    for k, (content, region, middle_s) in enumerate(scanned(with_speed=with_speed)):
         path = folder / "scans" / f"scan-{k}.nc"
         path.write_bytes(content)
         found.append((path, region, middle_s))
@@ -89,9 +89,9 @@ def mapping(path: Path, region: Region, middle_s: float, *, correcting: bool) ->
     return message
 
 
-def night(folder: Path) -> Lab:
+def night(folder: Path, *, with_speed: bool = True) -> Lab:
     lab = Lab("drift_pictures")
-    for k, one in enumerate(saved(folder)):
+    for k, one in enumerate(saved(folder, with_speed=with_speed)):
         told = mapping(*one, correcting=k >= SWITCHED_ON)
         lab.at(100.0 * (k + 1), partial(lab.publish, told, "DriftMapping"))
     return lab
@@ -108,6 +108,20 @@ def test_the_table_and_all_figures_are_there_when_the_experiment_has_ended(tmp_p
         "drift_offset", "drift_pairs", "drift_estimates_off", "drift_histogram_off", "drift_estimates_on",
         "drift_histogram_on", "drift_errors",
     }  # fmt: skip
+
+
+def test_scans_are_drawn_at_their_middle_where_the_file_has_the_end_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # paper F3: the matrix, Park and Nanosurf: the true drift was drawn half a scan beside its time
+    drawn: list[Any] = []
+    monkeypatch.setattr("afspm.plugins.drift.report.album.write", lambda one, *_, **__: drawn.append(one) or [])
+    lab = night(tmp_path, with_speed=False)
+    lab.at(1500.0, lab.kill)
+    run(DriftPictures("topography", "correlation"), lab, tmp_path / "state", run_dir=str(tmp_path), simulated=True)
+    (shown,) = drawn
+    assert [scan.mid_s for scan in shown.scans] == pytest.approx([middle_s for _, _, middle_s in scanned()])
+    assert abs(shown.truth_m - shown.record.drift_m).max() < 1e-12
 
 
 def test_a_restart_loses_nothing(tmp_path: Path) -> None:

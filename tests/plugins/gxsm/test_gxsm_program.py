@@ -232,7 +232,7 @@ def test_status_bits_of_the_redpitaya_differ(bench: Make) -> None:
         small(gxsm)
         assert bits(gxsm) == 1
         gxsm.call("action", "DSP_VP_IV_EXECUTE")
-        until(made, lambda: bits(gxsm) == 3)
+        until(made, lambda: bits(gxsm) == 2)  # the feedback is held
         until(made, lambda: bits(gxsm) == 1)
         gxsm.call("startscan")
         until(made, lambda: bits(gxsm) == 3)
@@ -398,6 +398,21 @@ def test_a_spectrum_and_its_event(bench: Make) -> None:
         assert true is not None
         assert true.position_m == pytest.approx((12e-9, 2e-9))
         np.testing.assert_allclose(content.spectra[0].values[:, 0], true.values[:, 0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("reads", ["off", "on"])
+def test_feedback_is_held_until_after_the_end_of_a_spectrum(bench: Make, reads: str) -> None:
+    made = bench(speed=20.0, feedback={"hold_s": 20.0, "hold_reads": reads})
+    held = int(reads == "on")
+    with calling(made) as gxsm:
+        assert bits(gxsm) & 1
+        gxsm.call("action", "DSP_VP_IV_EXECUTE")
+        assert bits(gxsm) & 9 == 8 + held
+        until(made, lambda: not bits(gxsm) & 8)
+        assert bits(gxsm) & 1 == held
+        assert made.emulator.rig.is_held(made.clock.now_s())
+        until(made, lambda: not made.emulator.rig.is_held(made.clock.now_s()))
+        assert bits(gxsm) & 1
 
 
 def test_frequency_shift_matches_picture_and_setpoint(bench: Make) -> None:

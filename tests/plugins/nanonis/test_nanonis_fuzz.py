@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,7 @@ def software(tmp_path: Path, clock: FakeClock) -> NanonisSoftware:
         range_m=100e-6,
         release=NanonisEmulator().release,
         rows_as_recorded=False,
+        unscanned=math.nan,
         log=logging.getLogger(),
     )
 

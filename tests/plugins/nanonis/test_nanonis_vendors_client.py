@@ -190,6 +190,67 @@ def test_client_stops_a_scan_which_ends_the_wait(client: Any) -> None:
     assert ask(client, "Scan_StatusGet") == [0]
 
 
+@pytest.mark.parametrize("unscanned", ["nan", "zeros"])
+def test_rows_not_yet_scanned_are_in_memory_as_set_and_missing_in_files(tmp_path: Path, unscanned: str) -> None:
+    # results Z1, T1
+    def is_missing(values: Any) -> Any:
+        return np.isnan(values) if unscanned == "nan" else np.equal(values, 0.0)
+
+    with connected(tmp_path, 100.0, unscanned=unscanned) as client:
+        ask(client, "Scan_BufferSet", [0, 14], 16, 8)
+        empty = ask(client, "Scan_FrameDataGrab", 14, 1)[4]
+        ask(client, "Scan_SpeedSet", 1e-8, 1e-8, 100.0, 100.0, 1, 1.0)  # 2 real seconds a line
+        ask(client, "Scan_Action", 0, 1)
+        deadline_s = time.monotonic() + DEADLINE_S
+        while is_missing(running := ask(client, "Scan_FrameDataGrab", 14, 0)[4]).all():
+            assert time.monotonic() < deadline_s
+        ask(client, "Scan_Action", 1, 0)
+        stopped = ask(client, "Scan_FrameDataGrab", 14, 1)[4]
+        ask(client, "Scan_Save", 1, -1)
+    for values in (empty, running, stopped):
+        missing = is_missing(values)
+        assert missing.all(axis=1).tolist() == missing.any(axis=1).tolist()
+    assert is_missing(empty).all()
+    (file,) = tmp_path.glob("*.sxm")
+    saved = read(file).scans[2]
+    assert saved.channel == "Z Forward"
+    scanned = ~is_missing(stopped)[::-1]
+    assert 0 < scanned.sum() < scanned.size
+    assert np.array_equal(np.isfinite(saved.values), scanned)
+
+
+@pytest.mark.parametrize("reads", ["off", "on"])
+@pytest.mark.parametrize("module", ["BiasSpectr", "ZSpectr"])
+def test_z_controller_is_held_until_after_the_end_of_a_spectrum(tmp_path: Path, module: str, reads: str) -> None:
+    held = [0], [3]
+    if reads == "on":
+        held = [1], [2]
+    with connected(tmp_path, 100.0, feedback={"hold_s": 100.0, "hold_reads": reads}) as client:
+
+        def switch() -> tuple[list[Any], list[Any]]:
+            return ask(client, "ZCtrl_OnOffGet"), ask(client, "ZCtrl_StatusGet")
+
+        assert switch() == ([1], [2])
+        ask(client, f"{module}_Open")
+        ask(client, f"{module}_Start", 0, "curve")
+        assert switch() == held
+        ask(client, f"{module}_Stop")
+        ask(client, f"{module}_Start", 1, "curve")  # answered at the reported end
+        assert switch() == held
+        deadline_s = time.monotonic() + DEADLINE_S
+        while switch() != ([1], [2]):
+            assert time.monotonic() < deadline_s
+
+
+def test_z_controller_switched_off_in_the_hold_stays_off(tmp_path: Path) -> None:
+    with connected(tmp_path, 100.0, feedback={"hold_s": 20.0, "hold_reads": "on"}) as client:
+        ask(client, "BiasSpectr_Open")
+        ask(client, "BiasSpectr_Start", 1, "curve")
+        ask(client, "ZCtrl_OnOffSet", 0)
+        ask(client, "BiasSpectr_Start", 1, "curve")
+        assert (ask(client, "ZCtrl_OnOffGet"), ask(client, "ZCtrl_StatusGet")) == ([0], [1])
+
+
 @pytest.mark.parametrize(("module", "first"), [("BiasSpectr", "Bias calc (V)"), ("ZSpectr", "Z rel (m)")])
 def test_client_takes_a_spectrum_with_a_row_for_each_channel(client: Any, module: str, first: str) -> None:
     # As in the client's examples.

@@ -22,8 +22,8 @@ class RunningClock(FakeClock):
         return self.t_s
 
 
-def studio(clock: FakeClock, folder: Path) -> StudioProgram:
-    rig = SimulatedInstrument({}, 1, clock.t_s)
+def studio(clock: FakeClock, folder: Path, **world: object) -> StudioProgram:
+    rig = SimulatedInstrument(world, 1, clock.t_s)
     faults = Faults([], NanosurfEmulator.all_faults(), clock.t_s)
     return StudioProgram(rig, faults, clock, folder, logging.getLogger(), start_s=0.0, file_s=0.0)
 
@@ -39,6 +39,21 @@ def test_curves_with_an_impossible_setpoint_end_as_if_stopped(tmp_path: Path, ca
         clock.t_s += 1.0
     assert not program.measuring_curve
     assert "the curves were interrupted: feedback: a setpoint is above zero, not -1" in caplog.text
+
+
+def test_next_curve_of_a_grid_waits_for_the_feedback(tmp_path: Path) -> None:
+    clock = FakeClock()
+    program = studio(clock, tmp_path, feedback={"hold_s": 5.0})
+    program.put("spectroscopy.grid_columns", 2)
+    program.start_curves(clock.t_s)
+    starts = set()
+    while program.measuring_curve:
+        program.advance(clock.t_s)
+        curve = program.rig.spectrum
+        starts |= {curve.start_s} if curve is not None else set()
+        clock.t_s += 0.1
+    first_s, second_s = sorted(starts)
+    assert second_s >= first_s + program.rig.world.settings.force.duration_s + 5.0
 
 
 @pytest.mark.parametrize("direction", [0, 1])

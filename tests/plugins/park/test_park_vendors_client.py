@@ -111,6 +111,26 @@ print(json.dumps({mode: remote.run(f"spm.spect.start('{mode}', 'here')")["result
     assert made.rig.spectrum.position_m == pytest.approx((2e-7, -1e-7))
 
 
+@pytest.mark.parametrize("reads", ["off", "on"])
+def test_feedback_is_held_until_after_the_end_of_a_curve(tmp_path: Path, client: Run, reads: str) -> None:
+    made = Emulated(seed=2, feedback={"hold_s": 100.0, "hold_reads": reads})
+    with made.running(tmp_path / "data", ExperimentClock.starting_now(speed=100.0)) as address:
+        told = client(
+            address,
+            """
+before = remote.run("spm.zservo.enable")["value"]
+held = remote.run("spm.spect.trigger('iv', 'here'); spm.zservo.enable")["value"]
+remote.run("spm.spect.stop()")
+after = remote.run("spm.spect.start('iv', 'here'); spm.zservo.enable")["value"]
+while (later := remote.run("spm.zservo.enable")["value"]) != before: pass
+remote.run("spm.zservo.enable = false")
+print(json.dumps({"values": [before, held, after, later, remote.run("spm.zservo.enable")["value"]]}))
+""",
+        )
+    held = "true" if reads == "on" else "false"
+    assert told == {"values": ["true", held, held, "true", "false"]}
+
+
 def test_computation_needs_no_instrument(tmp_path: Path, client: Run) -> None:
     with Emulated(seed=2, values="native").running(tmp_path / "data") as address:
         told = client(address, """print(json.dumps({"sum": remote.run("[1, 2, 3].map(x => x * x)")["value"]}))""")

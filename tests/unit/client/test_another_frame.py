@@ -74,3 +74,19 @@ def test_a_spectrum_somewhere_else_is_taken_again(lab: Lab, scope: Scope) -> Non
     spectrum = scope.spectrum((2e-7, 3e-7), kind="IV")
     assert spectrum.position_m == (2e-7, 3e-7)
     assert lab.begun_scans == 2
+
+
+def test_scan_of_a_person_of_the_same_frame_is_not_taken_for_the_own_one(lab: Lab, scope: Scope) -> None:
+    # results m1
+    publish = lab.publish
+
+    def by_a_person(thing: object) -> None:
+        if isinstance(thing, model.Scan):
+            holder = "" if lab.begun_scans == 1 else lab.name
+            publish(model.MeasurementConditions(thing.time_ns or 0, thing.filename, began_ns=1, holder=holder))
+        publish(thing)
+
+    lab.publish = by_a_person  # type: ignore[method-assign,assignment]
+    scans = scope.scan(REGION, shape=(8, 8))
+    assert lab.begun_scans == 2
+    assert re.search("another measurement was taken", scans.interruptions[0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -210,6 +210,18 @@ def test_a_tunnelling_current_of_either_sign_is_compared_by_its_logarithm() -> N
     off = relative_error(np.array([[-100e-12, -200e-12, -50e-12, 0.0]]), 100e-12, exponential=True)
     assert off[0, :3] == pytest.approx([0.0, np.log(2.0), -np.log(2.0)])
     assert np.isfinite(off).all()
+
+
+def test_current_of_a_file_in_na_is_compared_with_a_setpoint_in_a() -> None:
+    # paper F3: every pixel of GXSM's current was beyond the threshold at every gain
+    sample = SAMPLES["steps, tunnelling"]
+    signal, height = scanned(sample, 1500.0)
+    in_na = replace(signal, values=signal.values * 1e9, unit="nA")
+    units = FeedbackUnits(setpoint="A")
+    scope: Any = type("Scope", (), {"get": lambda *_, **__: sample.setpoint, "feedback_units": units})()
+    compared = [FeedbackSignal(None, None).error(one, height, sample.setpoint, scope) for one in (signal, in_na)]
+    assert compared[0].share == compared[1].share < 0.1
+    assert compared[1].missed == pytest.approx(compared[0].missed)
 
 
 def rows(values: np.ndarray) -> Iterator[np.ndarray]:

@@ -447,7 +447,12 @@ def test_setup_of_a_scan_and_place_of_a_spectrum_are_noted(clock: Any) -> None:
 @pytest.mark.parametrize("is_restored", [False, True])
 def test_tip_changes_in_the_scan_with_a_number(clock: Any, *, is_restored: bool) -> None:
     settings: Plain = {"tip_changes": {"in_scans": [[2, "double"], [3.5, "blunt"]]}}
-    rig = SimulatedInstrument(settings, 3, clock.t_s)
+    noted: list[Any] = []
+
+    def note(time_s: float, event: str, facts: Mapping[str, Any]) -> None:
+        noted.extend(facts.get("changes_in_scan", ()))
+
+    rig = SimulatedInstrument(settings, 3, clock.t_s, note=note)
     rig.setup.shape, rig.setup.line_s = (4, 4), 0.5
 
     def flaws_of_scan(start_s: float) -> list[tuple[float, list[str]]]:
@@ -455,7 +460,7 @@ def test_tip_changes_in_the_scan_with_a_number(clock: Any, *, is_restored: bool)
         scan = rig.start_scan(start_s)
         if is_restored:
             kept, setup = json.loads(json.dumps(rig.state())), rig.setup
-            rig = SimulatedInstrument(settings, 3, clock.t_s)
+            rig = SimulatedInstrument(settings, 3, clock.t_s, note=note)
             rig.setup = setup
             rig.restore(kept)
             assert rig.scan is not None
@@ -467,6 +472,7 @@ def test_tip_changes_in_the_scan_with_a_number(clock: Any, *, is_restored: bool)
     assert flaws_of_scan(1000.0) == [(0.0, [])]
     assert flaws_of_scan(1010.0)[-1] == (0.0, ["double"])
     assert flaws_of_scan(1020.0) == [(0.0, ["double"]), (1.0, ["blunt", "double"])]
+    assert noted == [(1010.0, "double"), (1021.0, "blunt")]
 
 
 def test_events_are_noted_with_the_truth(clock: Any) -> None:

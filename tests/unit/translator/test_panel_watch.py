@@ -207,6 +207,14 @@ def test_a_tip_withdrawn_just_before_a_start_is_seen_by_the_start(bench: Any) ->
     assert acts(bench) == [PanelAct.WITHDRAW]
 
 
+def test_a_tip_withdrawn_just_after_a_request_is_by_hand(bench: Any) -> None:
+    # results M5
+    assert bench.ask(PARAM, Parameter("tip-bias-voltage", "0.3", "V")).code == OK
+    bench.microscope.values["Engaged"] = False
+    assert bench.ask(ACTION, names.START_SCAN).code == ControlResponse.NOT_FREE
+    assert acts(bench) == [PanelAct.WITHDRAW]
+
+
 def test_a_withdrawal_that_takes_time_gives_one_act(bench: Any) -> None:
     bench.microscope.state = ScopeState.COARSE_MOTOR
     bench.look()

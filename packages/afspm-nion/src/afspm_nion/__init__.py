@@ -135,7 +135,7 @@ class Nion(Driver):
         lasts_s = rows * columns * dwell_s
         now_s = self.clock.now_s()
         # A simulated scan shows the sample of one moment.
-        self._put_stage(now_s + lasts_s / 2.0)
+        self._put_stage(now_s, now_s + lasts_s / 2.0, region)
         self._nion.record(region, (rows, columns), self.clock.real_s(dwell_s), self._detectors, self.wake)
         self._ends_s = now_s + lasts_s
 
@@ -152,12 +152,12 @@ class Nion(Driver):
         assert self._microscope is not None, "the translator connects first"
         return self._microscope
 
-    def _put_stage(self, at_s: float) -> None:
+    def _put_stage(self, start_s: float, at_s: float, region: Region) -> None:
         since_s = at_s - self.memory["start_s"]
         x, y = (speed_m_s * since_s for speed_m_s in self._drift_m_s)
         self._nion.move_stage((x, y))
         with (self.run_dir / "stage.csv").open("a", encoding="utf-8") as file:
-            file.write(f"{at_s!r},{x!r},{y!r}\n")
+            file.write(",".join(map(repr, (at_s, x, y, start_s, *region.center_m, *region.size_m))) + "\n")
 
     def _save(self, counts: Mapping[str, Any]) -> None:
         time_ns = self.clock.now_ns()

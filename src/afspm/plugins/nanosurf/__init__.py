@@ -87,6 +87,9 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
         **common: Any,
     ) -> None:
         super().__init__(poll_period_s=poll_period_s, **common)
+        if self.common.live_lines_s is not None and image_buffer is None:
+            hint = "set `image_buffer`; its number is not published, so ask Nanosurf"
+            raise ConfigError("lines of a running scan need `image_buffer`", where="live_lines_s", hint=hint)
         self.controller_at = address
         self._level = max(commands.level(release), 0 if image_buffer is None else commands.BUFFER_LEVEL)
         self._release, self._session_name = release, session

@@ -309,9 +309,11 @@ class Simulator(Driver):
             from importlib.metadata import version  # imported late, since the supervisor imports this class, too
 
             return f"simulated microscope of afspm {version('afspm')}"
-        self._reached(refuses=False)
+        controller = self._reached(refuses=False)
         if vendor not in self.memory["values"]:
             raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, f"the simulated controller has no {vendor!r}")
+        if vendor == FEEDBACK_ON:
+            return controller.instrument.feedback_reads(self.clock.now_s())
         value: Value = self.memory["values"][vendor]
         return value
 

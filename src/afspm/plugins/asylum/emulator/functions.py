@@ -143,7 +143,7 @@ class AsylumFunctions:
         return 0.0
 
     def _feedback_on(self) -> float:
-        return float(self._controller.rig.engaged and bool(self._controller.rig.setup.feedback.on))
+        return float(self._controller.rig.engaged and self._controller.rig.feedback_reads(self._now_s()))
 
     # --- spots ---
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, overload
 import numpy as np
 
 from afspm import Component, LineFile, csv_line
-from afspm.basics import AfspmError, FileError, counted, iso_utc
+from afspm.basics import NS_PER_S, AfspmError, FileError, counted, iso_utc
 from afspm.model import TOPOGRAPHY, ChannelName, RegistrationOutcome, of_role
 from afspm.plugins.drift.track.record import COLUMNS as RECORD
 from afspm.record import drift_at
@@ -90,10 +90,11 @@ def _text(value: float) -> str:
 
 @dataclass(frozen=True)
 class TabledScan:
-    """One row of the table: the scan's file, and whether components used sample coordinates at that time."""
+    """One row of the table: the scan's file and middle, and whether components used sample coordinates at that time."""
 
     file: str
     correcting: bool
+    middle_s: float
 
 
 def parts(tabled: Sequence[TabledScan]) -> list[tuple[str, int, int]]:
@@ -186,7 +187,8 @@ class DriftPictures(DriftTable):
         super().on_drift_mapping(message)
         if message.channel:
             self.memory["channel"] = message.channel
-        self._known_scans.setdefault(message.filename, TabledScan(message.filename, message.correcting))
+        middle_s = message.timestamp.ToNanoseconds() / NS_PER_S
+        self._known_scans.setdefault(message.filename, TabledScan(message.filename, message.correcting, middle_s))
         tabled, newest = list(self._known_scans.values()), list(self._known_scans).index(message.filename)
         for _, start, stop in parts(tabled):
             if start < newest < stop:
@@ -308,11 +310,17 @@ class DriftPictures(DriftTable):
         if scan is None:
             there = ", ".join(one.channel for one in content.scans)
             raise FileError(f"has no channel {channel!r}, but {there}", where=tabled.file)
-        return drift_scan(scan, content)
+        found = drift_scan(scan, content)
+        # a maker's file may have the start or the end alone
+        off_s = tabled.middle_s - found.mid_s
+        return replace(found, start_s=found.start_s + off_s, end_s=found.end_s + off_s)
 
     def _tabled_scans(self) -> list[TabledScan]:
         path = Path(self.run_dir) / self.file
         if not path.exists():
             return []
         with path.open(newline="", encoding="utf-8") as file:
-            return [TabledScan(row["filename"], row["correcting"] == "yes") for row in csv.DictReader(file)]
+            return [
+                TabledScan(row["filename"], row["correcting"] == "yes", float(row["time_s"]))
+                for row in csv.DictReader(file)
+            ]

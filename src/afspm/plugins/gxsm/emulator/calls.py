@@ -227,7 +227,7 @@ class GxsmFunctions:
         scanning = doing == "scan" and scan is not None and now_s >= scan.start_s + program.scan.shows_s
         scanning = scanning or (program.is_between_repeats and not doing)
         paused, probing = scanning and scan is not None and scan.paused, doing == "spectrum"
-        feedback = bool(program.rig.setup.feedback.on)
+        feedback = program.rig.feedback_reads(now_s)
         if program.card == "RPSPMC":
             ended = not (scanning or probing) and scan is not None
             return feedback + 2 * (scanning or probing) + 4 * paused + 16 * ended

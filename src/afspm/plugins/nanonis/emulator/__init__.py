@@ -18,6 +18,7 @@ from afspm.plugins.nanonis.emulator.software import NanonisSoftware
 RELEASES: Final = {"2021": 10862, "2022": 11798, "2023": 13742, "2024": 14429, "2025": 14573}
 """The first release with each version of the protocol, by the year of the software."""
 _ACTS: Final = ("Start", "Action", "Set", "Pulse", "Withdraw", "StartMove", "Home")
+_UNSCANNED: Final = {"nan": math.nan, "zeros": 0.0}
 _LOGS_EVERY_S: Final = 0.005
 """Real time between two polls of the TCP Logger."""
 _OTHER_NAME: Final = "Util.RTFreqGet"
@@ -75,6 +76,7 @@ class NanonisEmulator(Emulator):
         range_m: range of the scanner in x and y.
         bare_errors: True if replies with an error have no results; False: results of zeros.
         grabbed_rows: order of rows of scans in `Scan.FrameDataGrab`: "top-first" or as "recorded".
+        unscanned: values of rows not yet scanned in `Scan.FrameDataGrab`: "nan" or "zeros"; saved files have NaN.
         seed, faults, and the simulated world: settings of every emulator.
     """
 
@@ -120,6 +122,7 @@ class NanonisEmulator(Emulator):
         range_m: Length = 100e-6,
         bare_errors: bool = False,
         grabbed_rows: str = "top-first",
+        unscanned: str = "nan",
         **settings: Any,
     ) -> None:
         super().__init__(**{**settings, "feedback": _of_stm(settings.get("feedback", {}))})
@@ -131,9 +134,13 @@ class NanonisEmulator(Emulator):
         self._session_path = session_path
         self._range_m = range_m
         self._bare_errors = bare_errors
-        if grabbed_rows not in ("top-first", "recorded"):
-            raise ConfigError(f"unknown order {grabbed_rows!r}", where="grabbed_rows", hint='"top-first" or "recorded"')
-        self._grabbed_rows = grabbed_rows
+        for name, value, known in (
+            ("grabbed_rows", grabbed_rows, ("top-first", "recorded")),
+            ("unscanned", unscanned, tuple(_UNSCANNED)),
+        ):
+            if value not in known:
+                raise ConfigError(f"unknown value {value!r}", where=name, hint=f"one of {', '.join(known)}")
+        self._grabbed_rows, self._unscanned = grabbed_rows, unscanned
 
     def open(self) -> str:
         ports = [self.port + i if self.port else 0 for i in range(self._ports)]
@@ -155,6 +162,7 @@ class NanonisEmulator(Emulator):
             range_m=self._range_m,
             release=self.release,
             rows_as_recorded=self._grabbed_rows == "recorded",
+            unscanned=_UNSCANNED[self._unscanned],
             log=self.log,
         )
         return f"{LOOPBACK}:{','.join(map(str, self._server.ports))}"

@@ -123,6 +123,7 @@ class ScanModule:
 
     Args:
         rows_as_recorded: True if `Scan.FrameDataGrab` returns rows as recorded, False for the top row first.
+        unscanned: value of rows not yet scanned in `Scan.FrameDataGrab`.
 
     Attributes:
         frame: x, y, width, height in m, angle clockwise in degrees.
@@ -133,9 +134,9 @@ class ScanModule:
         ends: number of ended scans, completed or stopped.
     """
 
-    def __init__(self, core: NanonisCore, signals: Signals, *, rows_as_recorded: bool) -> None:
+    def __init__(self, core: NanonisCore, signals: Signals, *, rows_as_recorded: bool, unscanned: float) -> None:
         self._core, self._signals, self._files = core, signals, ScanFiles(core, signals)
-        self._rows_as_recorded = rows_as_recorded
+        self._rows_as_recorded, self._unscanned = rows_as_recorded, unscanned
         self.channels = sorted(CHANNELS[name] for name in core.rig.channels if name in CHANNELS)
         self.pixels, self.lines = 128, 128
         self.frame = (0.0, 0.0, 1e-6, 1e-6, 0.0)
@@ -375,7 +376,7 @@ class ScanModule:
             *_, there, back = self._files.images(last, self._core.now_s)[channel]
             raw, upwards = (there if forward else back[:, ::-1]), last.scan.upwards
         rows = raw if self._rows_as_recorded and upwards else raw[::-1]
-        return self._signals.names[channel], rows, int(upwards)
+        return self._signals.names[channel], np.where(np.isnan(rows), self._unscanned, rows), int(upwards)
 
     @answers("Scan.Save")
     def _save(self, wait: int, timeout_ms: int) -> Answer:

@@ -31,7 +31,7 @@ class NanonisSoftware:
     Args:
         session_path: session folder's path on the controller's computer; empty: the path of `folder`.
         range_m: range of the scanner in x and y.
-        rows_as_recorded: see `ScanModule`.
+        rows_as_recorded, unscanned: see `ScanModule`.
     """
 
     def __init__(
@@ -45,12 +45,13 @@ class NanonisSoftware:
         range_m: float,
         release: int,
         rows_as_recorded: bool,
+        unscanned: float,
         log: logging.Logger,
     ) -> None:
         session = SessionFolder(folder, session_path, faults, log)
         self.core = NanonisCore(rig, faults, clock, session, (range_m, range_m, _RANGE_Z_M), release, log)
         self.signals = Signals(self.core)
-        self.scans = ScanModule(self.core, self.signals, rows_as_recorded=rows_as_recorded)
+        self.scans = ScanModule(self.core, self.signals, rows_as_recorded=rows_as_recorded, unscanned=unscanned)
         self.spectra = SpectroscopyModules(self.core, self.signals)
         self.z_controller = ZController(self.core, self.scans, self.signals)
         modules = (

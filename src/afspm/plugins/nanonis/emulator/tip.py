@@ -68,6 +68,9 @@ class ZController:
             return 3
         if self.state == "off" and now_s < self._follows_s:
             return 4
+        # (!) The status of a real controller in a spectrum is unknown: here it follows `feedback.hold_reads`.
+        if self.state == "on" and not self._core.rig.feedback_reads(now_s):
+            return 3
         return {"off": 1, "on": 2, "safe": 5}[self.state]
 
     @answers("ZCtrl.StatusGet")

@@ -397,8 +397,9 @@ class StudioProgram(MakerProgram):
             self._grid = grid
 
     def _go_on_with_grid(self, now_s: float) -> None:
+        # Studio moves on to the next point of its grid once it regulates again
         grid = self._grid
-        while grid is not None and not self.rig.busy(now_s):
+        while grid is not None and not self.rig.busy(now_s) and not self.rig.is_held(now_s):
             if grid.at_point:
                 grid.at_point = False
                 try:

@@ -165,6 +165,8 @@ class SmartScanProgram(MakerProgram):
             return None
         if path == _GAIN and not self.reports_gains:
             return None
+        if path == _ENABLE:
+            return self.rig.feedback_reads(self.now_s)
         return self._reported[path]() if path in self._reported else self._values[path]
 
     def next_waking_s(self, now_s: float) -> float | None:
