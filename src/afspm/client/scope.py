@@ -44,6 +44,7 @@ from afspm.model import (
     RelayedMessage,
     ScanSet,
     Spectrum,
+    names,
 )
 from afspm.model.events import HasTime
 from afspm.model.instruments import InstrumentOrders
@@ -332,6 +333,19 @@ class Scope(ExperimentView):
         """Start an action of the microscope by its name; return when the microscope has accepted it."""
         with self._call():
             self._commands.in_control(ControlRequest.ACTION, name, self._link.until(timeout_s))
+
+    @checked_call
+    def feedback_may_be_off(self, *, timeout_s: float | None = ANSWER_S) -> None:
+        """Say, for a person, that the z feedback is off by intention; needs no control, and the mode MANUAL.
+
+        Raises:
+            Refused: the mode is not MANUAL, or this client speaks for no person with the role `approve`.
+        """
+        with self._call():
+            action = names.FEEDBACK_MAY_BE_OFF
+            response = self._commands.send(ControlRequest.ACTION, action, until_s=self._link.until(timeout_s))
+            if not response.ok:
+                raise refused(ControlRequest.ACTION, response, action)
 
     @checked_call
     def supports(self, action: str, *, timeout_s: float | None = ANSWER_S) -> bool:

@@ -63,6 +63,24 @@ def test_control_is_requested_and_released_by_each_call(lab: Lab, scope: Scope) 
     assert lab.count(ControlRequest.REQUEST_CTRL) == lab.count(ControlRequest.RELEASE_CTRL) == 1
 
 
+def test_words_of_a_person_about_the_feedback_need_no_control_and_may_be_refused(lab: Lab, scope: Scope) -> None:
+    answers = [Response(ControlResponse.SUCCESS), Response(ControlResponse.NOT_IN_CONTROL, reason="only a person")]
+    asked = []
+
+    def answer(request: Request) -> Response | str:
+        if request.kind != ControlRequest.ACTION:
+            return "go on"
+        asked.append(request.subject)
+        return answers.pop(0)
+
+    lab.intercept = answer
+    scope.feedback_may_be_off()
+    with pytest.raises(Refused, match="only a person"):
+        scope.feedback_may_be_off()
+    assert asked == [model.names.FEEDBACK_MAY_BE_OFF] * 2
+    assert lab.count(ControlRequest.REQUEST_CTRL) == 0
+
+
 def test_an_explicit_block_keeps_control_over_several_calls(lab: Lab, scope: Scope) -> None:
     with scope.control():
         scope.scan(REGION)

@@ -224,6 +224,8 @@ def _refusal_to_continue(draft: StateDraft, event: RequestIn) -> str:
 def _microscope_event(request: Request, rules: Rules) -> ArbitrationEvent:
     if reads(request):
         return ArbitrationEvent.READ
+    if request.kind == _ACTION and request.subject == names.FEEDBACK_MAY_BE_OFF:
+        return ArbitrationEvent.FEEDBACK_OFF
     is_adjustable = request.kind == _PARAM and request.subject.name in rules.adjustable
     return ArbitrationEvent.ADJUST if is_adjustable else ArbitrationEvent.COMMAND
 
@@ -402,10 +404,6 @@ def _not_allowed_now(draft: StateDraft, job: ForwardedRequest) -> Response | Non
     if ControlChange.FORWARD not in row.do:
         code = ControlResponse.NOT_IN_CONTROL if row.response is None else row.response
         return Response(int(code), b"", reason(row, draft.control, ask, rules), job.request.id)
-    says_off = job.request.kind == _ACTION and job.request.subject == names.FEEDBACK_MAY_BE_OFF
-    if says_off and draft.control.mode is not ControlMode.MANUAL:
-        why_not = "only a person says that the feedback is off by intention, while the mode is MANUAL"
-        return Response(int(ControlResponse.NOT_IN_CONTROL), b"", why_not, job.request.id)
     if (why := _refusal_for_tip(draft)) is not None:
         return Response(int(ControlResponse.NOT_FREE), b"", why, job.request.id)
     return None
