@@ -730,17 +730,18 @@ def test_a_scan_ends_though_repeat_is_on_at_the_panel(bench: Make) -> None:
     assert len(scanned(peer)) == 4
 
 
+def set_clock(emulator: Any, off_s: float) -> None:
+    emulator.file_clock.jump(off_s - emulator.file_clock.off_s, emulator.clock.now_s())
+
+
 def test_clock_of_gxsms_computer_may_differ_and_be_set(bench: Make) -> None:
     # An hour back is more than a scan: each scan seems to have started before its predecessor.
     made = bench(speed=20.0)
     peer = made.start()
     ready(peer)
 
-    def set_behind(emulator: Any, behind_s: float) -> None:
-        emulator.program.panel.behind_s = behind_s
-
     for behind_s in (0.0, 3600.0, 3600.0, 7200.0, 60.0):
-        made.at_panel(partial(set_behind, behind_s=behind_s))
+        made.at_panel(partial(set_clock, off_s=-behind_s))
         assert len(scanned(peer)) == 4
 
 
@@ -750,9 +751,9 @@ def test_scan_with_a_shorter_start_delay_counts_as_new(bench: Make) -> None:
     peer = made.start()
     ready(peer, shape=(64, 32))
     late_s = 30.0
-    made.at_panel(lambda emulator: setattr(emulator.program.panel, "behind_s", -late_s))
+    made.at_panel(partial(set_clock, off_s=late_s))
     assert len(scanned(peer)) == 4
-    made.at_panel(lambda emulator: setattr(emulator.program.panel, "behind_s", 0.0))
+    made.at_panel(partial(set_clock, off_s=0.0))
     last = made.emulator.program.scan.activity
     assert last is not None
     assert made.clock.now_s() > last.start_s + late_s, "else the clock seems to have been set back"

@@ -187,7 +187,7 @@ def test_z_controller_of_unknown_unit_is_named(bench: Make) -> None:
 
 
 def test_a_frame_beyond_the_scanner_is_refused_and_the_old_one_stays(bench: Make) -> None:
-    peer = bench(range_m=1e-6).start()
+    peer = bench(range_m=1e-6, clips_frames=True).start()
     ready(peer)
     far = Region((0.45e-6, 0.0), (300e-9, 100e-9))
     response = peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(far, SHAPE, ""))
@@ -197,7 +197,7 @@ def test_a_frame_beyond_the_scanner_is_refused_and_the_old_one_stays(bench: Make
 
 
 def test_a_size_beyond_the_scanner_is_refused_and_the_frame_stays_where_it_is(bench: Make) -> None:
-    made = bench(range_m=2e-6)
+    made = bench(range_m=2e-6, clips_frames=True)
     peer = made.start()
     ready(peer)
     before = made.emulator.software.scans.frame
