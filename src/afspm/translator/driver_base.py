@@ -459,7 +459,8 @@ class DriverBase(ABC):
     def same(self, name: str, a: Value, b: Value, among: Mapping[str, Value]) -> bool:
         """Return whether two values of a parameter are equal within the controller's precision.
 
-        Override only where a `resolution` in the table can't describe the precision.
+        Override only where a `resolution` in the table can't describe the precision, and accept what `super().same`
+        accepts: the experiment file may give any row a `resolution`.
 
         Args:
             among: the values that were read together with `a`.

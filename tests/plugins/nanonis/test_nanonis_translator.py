@@ -504,6 +504,20 @@ def test_parameters_and_actions_of_the_experiment_file(bench: Make) -> None:
     assert "the arguments of Bias.Set are f" in response.reason
 
 
+def test_measured_value_is_compared_within_the_resolution_of_its_row(bench: Make) -> None:
+    # spectra F4: the read-back of z has noise
+    z = {"vendor": "ZCtrl.ZPos", "unit": "m"}
+    made = bench()
+    peer = made.start(parameters={"x-z": {**z, "resolution": "1 nm"}, "x-exact-z": z})
+    ready(peer)
+    assert peer.set(names.FEEDBACK_ON, "false").ok
+    held_m = float(peer.get("x-z"))
+    assert peer.set("x-z", held_m + 5e-9, "m").ok
+    assert float(peer.get("x-z")) == pytest.approx(held_m + 5e-9, rel=1e-9)
+    refused = [peer.set("x-exact-z", held_m + step * 1e-9, "m") for step in range(5)]
+    assert any("the former values were restored" in one.reason for one in refused)
+
+
 # --- at the panel ---
 
 

@@ -163,7 +163,7 @@ class Nanonis(Driver):
         return self._session is not None and self._activity.reports_end()
 
     def same(self, name: str, a: Value, b: Value, among: Mapping[str, Value]) -> bool:
-        return geometry.same_float32(name, a, b, among)
+        return super().same(name, a, b, among) or geometry.same_float32(name, a, b, among)
 
     def get(self, vendor: str) -> Value:
         """Return a value by the prefix of a pair of functions: "Bias." means Bias.Get."""
