@@ -276,20 +276,15 @@ class ScanModule:
 
     @answers("Scan.FrameSet")
     def set_frame(self, x: float, y: float, width: float, height: float, angle_deg: float) -> Answer:
-        """Set the frame, clipped to the scanner's range like the real controller.
+        """Set the frame. Like the real controller, take one beyond the scanner's range, and return it as set.
 
-        (!) The real controller's answer to a frame smaller than an atom is unknown; the emulator refuses it.
+        A real one clips the voltages while it scans; the emulator scans the frame as it was set. (!) The real
+        controller's answer to a frame smaller than an atom is unknown; the emulator refuses it.
         """
         if not (min(width, height) >= _SMALLEST_M and all(map(math.isfinite, (x, y, width, height, angle_deg)))):
             raise FunctionRefused(
                 f"a frame of {width:g} m x {height:g} m can't be scanned: its sides must be at least {_SMALLEST_M:g} m"
             )
-        range_m = self._core.range_m[:2]
-        width, height = min(width, range_m[0]), min(height, range_m[1])
-        x, y = (
-            float(np.float32(np.clip(value, (size - whole) / 2, (whole - size) / 2)))
-            for value, size, whole in zip((x, y), (width, height), range_m, strict=True)
-        )
         self.frame = (x, y, width, height, angle_deg)
         self._adapt_speed(*self.speed)
         return ()
