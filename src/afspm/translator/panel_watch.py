@@ -62,6 +62,7 @@ class PanelWatch:
         self._kept = kept
         self._table = table
         self._written = written
+        self._settings = _SETTINGS | set(table.watched)
         self._last: ScopeState | None = None
         self._still: ScopeState | None = None
         self._tip_is_moved = False
@@ -125,10 +126,12 @@ class PanelWatch:
             act = self._tip_act(before, now, now_ns, is_calm=is_calm)
             acts += [] if act is None else [act]
         # a running scan moves the tip, and a spectrum may
-        watched = _SETTINGS if state is ScopeState.SCANNING or is_after_spectrum else _SETTINGS | set(POSITION)
+        watched = self._settings
+        if state is not ScopeState.SCANNING and not is_after_spectrum:
+            watched = watched | set(POSITION)
         if last in _CALM and state in _CALM and (changes := self._changes(before, now, watched)):
             acts.append(ActByHand(now_ns, PanelAct.VALUES, changes=tuple(changes.values())))
-            self._by_hand |= {name: now[name] for name in changes if name in _SETTINGS}
+            self._by_hand |= {name: now[name] for name in changes if name in self._settings}
         self._see_tip(now)
         return acts
 
