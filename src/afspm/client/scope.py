@@ -47,7 +47,7 @@ from afspm.model import (
     names,
 )
 from afspm.model.events import HasTime
-from afspm.model.instruments import InstrumentOrders
+from afspm.model.instruments import InstrumentOrders, newest_of
 from afspm.model.sessions import KEYED
 from afspm.model.sweep_plan import SweepOrder, SweepPlan, SweptValues
 from afspm.transport.process.parent import StopRequested
@@ -273,7 +273,22 @@ class Scope(ExperimentView):
 
     @checked_call
     def get(self, parameter: str, unit: str | None = None, *, timeout_s: float | None = ANSWER_S) -> Value:
-        """Return a parameter's value in `unit`; without `unit`, in SI for base parameters, else as received."""
+        """Return a parameter's value in `unit`; without `unit`, in SI for base parameters, else as received.
+
+        The value of another instrument, such as "lockin.x", is at most about a second old (its age at most in s:
+        "lockin.x.age"), and never from before the last request that has changed something.
+        """
+        return self._get(parameter, unit, timeout_s)
+
+    @checked_call
+    def read(self, parameter: str, unit: str | None = None, *, timeout_s: float | None = ANSWER_S) -> Value:
+        """Let an instrument measure a parameter now, and return the value, in the unit as for `get`.
+
+        A parameter of the microscope is read from its controller, as by `get`.
+        """
+        return self._get(newest_of(parameter), unit, timeout_s)
+
+    def _get(self, parameter: str, unit: str | None, timeout_s: float | None) -> Value:
         with self._call():
             asked = Parameter(parameter)
             response = self._commands.read(ControlRequest.PARAM, asked, self._link.until(timeout_s))

@@ -469,7 +469,8 @@ class Observer:
     def _read(self) -> dict[str, Value]:
         # a difference below the controller's resolution is no change
         table, old = self._driver.table, self.values
-        values = self._driver.in_force([*setting_groups.watched(table), *(name for name in EXTRA if name in table)])
+        extra = [name for name in EXTRA if name in table]
+        values = self._driver.in_force([*setting_groups.watched(table), *extra, *table.watched])
         return {
             name: old[name] if name in old and table[name].same(old[name], value) else value
             for name, value in values.items()

@@ -1099,6 +1099,14 @@ def test_second_thread_is_refused_while_one_waits_in_a_call(lab: Lab, scope: Sco
     assert scope.get("tip-bias-voltage") == 0.5
 
 
+def test_read_lets_an_instrument_measure_and_asks_the_microscope_as_get_does(lab: Lab, scope: Scope) -> None:
+    lab.values["source.bias"] = "0.25"
+    asked = []
+    lab.intercept = lambda request: asked.append(request.subject.name) or "go on"
+    assert (scope.read("source.bias"), scope.read("tip-bias-voltage")) == (0.25, 0.5)
+    assert asked == ["source.bias.now", "tip-bias-voltage"]
+
+
 def test_wait_accepts_a_target_that_the_instrument_has_rounded(lab: Lab, scope: Scope) -> None:
     lab.values |= {"source.bias": "0", "source.bias.target": "0.1667", "source.bias.busy": "false"}
     assert scope.set("source.bias", 1 / 6, "V", wait=True) == pytest.approx(1 / 6)

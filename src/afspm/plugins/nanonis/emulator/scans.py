@@ -284,7 +284,8 @@ class ScanModule:
     def set_frame(self, x: float, y: float, width: float, height: float, angle_deg: float) -> Answer:
         """Set the frame, also beyond the scanner's range unless `clips_frames`: the output of a scan is clipped.
 
-        (!) The real controller's answer to a frame smaller than an atom is unknown; the emulator refuses it.
+        A real one clips the voltages while it scans; the emulator scans the frame as it was set. (!) The real
+        controller's answer to a frame smaller than an atom is unknown; the emulator refuses it.
         """
         if not (min(width, height) >= _SMALLEST_M and all(map(math.isfinite, (x, y, width, height, angle_deg)))):
             raise FunctionRefused(
