@@ -16,4 +16,4 @@ def test_acts_at_the_panel_have_the_consequences_on_the_page(
 ) -> None:
     for name in ("HOME", "USERPROFILE", "TMPDIR"):  # of the secret of Gxsm's bridge, and of its lock
         monkeypatch.setenv(name, str(tmp_path))
-    assert table(maker) in PAGE.read_text(encoding="utf-8"), "python -m tests.plugins.panel_table writes it again"
+    assert table(maker) in PAGE.read_text(encoding="utf-8"), "tests.plugins.panel_table writes it again"

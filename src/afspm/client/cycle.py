@@ -6,7 +6,7 @@ from collections.abc import Callable
 from enum import Enum, auto
 from typing import Any
 
-from afspm.model import ScopeState
+from afspm.model import MeasurementConditions, ScopeState
 
 
 class CycleOutcome(Enum):
@@ -38,6 +38,7 @@ class Cycle:
         begun: whether the state `busy`, or a fitting result, was published.
         results: the results that fit.
         other: the first result since `busy` that does not fit.
+        conditions: those published last before the first result that fits; None: none were.
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class Cycle:
         self.outcome: CycleOutcome | None = None
         self.results: list[Any] = []
         self.other: Any = None
+        self.conditions: MeasurementConditions | None = None
 
     def control_was_lost(self) -> None:
         """Note the loss of control: other components may measure from now on."""
@@ -62,7 +64,7 @@ class Cycle:
             return
         if state is self._busy:
             self.results.clear()  # results before the start belong to another measurement
-            self.other = None
+            self.other = self.conditions = None
             self.begun = True
         elif not self.begun:
             return
@@ -71,6 +73,11 @@ class Cycle:
         elif state is ScopeState.FREE:
             without = CycleOutcome.VANISHED if self.other is None else CycleOutcome.ANOTHER
             self.outcome = CycleOutcome.COMPLETED if self.results else without
+
+    def on_conditions(self, conditions: MeasurementConditions, time_ns: int | None) -> None:
+        """Process the published conditions of the result that follows."""
+        if self.outcome is None and not self.results and not self._is_old(time_ns):
+            self.conditions = conditions
 
     def on_result(self, result: object, time_ns: int | None, *, is_ours: bool = True) -> None:
         """Process a published channel of a scan, or a spectrum.

@@ -15,12 +15,13 @@ from typing import Any
 from afspm import wire
 from afspm.basics.errors import FileError, InvalidValue, WireError
 from afspm.basics.plain_data import Plain, from_json
-from afspm.model import LoggedPacket, Note, Packet, Parameter, Scan, ScanSet, Spectrum
+from afspm.model import LoggedPacket, MeasurementConditions, Note, Packet, Parameter, Scan, ScanSet, Spectrum
 from afspm.model.snapshot import to_plain
 from afspm.storage.atomic import OutageLog, write_atomic
 from afspm.storage.disk import is_full
 from afspm.storage.memory import Memory
 from afspm.storage.segment import head_of, read_packet
+from afspm.wire.messages import CONDITIONS
 
 _log = logging.getLogger("afspm.memory")
 _HEAD = "result"
@@ -29,10 +30,11 @@ LONGEST_KEY = 100
 
 @dataclass(frozen=True)
 class MeasurementResult:
-    """The scans or spectra of a measurement, and its interruptions as text."""
+    """The scans or spectra of a measurement, its interruptions as text, and the conditions published with it."""
 
     things: list[Any]
     interruptions: list[str]
+    conditions: MeasurementConditions | None = None
 
     @property
     def scans(self) -> ScanSet:
@@ -144,7 +146,9 @@ class KeyedResults:
                 f"the key {key!r} was used for another measurement in this run: {head['plan']}",
                 hint="give each measurement its own key",
             )
-        return MeasurementResult([_with_roles(one, head) for one in things], head["interruptions"])
+        kept = head.get("conditions")  # none in results of an earlier version
+        conditions = None if kept is None else wire.decode(CONDITIONS.name, bytes.fromhex(kept))
+        return MeasurementResult([_with_roles(one, head) for one in things], head["interruptions"], conditions)
 
     def fulfil(self, key: str, plan: Plain, result: MeasurementResult) -> None:
         """Save the result of the intended measurement. If the disk is full, a restarted component measures again."""
@@ -159,6 +163,8 @@ class KeyedResults:
                 "things": len(things),
                 "roles": roles,
             }
+            if result.conditions is not None:
+                head["conditions"] = wire.encode(result.conditions)[1].hex()
             parts: list[bytes | memoryview] = []
             for name, payload in [(_HEAD, json.dumps(head).encode()), *things]:
                 parts += [head_of(LoggedPacket(Packet(name, payload), None, 0)), payload]

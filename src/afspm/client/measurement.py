@@ -108,6 +108,7 @@ class _Watch:
                 self.cycle.on_state(self._link.view.state, packet.time_ns)
             elif name == CONDITIONS.name:  # just before its result
                 self._conditions = wire.decode(name, packet.payload)
+                self.cycle.on_conditions(self._conditions, packet.time_ns)
             elif name == self._message:
                 found = self._link.view.with_roles(wire.decode(name, packet.payload))
                 self.cycle.on_result(found, packet.time_ns, is_ours=self._is_ours(found))
@@ -183,14 +184,14 @@ class MeasurementRunner:
         task = _MeasurementTask(target, key, stem, until_s, repeat)
         try:
             self._take_up(task)
-            things = self._finish(task)
+            things, conditions = self._finish(task)
         except BaseException:  # also Ctrl-C and StopRequested: the measurement goes on at the microscope
             if task.key is not None and task.watch is not None and not task.watch.is_over():
                 self._unfinished, task.watch = task.watch, None  # the next call with this key takes it up
             raise
         finally:
             task.drop_watch()
-        result = MeasurementResult(things, task.interruptions)
+        result = MeasurementResult(things, task.interruptions, conditions)
         self._channels[target.what] = frozenset(map(target.name_of, things))
         if key is not None:
             with self._link.clock.late():
@@ -225,17 +226,17 @@ class MeasurementRunner:
         if watch is not None:
             self._link.log.info("%s %s: resumed", task.target.what, task.key)
 
-    def _finish(self, task: _MeasurementTask) -> list[Any]:
+    def _finish(self, task: _MeasurementTask) -> tuple[list[Any], MeasurementConditions | None]:
         # the newest result of each name: a restarted translator may have published one twice
         if task.watch is not None:
             task.watch.wait_if_begun(task.until_s)
         if task.watch is not None and task.watch.cycle.outcome is CycleOutcome.COMPLETED:
             self._control.release_inherited()
-            results = task.watch.cycle.results
+            cycle = task.watch.cycle
         else:
             with self._control.hold(until_s=task.until_s):
-                results = self._measure(task).results
-        return list({task.target.name_of(thing): thing for thing in results}.values())
+                cycle = self._measure(task)
+        return list({task.target.name_of(thing): thing for thing in cycle.results}.values()), cycle.conditions
 
     def _measure(self, task: _MeasurementTask) -> Cycle:
         watch = task.watch

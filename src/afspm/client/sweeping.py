@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from afspm import wire
 from afspm.basics.errors import Refused, UnitError
@@ -15,8 +16,15 @@ from afspm.client.instrument_targets import InstrumentTargets
 from afspm.client.keyed_results import KeyedResults, MeasurementResult
 from afspm.client.measurement import MeasurementRunner
 from afspm.client.targets import Target
-from afspm.model import ControlRequest, Parameter, ScanSet, Spectrum, is_of_instrument
-from afspm.model.sweep_plan import SweepPlan, SweptValue
+from afspm.model import ControlRequest, MeasurementConditions, Parameter, ScanSet, Spectrum, is_of_instrument
+from afspm.model.sweep_plan import SweepAxis, SweepPlan, SweptValue
+
+
+class ValueInForce(NamedTuple):
+    """A swept value as read at the begin and at the end of a measurement; None where it was not read."""
+
+    begin: SweptValue | None
+    end: SweptValue | None
 
 
 @dataclass(frozen=True)
@@ -27,13 +35,18 @@ class SweepPoint:
         number: number of the point, from 1, in the order of measurement.
         of: the number of points.
         key: key of the measurement; empty if the sweep has no key.
-        values: value of each parameter; a number is in SI, or in the microscope's own unit (`SweepAxis.unit`).
+        values: value of each parameter by the plan; a number is in SI, or in the microscope's own unit
+            (`SweepAxis.unit`).
+        in_force: the same values as the microscope showed them at begin and end of the measurement, in the same units.
+            Without parameters of other instruments, those of the frame, measured values, and a value that was set
+            during the measurement; empty for results of an earlier version, or from another translator.
     """
 
     number: int
     of: int
     key: str
     values: Mapping[str, SweptValue]
+    in_force: Mapping[str, ValueInForce]
     _result: MeasurementResult
 
     @property
@@ -86,7 +99,8 @@ class ParameterSweep:
                 if self._before is None:
                     self._keep(self._read(until_s))
                 result = self._runner.take(target, key, until_s)
-            yield SweepPoint(index + 1, self._plan.total, key or "", self._plan.values(places), result)
+            in_force = _shown(self._plan, result.conditions)
+            yield SweepPoint(index + 1, self._plan.total, key or "", self._plan.values(places), in_force, result)
 
     def set_back(self, until_s: float | None) -> None:
         """Set the parameters to their values before the sweep; a value that the microscope refuses is logged.
@@ -154,6 +168,22 @@ class ParameterSweep:
         self._before = before
         if self._key is not None:
             self._results.keep_before_sweep(self._key, before)
+
+
+def _shown(plan: SweepPlan, conditions: MeasurementConditions | None) -> dict[str, ValueInForce]:
+    if conditions is None:
+        return {}
+    begin, end = ({one.name: one for one in given} for given in (conditions.begin_values, conditions.end_values))
+    shown = [axis for axis in plan.axes if axis.name in begin or axis.name in end]
+    return {axis.name: ValueInForce(_value(begin, axis), _value(end, axis)) for axis in shown}
+
+
+def _value(given: Mapping[str, Parameter], axis: SweepAxis) -> SweptValue | None:
+    if (parameter := given.get(axis.name)) is None:
+        return None
+    if isinstance(axis.values[0], bool):
+        return parameter.value == "true"
+    return parameter.value if isinstance(axis.values[0], str) else _number(parameter, axis.unit)
 
 
 def _text(parameter: Parameter) -> str:

@@ -224,16 +224,28 @@ def _with_settings(query: Query, table: str, rows: list[R]) -> list[R]:
     if not published:
         return rows
     ends: dict[int, int] = dict(query(_PUBLISHED[table]))
-    newest: dict[str, MeasurementSettings] = {}
+    by_hand = _changed_by_hand(query)
+    newest: dict[str, tuple[int, MeasurementSettings]] = {}
     made: dict[int, tuple[SweptSetting, ...]] = {}
     for end_ns, row in sorted(((ends.get(row.number, row.time_ns), row) for row in rows), key=itemgetter(0)):
         while published and published[-1][0] <= end_ns:
             with suppress(WireError):  # of a newer version
-                settings = wire.decode("MeasurementSettings", published.pop()[1])
-                newest[settings.who] = settings
-        if (conditions := newest.get(component_of(row.holder or ""))) is not None and conditions.key in ("", row.key):
-            made[row.number] = tuple(map(_swept, conditions.parameters))
+                set_ns, payload = published.pop()
+                settings = wire.decode("MeasurementSettings", payload)
+                newest[settings.who] = set_ns, settings
+        set_ns, settings = newest.get(component_of(row.holder or ""), (0, None))
+        if settings is not None and settings.key in ("", row.key):
+            changed = {name for at_ns, name in by_hand if set_ns < at_ns <= end_ns}
+            made[row.number] = tuple(_swept(one) for one in settings.parameters if one.name not in changed)
     return [replace(row, settings=made.get(row.number, ())) for row in rows]
+
+
+def _changed_by_hand(query: Query) -> list[tuple[int, str]]:
+    acts = []
+    for time_ns, payload in query("SELECT time_ns, payload FROM packets WHERE message = 'ActByHand'"):
+        with suppress(WireError):
+            acts.append((time_ns, wire.decode("ActByHand", payload)))
+    return [(time_ns, change.parameter) for time_ns, act in acts for change in act.changes]
 
 
 def _with_instruments(

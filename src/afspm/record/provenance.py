@@ -93,7 +93,9 @@ def _conditions(
     )
     for (payload,) in rows:
         one = _decoded("MeasurementConditions", payload)
-        if isinstance(one, MeasurementConditions) and (one.time_ns == measured_ns or one.filename in filenames):
+        if not isinstance(one, MeasurementConditions):
+            continue
+        if one.time_ns == measured_ns or (one.filename and one.filename in filenames):
             return one
     return None
 

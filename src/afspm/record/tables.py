@@ -68,6 +68,7 @@ class ScanRow:
         registration: how the position of the scan on the sample is known; None without drift correction.
         position_sd_m: standard deviation of the position along its most uncertain axis; None if unknown.
         settings: parameters that a sweep had set for the scan, as the microscope reported them; a column for each.
+            Without each that a person changed at the microscope before its end.
         tip_score: the last verdict on the tip: 1 good, 0.5 unclear, 0 bad; None if the scan was not judged.
         instruments: values of other instruments at the end; two columns each: "cryo.temperature [K]" and its age,
             "cryo.temperature.age [s]".

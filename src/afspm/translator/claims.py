@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from afspm.model import ActByHand, MeasurementConditions, Parameter, Request, TipStatus, names
 from afspm.translator.driver_base import DriverBase
-from afspm.translator.judge import Claim, Stated, Verdict, Witness, judge
+from afspm.translator.judge import Claim, ResultVerdict, Stated, Witness, judge
 from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.translator.setting_groups import FRAME, POSITION
 from afspm.translator.state import Kept
@@ -83,7 +83,7 @@ class Claims:
         """Note that no measurement runs any more."""
         self._kept["running"] = None
 
-    def verdict(self, tip: TipStatus | None, stated: Sequence[Stated], withdrew: str = "") -> Verdict:
+    def verdict(self, tip: TipStatus | None, stated: Sequence[Stated], withdrew: str = "") -> ResultVerdict:
         """Return the verdict on the results of the measurement that has ended.
 
         Args:

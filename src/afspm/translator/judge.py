@@ -65,17 +65,21 @@ class Stated:
     Attributes:
         began_ns, ended_ns: start and end by each file, in the clock of the files.
         earlier: the starts of earlier results in the same clock, each with the end of its measurement in ours.
+        pictures: the largest number of pictures of one channel.
+        at_most_ns: the longest duration of the measurement by our clock; None: it can't be compared with the files.
         unproved: what these files could have shown and do not, in words.
     """
 
     began_ns: tuple[int, ...] = ()
     ended_ns: tuple[int, ...] = ()
     earlier: Mapping[int, int] = field(default_factory=dict)
+    pictures: int = 1
+    at_most_ns: int | None = None
     unproved: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ResultVerdict:
     """The verdict on a result.
 
     Attributes:
@@ -102,12 +106,12 @@ class Witness:
     differs: Mapping[str, str] = field(default_factory=dict)
 
 
-def judge(claim: Claim, witness: Witness, stated: Stated) -> Verdict:
+def judge(claim: Claim, witness: Witness, stated: Stated) -> ResultVerdict:
     """Return the verdict on a result: the first rule that contradicts it."""
     for name, rule in RULES.items():
         if sentence := rule(claim, witness, stated):
-            return Verdict(name, sentence, stated.unproved)
-    return Verdict(unproved=stated.unproved)
+            return ResultVerdict(name, sentence, stated.unproved)
+    return ResultVerdict(unproved=stated.unproved)
 
 
 def _one_start(claim: Claim, witness: Witness, stated: Stated) -> str:
@@ -129,6 +133,21 @@ def _end_after_start(claim: Claim, witness: Witness, stated: Stated) -> str:
     return "its file was saved before the measurement had ended" if is_half else ""
 
 
+def _one_picture(claim: Claim, witness: Witness, stated: Stated) -> str:
+    if stated.pictures <= 1:
+        return ""
+    return f"its file has {stated.pictures} pictures of a channel: only one is of this measurement"
+
+
+def _own_start(claim: Claim, witness: Witness, stated: Stated) -> str:
+    if stated.at_most_ns is None or not (stated.began_ns and stated.ended_ns):
+        return ""
+    off_ns = max(stated.ended_ns) - min(stated.began_ns) - stated.at_most_ns
+    if off_ns <= RESOLUTION_NS:
+        return ""
+    return f"its file states a start {off_ns / NS_PER_S:.0f} s before it could have begun: it is of another measurement"
+
+
 def _tip_at_sample(claim: Claim, witness: Witness, stated: Stated) -> str:
     was, is_now = claim.tip, witness.tip
     withdrawn = was is not None and is_now is not None and was.engaged is True and is_now.engaged is False
@@ -140,9 +159,11 @@ def _values_in_force(claim: Claim, witness: Witness, stated: Stated) -> str:
 
 
 RULES: Mapping[str, Callable[[Claim, Witness, Stated], str]] = {
+    "one picture": _one_picture,
     "one start": _one_start,
     "new start": _new_start,
     "end after start": _end_after_start,
+    "own start": _own_start,
     "tip at the sample": _tip_at_sample,
     "values in force": _values_in_force,
 }

@@ -140,7 +140,8 @@ class ResultFiles(ABC):
         entry = next((one for one in self._kept["results"] if one["result"] == result), nothing)
         began_ns, ended_ns = entry.get("stated", ((), ()))
         earlier = {start_ns: end_ns for start_ns, end_ns, of in self._kept["started"] if of != result}
-        return Stated(tuple(began_ns), tuple(ended_ns), earlier)
+        unproved, most_ns = tuple(entry.get("unproved", ())), entry.get("at_most_ns")
+        return Stated(tuple(began_ns), tuple(ended_ns), earlier, entry.get("pictures", 1), most_ns, unproved)
 
     def _add(
         self,
@@ -150,6 +151,7 @@ class ResultFiles(ABC):
         content: Content,
         files: Iterable[FileContent] = (),
     ) -> None:
+        # `facts` may have "pictures", "at_most_ns" and "unproved", see `Stated`
         files = tuple(files)
         began_ns = [one.start_ns for one in files if one.start_ns is not None]
         stated = [began_ns, [one.end_ns for one in files if one.end_ns is not None]]

@@ -423,8 +423,9 @@ def messages_of_the_experiment() -> tuple[str, ...]:
 
 
 def followed_messages() -> tuple[str, ...]:
-    """Return the names of messages that every client follows: states and measurements."""
-    return tuple(name for name, one in _declared.items() if one.kind in (MessageKind.STATE, MessageKind.MEASUREMENT))
+    """Return the names of messages that every client follows: states, measurements and their conditions."""
+    kinds = (MessageKind.STATE, MessageKind.MEASUREMENT)
+    return tuple(name for name, one in _declared.items() if one.kind in kinds or one is CONDITIONS)
 
 
 def messages_without_values() -> tuple[str, ...]:

@@ -72,16 +72,57 @@ def test_scan_stopped_at_the_panel_is_by_hand_and_nothing_is_done_afterwards(
     made.until_logged("by hand: the measurement was stopped at the microscope (GXSM ended the scan before its last row")
 
 
-def test_end_of_a_simulated_scan_after_its_first_line_is_not_by_hand(bench: Make) -> None:
+# results X3
+@pytest.mark.parametrize("lines", [1, 2])
+def test_end_of_a_simulated_scan_after_its_first_lines_is_not_by_hand(bench: Make, lines: int) -> None:
     made = bench(**SIMULATOR)
     peer = small(made)
     for _ in range(2):
         held(made, peer)
-        stop(made, 1)  # as GXSM's own simulator does by itself
+        stop(made, lines)  # as GXSM's own simulator does by itself, with some channels of the second line
         received = peer.until(FREE)
         assert states(received) == ["SCANNING", "INTERRUPTED", "FREE"]
         assert acts(received) == []
         scanned(peer)
+
+
+# results M2
+@pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
+@pytest.mark.parametrize("lines", [4, 8], ids=["stopped", "complete"])
+def test_scan_replaced_by_one_of_a_person_is_by_hand(bench: Make, kind: dict[str, Any], lines: int) -> None:
+    made = bench(**kind)
+    peer = small(made)
+    scanned(peer)
+    calls = held(made, peer)
+
+    def replace(emulator: Any) -> None:
+        program = emulator.program
+        scan_until_line(program, lines)
+        program.stop_scan()
+        hold_scan(program, 1)
+        program.start_scan()
+
+    made.at_panel(replace)
+    received = peer.until(lambda one: isinstance(one, ActByHand))
+    assert acts(received) == [PanelAct.STOP]
+    made.at_panel(lambda emulator: scan_until_line(emulator.program, 1))
+    received += peer.until(FREE) + peer.until(FREE)
+    assert calls.acting == []
+    made.until_logged("another scan was begun at GXSM's panel before this one was saved")
+
+
+# results X5
+@pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
+def test_scan_that_becomes_several_layers_is_by_hand_and_multi_layer_named(bench: Make, kind: dict[str, Any]) -> None:
+    made = bench(**kind)
+    peer = small(made)
+    scanned(peer)
+    made.at_panel(lambda emulator: setattr(emulator.program.panel, "layers", 3))
+    assert peer.act(names.START_SCAN).ok
+    received = peer.until(lambda one: isinstance(one, ActByHand))
+    assert acts(received) == [PanelAct.STOP]
+    assert not scans(received)
+    made.until_logged("by hand: the measurement was stopped at the microscope (Multi Layer is on at GXSM's panel")
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)

@@ -14,7 +14,15 @@ from afspm import wire
 from afspm.basics.errors import InvalidValue, Refused
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
-from afspm.model import ControlRequest, ControlResponse, Parameter, Problem, Request, Response
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    MeasurementConditions,
+    Parameter,
+    Problem,
+    Request,
+    Response,
+)
 from afspm.model.events import MeasurementSettings
 from afspm.model.sweep_plan import SweptValues
 from afspm.scheduler.control.arbitration import ArbitrationEvent
@@ -72,6 +80,35 @@ def test_spectra_are_swept_too() -> None:
         assert [point.spectrum.kind for point in points] == ["IV"] * 4
     assert lab.measured == SNAKE
     assert lab.in_force == BEFORE
+
+
+class ShowsConditions(SweepLab):
+    """Publishes the swept values at begin and end before each result, in mV, as a translator does."""
+
+    def finish_scan(self) -> None:
+        volts, gain = self.in_force
+        begin = (Parameter("tip-bias-voltage", str(1e3 * float(volts)), "mV"), Parameter("zctrl-igain", gain))
+        self.publish(MeasurementConditions(self.clock.now_ns(), "", begin_values=begin, end_values=begin[:1]))
+        super().finish_scan()
+
+
+# results C3
+def test_point_has_the_values_in_force_beside_those_of_the_plan_also_after_a_restart(tmp_path: Path) -> None:
+    lab = ShowsConditions()
+    points = sweep(scope_of(lab, tmp_path), swept=TWO_POINTS)
+    lab.restart_component()
+    again = sweep(scope_of(lab, tmp_path, 1), swept=TWO_POINTS)
+    assert len(lab.measured) == 2
+    for found in (points, again):
+        assert [one.in_force["tip-bias-voltage"] for one in found] == [pytest.approx((v, v)) for v in (0.1, 0.2)]
+        assert [one.in_force["zctrl-igain"] for one in found] == [(1.0, None)] * 2
+
+
+def test_point_of_an_earlier_version_or_another_translator_shows_no_values_in_force(tmp_path: Path) -> None:
+    lab = SweepLab()
+    sweep(scope_of(lab, tmp_path))
+    lab.restart_component()
+    assert [one.in_force for one in sweep(scope_of(lab, tmp_path, 1))] == [{}] * 4
 
 
 @pytest.mark.parametrize("is_noticed", [True, False])

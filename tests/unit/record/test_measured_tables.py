@@ -12,7 +12,18 @@ from record_lab import REGION, Given, Night
 
 import afspm
 from afspm.basics.errors import ConfigError, InvalidValue
-from afspm.model import ControlResponse, JournalEntries, JournalEntry, Parameter, Scan, ScopeState, names
+from afspm.model import (
+    ActByHand,
+    ChangedValue,
+    ControlResponse,
+    JournalEntries,
+    JournalEntry,
+    PanelAct,
+    Parameter,
+    Scan,
+    ScopeState,
+    names,
+)
 from afspm.model.events import MeasurementSettings
 from afspm.record.export import export
 from afspm.record.store import RecordStore
@@ -146,6 +157,20 @@ def test_swept_parameters_are_columns_of_the_scans(night: Night, store: RecordSt
     assert "settings" not in frame.columns
     assert afspm.open_run(tmp_path).about(scans[1])["settings"] == {"zctrl-igain": 5.0, "scan-speed [m/s]": 2e-6}
     assert "zctrl-igain" in scans._repr_html_()
+
+
+# results C3: a swept value that a person had changed stood in the table as in force
+def test_value_that_a_person_changed_meanwhile_is_in_no_column(
+    night: Night, store: RecordStore, tmp_path: Path
+) -> None:
+    store.take([night.control(), settings(night, "5", "sweep-1"), start(night, "sweep-1")])
+    act = ActByHand(night.now_ns, PanelAct.VALUES, changes=(ChangedValue("zctrl-igain", "5", "9"),))
+    begun = [night.state(ScopeState.SCANNING), night.lines()]
+    store.take([*begun, night.packet(act), night.state(ScopeState.INTERRUPTED)])
+    store.take([settings(night, "5", "sweep-1"), start(night, "sweep-1"), *night.whole_scan(2)])
+    rows = afspm.open_run(tmp_path).scans
+    assert [row.interrupted for row in rows] == [True, False]
+    assert [[one.name for one in row.settings] for row in rows] == [["scan-speed"], ["zctrl-igain", "scan-speed"]]
 
 
 def test_swept_parameters_are_columns_of_the_spectra(night: Night, store: RecordStore, tmp_path: Path) -> None:

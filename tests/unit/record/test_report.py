@@ -155,6 +155,33 @@ def told(run: Path) -> story.RunStory:
         return story.read(opened)
 
 
+def test_result_shows_its_claim_and_the_facts_left_unproved(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text("{}", encoding="utf-8")
+    store = RecordStore(tmp_path, RecordSettings({"experiment": "night"}))
+    begin, end = ((model.Parameter("tip-bias-voltage", text, "V"),) for text in ("0.2", "0.3"))
+    shown = model.MeasurementConditions(
+        START, "", None, None, (), START, "series", begin, end, ("its file states <no> start",)
+    )
+    image = model.Scan(REGION, "Height", "m", np.eye(8), START)
+    for number, thing in enumerate([shown, image, replace(image, time_ns=START + 5 * S)]):  # the last of an older run
+        name, payload = wire.encode(thing)
+        store.take([(model.Packet(name, payload, START + number), "")])
+        if number == 1:
+            ended = wire.encode(model.ScopeStatus(ScopeState.FREE))
+            store.take([(model.Packet(*ended, START + number), "")])
+    store.finish()
+    store.close()
+    run = open_run(tmp_path)
+    first, second = (run.about(row).get("tip", {}) for row in run.scans)
+    assert first["settings"] == {"begin": {"tip-bias-voltage": "0.2 V"}, "end": {"tip-bias-voltage": "0.3 V"}}
+    assert (first["asked_by"], first["unproved"]) == ("series", ["its file states <no> start"])
+    assert second == {}
+    text = write(tmp_path).read_text(encoding="utf-8")
+    for words in ("Results not wholly proved", "states &lt;no&gt; start", "tip-bias-voltage 0.2 V (at the end 0.3 V)"):
+        assert words in text
+    assert text.count("<dt>asked for by</dt><dd>series</dd>") == 1
+
+
 def test_component_that_had_not_finished_is_named_beside_the_figures(run: Path) -> None:
     facts = json.loads((run / "run.json").read_text(encoding="utf-8"))
     facts[UNFINISHED] = {"drawing": "stopped 1 min 00 s after the end of the experiment, before it had finished"}

@@ -197,7 +197,9 @@ S = 1_000_000_000
         ("one start", Stated((10 * S, 40 * S))),
         ("new start", Stated((10 * S,), earlier={10 * S: 20 * S})),
         ("end after start", Stated((10 * S,), (5 * S,))),
-        ("", Stated((10 * S, 10 * S), (30 * S,), {5 * S: 20 * S})),
+        ("one picture", Stated((10 * S,), (30 * S,), pictures=2)),
+        ("own start", Stated((10 * S,), (30 * S,), at_most_ns=6 * S)),
+        ("", Stated((10 * S, 10 * S), (30 * S,), {5 * S: 20 * S}, at_most_ns=19 * S)),
         ("", Stated((10 * S, 10 * S), (10 * S,), {10 * S: 99 * S})),  # short scans of one second
     ],
 )

@@ -24,7 +24,7 @@ from afspm.driver import (
 from afspm.model import Region
 from afspm.plugins.gxsm.scan_memory import Rows, has_old_columns, in_files, is_unfinished
 
-_NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+\.nc)$")
+_NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+(?<!\.nc)\.nc)$")  # not ".nc.nc", which a person has typed
 _PRECISION: Final = FilePrecision(part=1e-5, angle_rad=1e-6)
 _CLOCK_NS: Final = 2 * NS_PER_S
 """Resolution of the start times in files, which have whole seconds, with a margin."""
@@ -33,6 +33,8 @@ LATE_S: Final = 20.0
 SOON_S: Final = 1.0
 """Longest wait for the file of a channel that the previous scan did not save either; measured: up to 0.3 s."""
 
+_JUMP: Final = "its start: GXSM's clock was set since the scan before"
+_REPLACED: Final = "another scan was begun at GXSM's panel before this one was saved: is Repeat on?"
 _STOPPED: Final = "GXSM ended the scan before its last row, and no request had stopped it"
 OLD_COLUMNS: Final = (
     "its first or last columns still hold the previous scan: is SubScan on at GXSM's panel? Then switch it off"
@@ -46,7 +48,7 @@ class GxsmFiles(ResultFiles):
         patience_s: longest wait for all files, experiment time.
         soon_s: longest wait for files of channels that the previous scan did not save, experiment time.
         late_s: longest difference between the start delays of two scans (`LATE_S`), experiment time.
-        ends_early: True if GXSM's hardware may end a scan after its first line by itself.
+        ends_early: True if GXSM's hardware may end a scan by itself, after its first line or in the second.
     """
 
     def __init__(
@@ -66,7 +68,8 @@ class GxsmFiles(ResultFiles):
         self._ends_early = ends_early
         self._by_hand = ""
         self._sizes: dict[Path, tuple[int, int]] = {}
-        self._before: set[int] = set()
+        self._before: dict[Path, FileContent] = {}
+        self._half: set[Path] = set()
         self._whole: dict[Path, FileContent] = {}
         self._outcome: bool | None = None  # of a measurement directly followed by the next
         self.upwards = False
@@ -155,13 +158,13 @@ class GxsmFiles(ResultFiles):
             own: True if the translator started the measurement.
             by_gxsm: True if GXSM saves by itself: files may appear before the end, and be written again.
         """
+        self._by_hand = ""
         self._hurry(begun_ns / NS_PER_S)
         followed = self._kept["ended"]
         newest = self.newest_ns(folder, _files(folder, what), what)
         place = None if folder is None else str(folder)
         facts = {"folder": place, "newest_ns": newest, "begun_ns": begun_ns, "before": None, "spoiled": ""}
         self._begins(what, {**facts, "own": own, "by_gxsm": by_gxsm, "ran": False, **taken})
-        self._by_hand = ""
         if followed is not None:
             # GXSM saves a scan before it starts the next: all new files belong to the ended scan
             there = _files(_folder(followed), followed["what"])
@@ -181,7 +184,7 @@ class GxsmFiles(ResultFiles):
         folder: Path | None = None,
         *,
         is_whole: bool | None = True,
-        has_second_row: bool = False,
+        has_third_row: bool = False,
         before: Rows | None = None,
         near_end: bool = False,
     ) -> None:
@@ -192,7 +195,7 @@ class GxsmFiles(ResultFiles):
             folder: folder of the files, which may have changed since the start.
             is_whole: True if a scan reached its last row; False: the scan has no result; None: unknown until its files
                 are compared with `before`.
-            has_second_row: True if an interrupted scan has scanned a second row.
+            has_third_row: True if an interrupted scan has scanned a third row.
             before: rows of the previous scan, for `is_whole` None; without rows the scan has no result.
             near_end: True if a scan that is followed by the next at once was last seen in its last rows.
         """
@@ -208,10 +211,10 @@ class GxsmFiles(ResultFiles):
         if folder is not None and str(folder) != ended["folder"]:  # old scans there are recognised by their start
             ended["folder"] = str(folder)
             ended["begun_ns"] = ended["begun_ns"] or end_ns
-        self._sizes, self._whole, self._before = {}, {}, set()
+        self._sizes, self._whole, self._before, self._half = {}, {}, {}, set()
         if is_whole is False:
             why = "it was stopped or never began: GXSM's first or last row still holds the previous scan"
-            self._give_up(why, has_second_row=has_second_row)
+            self._give_up(why, has_third_row=has_third_row)
 
     def _hurry(self, now_s: float) -> None:
         # The next measurement overwrites GXSM's memory and may overwrite files: read them now, or never.
@@ -263,14 +266,14 @@ class GxsmFiles(ResultFiles):
             is_followed = "names" in ended
             over = now_s >= ended["until_s"] or (is_followed and not ended["names"])
             gaps = [file for file, content in files.items() if lines_missing(content)]
-            has_second_row = any(
-                lines_missing(content) < len(scan.values) - 1 for content in files.values() for scan in content.scans
+            has_third_row = any(
+                lines_missing(content) < len(scan.values) - 2 for content in files.values() for scan in content.scans
             )
             if not any(scan.values.any() for content in files.values() for scan in content.scans):
                 gaps = [file for file in files if ended["what"] == SCAN]  # stopped in its first line
-                has_second_row = False
+                has_third_row = False
             if gaps and (over or is_followed or not ended["by_gxsm"]):
-                self._give_up(f"it was stopped: {gaps[0]} lacks lines", has_second_row=has_second_row)
+                self._give_up(f"it was stopped: {gaps[0]} lacks lines", has_third_row=has_third_row)
             elif files and not gaps and (over or self._all(ended, files, now_s)):
                 why = self._why_unfinished(ended, files) if ended["is_whole"] is None else ""
                 if why:
@@ -316,9 +319,14 @@ class GxsmFiles(ResultFiles):
                 except (AfspmError, OSError):
                     continue  # incomplete: GXSM is still writing it
             content = self._whole.get(file)
-            if content is None or _is_half(content):
+            self._half.discard(file)
+            if content is None:
                 continue
-            if not self._is_of_before(content, ended["begun_ns"]):
+            if _is_half(content):
+                self._half.add(file)
+            elif self._is_of_before(content, ended["begun_ns"]):
+                self._before[file] = content
+            else:
                 found[file] = content
         if ended["what"] == SCAN:  # one file for each channel: a person may save the scan again, under any name
             named = [file for file in found if file.name in ended.get("named", ())]
@@ -334,14 +342,29 @@ class GxsmFiles(ResultFiles):
         if start_ns is None:
             return False
         if start_ns in known:
-            is_of_before = True
-        elif known and start_ns < max(known):
-            is_of_before = False  # the clock was set back
-        else:
-            is_of_before = start_ns < begun_ns - self._kept["behind_ns"] - (self._late_ns if known else _CLOCK_NS)
-        if is_of_before:
-            self._before.add(start_ns)
-        return is_of_before
+            return True
+        if known and start_ns < max(known):
+            return False  # the clock was set back, or the picture of another scan was opened: see `_facts`
+        return start_ns + int(self._kept["behind_ns"]) < begun_ns - (self._late_ns if known else _CLOCK_NS)
+
+    def _before_named(self, ended: Entry) -> dict[Path, FileContent]:
+        # files of this scan, by their names, with the start of an earlier one: its picture was opened in the channel
+        return {file: content for file, content in self._before.items() if file.name in ended.get("named", ())}
+
+    def _facts(self, ended: Entry, files: Mapping[Path, FileContent]) -> dict[str, object]:
+        # A picture that a person opens in the window of a channel during a scan takes its place, with its start and the
+        # end of the scan. After a jump of GXSM's clock start and end are as far apart as they should be.
+        starts = [one.start_ns for one in files.values() if one.start_ns]
+        ends = [one.end_ns for one in files.values() if one.end_ns]
+        facts: dict[str, object] = {"pictures": max(len(one.scans) for one in files.values())}
+        begun_ns = ended["begun_ns"]
+        if not (self._kept["starts"] and starts and ends and begun_ns):
+            return facts
+        if abs(min(starts) + self._kept["behind_ns"] - begun_ns) > self._late_ns:
+            at_most_ns = ended["end_ns"] - begun_ns
+            is_jump = max(ends) - min(starts) <= at_most_ns + _CLOCK_NS
+            facts |= {"at_most_ns": at_most_ns, "unproved": [_JUMP] if is_jump else []}
+        return facts
 
     def _saw(self, ended: Entry, starts: set[int]) -> None:
         self._kept["starts"] = sorted(starts)
@@ -351,7 +374,7 @@ class GxsmFiles(ResultFiles):
         # A channel that the previous scan did not save either is awaited for a short time only.
         if "names" in ended:
             return all(Path(name) in self._whole for name in ended["names"])
-        missing = set(ended["channels"]) - endings(files).keys() - {""}
+        missing = set(ended["channels"]) - endings(files).keys() - endings(self._before_named(ended)).keys() - {""}
         return not missing or (missing <= set(self._kept["absent"]) and now_s >= ended["soon_s"])
 
     def _missing(self, ended: Entry) -> str:
@@ -368,6 +391,8 @@ class GxsmFiles(ResultFiles):
             return f"its folder {folder} does not exist on this computer: set scan_dir and probe_dir"
         if self._before:
             return f"GXSM saved an earlier scan in {folder}: check that this one began"
+        if self._half:
+            return f"{min(self._half)} was saved before the scan had ended, and GXSM has not saved it again"
         if ended["what"] == SCAN:
             return (
                 f"no new file in {folder} belongs to it: close GXSM's dialog if one is open, and check that a channel "
@@ -375,30 +400,34 @@ class GxsmFiles(ResultFiles):
             )
         return f"no new .vpdata in {folder}: switch on Auto Save of probes in GXSM, and set probe_dir to its folder"
 
-    def _give_up(self, why: str, *, has_second_row: bool | None = None) -> None:
-        # `has_second_row`: None if the scan does not lack rows
+    def _give_up(self, why: str, *, has_third_row: bool | None = None) -> None:
+        # `has_third_row`: None if the scan does not lack rows
         ended, self._kept["ended"] = self._kept["ended"], None
-        is_by_hand = has_second_row or (has_second_row is False and not self._ends_early)
-        if is_by_hand and ended["what"] == SCAN and ended["own"] and ended["ran"]:
-            self._by_hand = _STOPPED
+        is_stopped = has_third_row or (has_third_row is False and not self._ends_early)
+        if (is_stopped or "names" in ended) and ended["what"] == SCAN and ended["own"] and ended["ran"]:
+            self._by_hand = ended["spoiled"] or (_REPLACED if "names" in ended else _STOPPED)
         self._log.error("the %s has no result: %s", ended["what"], why)
         if self._before:
-            self._saw(ended, self._before)
+            self._saw(ended, {content.start_ns for content in self._before.values() if content.start_ns})
         if "names" in ended:
             self._outcome = False
         else:
             self.broken_off = True
 
     def _take(self, ended: Entry, files: Mapping[Path, FileContent]) -> None:
+        facts, of_another = self._facts(ended, files), self._before_named(ended)
         if ended["what"] == SCAN:
-            absent = sorted(set(ended["channels"]) - endings(files).keys() - {""})
+            for file in sorted(self._half):
+                self._log.warning("%s is left out: it was saved before the scan had ended", file)
+            absent = sorted(set(ended["channels"]) - endings({**files, **of_another}).keys() - {""})
             if set(absent) - set(self._kept["absent"]):
                 self._log.warning(
                     "GXSM did not save %s; from now on the translator waits for it for a short time only",
                     ", ".join(absent),
                 )
             self._kept["absent"] = absent
-            self._saw(ended, {content.start_ns for content in files.values() if content.start_ns})
+            if facts.get("at_most_ns") is None or facts["unproved"]:
+                self._saw(ended, {content.start_ns for content in files.values() if content.start_ns})
             self.upwards = any(content.upwards for content in files.values())
             for ending, file in endings(files).items():
                 scan, header = files[file].scans[0], files[file].header
@@ -408,7 +437,8 @@ class GxsmFiles(ResultFiles):
         names = [str(file) for file in files]
         # the end time makes the name unique: SRanger overwrites files of spectra
         content = [_PRECISION.as_set(one, ended) for file in files.values() for one in file]
-        self._add(f"{names[0]} ({ended['end_ns']})", ended, {"files": names}, content, files.values())
+        stating = [*files.values(), *of_another.values()]
+        self._add(f"{names[0]} ({ended['end_ns']})", ended, {"files": names, **facts}, content, stating)
         self._kept["ended"] = None
         if "names" in ended:
             self._outcome = True

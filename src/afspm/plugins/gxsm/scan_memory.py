@@ -64,13 +64,19 @@ def looked_at(ask: Asking, channels: int, rows: Collection[int], columns: int) -
     )
 
 
+def has_layers(ask: Asking) -> bool:
+    """Return whether the first channel has several layers, as *Multi Layer* makes them."""
+    shape = ask.call("get_dimensions", 0)
+    return isinstance(shape, tuple | list) and _is_shape(shape) and shape[2] > 1
+
+
 def in_files(files: Mapping[int, FileContent], like: Rows) -> Rows:
     """Return the digests of the rows and channels in `like`, from files by channel number."""
     return Rows(
         columns=like["columns"],
         digests={
             channel: {
-                row: _digests(_stored(files[int(channel)])[int(row)][: like["columns"]])
+                row: _digests(stored(files[int(channel)])[int(row)][: like["columns"]])
                 for row in rows
                 if int(row) < len(files[int(channel)].scans[0].values)
             }
@@ -80,7 +86,8 @@ def in_files(files: Mapping[int, FileContent], like: Rows) -> Rows:
     )
 
 
-def _stored(file: FileContent) -> np.ndarray:
+def stored(file: FileContent) -> np.ndarray:
+    """Return the values of a file as in GXSM's memory: rows from the top, without its factor `dz`."""
     scan, dz = file.scans[0], float(str(file.header["dz"]))
     return scan.values[::-1] / (ANGSTROM_M if scan.unit == "m" else 1.0) / dz
 

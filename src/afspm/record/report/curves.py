@@ -16,6 +16,7 @@ from afspm.model.geometry import XY
 from afspm.record.drawing.chart import BACKWARD, Axis, Band, Curve, chart
 from afspm.record.report import markup
 from afspm.record.report.markup import PageTimes
+from afspm.record.report.proofs import ResultProofs
 from afspm.record.run import Run
 from afspm.record.spectrum_grid import at, common_sweep, grid, ways
 from afspm.record.tables import SpectrumRow
@@ -100,9 +101,9 @@ def read(run: Run, unread: list[str]) -> list[SpectrumGroup]:
     return groups
 
 
-def html(groups: Sequence[SpectrumGroup], clock: PageTimes) -> str:
+def html(groups: Sequence[SpectrumGroup], clock: PageTimes, proofs: ResultProofs) -> str:
     """Return the HTML of all spectra; empty without spectra."""
-    return "".join(_group(group, number, clock) for number, group in enumerate(groups, 1))
+    return "".join(_group(group, number, clock, proofs) for number, group in enumerate(groups, 1))
 
 
 def _read(run: Run, rows: Iterable[SpectrumRow], unread: list[str]) -> Iterator[SpectrumCurves]:
@@ -113,13 +114,13 @@ def _read(run: Run, rows: Iterable[SpectrumRow], unread: list[str]) -> Iterator[
             unread.append(f"spectrum {row.number}: {error}")
 
 
-def _group(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
+def _group(group: SpectrumGroup, number: int, clock: PageTimes, proofs: ResultProofs) -> str:
     x, axes = group.axes
     charts = "".join(_all(group, x, axis, name) for name, axis in axes.items())
     kind = escape(group.first.kind or "spectra")
     return (
         f'<h3>{kind}: {group.count}</h3><div class="charts">{charts}</div><p class="note">{_legend(group)}</p>'
-        f"{_small(group, number, clock)}"
+        f"{_small(group, number, clock, proofs)}"
     )
 
 
@@ -165,7 +166,7 @@ def _legend(group: SpectrumGroup) -> str:
     return " ".join(sentences)
 
 
-def _small(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
+def _small(group: SpectrumGroup, number: int, clock: PageTimes, proofs: ResultProofs) -> str:
     shown = group.measured[:MOST_SMALL]
     if len(shown) < 2:
         return ""
@@ -173,7 +174,7 @@ def _small(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
     names = ["", *(f"spectrum-{number}-{spectrum.row.number}" for spectrum in shown), ""]
     axes = group.axes
     figures = "".join(
-        _figure(spectrum, axes, clock, names[k : k + 3], places[k] if places else "")
+        _figure(spectrum, axes, clock, names[k : k + 3], places[k] if places else "", proofs)
         for k, spectrum in enumerate(shown)
     )
     style = f' style="grid-template-columns:repeat({columns},minmax(0,1fr));gap:.3rem"' if places else ""
@@ -196,7 +197,12 @@ def _places(shown: Sequence[SpectrumCurves]) -> tuple[list[str], int]:
 
 
 def _figure(
-    spectrum: SpectrumCurves, axes: tuple[Axis, dict[str, Axis]], clock: PageTimes, names: Sequence[str], place: str
+    spectrum: SpectrumCurves,
+    axes: tuple[Axis, dict[str, Axis]],
+    clock: PageTimes,
+    names: Sequence[str],
+    place: str,
+    proofs: ResultProofs,
 ) -> str:
     x, others = axes
     charts = [chart(x, axis, list(_both_ways(spectrum, name))) for name, axis in others.items()]
@@ -209,6 +215,7 @@ def _figure(
         "points": str(row.points),
         "in control": escape(row.holder or "none"),
         "problems": escape(", ".join(row.problems)),
+        **dict(proofs.facts(row)),
         "file": escape(row.file),
         "variables": f'<div class="charts">{"".join(charts[1:])}</div>' if charts[1:] else "",
     }

@@ -14,7 +14,7 @@ from afspm.record.allowed_bands import instrument_curves
 from afspm.record.drawing import timeline
 from afspm.record.drawing.image_html import data_url
 from afspm.record.overview import ROUTINE
-from afspm.record.report import agents, curves, estimate, markup, parameters, sample, shadow
+from afspm.record.report import agents, curves, estimate, markup, parameters, proofs, sample, shadow
 from afspm.record.report.curves import SpectrumGroup
 from afspm.record.report.markup import PageTimes, document, section, table
 from afspm.record.report.pictures import FigurePicture, TopographyPicture
@@ -44,6 +44,7 @@ def html(
         section("Problems and repairs", _problems(story, clock)),
         section("Critical messages", _alarms(story, clock)),
         section("Files that could not be read", table(["scans and spectra"], [[escape(one)] for one in unread])),
+        section("Results not wholly proved", proofs.html(story.proofs, story.measured, clock)),
         section("Treatments of the tip", _treatments(story)),
         section("Parameters changed", parameters.html(story.changes, clock)),
         section("Other instruments", _instruments(story)),
@@ -52,7 +53,7 @@ def html(
         section("Notes", _notes(story, clock)),
         section("On the sample", sample.sample_map(shown, places, story.ledger.places, story.frame)),
         section("Scans", sample.sheet(story, shown, clock)),
-        section("Spectra", curves.html(spectra, clock)),
+        section("Spectra", curves.html(spectra, clock, story.proofs)),
         section("Figures", _unfinished(story) + _figures(figures)),
         section("What the time went into", _shares(story)),
         section("Refusals", _refusals(story, clock)),

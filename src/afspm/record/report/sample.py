@@ -250,6 +250,7 @@ def _facts(picture: TopographyPicture, story: RunStory, clock: PageTimes) -> Ite
         yield escape(value.name), escape(f"{value.text}{outside}")
     yield "in control", escape(row.holder or "none")
     yield "problems", escape(", ".join(row.problems))
+    yield from story.proofs.facts(row)
     yield "interrupted", "yes" if row.interrupted else ""
     yield (
         "tip changed",

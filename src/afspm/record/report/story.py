@@ -22,7 +22,8 @@ from afspm.record.allowed_bands import AllowedBands, allowed_bands
 from afspm.record.drawing.timeline import TimelineRow
 from afspm.record.expected_end import plans_of
 from afspm.record.overview import Overview, ProcessRestart
-from afspm.record.report import agents, parameters, shadow
+from afspm.record.report import agents, parameters, proofs, shadow
+from afspm.record.report.proofs import ResultProofs
 from afspm.record.report.work_comparison import WorkComparison, compare
 from afspm.record.run import Run
 from afspm.record.run_json import REAL_S, UNFINISHED
@@ -70,6 +71,8 @@ class RunStory:
         unfinished: how each unfinished component was stopped, as text by name.
         beside_instruments: the scans and spectra with values of other instruments.
         watched: the counts of each watch on running scans, by the name of the component.
+        proofs: the conditions of each result.
+        measured: the scans and spectra, in this order.
     """
 
     name: str
@@ -96,6 +99,8 @@ class RunStory:
     unfinished: Mapping[str, str] = field(default_factory=dict)
     beside_instruments: Sequence[ScanRow | SpectrumRow] = ()
     watched: Mapping[str, WatchCounts] = field(default_factory=dict)
+    proofs: ResultProofs = field(default_factory=ResultProofs)
+    measured: Sequence[ScanRow | SpectrumRow] = ()
 
     @property
     def end_ns(self) -> int:
@@ -202,6 +207,8 @@ def read(run: Run) -> RunStory:
         unfinished=run.facts.get(UNFINISHED) or {},
         beside_instruments=[row for row in (*scans, *spectra) if row.instruments],
         watched=run.watch_counts(),
+        proofs=proofs.read(run),
+        measured=[*scans, *spectra],
     )
 
 

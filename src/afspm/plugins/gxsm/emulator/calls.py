@@ -285,7 +285,9 @@ class GxsmFunctions:
     @_function
     def _get_dimensions(self, channel: int) -> tuple[int, ...]:
         scan = self._program.scan.activity
-        return (_NOBODY,) * 4 if scan is None or not self._has(channel) else (scan.shape[1], scan.shape[0], 1, 1)
+        if scan is None or not self._has(channel):
+            return (_NOBODY,) * 4
+        return (scan.shape[1], scan.shape[0], self._program.panel.layers, 1)
 
     @_function
     def _get_differentials(self, channel: int) -> tuple[float, ...]:

@@ -92,7 +92,7 @@ class GxsmScanFile:
     """The content of the file of one channel of a scan.
 
     Attributes:
-        raw: stored values, rows from the top; multiplied by `dz`, they are in GXSM's base unit.
+        raw: stored values [y, x] or [time, y, x], rows from the top; multiplied by `dz`, they are in GXSM's base unit.
         unit: name of the display unit, and its symbol.
         frame: x, y, width, height in ångström, angle clockwise in degrees.
         original: path in the variable "basename"; empty: the path of this file.
@@ -113,7 +113,7 @@ class GxsmScanFile:
     def numbers(self) -> dict[str, float]:
         """Return the variables with one floating-point number."""
         x, y, width, height, angle_deg = self.frame
-        rows, columns = self.raw.shape
+        rows, columns = self.raw.shape[-2:]
         return {
             "rangex": width,
             "rangey": height,
@@ -152,15 +152,23 @@ class GxsmScanFile:
             "extra_scan_info": "Extra Scan Info: N/A",
         }
 
+    def field(self) -> np.ndarray:
+        """Return the stored values [time, value, y, x]."""
+        return self.raw.reshape(-1, 1, *self.raw.shape[-2:])
+
+    def seconds(self) -> list[float]:
+        """Return the values of the axis of time."""
+        return [self.end_s - self.start_s] * len(self.field())
+
     def info(self) -> str:
         """Return the sentence in which Gxsm4 names the first value in the display unit."""
-        shown = float(self.raw[0, 0]) * self.dz / UNITS[self.unit[0]][1]
+        shown = float(self.raw.flat[0]) * self.dz / UNITS[self.unit[0]][1]
         return f"The value for {self.label} is {shown:g} {self.unit[1]}."
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
         """Return x ascending and y descending, relative to the centre, in ångström."""
         _, _, width, height, _ = self.frame
-        rows, columns = self.raw.shape
+        rows, columns = self.raw.shape[-2:]
         return np.linspace(-width / 2, width / 2, columns), np.linspace(height / 2, -height / 2, rows)
 
     def about(self, version: int) -> dict[str, str]:
@@ -189,15 +197,15 @@ def netcdf3(scan: GxsmScanFile) -> bytes:
     file: Any = netcdf_file(made, "w", version=1)
     for name, value in scan.about(3).items():
         setattr(file, name, value.encode())
-    rows, columns = scan.raw.shape
-    for name, size in (("time", 1), ("value", 1), ("dimy", rows), ("dimx", columns)):
+    times, _, rows, columns = scan.field().shape
+    for name, size in (("time", times), ("value", 1), ("dimy", rows), ("dimx", columns)):
         file.createDimension(name, size)
     x, y = scan.axes()
-    field = _variable(file, "FloatField", "f4", ("time", "value", "dimy", "dimx"), scan.raw[None, None])
+    field = _variable(file, "FloatField", "f4", ("time", "value", "dimy", "dimx"), scan.field())
     field.long_name = b"FLOAT: single precision floating point data field"
     field.ZLabel = b"Z" if scan.unit[0] == "AA" else scan.label.encode()
     field.unit, field.ZSrcUnit = (unit.encode() for unit in reversed(scan.unit))
-    _variable(file, "time", "f8", ("time",), [scan.end_s - scan.start_s])
+    _variable(file, "time", "f8", ("time",), scan.seconds())
     _variable(file, "value", "f8", ("value",), [scan.bias_v])
     _variable(file, "dimx", "f4", ("dimx",), x)
     _variable(file, "dimy", "f4", ("dimy",), y)
@@ -225,12 +233,12 @@ def netcdf4(scan: GxsmScanFile) -> bytes:
     with h5py.File(made, "w") as file:
         for name, value in scan.about(4).items():
             file.attrs[name] = np.bytes_(value)
-        field = file.create_dataset("FloatField", data=scan.raw[None, None].astype("<f4"))
+        field = file.create_dataset("FloatField", data=scan.field().astype("<f4"))
         _describe(field, label=scan.label, var_unit=scan.unit[1], unit=scan.unit[0])
         _describe(field, Info=scan.info(), ZLabel=scan.label, unit_x_dz=scan.unit[1], ZSrcUnit=scan.unit[0])
         x, y = scan.axes()
         for name, values, unit in (
-            ("time", [scan.end_s - scan.start_s], "s"),
+            ("time", scan.seconds(), "s"),
             ("value", [scan.bias_v], "V"),
             ("dimy", y, "AA"),
             ("dimx", x, "AA"),

@@ -11,13 +11,15 @@ from typing import Final
 import numpy as np
 
 from afspm import read
-from afspm.basics import Clock, InvalidValue, Plain
+from afspm.basics import NS_PER_S, Clock, InvalidValue, Plain
+from afspm.driver import FileContent
 from afspm.emulation import Faults, ScanActivity, SimulatedInstrument, SpectrumActivity
 from afspm.model import Region
 from afspm.plugins.gxsm.emulator import files
 from afspm.plugins.gxsm.emulator.entries import GxsmEntries, GxsmEntry, lengths, simulated_3, subscan
 from afspm.plugins.gxsm.emulator.file_writer import GxsmFileWriter
 from afspm.plugins.gxsm.emulator.files import CHANNELS, SIMULATED_3, UNITS, GxsmChannel
+from afspm.plugins.gxsm.scan_memory import stored
 
 CARDS: Final = {"SRanger": "SRangerMK2:SPM", "RPSPMC": "RPSPMC:SPM", "simulator": "SPM-SIM:SPM"}
 FAULT_KINDS: Final[Mapping[str, str]] = {
@@ -72,6 +74,7 @@ class GxsmPanel:
     Attributes:
         auto_save, probe_auto_save: automatic saving of scans, of spectra.
         repeats: True if each complete scan is followed by another scan.
+        layers: number of scans that *Multi Layer* makes of one; they are saved together, after the last.
         behind_s: lag of the clock of GXSM's computer, whose times are in files; that clock may be set at any time.
         original: path of the file that was opened last; empty: none since the start of GXSM.
         subscan: first column, columns, first row and rows of *SubScan*; zeros: off.
@@ -81,6 +84,7 @@ class GxsmPanel:
     auto_save: bool
     probe_auto_save: bool
     repeats: bool = False
+    layers: int = 1
     behind_s: float = 0.0
     original: str = ""
     subscan: list[int] = field(default_factory=lambda: [0, 0, 0, 0])
@@ -99,12 +103,16 @@ class GxsmScan:
         shows_s: delay of the scanning bit after the start of the scan.
         next_follows: True if another scan is due to start.
         follows: True if the due scan is a repetition, which shows at once in the scanning bit and the file names.
+        layer: number of the layer, see `GxsmPanel`.
         number, own: number in the scan's file names; paths of its files, empty until they are saved.
         before: file names of the previous scan, reported at first; None: own file names from the start.
         y_before: line reported until the first line of the scan is complete.
         memory: image of stored values before the scan, by channel.
         elsewhere: line from which the scan goes on in a frame that was moved meanwhile, and this scan; in order.
         subscan: part of the frame at the start of the scan, see `GxsmPanel`.
+        ended_s: end of the last ended scan in GXSM's clock; 0.0: none.
+        ended_before_s: `ended_s` at the start of the scan: a file saved during the scan has it.
+        opened: the picture that a person has opened in a channel during the scan: the scan goes on without it.
     """
 
     activity: ScanActivity | None = None
@@ -114,6 +122,7 @@ class GxsmScan:
     shows_s: float = SHOWS_S
     next_follows: bool = False
     follows: bool = False
+    layer: int = 0
     number: int = 0
     before: list[Path] | None = None
     y_before: int = 0
@@ -121,6 +130,9 @@ class GxsmScan:
     own: list[Path] = field(default_factory=list)
     elsewhere: list[tuple[int, ScanActivity]] = field(default_factory=list)
     subscan: list[int] = field(default_factory=lambda: [0, 0, 0, 0])
+    ended_s: float = 0.0
+    ended_before_s: float = 0.0
+    opened: dict[GxsmChannel, FileContent] = field(default_factory=dict)
 
 
 class GxsmProgram:
@@ -157,6 +169,7 @@ class GxsmProgram:
         self.has_crashed = False
         self.saving = GxsmFileWriter(folder, faults)
         self.scan = GxsmScan()
+        self._pictures: dict[GxsmChannel, list[np.ndarray]] = {}  # opened since the start, each a time element
         self.curve: SpectrumActivity | None = None
         self._bias_since_s = -math.inf
         self._curves = 0
@@ -251,10 +264,12 @@ class GxsmProgram:
         if self.scan.runs and self.faults.strikes("panel-stop", now_s):
             self.rig.stop_scan(now_s)
         if self.scan.runs and self.scan.activity is not None and not self.scan.activity.running(now_s):
-            self.scan.runs = False
-            if self.panel.auto_save:
+            self.scan.runs, self.scan.ended_s = False, self.scan.activity.end_s - self.panel.behind_s
+            is_whole = self.scan.activity.stopped_s is None
+            self.scan.layer = (self.scan.layer + 1) % self.panel.layers if is_whole else 0
+            if self.panel.auto_save and not self.scan.layer:
                 self.save(now_s, finished=True)
-            self.scan.next_follows = self.scan.follows = self.panel.repeats and self.scan.activity.stopped_s is None
+            self.scan.next_follows = self.scan.follows = is_whole and (self.panel.repeats or self.scan.layer > 0)
         if self.curve is not None and not self.curve.running(now_s):
             curve, self.curve = self.curve, None
             if self.panel.probe_auto_save:
@@ -268,7 +283,7 @@ class GxsmProgram:
     def is_between_repeats(self) -> bool:
         """True during and between repeated scans, so that GXSM's scanning bit stays set."""
         is_whole = self.scan.activity is not None and self.scan.activity.stopped_s is None
-        return self.panel.repeats and is_whole and (self.scan.runs or self.scan.next_follows)
+        return (self.panel.repeats or self.panel.layers > 1) and is_whole and (self.scan.runs or self.scan.next_follows)
 
     def stop_scan(self) -> None:
         """Stop the running scan, and cancel the scan that is due to start."""
@@ -306,7 +321,8 @@ class GxsmProgram:
         is_first = self.scan.activity is None and self.card == "simulator" and self.version == 4
         self.scan.y_before = _NEVER_WRITTEN if is_first else self.y_current(now_s)
         self.scan.before, self.scan.own = None if follows else self.names(now_s), []
-        self.scan.elsewhere, self.scan.subscan = [], list(self.panel.subscan)
+        self.scan.elsewhere, self.scan.subscan, self.scan.opened = [], list(self.panel.subscan), {}
+        self.scan.ended_before_s = self.scan.ended_s
         self.scan.number = self.saving.next_number()
         self.scan.shows_s = 0.0 if follows else SHOWS_S
         self.scan.activity = started
@@ -352,6 +368,8 @@ class GxsmProgram:
         """Return a channel of GXSM's memory as stored values; rows not yet scanned hold the previous scan."""
         if self.scan.activity is None or channel not in self.scan.memory:
             return np.zeros((0, 0), np.float32)
+        if channel in self.scan.opened:
+            return _resized(stored(self.scan.opened[channel]).astype(np.float32), self.scan.activity.shape)
         now_s = self.clock.now_s()
         until_s = now_s if self.scan.runs else self.scan.activity.stopped_s
         scanned = channel.raw(self.scan.activity.channels(until_s)[channel.source][1])
@@ -397,6 +415,17 @@ class GxsmProgram:
         self.entries.put("PointsX", scan.shape[1])
         self.entries.put("PointsY", scan.shape[0])
 
+    def open_here(self, path: Path, number: int = 0) -> None:
+        """Open a file in the window of a channel. During a scan the picture replaces the scan there."""
+        self.open_file(path)
+        channel, content = self.channels[number], read(path)
+        self.scan.opened[channel] = content
+        self._pictures.setdefault(channel, []).append(stored(content).astype(np.float32))
+
+    def save_as(self, path: Path, number: int = 0) -> None:
+        """Save a channel under another name, at once."""
+        path.write_bytes(self._file(self.channels[number], path, finished=self._is_finished(self.clock.now_s())))
+
     def keep_movie(self) -> None:
         """Keep the last scan as the picture of a *Movie*."""
         assert self.scan.activity is not None
@@ -420,11 +449,14 @@ class GxsmProgram:
         if self.scan.saved:
             self.scan.own = []
         own = [self.saving.free(ending, self.scan.number) for ending in self._endings()]
-        finished = finished or now_s >= self.scan.activity.end_s + UNFINISHED_S
+        finished = finished or self._is_finished(now_s)
         pairs = zip(own, self.channels, strict=True)
         self.saving.write([(path, self._file(one, path, finished=finished)) for path, one in pairs], now_s)
         self.saving.counted(own)
         self.scan.own, self.scan.saved = own, True
+
+    def _is_finished(self, now_s: float) -> bool:
+        return self.scan.activity is not None and now_s >= self.scan.activity.end_s + UNFINISHED_S
 
     def _endings(self) -> list[str]:
         return [channel.ending(master=number == 0) for number, channel in enumerate(self.channels)]
@@ -432,15 +464,17 @@ class GxsmProgram:
     def _file(self, channel: GxsmChannel, path: Path, *, finished: bool) -> bytes:
         scan = self.scan.activity
         assert scan is not None
+        image, opened = self.image(channel), self.scan.opened.get(channel)
+        start_s = scan.start_s - self.panel.behind_s
         saved = files.GxsmScanFile(
             str(path),
             channel.label,
-            self.image(channel),
+            np.stack([_resized(one, scan.shape) for one in self._pictures[channel]]) if opened else image[None],
             channel.dz,
             channel.unit,
             self.scan.frame,
-            scan.start_s - self.panel.behind_s,
-            scan.end_s - self.panel.behind_s if finished else 0.0,
+            start_s if opened is None else (opened.start_ns or 0) / NS_PER_S,
+            scan.end_s - self.panel.behind_s if finished else self.scan.ended_before_s,
             CARDS[self.card],
             scan.bias_v,
             self.panel.original,

@@ -1,0 +1,68 @@
+"""What each result stands for, and the facts that it left unproved, for the report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from html import escape
+
+from afspm.model import MeasurementConditions, Parameter
+from afspm.record.report import markup
+from afspm.record.report.markup import PageTimes
+from afspm.record.run import Run
+from afspm.record.tables import ScanRow, SpectrumRow
+
+MOST_ROWS = 200
+
+
+class ResultProofs:
+    """The published conditions of all results; none for results of other translators and of earlier versions."""
+
+    def __init__(self, conditions: Sequence[MeasurementConditions] = ()) -> None:
+        self._by_time = {one.time_ns: one for one in conditions}
+        self._by_file = {one.filename: one for one in conditions if one.filename}
+
+    def of(self, row: ScanRow | SpectrumRow) -> MeasurementConditions | None:
+        """Return the conditions of a result: by its time, or by its file if the result had no time of its own."""
+        return self._by_time.get(row.time_ns) or self._by_file.get(row.filename)
+
+    def facts(self, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, str]]:
+        """Yield who asked for a result, the settings in force and the unproved facts, as names and HTML."""
+        one = self.of(row)
+        if one is not None:
+            yield "asked for by", escape(one.holder or "a person, at the microscope" if one.began_ns else "")
+            yield "set for it", escape(_settings(one))
+            yield "not proved", escape("; ".join(one.unproved))
+
+
+def read(run: Run) -> ResultProofs:
+    return ResultProofs([one for _, _, one in run.messages(("MeasurementConditions",))])
+
+
+def html(proofs: ResultProofs, rows: Sequence[ScanRow | SpectrumRow], clock: PageTimes) -> str:
+    """Return the table of the results with unproved facts; empty without any."""
+    found = [(row, one.unproved) for row in rows if (one := proofs.of(row)) is not None and one.unproved]
+    cells = [
+        [
+            f"{'scan' if isinstance(row, ScanRow) else 'spectrum'} {row.number}",
+            clock.both(row.time_ns),
+            escape("; ".join(unproved)),
+        ]
+        for row, unproved in found[:MOST_ROWS]
+    ]
+    left_out = len(found) - len(cells)
+    more = f'<p class="note">{left_out} more are in the record.</p>' if left_out else ""
+    return markup.table(["result", "finished", "the controller could have shown, and did not"], cells) + more
+
+
+def _settings(one: MeasurementConditions) -> str:
+    at_end = {each.name: _text(each) for each in one.end_values}
+    begin = ((each.name, _text(each)) for each in one.begin_values)
+    return ", ".join(f"{name} {text}{_changed(text, at_end.get(name, text))}" for name, text in begin)
+
+
+def _changed(begin: str, end: str) -> str:
+    return "" if end == begin else f" (at the end {end})"
+
+
+def _text(one: Parameter) -> str:
+    return " ".join(filter(None, (one.value, one.unit)))
