@@ -61,6 +61,8 @@ WAITS_S: Final = 6.0
 """How long the run waits for a microscope that is not free, or for a measurement that does not end: real seconds."""
 DELAYS_MS: Final = (0, 5, 20, 50, 100)
 _OFF_AGAIN_S: Final = 0.03
+_BRIEF_S: Final = 0.3
+"""No reading of the run sees what a person has put right so soon after an end."""
 _MATCHES: Final = 0.02
 """Largest difference of a published value from the true one, as a share of the standard deviation of its channel."""
 _FACTORS: Final = (1.0, 1e9, 60e-9)
@@ -763,8 +765,8 @@ class Verdict:
 
     Attributes:
         wrong: each wrong complete result, in words.
-        elsewhere: complete results of a frame that the person has set, and that say so; counted apart.
-        in_hold: results that began, or lost the feedback, while the controller held it; counted apart.
+        apart: complete results that began, or lost the feedback, while the controller held it; that lost it for less
+            than `_BRIEF_S` at their end; or that say that they are of the frame that the person has set.
         events: the sequence, for who wants to see it again.
     """
 
@@ -773,8 +775,7 @@ class Verdict:
     has_trace: bool = False
     is_told: bool = False
     wrong: tuple[str, ...] = ()
-    in_hold: tuple[str, ...] = ()
-    elsewhere: tuple[str, ...] = ()
+    apart: tuple[str, ...] = ()
     unmatched: tuple[str, ...] = ()
     results: int = 0
     repeats: int = 0
@@ -788,12 +789,11 @@ class Verdict:
 def judged(run: Run, case: Case) -> Verdict:
     """Compare all results with the truth."""
     wrong: dict[str, None] = {}
-    in_hold: dict[str, None] = {}
-    elsewhere: dict[str, None] = {}
+    apart: dict[str, None] = {}
     unmatched: dict[str, None] = {}
     for one in run.results:
         for kind, words in _faults(one, run, case):
-            {"wrong": wrong, "hold": in_hold, "elsewhere": elsewhere, "unmatched": unmatched}[kind][words] = None
+            {"wrong": wrong, "apart": apart, "unmatched": unmatched}[kind][words] = None
     truth, person = run.truth, run.person
     acted_s = None if person.refused and case.act not in ("own", "replace") else person.acted_s
     after = [] if acted_s is None else [one for one in truth.taken if one.end_s >= acted_s]
@@ -812,8 +812,7 @@ def judged(run: Run, case: Case) -> Verdict:
         has_trace=acted_s is not None and trace,
         is_told=bool(run.acts) or "panel" in run.refused,
         wrong=tuple(wrong),
-        in_hold=tuple(in_hold),
-        elsewhere=tuple(elsewhere),
+        apart=tuple(apart),
         unmatched=tuple(unmatched),
         results=run.measured,
         repeats=run.repeats,
@@ -842,14 +841,16 @@ def _faults(one: Published, run: Run, case: Case) -> Iterator[tuple[str, str]]:
         yield "wrong", f"{name}: measurement {number} was stopped"
     if not begin.on:
         yield "wrong", f"{name}: the feedback was off at its begin"
+    elif not end.on and truth.at(taken.end_s + _BRIEF_S).on:
+        yield "apart", f"{name}: the feedback was off at its end, and on again soon after"
     elif not end.on and taken.is_scan:
         yield "wrong", f"{name}: the feedback was off at its end"
     elif not end.on:
-        yield "hold", f"{name}: the feedback was switched off while the controller held it"
+        yield "apart", f"{name}: the feedback was switched off while the controller held it"
     if not (begin.engaged and end.engaged):
         yield "wrong", f"{name}: the tip was withdrawn at its {'begin' if not begin.engaged else 'end'}"
     if taken.in_hold:
-        yield "hold", f"{name}: it began while the feedback was still held"
+        yield "apart", f"{name}: it began while the feedback was still held"
     if wanted.value is not None and not taken.by_hand:
         for when, look in (("begin", begin), ("end", end)):
             if abs(look.value - wanted.value) > 1e-6:
@@ -862,7 +863,7 @@ def _faults(one: Published, run: Run, case: Case) -> Iterator[tuple[str, str]]:
             if taken.by_hand and not told & {PanelAct.SCAN, PanelAct.STOP}:
                 yield "wrong", f"{name}: it is a scan of the person of another frame, without a word"
             else:
-                yield "elsewhere", f"{name}: it is of the frame that the person has set"
+                yield "apart", f"{name}: it is of the frame that the person has set"
     elif isinstance(packet, Spectrum):
         at_m = taken.activity.position_m
         if packet.position_m is not None and not _near(packet.position_m, at_m, 1e-9):
@@ -985,8 +986,8 @@ def cases(makers: Sequence[str], count: int, *, first: int = 0, persons: Sequenc
 def table(verdicts: Sequence[Verdict]) -> str:
     """Return the counts by maker and kind of act."""
     lines = [
-        "| maker | act | cases | acts | with a trace | wrong results | told | his frame | in the hold | errors |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| maker | act | cases | acts | with a trace | wrong results | told | apart | errors |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     groups: dict[tuple[str, str], list[Verdict]] = {}
     for one in verdicts:
@@ -1000,14 +1001,13 @@ def table(verdicts: Sequence[Verdict]) -> str:
             sum(one.has_trace for one in ones),
             sum(bool(one.wrong) for one in ones),
             sum(one.has_trace and one.is_told for one in ones),
-            sum(bool(one.elsewhere) for one in ones),
-            sum(bool(one.in_hold) for one in ones),
+            sum(bool(one.apart) for one in ones),
             sum(bool(one.error) for one in ones),
         )
         lines.append(f"| {maker} | {act} | {' | '.join(map(str, counts))} |")
     lines += [
         "",
-        "| without a person | runs | measurements | false acts | interrupted | repeats | wrong | in the hold | error |",
+        "| without a person | runs | measurements | false acts | interrupted | repeats | wrong | apart | errors |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     alone = [one for one in verdicts if not one.case.act]
@@ -1021,7 +1021,7 @@ def table(verdicts: Sequence[Verdict]) -> str:
             sum(one.interrupted for one in whole),
             sum(one.repeats for one in whole),
             sum(len(one.wrong) for one in ones),
-            sum(len(one.in_hold) for one in ones),
+            sum(len(one.apart) for one in ones),
             sum(bool(one.error) for one in ones),
         )
         lines.append(f"| {maker} | {' | '.join(map(str, numbers))} |")
@@ -1037,7 +1037,7 @@ def is_bad(one: Verdict) -> bool:
 def shown(one: Verdict, *, events: bool = True) -> str:
     """Return a verdict with its sequence."""
     found = [str(one.case)]
-    for kind in ("wrong", "elsewhere", "in_hold", "unmatched", "false_acts"):
+    for kind in ("wrong", "apart", "unmatched", "false_acts"):
         found += [f"  {kind.upper()}: {words}" for words in getattr(one, kind)]
     found += [f"  ended: {one.ended}"] if one.ended else []
     found += [one.error] if one.error else []
