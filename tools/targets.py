@@ -26,6 +26,7 @@ LEFT_OUT: Final = {
     "test-windows": "takes hours under Wine",
 }
 IN_TURN: Final = {
+    "acts": "CASES=6",
     "bench-drift": "EIGHTH=1",
     "chaos": "NIGHTS=4",
     "crowd": "",
