@@ -25,6 +25,7 @@ from afspm.plugins.gxsm.scan_memory import (
     has_layers,
     has_new_row,
     has_old_columns,
+    is_partly_whole,
     is_unfinished,
     looked_at,
     only,
@@ -39,6 +40,9 @@ _CHANNELS: Final = 40
 _NO_CHANNEL: Final = "EE:"
 _MOVED: Final = (
     "the frame was moved or turned during the scan, at GXSM's panel (opening a file sets it, too) or by another program"
+)
+_OPENED: Final = (
+    "it came to its end, and a channel still holds rows of the previous scan: was that file opened in its window?"
 )
 _MULTI_LAYER: Final = "Multi Layer is on at GXSM's panel, and makes several scans of one: switch it off"
 _ONLY_A_PART: Final = "SubScan is on at GXSM's panel and scans a part of the frame ({}): switch it off"
@@ -511,7 +515,12 @@ class GxsmActivity(Activity):
             return None if self._scan.follows else True
         if has_old_columns(before, after):
             self._files.spoil(OLD_COLUMNS)
-        return not is_unfinished(before, after)
+        if not is_unfinished(before, after):
+            return True
+        if is_partly_whole(before, after):
+            self._files.spoil(_OPENED)
+            return True
+        return False
 
     def _has_third_row(self) -> bool:
         if self._files.before is None:
