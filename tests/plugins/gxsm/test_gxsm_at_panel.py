@@ -117,8 +117,14 @@ def test_scan_that_becomes_several_layers_is_by_hand_and_multi_layer_named(bench
     made = bench(**kind)
     peer = small(made)
     scanned(peer)
-    made.at_panel(lambda emulator: setattr(emulator.program.panel, "layers", 3))
-    assert peer.act(names.START_SCAN).ok
+
+    def begin(emulator: Any) -> None:
+        emulator.program.panel.layers = 3
+        hold_scan(emulator.program, 2)
+
+    made.at_panel(begin)
+    held(made, peer)
+    made.at_panel(lambda emulator: scan_until_line(emulator.program, 8))
     received = peer.until(lambda one: isinstance(one, ActByHand))
     assert acts(received) == [PanelAct.STOP]
     assert not scans(received)

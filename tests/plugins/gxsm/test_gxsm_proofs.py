@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_until_line
+from tests.plugins.by_hand import acts
+from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_to_line
 from tests.plugins.vendor_bench import Peer, ready, scanned, scans, states
 
 from afspm import read
@@ -41,8 +42,9 @@ def with_person(made: Bench, peer: Peer, act: Callable[[Any], object]) -> list[A
     peer.until(ScopeState.SCANNING)
 
     def at_once(emulator: Any) -> None:
-        scan_until_line(emulator.program, 4)
+        scan_to_line(emulator.program, 4)
         act(emulator.program)
+        emulator.program.resume_scan()
 
     made.at_panel(at_once)
     return peer.until(FREE)
@@ -100,7 +102,10 @@ def test_picture_of_an_earlier_scan_opened_in_a_running_channel_is_not_published
     received = with_person(made, peer, lambda program: program.open_here(paths[-before]))
     assert states(received) == ["INTERRUPTED", "FREE"]
     assert not scans(received)
-    made.until_logged("its channels state starts")
+    made.until_logged(
+        "its channels state starts" if before > 1 else "was that file opened in its window?"
+    )  # results X8
+    assert not acts(received)
     assert is_truth(made, list(scanned(peer).values()))
 
 

@@ -19,12 +19,13 @@ from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.plugins.gxsm.errors import GxsmError
 from afspm.plugins.gxsm.hardware import ABORT, AUTOSAVE, STATUS, Doing, Hardware, decoded, execute
 from afspm.plugins.gxsm.link import Asking
-from afspm.plugins.gxsm.result_files import OLD_COLUMNS, GxsmFiles, endings
+from afspm.plugins.gxsm.result_files import OLD_COLUMNS, GxsmFiles, endings, few
 from afspm.plugins.gxsm.scan_memory import (
     Rows,
     has_layers,
     has_new_row,
     has_old_columns,
+    is_partly_whole,
     is_unfinished,
     looked_at,
     only,
@@ -39,6 +40,9 @@ _CHANNELS: Final = 40
 _NO_CHANNEL: Final = "EE:"
 _MOVED: Final = (
     "the frame was moved or turned during the scan, at GXSM's panel (opening a file sets it, too) or by another program"
+)
+_OPENED: Final = (
+    "it came to its end, and a channel still holds rows of the previous scan: was that file opened in its window?"
 )
 _MULTI_LAYER: Final = "Multi Layer is on at GXSM's panel, and makes several scans of one: switch it off"
 _REPEATS: Final = (
@@ -253,7 +257,7 @@ class GxsmActivity(Activity):
         self._scan.lines = LineWatch(int(self.gxsm.ask.number("y_current")))
         rows, columns = self._set_frame()[1]
         # a scan that is stopped or does not start is recognised by rows that still hold the previous scan
-        looked = {0, rows - 1, *self._third_rows(rows)}
+        looked = {0, rows - 1, *self._later_rows(rows)}
         self._files.looked(looked_at(self.gxsm.ask, len(self._channels()), looked, columns), None)
         self._shows_until_s = self._clock.now_s() + self._shows_s
         # returns 0 at once, even if no scan starts (no channel is set, or a scan is running)
@@ -432,10 +436,11 @@ class GxsmActivity(Activity):
         goes_up = self._files.upwards if self._scan.goes_up is None else self._scan.goes_up
         return 0 if goes_up else self._files.scanning[1][0] - 1
 
-    def _third_rows(self, rows: int) -> set[int]:
-        # In either direction. GXSM's simulator ends a scan by itself if its first line takes long, with some channels
-        # of the second line in memory: only a scan of more lines was ended by a person.
-        return {2, rows - 3} - {0, 1, rows - 2, rows - 1} if self.gxsm.ends_early else set()
+    def _later_rows(self, rows: int) -> set[int]:
+        # In either direction. GXSM's simulator ends a scan by itself if its first line takes long: only a scan of more
+        # rows was ended by a person.
+        row = few(rows)
+        return {row, rows - 1 - row} if self.gxsm.ends_early and row < rows - 1 - row else set()
 
     def _before(self) -> Rows | None:
         # Rows of the previous scan that must have changed when this scan is complete.
@@ -498,7 +503,7 @@ class GxsmActivity(Activity):
             self._files.end(now_ns, now_ns)
             return
         is_whole = self._is_whole()
-        has_third_row = is_whole is False and self._has_third_row()
+        has_more_rows = is_whole is False and self._has_more_rows()
         if is_whole and not self._files.spoiled and not self._files.is_saved_by_gxsm:
             try:
                 # `autosave` returns the line, not a path; a second call would save the scan again
@@ -508,7 +513,7 @@ class GxsmActivity(Activity):
         # not earlier: up to 40 ms after a start GXSM still reports the paths of the previous scan
         channels, folder = self._channels(), self._folder()
         now_ns, ended_ns = self._clock.now_ns(), self._scan.ended_ns
-        self._files.end(ended_ns, now_ns, channels, folder, is_whole=is_whole, has_third_row=has_third_row)
+        self._files.end(ended_ns, now_ns, channels, folder, is_whole=is_whole, has_more_rows=has_more_rows)
 
     def _is_whole(self) -> bool | None:
         # None: the scan followed another scan at once, and no poll came early enough to read the previous rows.
@@ -522,14 +527,19 @@ class GxsmActivity(Activity):
             return None if self._scan.follows else True
         if has_old_columns(before, after):
             self._files.spoil(OLD_COLUMNS)
-        return not is_unfinished(before, after)
+        if not is_unfinished(before, after):
+            return True
+        if is_partly_whole(before, after):
+            self._files.spoil(_OPENED)
+            return True
+        return False
 
-    def _has_third_row(self) -> bool:
+    def _has_more_rows(self) -> bool:
         if self._files.before is None:
             return False
         rows = self._files.scanning[1][0]
-        before = only(self._files.before[0], *self._third_rows(rows))
-        after = looked_at(self.gxsm.ask, len(self._channels()), self._third_rows(rows), before["columns"])
+        before = only(self._files.before[0], *self._later_rows(rows))
+        after = looked_at(self.gxsm.ask, len(self._channels()), self._later_rows(rows), before["columns"])
         return has_new_row(before, after)
 
     def _folder(self) -> Path | None:

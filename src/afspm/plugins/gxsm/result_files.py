@@ -48,7 +48,7 @@ class GxsmFiles(ResultFiles):
         patience_s: longest wait for all files, experiment time.
         soon_s: longest wait for files of channels that the previous scan did not save, experiment time.
         late_s: longest difference between the start delays of two scans (`LATE_S`), experiment time.
-        ends_early: True if GXSM's hardware may end a scan by itself, after its first line or in the second.
+        ends_early: True if GXSM's hardware may end a scan by itself, in its first rows (`few`).
     """
 
     def __init__(
@@ -184,7 +184,7 @@ class GxsmFiles(ResultFiles):
         folder: Path | None = None,
         *,
         is_whole: bool | None = True,
-        has_third_row: bool = False,
+        has_more_rows: bool = False,
         before: Rows | None = None,
         near_end: bool = False,
     ) -> None:
@@ -195,7 +195,7 @@ class GxsmFiles(ResultFiles):
             folder: folder of the files, which may have changed since the start.
             is_whole: True if a scan reached its last row; False: the scan has no result; None: unknown until its files
                 are compared with `before`.
-            has_third_row: True if an interrupted scan has scanned a third row.
+            has_more_rows: True if an interrupted scan has scanned more than a few rows (`few`).
             before: rows of the previous scan, for `is_whole` None; without rows the scan has no result.
             near_end: True if a scan that is followed by the next at once was last seen in its last rows.
         """
@@ -214,7 +214,7 @@ class GxsmFiles(ResultFiles):
         self._sizes, self._whole, self._before, self._half = {}, {}, {}, set()
         if is_whole is False:
             why = "it was stopped or never began: GXSM's first or last row still holds the previous scan"
-            self._give_up(why, has_third_row=has_third_row)
+            self._give_up(why, has_more_rows=has_more_rows)
 
     def _hurry(self, now_s: float) -> None:
         # The next measurement overwrites GXSM's memory and may overwrite files: read them now, or never.
@@ -266,14 +266,16 @@ class GxsmFiles(ResultFiles):
             is_followed = "names" in ended
             over = now_s >= ended["until_s"] or (is_followed and not ended["names"])
             gaps = [file for file, content in files.items() if lines_missing(content)]
-            has_third_row = any(
-                lines_missing(content) < len(scan.values) - 2 for content in files.values() for scan in content.scans
+            has_more_rows = any(
+                lines_missing(content) < len(scan.values) - few(len(scan.values))
+                for content in files.values()
+                for scan in content.scans
             )
             if not any(scan.values.any() for content in files.values() for scan in content.scans):
                 gaps = [file for file in files if ended["what"] == SCAN]  # stopped in its first line
-                has_third_row = False
+                has_more_rows = False
             if gaps and (over or is_followed or not ended["by_gxsm"]):
-                self._give_up(f"it was stopped: {gaps[0]} lacks lines", has_third_row=has_third_row)
+                self._give_up(f"it was stopped: {gaps[0]} lacks lines", has_more_rows=has_more_rows)
             elif files and not gaps and (over or self._all(ended, files, now_s)):
                 why = self._why_unfinished(ended, files) if ended["is_whole"] is None else ""
                 if why:
@@ -400,10 +402,10 @@ class GxsmFiles(ResultFiles):
             )
         return f"no new .vpdata in {folder}: switch on Auto Save of probes in GXSM, and set probe_dir to its folder"
 
-    def _give_up(self, why: str, *, has_third_row: bool | None = None) -> None:
-        # `has_third_row`: None if the scan does not lack rows
+    def _give_up(self, why: str, *, has_more_rows: bool | None = None) -> None:
+        # `has_more_rows`: None if the scan does not lack rows
         ended, self._kept["ended"] = self._kept["ended"], None
-        is_stopped = has_third_row or (has_third_row is False and not self._ends_early)
+        is_stopped = has_more_rows or (has_more_rows is False and not self._ends_early)
         if (is_stopped or "names" in ended) and ended["what"] == SCAN and ended["own"] and ended["ran"]:
             self._by_hand = ended["spoiled"] or (_REPLACED if "names" in ended else _STOPPED)
         self._log.error("the %s has no result: %s", ended["what"], why)
@@ -448,6 +450,12 @@ def _is_half(content: FileContent) -> bool:
     # a scan that a person saves while it runs has no end, or the end of the scan before
     start_ns, end_ns = content.start_ns, content.end_ns
     return bool(content.scans) and start_ns is not None and (end_ns is None or end_ns < start_ns)
+
+
+def few(rows: int) -> int:
+    """Return the number of rows after which GXSM's simulator does not end a scan by itself."""
+    # one or two rows in 60 such ends, more than two in one, while the computer was overloaded
+    return max(2, rows // 8)
 
 
 def endings(files: Iterable[Path]) -> dict[str, Path]:

@@ -128,6 +128,15 @@ def is_unfinished(before: Rows, after: Rows) -> bool:
     return unchanged and not changed
 
 
+def is_partly_whole(before: Rows, after: Rows) -> bool:
+    """Return True if a channel has all these rows changed: then the scan has come to its end."""
+    return any(
+        bool(rows)
+        and all(after["digests"].get(channel, {}).get(row, digests)[0] != digests[0] for row, digests in rows.items())
+        for channel, rows in before["digests"].items()
+    )
+
+
 def has_old_columns(before: Rows, after: Rows) -> bool:
     """Return True if the first or the last columns of all changed rows hold the previous scan, in each channel."""
     changed = [

@@ -110,7 +110,8 @@ class GxsmScan:
         subscan: part of the frame at the start of the scan, see `GxsmPanel`.
         ended_s: end of the last ended scan in GXSM's clock; 0.0: none.
         ended_before_s: `ended_s` at the start of the scan: a file saved during the scan has it.
-        opened: the picture that a person has opened in a channel during the scan: the scan goes on without it.
+        opened: the picture that a person has opened in a channel during the scan, and the lines complete before: the
+            scan goes on in it.
     """
 
     activity: ScanActivity | None = None
@@ -130,7 +131,7 @@ class GxsmScan:
     subscan: list[int] = field(default_factory=lambda: [0, 0, 0, 0])
     ended_s: float = 0.0
     ended_before_s: float = 0.0
-    opened: dict[GxsmChannel, FileContent] = field(default_factory=dict)
+    opened: dict[GxsmChannel, tuple[int, FileContent]] = field(default_factory=dict)
 
 
 class GxsmProgram:
@@ -376,8 +377,6 @@ class GxsmProgram:
         """Return a channel of GXSM's memory as stored values; rows not yet scanned hold the previous scan."""
         if self.scan.activity is None or channel not in self.scan.memory:
             return np.zeros((0, 0), np.float32)
-        if channel in self.scan.opened:
-            return _resized(stored(self.scan.opened[channel]).astype(np.float32), self.scan.activity.shape)
         now_s = self.clock.now_s()
         until_s = now_s if self.scan.runs else self.scan.activity.stopped_s
         scanned = channel.raw(self.scan.activity.channels(until_s)[channel.source][1])
@@ -388,6 +387,8 @@ class GxsmProgram:
             inside = np.zeros(scanned.shape, bool)
             inside[top : top + height, left : left + width] = True
             scanned[~inside] = np.nan
+        if channel in self.scan.opened:
+            scanned[: self.scan.opened[channel][0]] = np.nan
         return np.where(np.isnan(scanned), self.scan.memory[channel], scanned)
 
     # --- a person ---
@@ -424,11 +425,14 @@ class GxsmProgram:
         self.entries.put("PointsY", scan.shape[0])
 
     def open_here(self, path: Path, number: int = 0) -> None:
-        """Open a file in the window of a channel. During a scan the picture replaces the scan there."""
+        """Open a file in the window of a channel. During a scan the picture replaces the lines scanned so far."""
+        assert self.scan.activity is not None
         self.open_file(path)
-        channel, content = self.channels[number], read(path)
-        self.scan.opened[channel] = content
-        self._pictures.setdefault(channel, []).append(stored(content).astype(np.float32))
+        channel, content, shape = self.channels[number], read(path), self.scan.activity.shape
+        picture = _resized(stored(content).astype(np.float32), shape)
+        self.scan.memory[channel] = picture
+        self.scan.opened[channel] = self.scan.activity.lines_done(self.clock.now_s()), content
+        self._pictures.setdefault(channel, []).append(picture)
 
     def save_as(self, path: Path, number: int = 0) -> None:
         """Save a channel under another name, at once."""
@@ -472,11 +476,12 @@ class GxsmProgram:
     def _file(self, channel: GxsmChannel, path: Path, *, finished: bool) -> bytes:
         scan = self.scan.activity
         assert scan is not None
-        image, opened = self.image(channel), self.scan.opened.get(channel)
+        image, (_, opened) = self.image(channel), self.scan.opened.get(channel, (0, None))
+        pictures = [_resized(one, scan.shape) for one in self._pictures.get(channel, ())]
         saved = files.GxsmScanFile(
             str(path),
             channel.label,
-            np.stack([_resized(one, scan.shape) for one in self._pictures[channel]]) if opened else image[None],
+            image[None] if opened is None or len(pictures) == 1 else np.stack(pictures),
             channel.dz,
             channel.unit,
             self.scan.frame,
