@@ -19,7 +19,7 @@ from tests.plugins.by_hand import acts
 from tests.plugins.vendor_bench import TURNED, VendorBench, benches, ready, scanned, scans, small, states
 
 from afspm import read
-from afspm.basics import AfspmError, entry_points
+from afspm.basics import AfspmError
 from afspm.driver import FileContent
 from afspm.model import ControlResponse, PanelAct, ScopeState, names
 
@@ -206,11 +206,3 @@ def test_scan_that_does_not_start_is_refused(maker: Maker, bench: Make) -> None:
     assert response.code == ControlResponse.ACTION_ERROR
     assert "did not begin the scan that it was asked for" in response.reason
     assert scanned(peer), "the next one is taken"
-
-
-@pytest.mark.parametrize("driver", entry_points.names(entry_points.DRIVERS))
-def test_every_driver_compares_within_the_resolution_of_a_row(driver: str) -> None:
-    made = object.__new__(entry_points.load(entry_points.DRIVERS, driver))
-    made.table = type(made).parameter_table({"x-own": {"unit": "m", "resolution": "20 pm"}})
-    assert made.same("x-own", 7.12e-11, 6.94e-11, {})  # spectra F4
-    assert not made.same("x-own", 7.12e-11, 1.12e-10, {})

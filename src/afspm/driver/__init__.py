@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     )
     from afspm.translator.scripted_driver import ScriptedDriver
     from afspm.translator.setting_groups import (
-        CENTER,
         FRAME,
         POSITION,
         KeptSettings,
@@ -56,6 +55,7 @@ if TYPE_CHECKING:  # one maker's controller has it today, and another's may
     from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
     from afspm.translator.parameters import ParameterSpec, ParameterTable, refuse_value
     from afspm.translator.result_files import NEW_FRAME, missing_text, newest
+    from afspm.translator.setting_groups import CENTER
     from afspm.translator.trace import TCP, TRACE
 
 __all__ = [

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -16,16 +14,12 @@ from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_to_line
 from tests.plugins.vendor_bench import Peer, ready, scanned, scans, states
 
 from afspm import read
-from afspm.basics import NS_PER_S
 from afspm.model import MeasurementConditions, Region, Scan, ScopeState, names
-from afspm.plugins.gxsm.result_files import LATE_S, SOON_S, GxsmFiles
-from afspm.translator.judge import Claim, Witness, judge
 
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE
 KINDS: list[dict[str, Any]] = [{"version": 3}, {}, {"transport": "shm"}]
 each_kind = pytest.mark.parametrize("kind", KINDS, ids=["gxsm3", "gxsm4", "shm"])
-CASES = Path(__file__).parents[4] / "shared" / "cases" / "gxsm" / "results"
 
 
 def small(made: Bench, **settings: Any) -> Peer:
@@ -168,40 +162,3 @@ def test_scan_after_a_jump_of_gxsms_clock_is_unproved_and_published(bench: Make)
 
 def set_behind(emulator: Any, behind_s: float) -> None:
     emulator.file_clock.jump(-behind_s - emulator.file_clock.off_s, emulator.clock.now_s())
-
-
-FIRST, SECOND = "between057-M-Xp-ZSmTopo.nc", "between057-Xp-ImTunnel.nc"
-
-
-@pytest.mark.skipif(not CASES.is_dir(), reason="no files of a real Gxsm4 beside the repository")
-@pytest.mark.parametrize(
-    ("there", "earlier", "own", "rule"),
-    [
-        (["between030-M-Xp-ZSmTopo.nc", "zz030-M-Xp-ZSmTopo.nc"], ["between029-M-Xp-ZSmTopo.nc"], 0, ""),
-        ([FIRST, SECOND], ["between054-M-Xp-ZSmTopo.nc"], 1, "one start"),
-        ([FIRST], ["between054-M-Xp-ZSmTopo.nc"], 0, "new start"),
-        ([FIRST], [], 0, "own start"),
-    ],
-)
-def test_files_of_the_real_gxsm(tmp_path: Path, there: list[str], earlier: list[str], own: int, rule: str) -> None:
-    kept: dict[str, Any] = {}
-    files = GxsmFiles(kept, logging.getLogger(), patience_s=10.0, soon_s=SOON_S, late_s=LATE_S)
-
-    def taken(names: list[str], start_ns: int, end_ns: int) -> str:
-        frame = {"frame": [0.0, 0.0, 1e-8, 1e-8, 0.0], "shape": [150, 32], "place": []}
-        files.begin("scan", tmp_path, start_ns, frame, own=True)
-        paths = [Path(shutil.copy(CASES / name, tmp_path)) for name in names]
-        files.end(end_ns, end_ns, [str(path) for path in paths if path.name.startswith("between")])
-        files.results(0.0)
-        return files.results(0.0)[-1]
-
-    for name in earlier:
-        before = read(CASES / name)
-        taken([name], before.start_ns or 0, before.end_ns or 0)
-    # the other scans before it are not among these files
-    whole = read(CASES / (SECOND if there[0] == FIRST else there[0]))
-    start_ns, end_ns = whole.start_ns or 0, whole.end_ns or 0
-    kept["starts"] = [start_ns - 8 * NS_PER_S]
-    result = taken(there, start_ns, end_ns)
-    assert judge(Claim(start_ns), Witness(), files.stated(result)).rule == rule
-    assert {scan.filename for scan in files.load(result)} == {str(tmp_path / name) for name in there[: own + 1]}

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from afspm.basics import entry_points
 from afspm.basics.errors import ConfigError, Refused
 from afspm.driver import Driver, ParameterSpec, ParameterTable, Value
 from afspm.model import names
@@ -131,3 +132,11 @@ def test_faults_of_the_simulator_equal_the_ones_that_can_be_demanded() -> None:
 def test_impossible_settings_of_the_simulator_are_refused(settings: dict[str, object]) -> None:
     with pytest.raises((ConfigError, TypeError)):
         Simulator(**settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("driver", entry_points.names(entry_points.DRIVERS))
+def test_every_driver_compares_within_the_resolution_of_a_row(driver: str) -> None:
+    made = object.__new__(entry_points.load(entry_points.DRIVERS, driver))
+    made.table = type(made).parameter_table({"x-own": {"unit": "m", "resolution": "20 pm"}})
+    assert made.same("x-own", 7.12e-11, 6.94e-11, {})  # spectra F4
+    assert not made.same("x-own", 7.12e-11, 1.12e-10, {})
