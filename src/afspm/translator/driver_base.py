@@ -219,6 +219,8 @@ class DriverBase(ABC):
     """The company or project that makes the controller, for the files of a run."""
     software: ClassVar[str] = ""
     """The controller's program, for the files of a run."""
+    counts_clockwise: ClassVar[bool] = False
+    """True if the controller's panel shows angles clockwise; afspm's are counter-clockwise."""
     simulated: ClassVar[bool] = False
     """True if no real tip can break, so that the experiment's clock may differ from real time."""
     memory_is_all: ClassVar[bool] = False

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_until_line, until
+from tests.plugins.gxsm.gxsm_bench import Bench, Calls, hold_scan, scan_until_line, until
 from tests.plugins.vendor_bench import FLAT, SHAPE, SOON, Peer, ready, scans, states
 
 from afspm import read
@@ -258,6 +258,28 @@ def test_nothing_is_begun_after_a_restart_until_channels_are_set(bench: Make, se
     assert peer.act_once_free(names.START_SCAN).ok
     while not scans(peer.until(FREE)):
         pass
+
+
+# results X6
+@pytest.mark.parametrize("is_killed", [False, True], ids=["", "translator-killed"])
+def test_nothing_is_begun_after_a_restart_in_the_first_scan_of_a_run(bench: Make, is_killed: bool) -> None:
+    made = bench(speed=20.0)
+    peer = small(made)
+    made.at_panel(lambda emulator: hold_scan(emulator.program, 1))
+    calls = Calls(made)
+    assert peer.act(names.START_SCAN).ok
+    calls.until_scan_is_seen()
+    if is_killed:
+        made.kill()
+    made.strike("crash")
+    if not is_killed:
+        peer.until(UNDEFINED)
+    made.start_controller_again(channels_set=False)
+    if is_killed:
+        peer = made.start()
+    made.until_logged("GXSM reports no channel, as after a restart")
+    assert peer.act(names.START_SCAN).code == ControlResponse.NO_RESPONSE
+    assert made.emulator.program.dialogs == []
 
 
 def test_scan_begun_at_a_restarted_gxsm_is_not_the_scan_that_ended_with_the_old_one(bench: Make) -> None:

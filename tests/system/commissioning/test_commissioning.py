@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -20,9 +21,15 @@ from makers import MAKERS
 from rotation import rotated
 from systems import can_interrupt, freeze, interrupt, not_on_wine
 
+from afspm.driver import Driver
+from afspm.plugins.asylum import Asylum
 from afspm.plugins.asylum import link as asylum
+from afspm.plugins.gxsm import Gxsm
+from afspm.plugins.nanonis import Nanonis
 from afspm.plugins.nanonis import session as nanonis
-from afspm.testing.commissioning.guide import NO_PANEL
+from afspm.plugins.nanosurf import Nanosurf
+from afspm.plugins.park import Park
+from afspm.testing.commissioning.guide import NO_PANEL, Guide
 from afspm.testing.commissioning.procedure import REHEARSAL_PATIENCE, CommissioningResult, commission
 from afspm.testing.commissioning.report import InstrumentReport
 from afspm.testing.conformance import CheckOutcome
@@ -151,6 +158,16 @@ def test_a_panel_that_shows_something_else_is_a_mismatch(
     found = result.progress.results[step]
     assert found.outcome is CheckOutcome.FAILED
     assert said in found.line
+
+
+# results X4
+@pytest.mark.parametrize(
+    ("driver", "shown"), [(Gxsm, "20"), (Nanonis, "20"), (Asylum, "20"), (Park, "-20"), (Nanosurf, "-20")]
+)
+def test_angle_is_typed_as_the_panel_shows_it(driver: type[Driver], shown: str, tmp_path: Path) -> None:
+    kit: Any = None
+    person = Person({"angle": shown})
+    assert Guide(kit, person, tmp_path, counts_clockwise=driver.counts_clockwise).compare_angle(-20.0)
 
 
 def test_a_panel_that_shows_the_width_of_whole_pixels_is_right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

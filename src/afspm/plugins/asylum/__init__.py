@@ -77,6 +77,7 @@ class Asylum(ScriptedDriver[Session, AsylumActivity]):
     channel_roles = _CHANNELS
     maker: ClassVar[str] = "Oxford Instruments Asylum Research"
     software: ClassVar[str] = "Asylum Research in Igor Pro"
+    counts_clockwise: ClassVar[bool] = True
     program: ClassVar[str] = "Igor"
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0

@@ -109,6 +109,7 @@ class Gxsm(Driver):
     channel_roles = _CHANNELS
     maker: ClassVar[str] = "Gxsm project"
     software: ClassVar[str] = "Gxsm"
+    counts_clockwise: ClassVar[bool] = True
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
     shadow: ClassVar[str] = "afspm.plugins.gxsm.shadow.GxsmShadow"

@@ -224,7 +224,10 @@ class GxsmActivity(Activity):
 
         After a restart Gxsm4 has no channels. A scan would only open a dialog, which takes all later starts, too.
         """
-        if self._files.channels and all(self._reported(channel) is None for channel in range(_CHANNELS)):
+        # a translator killed in the first scan has perhaps not stored that GXSM named it
+        is_known = self._files.has_named or bool(self._files.what)
+        if is_known and all(self._reported(channel) is None for channel in range(_CHANNELS)):
+            self._files.named()
             self._files.end_with_gxsm()
             hint = (
                 "set the channels at its panel, close its dialog about them, and start a scan there:"
@@ -561,7 +564,10 @@ class GxsmActivity(Activity):
 
     def _reported(self, channel: int) -> str | None:
         path = self.gxsm.ask.text("chfname", channel)  # "EE: invalid channel" for an unused number
-        return None if path.startswith(_NO_CHANNEL) else path
+        if path.startswith(_NO_CHANNEL):
+            return None
+        self._files.named()
+        return path
 
     def _absolute(self, path: str) -> str:
         # "./name" is relative to the folder in which GXSM was started.

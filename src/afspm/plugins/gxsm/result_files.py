@@ -76,6 +76,7 @@ class GxsmFiles(ResultFiles):
         kept.setdefault("absent", [])
         kept.setdefault("channels", {})
         kept.setdefault("program", "")
+        kept.setdefault("has_named", False)
         kept.setdefault("starts", [])  # start times in the last scan's files
         kept.setdefault("behind_ns", 0)  # lag of the clock in the files
 
@@ -133,6 +134,15 @@ class GxsmFiles(ResultFiles):
     def is_written(self, file: Path) -> bool:
         """Return True if the file is newer than all files in the folder at the start of the running measurement."""
         return modified_ns(file) > int(self._kept["running"]["newest_ns"])
+
+    @property
+    def has_named(self) -> bool:
+        """True once GXSM has named the file of a channel in this run."""
+        return bool(self._kept["has_named"])
+
+    def named(self) -> None:
+        """Register that GXSM names the file of a channel."""
+        self._kept["has_named"] = True
 
     @property
     def channels(self) -> dict[str, list[str]]:

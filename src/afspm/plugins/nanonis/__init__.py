@@ -105,6 +105,7 @@ class Nanonis(Driver):
     channel_roles = _CHANNELS
     maker: ClassVar[str] = "SPECS Zurich"
     software: ClassVar[str] = "Nanonis"
+    counts_clockwise: ClassVar[bool] = True
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
     shadow: ClassVar[str] = "afspm.plugins.nanonis.shadow.NanonisShadow"

@@ -43,6 +43,7 @@ class Guide:
         has_panel: True for a real controller. Without a panel, each question about it is shown and skipped.
         has_tip: False for a microscope without a tip, where the steps about it are left out.
         program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
+        counts_clockwise: True if the controller's panel shows angles clockwise.
         in_contact: True if the person has approached the tip, which is withdrawn after the steps at the sample.
     """
 
@@ -52,6 +53,7 @@ class Guide:
     has_panel: bool = True
     has_tip: bool = True
     program_s: float = 0.0
+    counts_clockwise: bool = False
     in_contact: bool = False
 
     @property
@@ -160,6 +162,10 @@ class Guide:
                 return True
             if self.prompts.confirm(f"  afspm reads {shown}, which is not {typed}. Is {typed} what the panel shows?"):
                 raise Failed(f"{what} as at the panel, {typed}", shown)
+
+    def compare_angle(self, turned_deg: float) -> bool:
+        """Compare a counter-clockwise angle with the number at the panel, which may count clockwise."""
+        return self.compare("angle", -turned_deg if self.counts_clockwise else turned_deg, "deg", 0.2)
 
     def _can_be_seen(self, question: str) -> bool:
         if not self.has_panel:

@@ -93,7 +93,13 @@ def _in_session(
     try:
         with restored(session, checks) as kit:
             guide = Guide(
-                kit, prompts, session.folder, has_panel=has_panel, has_tip=session.has_tip, program_s=session.program_s
+                kit,
+                prompts,
+                session.folder,
+                has_panel=has_panel,
+                has_tip=session.has_tip,
+                program_s=session.program_s,
+                counts_clockwise=session.counts_clockwise,
             )
             walk = _Walk(guide, result.progress, write)
             try:

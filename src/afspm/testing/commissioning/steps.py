@@ -101,7 +101,7 @@ def _compare_frame(guide: Guide, frame: FrameSetting) -> int:
     ]
     if guide.kit.support.has(names.SCAN_ANGLE):
         turned_deg = math.degrees(math.remainder(region.angle_rad, math.tau))
-        seen.append(guide.compare("angle, counter-clockwise", turned_deg, "deg", 0.2))
+        seen.append(guide.compare_angle(turned_deg))
     seen += [guide.compare("pixels in a line", columns, ""), guide.compare("lines", rows, "")]
     return sum(seen)
 

@@ -90,6 +90,7 @@ class CheckSession:
         excused: checks that this controller can't pass, with the reason.
         complaints: the logged warnings and errors; the list grows.
         program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
+        counts_clockwise: True if the controller's panel shows angles clockwise.
         has_tip: False for a microscope without a tip.
     """
 
@@ -103,6 +104,7 @@ class CheckSession:
     complaints: Sequence[str]
     maker: str = ""
     program_s: float = 0.0
+    counts_clockwise: bool = False
     has_tip: bool = True
 
 
@@ -149,10 +151,11 @@ def opened(options: CheckOptions) -> Iterator[CheckSession]:
         support = find_out(client, sorted(actions), sorted(parameters))
         named = translator.class_path or " ".join(translator.part.command)
         excused: Mapping[str, str] = {}
-        maker, program_s = "", 0.0
+        maker, program_s, clockwise = "", 0.0, False
         if translator.component is not None and issubclass(translator.component, Driver):
             driver = translator.component
             excused, maker, program_s = driver.excused(support.controller), driver.maker, driver.program_s
+            clockwise = driver.counts_clockwise
         yield CheckSession(
             client,
             support,
@@ -164,6 +167,7 @@ def opened(options: CheckOptions) -> Iterator[CheckSession]:
             complaints,
             maker,
             program_s,
+            clockwise,
             has_tip(experiment),
         )
 
