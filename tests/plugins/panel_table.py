@@ -107,10 +107,11 @@ def _end_of_rig(emulator: Any) -> None:
 
 
 def _end_spectrum(emulator: Any) -> None:
-    program = getattr(emulator, "software", None)
-    for curve in (emulator.rig.spectrum, None if program is None else program.spectra.running):
+    program, rig = getattr(emulator, "software", None), emulator.rig
+    for curve in (rig.spectrum, None if program is None else program.spectra.running):
         if curve is not None:
             object.__setattr__(curve, "end_s", _now(emulator))
+    rig._held_until_s = _now(emulator) + rig.world.settings.feedback.hold_s
 
 
 def _nanonis(name: str, *arguments: object) -> Hand:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 import shutil
+import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -12,9 +14,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deadlines import DEADLINE_S
 from tests.plugins.by_hand import acts
 from tests.plugins.vendor_bench import TURNED, VendorBench, benches, ready, scanned, scans, small, states
 
+from afspm import read
+from afspm.basics import AfspmError, entry_points
+from afspm.driver import FileContent
 from afspm.model import ControlResponse, PanelAct, ScopeState, names
 
 FREE = ScopeState.FREE
@@ -84,6 +90,37 @@ def test_consecutive_scans_have_files_of_their_own(maker: Maker, bench: Make) ->
     assert first in (0, 1)
     assert others == [first + 1, first + 2]
     assert not np.array_equal(found[0].values, found[1].values)
+
+
+def until_file(maker: Maker, folder: Path, before: set[Path]) -> tuple[Path, FileContent]:
+    """Wait until another scan is saved; return its file with the heights, and what that contains."""
+    deadline_s = time.monotonic() + DEADLINE_S
+    while time.monotonic() < deadline_s:
+        for file in set(folder.iterdir()) - before:
+            if re.search(maker.number, file.name):
+                with suppress(AfspmError, OSError):  # it is being written
+                    return file, read(file)
+    raise AssertionError(f"no new file among {list(folder.iterdir())}")
+
+
+@each
+@pytest.mark.parametrize("dates_files", [False, True])
+def test_times_in_files_follow_the_clock_of_the_controller(maker: Maker, bench: Make, *, dates_files: bool) -> None:
+    made = bench(speed=20.0, clock_off_s=-300.0, dates_files=dates_files)
+    small(made)
+    made.kill()  # only the emulated controller is tested here
+    for off_s in (-300.0, 600.0):
+        before, begin_s, real_s = set(made.data.iterdir()), made.clock.now_s(), time.time()
+        made.at_panel(lambda emulator: maker.start(emulator, made.clock.now_s()))
+        file, content = until_file(maker, made.data, before)
+        end_s = made.clock.now_s()
+        times_ns = [one for one in (content.start_ns, content.end_ns) if one is not None]
+        assert times_ns
+        for time_ns in times_ns:  # in whole seconds
+            assert begin_s - 1.0 <= time_ns * 1e-9 - off_s <= end_s + 1.0
+        modified_s = file.stat().st_mtime - (off_s if dates_files else 0.0)
+        assert real_s - 1.0 <= modified_s <= time.time() + 1.0
+        made.strike("clock-ahead", duration_s=900.0)
 
 
 @pytest.mark.parametrize("maker", [MAKERS[name] for name in ("nanonis", "nanosurf", "park")], ids=lambda one: one.name)
@@ -169,3 +206,11 @@ def test_scan_that_does_not_start_is_refused(maker: Maker, bench: Make) -> None:
     assert response.code == ControlResponse.ACTION_ERROR
     assert "did not begin the scan that it was asked for" in response.reason
     assert scanned(peer), "the next one is taken"
+
+
+@pytest.mark.parametrize("driver", entry_points.names(entry_points.DRIVERS))
+def test_every_driver_compares_within_the_resolution_of_a_row(driver: str) -> None:
+    made = object.__new__(entry_points.load(entry_points.DRIVERS, driver))
+    made.table = type(made).parameter_table({"x-own": {"unit": "m", "resolution": "20 pm"}})
+    assert made.same("x-own", 7.12e-11, 6.94e-11, {})  # spectra F4
+    assert not made.same("x-own", 7.12e-11, 1.12e-10, {})

@@ -334,7 +334,7 @@ class Lab:
             case ControlRequest.PARAM, Parameter(name, value, unit):
                 if value is not None:
                     self.values[name] = value
-                return Response(0, wire.encode(Parameter(name, self.values[name], unit or "V"))[1])
+                return Response(0, wire.encode(Parameter(name, self.values[name.removesuffix(".now")], unit or "V"))[1])
         self.executed.append(request.id)
         return Response(ControlResponse.SUCCESS)
 

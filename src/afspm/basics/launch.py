@@ -78,6 +78,9 @@ class Launch:
     """Positions are sample coordinates, which the scheduler maps to tip coordinates."""
     retracts: bool = False
     """For a translator: retract the tip if standard input ends while a request of the run keeps the feedback off."""
+    feedback_off: str = ""
+    """For a translator: a text of its own for each start that a person makes with the feedback off by intention; the
+    translator takes each text once."""
     adjustable: tuple[str, ...] = ()
     """For a translator: parameters that may be set during a scan."""
     solved: tuple[str, ...] = ()

@@ -12,6 +12,7 @@ from afspm.cli.arguments import RUNS, CheckSpeed, HelpWhenBare, Runs, WithinFram
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from afspm.basics.plain_data import Plain
     from afspm.simulation.emulation.emulator import Emulator
     from afspm.testing.translators import CheckOptions
 
@@ -198,7 +199,7 @@ def emulate(
         return
     class_ = find_emulator(name)
     given = {**(class_.usual if usual else {}), **({"port": port} if port else {}), **_settings(settings or [])}
-    made = class_(seed=seed, faults=fault or [], **given)
+    made = class_(seed=seed, faults=fault or [], **_in_si(class_, given))
     made.check()
     _emulate(made, speed, folder or Path(f"emulated-{class_.vendor.lower()}"))
 
@@ -262,6 +263,26 @@ def _settings(given: list[str]) -> dict[str, object]:
         return tomllib.loads("\n".join(lines))
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{' '.join(given)}: {error}", hint="SETTING=VALUE, names separated by dots") from error
+
+
+def _in_si(class_: type[Emulator], given: Plain) -> Plain:
+    # quantities are read as in an experiment file: range_m="2.6 um"
+    from typing import get_type_hints
+
+    from afspm.basics.errors import ConfigError, UnitError
+    from afspm.basics.units import Unit
+
+    found = dict(given)
+    for maker in class_.__mro__:
+        hints = get_type_hints(vars(maker).get("__init__", None) or (lambda: None), include_extras=True)
+        for name in given.keys() & hints.keys():
+            for unit in getattr(hints[name], "__metadata__", ()):
+                if isinstance(unit, Unit):
+                    try:
+                        found[name] = unit.read(given[name])
+                    except UnitError as error:
+                        raise ConfigError(error.what, where=name, hint=error.hint) from error
+    return found
 
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Of it and of its folder, e.g. my_idea.")]

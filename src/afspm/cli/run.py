@@ -79,6 +79,7 @@ def run(
         bool | None,
         opt("Keep the dashboard when it has ended. Default: in a terminal, until Ctrl-C.", "--stay/--no-stay"),
     ] = None,
+    feedback_off: Annotated[bool, opt("The z feedback is off because you want it so.", "--feedback-off")] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show details, too.")] = False,
 ) -> None:
     """Run an experiment.
@@ -104,11 +105,13 @@ def run(
         without=names_in(without),
         speed=speed,
         report=report,
+        feedback_off=feedback_off,
         log_level=logging.DEBUG if verbose else logging.INFO,
     )
     if resume is not None:
         if files or only or without or speed or dry_run or ask:
-            refusal = "a run is resumed as it was started: of other options only --dashboard is possible"
+            others = "--dashboard and --feedback-off"
+            refusal = f"a run is resumed as it was started: of other options only {others} are possible"
             raise typer.BadParameter(refusal, param_hint="--resume")
         found = resuming.find(resume)
         if dashboard:

@@ -39,7 +39,7 @@ def go_on(
     off, by hand; `--feedback-off` lets it measure without feedback, until a request of the run or a person switches it
     on. The experiment must be running: after a kill or a power cut use `afspm run --resume RUN`.
     """
-    from afspm.model import ControlMode, TipStatus, names
+    from afspm.model import ControlMode, TipStatus
 
     with looking(where, acts=True) as follower:
         seen = follower.overview
@@ -49,7 +49,7 @@ def go_on(
             typer.confirm("Let the run continue?", abort=True)
     if feedback_off:
         with acting(where) as scope:
-            scope.action(names.FEEDBACK_MAY_BE_OFF)
+            scope.feedback_may_be_off()
     _set_mode(where, ControlMode.AUTOMATED, "the experiment goes on (AUTOMATED)")
 
 

@@ -12,10 +12,10 @@ from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.parameter_text import Value, value_in
 from afspm.model import ControlRequest, ControlResponse, Parameter
-from afspm.model.instruments import target_of
+from afspm.model.instruments import newest_of, target_of
 
-_LOOK_S = 0.5
-"""Real time between two readings of a value that has not arrived at its target."""
+_FIRST_LOOK_S, _LOOK_S = 0.02, 0.5
+"""Real time between two readings of a value that has not arrived at its target: at first, doubled, and at most."""
 _ROUNDED = 1e-3  # relative: an instrument may round a target, also at the end of a ramp in steps
 
 
@@ -70,11 +70,12 @@ class InstrumentTargets:
             NoResponse: another target was set meanwhile, the value did not arrive by `until_s`, or the instrument has
                 had no value for a minute.
         """
-        link, name = self._link, asked.name
+        link, name, look_s = self._link, asked.name, _FIRST_LOOK_S
         lost_s: float | None = None
         while True:
             found = {part: self._read(f"{name}.{part}", asked.unit, until_s)[0] for part in ("target", "busy")}
-            value, why = self._read(name, asked.unit, until_s)
+            # the value of the last report may be from before its arrival
+            value, why = self._read(name if found["busy"] else newest_of(name), asked.unit, until_s)
             if in_control and not self._control.held:
                 return math.nan if value is None else value
             if found["target"] is not None and not math.isclose(float(found["target"]), target, rel_tol=_ROUNDED):
@@ -87,7 +88,8 @@ class InstrumentTargets:
             if lost_s is not None and now_s - lost_s > PATIENCE_S:
                 what = f"{name} has had no value for {PATIENCE_S:g} s on its way to {asked.value} {asked.unit or ''}"
                 raise NoResponse(what, where=link.name, hint=why)
-            link.wait(lambda: False, link.earlier(_LOOK_S, until_s))
+            link.wait(lambda: False, link.earlier(look_s, until_s))
+            look_s = min(2.0 * look_s, _LOOK_S)
             if until_s is not None and link.clock.monotonic_s() >= until_s:
                 raise NoResponse(f"{name} has not arrived at {asked.value} {asked.unit or ''} in time", where=link.name)
 

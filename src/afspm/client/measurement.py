@@ -107,8 +107,8 @@ class _Watch:
             if name == "ScopeStateMsg":
                 self.cycle.on_state(self._link.view.state, packet.time_ns)
             elif name == CONDITIONS.name:  # just before its result
-                self._conditions = wire.decode(name, packet.payload)
-                self.cycle.on_conditions(self._conditions, packet.time_ns)
+                self._conditions = conditions = wire.decode(name, packet.payload)
+                self.cycle.on_conditions(conditions, packet.time_ns)
             elif name == self._message:
                 found = self._link.view.with_roles(wire.decode(name, packet.payload))
                 self.cycle.on_result(found, packet.time_ns, is_ours=self._is_ours(found))

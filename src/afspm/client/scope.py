@@ -44,9 +44,10 @@ from afspm.model import (
     RelayedMessage,
     ScanSet,
     Spectrum,
+    names,
 )
 from afspm.model.events import HasTime
-from afspm.model.instruments import InstrumentOrders
+from afspm.model.instruments import InstrumentOrders, newest_of
 from afspm.model.sessions import KEYED
 from afspm.model.sweep_plan import SweepOrder, SweepPlan, SweptValues
 from afspm.transport.process.parent import StopRequested
@@ -272,7 +273,22 @@ class Scope(ExperimentView):
 
     @checked_call
     def get(self, parameter: str, unit: str | None = None, *, timeout_s: float | None = ANSWER_S) -> Value:
-        """Return a parameter's value in `unit`; without `unit`, in SI for base parameters, else as received."""
+        """Return a parameter's value in `unit`; without `unit`, in SI for base parameters, else as received.
+
+        The value of another instrument, such as "lockin.x", is at most about a second old (its age at most in s:
+        "lockin.x.age"), and never from before the last request that has changed something.
+        """
+        return self._get(parameter, unit, timeout_s)
+
+    @checked_call
+    def read(self, parameter: str, unit: str | None = None, *, timeout_s: float | None = ANSWER_S) -> Value:
+        """Let an instrument measure a parameter now, and return the value, in the unit as for `get`.
+
+        A parameter of the microscope is read from its controller, as by `get`.
+        """
+        return self._get(newest_of(parameter), unit, timeout_s)
+
+    def _get(self, parameter: str, unit: str | None, timeout_s: float | None) -> Value:
         with self._call():
             asked = Parameter(parameter)
             response = self._commands.read(ControlRequest.PARAM, asked, self._link.until(timeout_s))
@@ -332,6 +348,19 @@ class Scope(ExperimentView):
         """Start an action of the microscope by its name; return when the microscope has accepted it."""
         with self._call():
             self._commands.in_control(ControlRequest.ACTION, name, self._link.until(timeout_s))
+
+    @checked_call
+    def feedback_may_be_off(self, *, timeout_s: float | None = ANSWER_S) -> None:
+        """Say, for a person, that the z feedback is off by intention; needs no control, and the mode MANUAL.
+
+        Raises:
+            Refused: the mode is not MANUAL, or this client speaks for no person with the role `approve`.
+        """
+        with self._call():
+            action = names.FEEDBACK_MAY_BE_OFF
+            response = self._commands.send(ControlRequest.ACTION, action, until_s=self._link.until(timeout_s))
+            if not response.ok:
+                raise refused(ControlRequest.ACTION, response, action)
 
     @checked_call
     def supports(self, action: str, *, timeout_s: float | None = ANSWER_S) -> bool:

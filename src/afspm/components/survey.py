@@ -54,7 +54,8 @@ class Survey(Component):
     The component writes a table into the run folder (number, position, height, outcome, files of zoom and curves) and a
     picture (`.png`, and `.pdf` for print): the survey with its numbered targets, their zooms and curves. If the zoom or
     a curve of a target is refused, for instance by a limit, the table has the reason, and the survey goes on with the
-    next target. With a Drift Compensated Scheduler, positions are positions on the sample.
+    next target. If all zooms are refused, the component ends with the reason. With a Drift Compensated Scheduler,
+    positions are positions on the sample.
 
     Each scan and each curve is taken once, even if processes are killed. If the experiment ends early, table and
     picture show the measurements up to then. Their keys are `survey`, `zoom-3`, `curve-top-3` and so on:
@@ -140,6 +141,7 @@ class Survey(Component):
         separation_m = half_m if separation is None else separation
         self.finder = TargetFinder(targets, count, min_height, separation_m, min(self._wide.region.size_m), refine)
         self._record: SurveyRecord | None = None
+        self._refused: Refused | None = None
         self._needs(dict.fromkeys((*self._wide.parameters, *self._closer.parameters)))
 
     def _needs(self, parameters: Iterable[str]) -> None:
@@ -187,6 +189,10 @@ class Survey(Component):
         if registered:
             level = logging.INFO if all(one.is_registered for one in registered) else logging.WARNING
             self.log.log(level, "zooms: %s", registration_summary(registered))
+        if visits and all(visit.zoom is None for visit in visits):
+            assert self._refused is not None
+            self.log.error("no target could be zoomed: all %d were refused", len(visits))
+            raise self._refused
         if self.end_when_done:
             self.scope.end_experiment()
 
@@ -229,6 +235,7 @@ class Survey(Component):
             scans = self.scope.scan(region, shape=self._closer.shape, key=f"zoom-{visit.number}")
         except Refused as refused:
             visit.refusals.append(f"zoom: {refused.reason}")
+            self._refused = refused
             return
         visit.zoom = self._channel(scans)
         visit.registration, visit.position_sd_m = self._position(visit, scans, mappings)

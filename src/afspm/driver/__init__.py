@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     )
     from afspm.translator.scripted_driver import ScriptedDriver
     from afspm.translator.setting_groups import (
+        CENTER,
         FRAME,
         POSITION,
         KeptSettings,
@@ -59,6 +60,7 @@ if TYPE_CHECKING:  # one maker's controller has it today, and another's may
 
 __all__ = [
     "ANSWERS_S",
+    "CENTER",
     "FEEDBACK_ON",
     "FRAME",
     "LOST",

@@ -13,6 +13,7 @@ from afspm.basics.lazy import lazily
 
 if TYPE_CHECKING:
     from afspm.simulation.activities import RETRACE, ScanActivity, SpectrumActivity
+    from afspm.simulation.emulation.controller_clock import ControllerClock
     from afspm.simulation.emulation.emulator import LOOPBACK, Crashed, Emulator
     from afspm.simulation.emulation.program import MakerProgram, NamedFile
     from afspm.simulation.emulation.scripted import (
@@ -45,6 +46,7 @@ __all__ = [
     "Channels",
     "Client",
     "ClientConnection",
+    "ControllerClock",
     "Crashed",
     "Emulator",
     "Faults",

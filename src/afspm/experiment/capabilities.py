@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from afspm.basics.errors import AfspmError, Refused
 from afspm.experiment.toml_lines import Table
-from afspm.model import ChannelRoles, Parameter, names
+from afspm.model import ChannelRoles, Parameter, Region, names
 
 if TYPE_CHECKING:
     from afspm.translator.parameters import ParameterTable
@@ -22,6 +22,7 @@ class MicroscopeCapabilities:
         parameters: SI unit of each parameter; None: the unit depends on the operating mode.
         sets: parameters that an action of the experiment file sets, by the action's name.
         table: the microscope's parameter table.
+        max_pixels: the largest number of pixels of a scan.
         channels: the channels that the microscope may have, by their roles.
     """
 
@@ -30,6 +31,7 @@ class MicroscopeCapabilities:
     sets: Mapping[str, tuple[Parameter, ...]]
     table: ParameterTable
     channels: ChannelRoles
+    max_pixels: int
 
     def refuses(self, parameter: Parameter) -> str:
         """Return the reason of the microscope to refuse a value; empty for a valid value or an unknown parameter."""
@@ -37,6 +39,19 @@ class MicroscopeCapabilities:
             return ""
         try:
             self.table[parameter.name].parse(parameter.value, parameter.unit)
+        except Refused as refused:
+            return refused.reason
+        return ""
+
+    def refuses_frame(self, region: Region, shape: tuple[int, int]) -> str:
+        """Return the reason of the microscope to refuse a frame as a whole; empty for a frame that it can scan.
+
+        A range that only the controller knows, or a setting in force, may forbid the frame later on.
+        """
+        from afspm.translator.setting_groups import check_together, frame_values, reach_in
+
+        try:
+            check_together(frame_values(region, shape), reach_in(self.table), self.max_pixels)
         except Refused as refused:
             return refused.reason
         return ""
@@ -60,7 +75,7 @@ def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None
     except (AfspmError, AttributeError):
         return None  # the check of its settings reports the error in the table
     units = {name: table[name].si_unit for name in table}
-    return MicroscopeCapabilities(frozenset(actions), units, sets, table, channels)
+    return MicroscopeCapabilities(frozenset(actions), units, sets, table, channels, acting.max_pixels)
 
 
 def _set_by(action: object, table: ParameterTable) -> tuple[Parameter, ...]:

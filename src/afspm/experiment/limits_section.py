@@ -263,14 +263,13 @@ class LimitsReader:
 
     def _compare(self, atom: RuleComparison, units: dict[str, str]) -> None:
         terms = (atom.left, atom.right)
-        for term in terms:
-            kind = "bool" if term.name in STATES else self._type_of(term.name, term.at) if term.name else ""
+        for name, at in ((name, term.at) for term in terms for name in term.names):
+            kind = "bool" if name in STATES else self._type_of(name, at)
             if kind == "text":
-                raise RuleError(f"{term.name} is a text, which no rule can judge", term.at)
+                raise RuleError(f"{name} is a text, which no rule can judge", at)
             if kind:
-                hint = f"write {term.name} or not {term.name} alone"
-                raise RuleError(f"{term.name} is on or off, and can't be compared", term.at, hint)
-        known = {term.name: self.parameters.get(term.name) for term in terms if term.name}
+                raise RuleError(f"{name} is on or off, and can't be compared", at, f"write {name} or not {name} alone")
+        known = {name: self.parameters.get(name) for term in terms for name in term.names}
         known_units = [term.unit for term in terms if not term.name] + [
             unit for unit in known.values() if unit is not None
         ]
@@ -283,9 +282,9 @@ class LimitsReader:
         if left != right:
             what = f"{atom.left} and {atom.right} have different units: {left or 'no unit'} and {right or 'no unit'}"
             raise RuleError(what, atom.left.at if atom.right.name else atom.right.at)
-        for name in known:
-            if units.setdefault(name, left) != left:
-                raise RuleError(f"{name} is compared in {units[name]} and in {left}", atom.left.at)
+        for name, unit in known.items():
+            if units.setdefault(name, left) != left or unit not in (None, left):
+                raise RuleError(f"{name} is compared in {unit or units[name]} and in {left}", atom.left.at)
 
     def _type_of(self, name: str, at: int) -> str:
         # empty for a number

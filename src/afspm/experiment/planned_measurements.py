@@ -93,6 +93,14 @@ class PlannedMeasurements:
         ):
             yield from (Parameter(name, repr(float(end_m)), "m") for end_m in (min(places_m), max(places_m)))
 
+    def scans(self) -> Iterator[tuple[tuple[str | int, ...], Region, tuple[int, int]]]:
+        """Yield each planned scan with its setting: path of the setting, region and (rows, columns)."""
+        for number, region in enumerate(self.regions if self.shape else ()):
+            yield (("regions", number) if self.is_listed else ()), region, self.shape or (1, 1)
+        for setting, scan in self.placed_later.items():
+            if isinstance(scan.region, Region) and isinstance(scan.shape, tuple):
+                yield (setting,), scan.region, scan.shape
+
 
 @dataclass(frozen=True)
 class Refusal:

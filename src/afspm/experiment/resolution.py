@@ -302,8 +302,14 @@ def _resolve_plan(
     wanted: list[tuple[tuple[str, ...], Parameter]] = [((name,), parameter) for parameter in plan.frame()]
     for key, parameters in plan.parameters.items():
         wanted += [((name, key, parameter.name), parameter) for parameter in parameters]
-    for path, parameter in wanted:
-        if reason := has.refuses(parameter):
+    refused: list[tuple[tuple[str | int, ...], str]] = [(path, has.refuses(parameter)) for path, parameter in wanted]
+    if not any(reason for _, reason in refused):
+        refused += [((name, *path), has.refuses_frame(region, shape)) for path, region, shape in plan.scans()]
+        if not plan.is_listed:  # of a grid outside, one reason is enough
+            refused.sort(key=lambda one: not one[1])
+            del refused[1:]
+    for path, reason in refused:
+        if reason:
             resolved.document.error(f"[{name}] plans what its microscope refuses: {reason}", *path)
 
 

@@ -9,8 +9,10 @@ from afspm.model.requests import Parameter
 
 SEPARATOR = "."
 """The separator of component and parameter in a parameter's name: "cryo.temperature"."""
-PARTS = ("target", "busy")
-"""Suffixes of read-only parameter names: "cryo.temperature.target", "cryo.temperature.busy"."""
+NOW = "now"
+PARTS = ("target", "busy", "age", NOW)
+"""Suffixes of read-only parameter names, such as "cryo.temperature.target". "now" lets the instrument measure; "age" is
+the real time in s since the last value was measured, at most."""
 
 
 def instrument_of(parameter: str) -> str:
@@ -27,6 +29,17 @@ def is_of_instrument(parameter: str) -> bool:
 def target_of(parameter: str) -> str:
     """Return the name under which the target of a parameter is read."""
     return f"{parameter}{SEPARATOR}{PARTS[0]}"
+
+
+def newest_of(parameter: str) -> str:
+    """Return the name under which a parameter is measured now; a parameter of the microscope keeps its name."""
+    return f"{parameter}{SEPARATOR}{NOW}" if is_of_instrument(parameter) else parameter
+
+
+def split(parameter: str) -> tuple[str, str]:
+    """Return a parameter and the part in its name: "cryo.temperature.busy" has the part "busy", others have ""."""
+    base, _, part = parameter.rpartition(SEPARATOR)
+    return (base, part) if part in PARTS and instrument_of(base) else (parameter, "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +88,7 @@ class InstrumentReadings:
 
     Attributes:
         token: the token of the scheduler's last answer before the report.
+        patience_s: real time for which the scheduler may hold back its answer until it has an order.
     """
 
     time_ns: int
@@ -82,11 +96,12 @@ class InstrumentReadings:
     readings: tuple[InstrumentReading, ...] = ()
     outcomes: tuple[OrderOutcome, ...] = ()
     token: int = 0
+    patience_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class InstrumentOrder:
-    """A target for an instrument to set.
+    """A target for an instrument to set, or a parameter without a value, to measure now.
 
     Attributes:
         number: identifies the order in its outcome.
@@ -99,6 +114,10 @@ class InstrumentOrder:
     parameter: Parameter
     rate_per_s: float | None = None
     rate_unit: str = ""
+
+    @property
+    def is_reading(self) -> bool:
+        return self.parameter.value is None
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,8 @@ MOVE_SPEED: Final = "move-speed"
 PROBE_POS_X: Final = "probe-pos-x"
 PROBE_POS_Y: Final = "probe-pos-y"
 TIP_BIAS_VOLTAGE: Final = "tip-bias-voltage"
+SAMPLE_BIAS: Final = "x-sample-bias"
+"""The second electrode, of a microscope that has both: between tip and sample lies the difference."""
 
 # The SI unit of each base parameter; None where it depends on the operating mode of the microscope.
 BASE_PARAMETERS: Final[dict[str, str | None]] = {

@@ -145,6 +145,7 @@ class SchedulerCore:
         draft, is_restart = StateDraft(self.state, self._env, now_s, now_ns), self._restored is not None
         draft.peers = replace(draft.peers, timeout=replace(draft.peers.timeout, started_s=now_s))
         draft.watchdog = draft.watchdog.begun(now_s)
+        draft.instruments = draft.instruments.changed(now_s)  # an earlier life may have changed anything
         draft.lease = draft.lease.held_by(draft.control.holder, now_ns)
         if self._restored is not None:
             draft.lease = draft.lease.asked(self._restored.lease_s, now_s)

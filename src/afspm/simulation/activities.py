@@ -12,7 +12,7 @@ import numpy as np
 from afspm.model import Feedback, Region
 from afspm.model.arrays import Array
 from afspm.simulation.measuring import Adjustment
-from afspm.simulation.scanning import Course, SimulatedScan
+from afspm.simulation.scanning import Course, SimulatedScan, clipped
 
 Channels = dict[str, tuple[str, Array]]
 """Channel -> (unit, values [y, x], both ascending)."""
@@ -63,6 +63,7 @@ class ScanActivity:
         upwards: True if the first line has the smallest y.
         feedback, bias_v, slope: settings at the start of the scan.
         adjusted: changes during the scan, each in force from the next line on.
+        reach_m: largest distance of the tip from the scanner's centre, in x and y; None: unlimited.
         stopped_s: the time of the scan's interruption; None without.
     """
 
@@ -76,6 +77,7 @@ class ScanActivity:
     bias_v: float
     slope: tuple[float, float] = (0.0, 0.0)
     adjusted: tuple[Adjustment, ...] = ()
+    reach_m: tuple[float, float] | None = None
     stopped_s: float | None = None
     paused_since_s: float | None = None
     paused_s: float = 0.0
@@ -91,7 +93,8 @@ class ScanActivity:
         Raises:
             InvalidValue: the settings allow no scan.
         """
-        return Course(self.region, self.shape, self.line_s, self.start_s, "up" if self.upwards else "down")
+        direction = "up" if self.upwards else "down"
+        return Course(self.region, self.shape, self.line_s, self.start_s, direction, self.reach_m)
 
     def draw(self, values: ScanValues) -> None:
         """Set the values; `channels` waits for this call."""
@@ -145,7 +148,9 @@ class ScanActivity:
         along = np.array([there - 0.5, (up if self.upwards else 1.0 - up) - 0.5]) * self.region.size_m
         cos, sin = np.cos(self.region.angle_rad), np.sin(self.region.angle_rad)
         (x, y), (cx, cy) = along, self.region.center_m
-        return float(cx + cos * x - sin * y), float(cy + sin * x + cos * y)
+        at_m = np.array([cx + cos * x - sin * y, cy + sin * x + cos * y])
+        tip_x, tip_y = at_m if self.reach_m is None else clipped(at_m, np.array(self.reach_m))
+        return float(tip_x), float(tip_y)
 
     def channels(self, until_s: float | None = None) -> Channels:
         """Return channel -> (unit, values [y, x]), both ascending; lines not complete at `until_s` are NaN.

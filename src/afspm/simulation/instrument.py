@@ -67,6 +67,7 @@ class InstrumentSetup:
         slope: tilt compensation (dz/dx, dz/dy), without unit.
         move_speed_m_s: speed of the probe outside of scans.
         approach_s: duration of an approach or a withdrawal.
+        reach_m: largest distance of the tip from the scanner's centre in a scan, in x and y; None: unlimited.
     """
 
     def __init__(self, feedback: FeedbackSettings) -> None:
@@ -81,6 +82,7 @@ class InstrumentSetup:
         self.slope = (0.0, 0.0)
         self.move_speed_m_s = 5e-6
         self.approach_s = 1.0
+        self.reach_m: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,8 @@ class SimulatedInstrument:
         self._noise = np.random.default_rng((seed, 3))
         self._signals: Mapping[str, float] = {}
         self._held_until_s = -math.inf
+        self._measured: ScanActivity | SpectrumActivity | None = None
+        self._conditions: Plain = {}
         self._note = note
         self.damage = DamageCounter(self.world, start_s, note)
 
@@ -250,13 +254,14 @@ class SimulatedInstrument:
             setup.bias_v,
             setup.slope,
             tuple(later),
+            setup.reach_m,
         )
         draw = self.drawing.prepared(scan, engaged=self.engaged)
         changes = self._change_tip_in(scan)
         self.drawing.keep_world()
         self._counts["scan"] = number
         self.note(now_s, "scan starts", {"number": number, "setup": _setup_of(scan), "changes_in_scan": changes})
-        self.scan = self._doing = scan
+        self.scan = self._doing = self._measured = scan
         if self.engaged:
             self.damage.scan_starts(scan, now_s)
         self.drawing.start(scan, draw)
@@ -328,21 +333,25 @@ class SimulatedInstrument:
                 values[:, column] = noise_in_air(random, values.shape[:1], unit)
         end_s = now_s + sweeps * self.world.spectrum_s(kind)
         self.spectrum = SpectrumActivity(number, kind, self._probe_m, now_s, end_s, names, units, values)
-        self._doing = self.spectrum
+        self._doing = self._measured = self.spectrum
         if self.engaged:
             self._held_until_s = end_s + self._hold_s
         self.damage.spectrum_starts(self.spectrum if self.engaged else None)
         facts = {"number": number, "kind": kind, "position_m": self._probe_m, "bias_v": self.setup.bias_v}
         self.note(now_s, "spectrum starts", {**facts, **self.world.property_truth(self._probe_m, now_s)})
+        self.note_changes(now_s)
         return self.spectrum
 
     def stop_spectrum(self, now_s: float) -> None:
         """Interrupt and discard a running spectrum."""
         if isinstance(self._doing, SpectrumActivity) and self._doing.running(now_s):
+            self.note_changes(now_s)
+            self._measured = replace(self._doing, end_s=now_s)
             self._doing = self.spectrum = None
             self._held_until_s = min(self._held_until_s, now_s + self._hold_s)
             self.damage.spectrum_starts(None)
             self.note(now_s, "spectrum stopped", {})
+            self.note_changes(now_s)
 
     # -- moves
 
@@ -407,6 +416,7 @@ class SimulatedInstrument:
         """Switch the feedback on or off, and count the time up to now in the ledger."""
         self.account(now_s)
         self.setup.feedback = replace(self.setup.feedback, on=on)
+        self.note_changes(now_s)
 
     def is_held(self, now_s: float) -> bool:
         """Return whether the controller holds the feedback, in a spectrum or after it, and will give it back."""
@@ -488,6 +498,7 @@ class SimulatedInstrument:
         """Start the approach to the sample; `engaged` is True from its start."""
         self._check_free(now_s)
         self.engaged = True
+        self.note_changes(now_s)
         self.occupy("approach", self.setup.approach_s, now_s)
 
     def withdraw(self, now_s: float) -> None:
@@ -495,7 +506,8 @@ class SimulatedInstrument:
         self.stop_scan(now_s)
         self.stop_spectrum(now_s)
         self.account(now_s)
-        self._doing, self.engaged, self._held_until_s = None, False, -math.inf
+        self._doing, self.engaged, self._held_until_s = None, False, min(self._held_until_s, now_s)
+        self.note_changes(now_s)
         self.occupy("approach", self.setup.approach_s, now_s)
 
     # -- anything else
@@ -523,8 +535,10 @@ class SimulatedInstrument:
         """Add to the ledger the time since the last call, and the measurement if it has ended.
 
         Call this method before a change of `setup.feedback` or `engaged`: the elapsed time counts with the old values.
+        Also note the changes since the last call.
         """
         self.damage.account(now_s, feedback_off=self._is_feedback_off)
+        self.note_changes(now_s)
 
     @property
     def ledger(self) -> DamageLedger:
@@ -577,6 +591,7 @@ class SimulatedInstrument:
         self.scan, self.spectrum = found.scan, found.spectrum
         self._held_until_s = -math.inf if found.held_until_s is None else found.held_until_s
         self._doing = found.scan or found.spectrum or found.move or found.occupied
+        self._measured = found.scan or found.spectrum
         self.damage.restore(found.ledger, found.scanned, (found.scan or found.spectrum) if found.engaged else None)
         # the values are not saved: the world at the start of the scan gives the same values again
         if self.scan is not None:
@@ -594,6 +609,39 @@ class SimulatedInstrument:
         if self._note is not None:
             truth = {} if self.drawing.goes_on else {"truth": self.world.truth(time_s)}
             self._note(time_s, event, {**facts, **truth})
+
+    def note_changes(self, now_s: float) -> None:
+        """Record the end of the measurement, and conditions that have changed since the last call.
+
+        The conditions of a measurement are in the last line before its start, and in all lines until its end. These
+        lines are many, and so without the ground truth.
+        """
+        if self._note is None:
+            return
+        lines: list[tuple[float, str, Plain]] = []
+        measured, before = self._measured, self._conditions
+        if measured is not None and not measured.running(now_s):
+            self._measured = None
+            lines.append((measured.end_s, f"{measured.what} ends", self._end_of(measured)))
+        if before.get("held") and self._held_until_s <= now_s:
+            before = {**before, "held": False}
+            lines.append((self._held_until_s, "conditions", before))
+        self._conditions = {
+            "engaged": self.engaged,
+            "held": self.is_held(now_s),
+            "feedback": asdict(self.setup.feedback),
+            "bias_v": self.setup.bias_v,
+        }
+        if self._conditions != before:
+            lines.append((now_s, "conditions", self._conditions))
+        for line in sorted(lines, key=lambda line: line[0]):
+            self._note(*line)
+
+    def _end_of(self, measured: ScanActivity | SpectrumActivity) -> Plain:
+        if isinstance(measured, SpectrumActivity):
+            return {"number": measured.number, "stopped": self.spectrum is None}
+        lines = measured.lines_done(measured.end_s)
+        return {"number": measured.number, "stopped": measured.stopped_s is not None, "lines": lines}
 
     def _check_free(self, now_s: float) -> None:
         doing = self.doing(now_s)
@@ -621,6 +669,7 @@ def _setup_of(scan: ScanActivity) -> Plain:
         "feedback": asdict(scan.feedback),
         "bias_v": scan.bias_v,
         "slope": scan.slope,
+        "reach_m": scan.reach_m,
     }
 
 

@@ -245,7 +245,7 @@ def feel(course: Course, tips: TipTimes, setup: Setup) -> Felt:
 
 def _sample_positions(course: Course, setup: Setup, part: float) -> tuple[Array, Array]:
     # the drift is constant within a row
-    x, y = course.region.pixels_m(course.shape)
+    x, y = course.pixels_m()
     times = course.row_times_s(part)
     away = setup.drift_m(times)[:, :2] + setup.offset_m(times)
     lag = setup.scanner.backlash_m if part > 0.5 else 0.0
@@ -304,7 +304,7 @@ def _tilt(course: Course, slope: tuple[float, float]) -> Array | float:
     # a plane through the origin of tip coordinates
     if slope == (0.0, 0.0):
         return 0.0
-    x, y = course.region.pixels_m(course.shape)
+    x, y = course.pixels_m()
     return np.asarray(slope[0] * x + slope[1] * y)
 
 

@@ -123,6 +123,7 @@ class ScanDrawing:
             direction=course.direction,
             slope=scan.slope,
             adjusted=scan.adjusted,
+            reach_m=scan.reach_m,
         )
 
 

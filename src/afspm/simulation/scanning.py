@@ -50,6 +50,11 @@ class ScannerSettings:
         check(self, from_zero="band_limit_px oversampling backlash_m", fraction="creep")
 
 
+def clipped(along_m: Array, reach_m: Array | float) -> Array:
+    """Return positions within the scanner's reach."""
+    return np.asarray(np.clip(along_m, -reach_m, reach_m))
+
+
 @dataclass(frozen=True)
 class Course:
     """Positions and times of a scan's pixels.
@@ -59,6 +64,8 @@ class Course:
         shape: (ny, nx).
         line_s: duration of trace and retrace together.
         direction: direction of the slow axis, "up" (small y first) or "down".
+        reach_m: largest distance of the tip from the scanner's centre, in x and y: beyond it the output is clipped, so
+            that pixels show the surface at the edge; None: unlimited.
     """
 
     region: Region
@@ -66,6 +73,7 @@ class Course:
     line_s: float
     start_s: float
     direction: str = "up"
+    reach_m: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         ny, nx = self.shape
@@ -100,6 +108,11 @@ class Course:
         if until_s is None:
             return np.ones(self.shape[0], dtype=bool)
         return np.asarray(self.row_times_s(1.0) <= until_s + 1e-9 * self.line_s)
+
+    def pixels_m(self) -> tuple[Array, Array]:
+        """Return x and y of the tip at each pixel, in m, both of the scan's shape."""
+        x, y = self.region.pixels_m(self.shape)
+        return (x, y) if self.reach_m is None else (clipped(x, self.reach_m[0]), clipped(y, self.reach_m[1]))
 
     @property
     def pixel_m(self) -> tuple[float, float]:

@@ -160,6 +160,7 @@ class World:
         direction: str = "up",
         slope: tuple[float, float] = (0.0, 0.0),
         adjusted: Sequence[Adjustment] = (),
+        reach_m: tuple[float, float] | None = None,
     ) -> SimulatedScan:
         """Scan a region, from `start_s` on.
 
@@ -171,11 +172,12 @@ class World:
             direction: direction of the slow axis, "up" (small y first) or "down".
             slope: compensation of the sample's tilt, (x, y) in m/m.
             adjusted: changes during the scan, each in force from the next line on.
+            reach_m: largest distance of the tip from the scanner's centre, in x and y; None: unlimited.
 
         Raises:
             InvalidValue: an impossible scan, or invalid feedback.
         """
-        course = Course(region, shape, line_s, start_s, direction)
+        course = Course(region, shape, line_s, start_s, direction, reach_m)
         loop = Loop.of(self.settings.feedback, feedback)
         if not all(map(math.isfinite, (bias_v, *slope))):
             raise InvalidValue(f"bias {bias_v} V and slope {slope} must be finite")

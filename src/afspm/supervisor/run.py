@@ -23,6 +23,7 @@ from afspm.model.events import LOGGED_AS
 from afspm.record.run_json import (
     COMPUTER,
     ENDED,
+    FEEDBACK_OFF,
     METADATA,
     PLANNED,
     REAL_S,
@@ -69,6 +70,7 @@ class RunOptions:
         speed: experiment seconds in a real second, instead of the file's; for simulated microscopes only.
         report: whether to write the report at the end.
         metadata: entries that override [metadata] of the file.
+        feedback_off: whether a person says that the z feedback is off by intention at this start.
         log_level: lowest level of log lines, of `logging`, for the processes and the terminal.
     """
 
@@ -78,6 +80,7 @@ class RunOptions:
     speed: float | None = None
     metadata: Mapping[str, str] = field(default_factory=dict)
     report: bool = True
+    feedback_off: bool = False
     log_level: int = logging.INFO
 
 
@@ -141,6 +144,8 @@ def go(
         before = run_json_or_empty(folder)  # empty unless the run is resumed
         files = before.get(FILES) or list(map(str, experiment.files))
         facts = {**run_facts(name, starts, common), **facts_to_resume(experiment, starts, options), FILES: files}
+        if said := [*before.get(FEEDBACK_OFF, ()), *([clock.now_ns()] if options.feedback_off else [])]:
+            facts[FEEDBACK_OFF] = said
         facts |= own_runs.signed(folder, [*map(str, experiment.folders)])
         facts[METADATA] = before.get(METADATA) or experiment.resolved.metadata() | dict(options.metadata)
         works = experiment.planned_work().items()
@@ -288,7 +293,18 @@ def _starts(
     )
     if not starts:
         raise ConfigError("nothing is left to start", hint="see --only and --without")
+    if options.feedback_off:
+        starts = [_with_feedback_off(start, common.clock.now_ns()) for start in starts]
+        if not any(start.launch.feedback_off for start in starts):
+            hint = "say it where the translator is started"
+            raise ConfigError("no translator is started here", where="--feedback-off", hint=hint)
     return starts
+
+
+def _with_feedback_off(start: ProcessStart, now_ns: int) -> ProcessStart:
+    # of this start alone: a restarted translator gets the same text, and in a resumed run it gets another one
+    is_translator = start.role is Role.TRANSLATOR
+    return replace(start, launch=replace(start.launch, feedback_off=str(now_ns))) if is_translator else start
 
 
 def _own_identity(experiment: Experiment, options: RunOptions) -> RunIdentity:

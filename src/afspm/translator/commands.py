@@ -145,10 +145,21 @@ class Commands:
         if action.only_stops and state not in action.interrupts:
             return done
         self._refuse_if_busy(action.while_busy)
+        treatment = self._temporary.treatment
         if action.name in STARTS:
             self._refuse_without_tip()
+            treatment.refuse_start()
+        treatment.forget()  # of a treatment that this action ends
+        if action.name in names.TREATMENTS:
+            treatment.expect(action.name, action.state)
         self._about_to_act(request)
-        action.do()
+        try:
+            action.do()
+        except LOST:
+            raise  # it may have been carried out
+        except Exception:  # a driver may raise anything; it is raised again
+            treatment.forget()
+            raise
         if state in action.interrupts:
             done.steps = self._sequence.interrupt()
         elif action.state is not None:

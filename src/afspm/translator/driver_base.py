@@ -17,9 +17,9 @@ from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.basics.units import Duration, PollPeriod
 from afspm.model import ChannelRoles, ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.translator.judge import Stated
-from afspm.translator.parameters import ParameterTable, Value
+from afspm.translator.parameters import ParameterSpec, ParameterTable, Value
 from afspm.translator.polling import EAGER_S
-from afspm.translator.setting_groups import SettingsGroup
+from afspm.translator.setting_groups import SettingsGroup, reach_in
 
 T = TypeVar("T")
 
@@ -268,6 +268,8 @@ class DriverBase(ABC):
         if live_lines_s is not None and type(self).lines is DriverBase.lines:
             raise ConfigError(f"{type(self).__name__} does not publish lines of a running scan", where="live_lines_s")
         self.table = self.parameter_table(parameters or {})
+        # a microscope that can't move its tip alone has no rows for it later on, and the same scanner
+        self._reach = reach_in(self.table)
         self.channels = self.channels_of({"channels": channels})
         self.common = CommonSettings(dict(actions or {}), poll_period_s, result_timeout_s, live_lines_s, trace)
         self.adjustable: frozenset[str] = frozenset()
@@ -405,6 +407,13 @@ class DriverBase(ABC):
         """
         return ""
 
+    def current_a(self) -> float | None:
+        """Return the tunnelling current that the feedback holds, in A; None if the controller does not show it.
+
+        Override where it does: a pulse or crash then ends once the feedback holds the current at its setpoint.
+        """
+        return None
+
     def is_last_written(self, name: str, value: Value) -> bool:
         """Return whether the run has set this parameter last, and to this value."""
         return name in self._last_written and self.table[name].same(self._last_written[name], value)
@@ -478,12 +487,20 @@ class DriverBase(ABC):
     def same(self, name: str, a: Value, b: Value, among: Mapping[str, Value]) -> bool:
         """Return whether two values of a parameter are equal within the controller's precision.
 
-        Override only where a `resolution` in the table can't describe the precision.
+        Override only where a `resolution` in the table can't describe the precision, and accept what `super().same`
+        accepts: the experiment file may give any row a `resolution`.
 
         Args:
             among: the values that were read together with `a`.
         """
         return self.table[name].same(a, b)
+
+    def reach(self) -> Mapping[str, ParameterSpec]:
+        """Return the range of the scanner: rows of the table for the places of the probe and of a frame's centre.
+
+        Each frame is compared with it, with all corners. Override where the controller reports its range.
+        """
+        return self._reach
 
     def in_force(self, wanted: Collection[str]) -> dict[str, Value]:
         """Return the values of `read`, each replaced by the last set value if equal within the precision.

@@ -75,6 +75,7 @@ class Observer:
         self._polling = AdaptivePolling(driver.common.poll_period_s, driver.eager_poll_s)
         self._live = LiveLines(driver)
         self.values: dict[str, Value] = {}
+        self._told: dict[str, Value] = {}
         # of real time at least, for an emulated controller
         settles_s = max(driver.settles_s, driver.settles_s / self._clock.real_s(1.0))
         feedback = WishedFeedback(state.kept, settles_s, follows=driver.only_reads)
@@ -107,6 +108,7 @@ class Observer:
             self._is_after_spectrum = True
             self.panel.feedback.held(self._clock.now_s())
         self._take_in(self._read())
+        self._told = self._as_told()
         acts = self.panel.read({}, self.values, ScopeState.UNDEFINED, self._clock.now_ns(), self._driver.withdrew_tip())
         self.publish_all()
         self._tell(acts)
@@ -352,7 +354,7 @@ class Observer:
 
     def _publish_channels(self) -> None:
         # at constant height another channel shows the surface
-        feedback = setting_groups.feedback(self.values)
+        feedback = setting_groups.feedback(self._told)
         self._publish_change(self._driver.channels.with_topography(feedback_on=feedback.on))
 
     def _publish_units(self) -> None:
@@ -418,7 +420,7 @@ class Observer:
 
     def publish_all(self) -> None:
         """Publish the present settings and the published state again, for a newly connected scheduler."""
-        for thing in setting_groups.messages(self.values).values():
+        for thing in setting_groups.messages(self._told).values():
             self.publish(thing)
         self._published_last.clear()
         self._publish_channels()
@@ -446,12 +448,12 @@ class Observer:
         return self._temporary.status or self._driver.status()
 
     def _observe_values(self, announce: Sequence[str]) -> None:
-        values, old = self._read(), self.values
-        self._take_in(values)
-        if announce or values != old:
+        self._take_in(self._read())
+        old, self._told = self._told, self._as_told()
+        if announce or self._told != old:
             self._publish_channels()
             before = setting_groups.messages(old)
-            for name, thing in setting_groups.messages(values).items():
+            for name, thing in setting_groups.messages(self._told).items():
                 if name in announce or before.get(name) != thing:
                     self.publish(thing)
         self._plan_reading()
@@ -467,11 +469,20 @@ class Observer:
     def _read(self) -> dict[str, Value]:
         # a difference below the controller's resolution is no change
         table, old = self._driver.table, self.values
-        values = self._driver.in_force([*setting_groups.watched(table), *(name for name in EXTRA if name in table)])
+        extra = [name for name in EXTRA if name in table]
+        values = self._driver.in_force([*setting_groups.watched(table), *extra, *table.watched])
         return {
             name: old[name] if name in old and table[name].same(old[name], value) else value
             for name, value in values.items()
         }
+
+    def _as_told(self) -> dict[str, Value]:
+        # a feedback that the controller itself holds in a spectrum, and gives back, is on for others
+        feedback = self.panel.feedback
+        may_hold = self._state.sequence.published.state is ScopeState.SPEC or feedback.level is FeedbackLevel.HELD
+        if may_hold and feedback.wished and self.values.get(FEEDBACK_ON) is False:
+            return {**self.values, FEEDBACK_ON: True}
+        return self.values
 
     def _take_in(self, values: dict[str, Value]) -> None:
         self.values = values

@@ -71,6 +71,7 @@ class PanelWatch:
         self._kept = kept
         self._table = table
         self._written = written
+        self._settings = _SETTINGS | set(table.watched)
         self._last: ScopeState | None = None
         self._still: ScopeState | None = None
         self._tip_is_moved = self._is_lost = False
@@ -143,11 +144,14 @@ class PanelWatch:
             acts.append(self._tip_act(PanelAct.WITHDRAW, now_ns))
         acts += self._feedback_acts(now, state, now_ns, withdrew)
         # a running scan moves the tip, and a spectrum may
-        watched = _SETTINGS if state is ScopeState.SCANNING or is_after_spectrum else _SETTINGS | set(POSITION)
+        watched = self._settings
+        if state is not ScopeState.SCANNING and not is_after_spectrum:
+            watched = watched | set(POSITION)
         if last in CALM and state in CALM and (changes := self._changes(before, now, watched)):
             acts.append(ActByHand(now_ns, PanelAct.VALUES, changes=tuple(changes.values())))
-            self._by_hand |= {name: now[name] for name in changes if name in _SETTINGS}
-        self._see_tip(now)
+            self._by_hand |= {name: now[name] for name in changes if name in self._settings}
+        is_held = state is ScopeState.SPEC or self.feedback.level is FeedbackLevel.HELD
+        self._see_tip({**now, FEEDBACK_ON: True} if is_held and self.feedback.wished and FEEDBACK_ON in now else now)
         return acts
 
     def _feedback_acts(

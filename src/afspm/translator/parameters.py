@@ -49,6 +49,8 @@ class ParameterSpec:
         sign: -1 where the controller's sign is opposite (an axis pointing down, angles clockwise).
         resolution: smaller differences are ignored (rounding by the controller, noise of a read-back), in SI.
         measured: a reading is a measured value, and not the setting: no measurement stands for it.
+        multiple: for an "int", the step of the accepted values, from 0: 16 accepts 16, 32, 48 …
+        watched: a change by a person is published and recorded, as one of bias, setpoint and frame always is.
         where: the place where `range` was set; empty without a range.
     """
 
@@ -63,6 +65,8 @@ class ParameterSpec:
     sign: float = 1.0
     resolution: float = 0.0
     measured: bool = False
+    multiple: int = 1
+    watched: bool = False
     where: str = ""
 
     @property
@@ -129,6 +133,10 @@ class ParameterSpec:
         if self.type == "int":
             if value != int(value):
                 raise refuse_value(self.name, f"{value:g} is not a whole number")
+            if value % self.multiple:
+                below = max(int(value // self.multiple), 1) * self.multiple
+                nearest = f"{below} or {below + self.multiple}"
+                raise refuse_value(self.name, f"{value:g} is no multiple of {self.multiple}: set {nearest}")
             return int(value)
         return float(value)
 
@@ -192,6 +200,15 @@ class ParameterSpec:
         number = units.convert(float(value), self.si_unit, self.unit)
         return f"{number:.6g} {unit_text(self.unit)}".rstrip()
 
+    def within(self, bounds: tuple[float, float], where: str) -> ParameterSpec:
+        """Return the row with a narrower range, if it reaches beyond these bounds.
+
+        Args:
+            where: the place where the bounds are set, for people.
+        """
+        low, high = max(self.range[0], bounds[0]), min(self.range[1], bounds[1])
+        return self if (low, high) == self.range else replace(self, range=(low, high), where=where)
+
     def range_text(self) -> str:
         """Return the range as readable text, with the place where the range was set."""
         text = f"{self.quantity(self.range[0])} to {self.quantity(self.range[1])}"
@@ -250,6 +267,11 @@ class ParameterTable(Mapping[str, ParameterSpec]):
 
     def without(self, names_: Collection[str]) -> ParameterTable:
         return ParameterTable({name: row for name, row in self._rows.items() if name not in names_})
+
+    @property
+    def watched(self) -> tuple[str, ...]:
+        """The names of the rows whose changes by a person are published."""
+        return tuple(name for name, row in self._rows.items() if row.watched)
 
     def find(self, name: str) -> ParameterSpec:
         """Return a parameter by the name that a peer sent.
@@ -328,7 +350,10 @@ def _row(known: ParameterSpec, given: PlainMapping, where: str, *, translated: b
     for key in ("vendor", "unit", "type"):
         if not isinstance(values.get(key, ""), str):
             raise ConfigError(f"{key} must be a text, not {values[key]!r}", where=at)
-    for key in ("read_only", "while_busy"):
+    multiple = values.get("multiple", 1)
+    if isinstance(multiple, bool) or not isinstance(multiple, int) or multiple < 1:
+        raise ConfigError(f"multiple must be a whole number from 1 on, not {multiple!r}", where=at)
+    for key in ("read_only", "while_busy", "watched"):
         if not isinstance(values.get(key, False), bool):
             raise ConfigError(f"{key} must be true or false, not {values[key]!r}", where=at)
     if "choices" in values:

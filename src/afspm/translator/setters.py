@@ -75,7 +75,8 @@ def apply(
     speed = {names.SCAN_SPEED} & table.keys() if framed else set()
     before = driver.in_force(whole | speed)
     wanted = {**before, **values}
-    check_together(wanted, table, driver.max_pixels)
+    if framed or not values.keys().isdisjoint(POSITION):
+        check_together(wanted, driver.reach(), driver.max_pixels)
     former = {name: value for name, value in before.items() if not table[name].read_only}
     about_to_act()
     try:

@@ -8,9 +8,10 @@ from collections.abc import Collection, Mapping
 from typing import Final
 
 from afspm.basics.errors import InvalidValue, Refused
+from afspm.basics.formatting import lengths_text
 from afspm.basics.plain_data import Plain
 from afspm.model import ControlResponse, Feedback, ProbePosition, Region, ScanParameters, names
-from afspm.translator.parameters import FEEDBACK_ON, ParameterTable, Value, refuse_value
+from afspm.translator.parameters import FEEDBACK_ON, ParameterSpec, ParameterTable, Value, refuse_value
 from afspm.wire.messages import FEEDBACK as FEEDBACK_STATE
 from afspm.wire.messages import PROBE_POSITION, SCAN_PARAMETERS
 
@@ -29,6 +30,8 @@ EXTENT: Final = (names.SCAN_SIZE_X, names.SCAN_RESOLUTION_Y, names.SCAN_RESOLUTI
 """The parameters that a scan's duration depends on, with the speed: certainly width and rows, perhaps the others."""
 FEEDBACK: Final = (FEEDBACK_ON, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN, names.ZCTRL_SETPOINT)
 POSITION: Final = (names.PROBE_POS_X, names.PROBE_POS_Y)
+CENTER: Final = ("x-scan-center-x", "x-scan-center-y")
+"""The centre of the frame, at a controller whose offset has a range of its own."""
 _FRAME_MESSAGE, _FEEDBACK_MESSAGE, _POSITION_MESSAGE = SCAN_PARAMETERS.name, FEEDBACK_STATE.name, PROBE_POSITION.name
 
 MOVES: Final = frozenset(FRAME + POSITION)
@@ -165,14 +168,21 @@ def feedback(values: Mapping[str, Value]) -> Feedback:
     )
 
 
-def check_together(values: Mapping[str, Value], table: ParameterTable, max_pixels: int) -> None:
-    """Check a frame as a whole: its size, its number of pixels, and the reach of the probe.
+def check_together(values: Mapping[str, Value], reach: Mapping[str, ParameterSpec], max_pixels: int) -> None:
+    """Compare a frame with the number of pixels and the range of the scanner, and a position with this range.
 
-    Values without a complete frame are not checked.
+    A frame that is not complete in `values` is not compared.
+
+    Args:
+        reach: the ranges of the scanner, by the names of `POSITION` and `CENTER`, as `DriverBase.reach` returns them.
 
     Raises:
         Refused: PARAM_ERROR.
     """
+    for name in POSITION:
+        if name in values and name in reach and not _is_inside(reach[name], _number(values, name)):
+            place = lengths_text([_number(values, name)])
+            raise refuse_value(name, f"{place} is beyond the scanner's {_range_text(reach[name])}")
     if not all(name in values for name in FRAME if name != names.SCAN_ANGLE):
         return
     try:
@@ -183,18 +193,46 @@ def check_together(values: Mapping[str, Value], table: ParameterTable, max_pixel
         raise refuse_value(
             "scan-resolution", f"{columns} x {rows} pixels exceed the {max_pixels} that this microscope takes"
         )
-    for axis, name in enumerate(POSITION):
-        if name in table:
-            low, high = table[name].range
-            reached = region.corners_m()[:, axis]
-            # the corners are computed, so their last bits may miss a bound that the frame touches
-            slack = 1e-9 * max(abs(reached).max(), region.size_m[axis])
-            if reached.min() < low - slack or reached.max() > high + slack:
-                extent = " to ".join(table[name].quantity(float(end)) for end in (reached.min(), reached.max()))
-                raise refuse_value(
-                    "scan frame",
-                    f"it reaches from {extent} in {'xy'[axis]}, outside the probe's {table[name].range_text()}",
-                )
+    if why := frame_outside(region, reach):
+        raise refuse_value("scan frame", why)
+
+
+def reach_in(table: ParameterTable) -> dict[str, ParameterSpec]:
+    """Return the rows of a table that have the range of the scanner."""
+    return {name: table[name] for name in (*POSITION, *CENTER) if name in table}
+
+
+def frame_outside(region: Region, reach: Mapping[str, ParameterSpec]) -> str:
+    """Return why a frame, with its angle, does not fit into the range of the scanner; empty if it fits."""
+    corners_m = region.corners_m().T.tolist()
+    parts = [(name, "its corners are", corners_m[axis]) for axis, name in enumerate(POSITION)]
+    parts += [(name, "its centre is", [region.center_m[axis]]) for axis, name in enumerate(CENTER)]
+    for name, what, places_m in parts:
+        if name not in reach:
+            continue
+        first_m, last_m = min(places_m), max(places_m)
+        # the corners are computed, so their last bits may miss a bound that the frame touches
+        slack_m = 1e-9 * max(abs(first_m), abs(last_m), *region.size_m)
+        if _is_inside(reach[name], first_m, slack_m) and _is_inside(reach[name], last_m, slack_m):
+            continue
+        low_m, high_m = reach[name].range
+        too_far_m = last_m - first_m - (high_m - low_m)
+        remedy = f"move the frame by {lengths_text([max(low_m - first_m, 0.0) or high_m - last_m])} in {name[-1]}"
+        if too_far_m > slack_m:
+            remedy = f"make it smaller, or turn it: they are {lengths_text([too_far_m])} too far apart"
+        ends = lengths_text(sorted({first_m, last_m}), " to ")
+        return f"{what} at {ends} in {name[-1]}, beyond the scanner's {_range_text(reach[name])}; {remedy}"
+    return ""
+
+
+def _is_inside(row: ParameterSpec, value_m: float, slack_m: float = 0.0) -> bool:
+    low_m, high_m = row.range
+    return low_m - slack_m <= value_m <= high_m + slack_m
+
+
+def _range_text(row: ParameterSpec) -> str:
+    text = lengths_text(row.range, " to ")
+    return f"{text} (set in {row.where})" if row.where else text
 
 
 def _number(values: Mapping[str, Value], name: str, default: float | None = None) -> float:

@@ -15,18 +15,24 @@ from afspm.translator.parameters import Value
 from afspm.translator.setters import apply
 from afspm.translator.setting_groups import MOVES
 from afspm.translator.state import TranslatorState
+from afspm.translator.treatment_end import TreatmentEnd
 
 _KEY = "temporary"
 
 
 class TemporarySettings:
-    """Values that are set for a limited time, and the former values to restore."""
+    """Values that are set for a limited time, and the former values to restore.
+
+    Attributes:
+        treatment: the end of a pulse or crash, for which the microscope counts as busy, too.
+    """
 
     def __init__(self, driver: DriverBase, state: TranslatorState, log: logging.Logger) -> None:
         self._driver = driver
         self._state = state
         self._kept = state.kept
         self._log = log
+        self.treatment = TreatmentEnd(driver, state.kept, log)
 
     def begin(self, values: Mapping[str, Value], for_s: float) -> None:
         """Set values, and restore the former values after `for_s` experiment seconds.
@@ -52,15 +58,18 @@ class TemporarySettings:
 
     @property
     def until_s(self) -> float | None:
-        """Experiment time at which the former values are restored; None without temporary values."""
+        """Experiment time at which the former values are restored, or the end of a treatment is looked for.
+
+        None without either.
+        """
         found = self._kept.get(_KEY)
-        return None if found is None else float(found["until_s"])
+        return self.treatment.next_s if found is None else float(found["until_s"])
 
     @property
     def status(self) -> ScopeStatus | None:
-        """The state of the microscope during a temporary change; None without one."""
+        """The state of the microscope during a temporary change or a treatment; None without either."""
         found = self._kept.get(_KEY)
-        return None if found is None else ScopeStatus(state_for(found["former"]))
+        return self.treatment.status() if found is None else ScopeStatus(state_for(found["former"]))
 
     def end_if_due(self) -> None:
         """Restore the former values once they are due.
@@ -68,7 +77,8 @@ class TemporarySettings:
         Raises:
             an error in `LOST`.
         """
-        if self.until_s is not None and self._driver.clock.now_s() >= self.until_s:
+        found = self._kept.get(_KEY)
+        if found is not None and self._driver.clock.now_s() >= float(found["until_s"]):
             self.end()
 
     def end(self) -> None:

@@ -50,12 +50,14 @@ class TranslatorRun:
         simulated: True if the microscope is simulated, so that the scheduler of a simulated experiment may use it.
         retracts: True to retract the tip when a request has switched the feedback off and no process is left to switch
             it on again.
+        feedback_off: see `Launch`.
     """
 
     folder: Path
     name: str = ""
     simulated: bool = False
     retracts: bool = False
+    feedback_off: str = ""
 
 
 class Translator:
@@ -91,6 +93,11 @@ class Translator:
         self.state = state = TranslatorState(memory, clock, 2 * driver.patience_s(driver.common.result_timeout_s / 2))
         temporary = TemporarySettings(driver, state, log)
         self.observer = observer = Observer(driver, port, state, temporary, log)
+        if run.feedback_off and state.kept.get("feedback_off_by") != run.feedback_off:  # a restart takes it no more
+            state.kept["feedback_off_by"] = run.feedback_off
+            observer.panel.may_be_off()
+            state.save()
+            log.warning("the z feedback is off by intention: so says the person who has begun this run")
         # the sequence keeps its state: the microscope may still be scanning when it is reconnected
         undefined = partial(observer.publish, ScopeStatus(ScopeState.UNDEFINED))
         self._connection = connection = Connection(driver, controller, clock, log, on_lost=undefined)
@@ -245,7 +252,7 @@ def _run_locked(driver: DriverBase, context: ProcessContext, make: Callable[...,
         context.log.error("the newest saved state is damaged, the one before it is used: %s", memory.damage)
     port = open_server_port(launch, context.clock)
     context.when_stopping(lambda: port.wake_up(ParentGone()))
-    run = TranslatorRun(Path(launch.run_dir or "."), launch.run, launch.simulated, launch.retracts)
+    run = TranslatorRun(Path(launch.run_dir or "."), launch.run, launch.simulated, launch.retracts, launch.feedback_off)
     driver.adjustable = frozenset(launch.adjustable)
     translator = make(driver, port, memory, run, context.log, context.activity.step)
     context.tip_in_danger(translator.leaves_danger)

@@ -181,4 +181,5 @@ class WishedFeedback:
     @property
     def hint(self) -> str:
         """What may have switched the feedback off beside a person, as the rest of a sentence."""
-        return f", perhaps by {self.after}, which does not say `switches_feedback`" if self.after else ""
+        known = self.after in ("", names.START_SPEC)
+        return "" if known else f", perhaps by {self.after}, which does not say `switches_feedback`"

@@ -373,6 +373,7 @@ MAPPINGS: tuple[MessageMapping[Any], ...] = (
         model.InstrumentReadings,
         instruments_pb2.InstrumentReadings,
         *("instrument", "token"),
+        patience_s=FieldMapping("patience", sparse=True),
         time_ns=_time(),
         readings=_each("readings", _READING),
         outcomes=_each("outcomes", _OUTCOME),

@@ -52,6 +52,18 @@ class LeftToRight:
         return len(self.taken) >= 7, "seven are enough"
 
 
+class FromLeft(LeftToRight):
+    """An optimiser with three positions, where there is nothing on the left."""
+
+    def __init__(self, region: Region, quantity: str) -> None:
+        super().__init__(region, quantity)
+        self.left = 3
+
+    def suggest(self, num_points: int | None = None) -> Sequence[Mapping[str, Any]]:
+        self.left -= 1
+        return [{"_id": self.left, "x": -2e-6 - 1e-8 * self.left, "y": 0.0}] if self.left >= 0 else []
+
+
 def adaptive(quantity: str = "height", **settings: Any) -> Adaptive:
     found = {"size": (1e-6, 1e-6), "until": {"spectra": 30}, "end_when_done": True, **settings}
     return Adaptive(quantity=f"{HERE}.{quantity}", **found)
@@ -105,6 +117,12 @@ def test_curves_that_show_nothing_are_left_out_and_counted(tmp_path: Path, caplo
 def test_positions_that_are_refused_one_after_the_other_end_the_component(tmp_path: Path) -> None:
     component = adaptive("height_of_the_right_half", center=(-2e-6, 0.0))
     with pytest.raises(MeasurementFailed, match="10 positions in a row gave no value"):
+        run(component, Lab("map"), tmp_path / "state", run_dir=str(tmp_path))
+
+
+def test_map_without_any_value_ends_the_component(tmp_path: Path) -> None:
+    component = adaptive("height_of_the_right_half", optimizer=f"{HERE}.FromLeft")
+    with pytest.raises(MeasurementFailed, match="none of the 3 positions of the map gave a value"):
         run(component, Lab("map"), tmp_path / "state", run_dir=str(tmp_path))
 
 

@@ -150,6 +150,7 @@ def test_frame_changed_in_a_scan_leaves_it_without_a_result(bench: Make) -> None
         ("AmplitudeSetpointVolts", 0.5, names.ZCTRL_SETPOINT),
         ("IntegralGain", 12.0, names.ZCTRL_IGAIN),
         ("TipVoltage", 0.25, names.TIP_BIAS_VOLTAGE),
+        ("SurfaceVoltage", 1.5, names.SAMPLE_BIAS),  # results M4
         ("XOffset", 3e-6, names.SCAN_TOP_LEFT_X),
     ],
 )

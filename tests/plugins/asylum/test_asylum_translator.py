@@ -41,6 +41,19 @@ def moved_exactly(peer: Peer, x_m: float, y_m: float) -> None:
 # --- scans ---
 
 
+def test_start_is_refused_while_last_scan_stays_0(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    # results T5: the switch was set, and never read back
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    values = made.emulator.controller.values
+    put = values.put
+    monkeypatch.setattr(values, "put", lambda name, value: put(name, 0 if name == "LastScan" else value))
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "LastScan stays 0" in response.reason
+
+
 def test_scan_has_exactly_the_frame_that_was_set(bench: Make) -> None:
     made = bench()
     peer = made.start()

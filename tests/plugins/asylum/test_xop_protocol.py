@@ -380,3 +380,14 @@ def test_feedback_is_held_until_after_the_end_of_a_force_curve(tmp_path: Path, r
         assert emulator.rig.is_held(clock.now_s())
         until(lambda: not emulator.rig.is_held(clock.now_s()))
         assert number("AfspmFeedbackOn")
+
+
+def test_values_of_the_panel_are_in_force_at_once(tmp_path: Path) -> None:
+    emulator = AsylumEmulator(port=0)
+    with emulator.running(tmp_path) as address, closing(Client(address)) as client:
+        for name, value in (("TipVoltage", 0.5), ("IntegralGain", 12.0), ("AmplitudeSetpointVolts", 0.6)):
+            client.call("PV", name, value)
+        setup = emulator.rig.setup
+        assert (setup.bias_v, setup.feedback.integral_gain, setup.feedback.setpoint) == (0.5, 1800.0, 0.6)
+        client.call("PV", "TipVoltage", "nan")
+        assert setup.bias_v == 0.5

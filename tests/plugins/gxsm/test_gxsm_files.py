@@ -10,7 +10,7 @@ import pytest
 
 from afspm import read
 from afspm.basics import convert
-from afspm.emulation import Faults
+from afspm.emulation import ControllerClock, Faults
 from afspm.plugins.gxsm.emulator import files
 from afspm.plugins.gxsm.emulator.file_writer import FAULT_KINDS, GxsmFileWriter
 from afspm.plugins.gxsm.emulator.files import CHANNELS
@@ -24,7 +24,7 @@ def sizes(folder: Path) -> dict[str, int]:
 
 
 def test_files_appear_after_the_end_one_by_one_the_last_first_and_in_parts(tmp_path: Path) -> None:
-    saving = GxsmFileWriter(tmp_path, Faults([], FAULT_KINDS, START_S))
+    saving = GxsmFileWriter(tmp_path, Faults([], FAULT_KINDS, START_S), ControllerClock())
     saving.write([(tmp_path / "a", bytes(100)), (tmp_path / "b", bytes(200))], START_S)
     seen = [sizes(tmp_path)]
     next_s: float | None = START_S
@@ -36,7 +36,7 @@ def test_files_appear_after_the_end_one_by_one_the_last_first_and_in_parts(tmp_p
 
 
 def test_next_number_is_the_first_free_one(tmp_path: Path) -> None:
-    saving = GxsmFileWriter(tmp_path, Faults([], FAULT_KINDS, START_S))
+    saving = GxsmFileWriter(tmp_path, Faults([], FAULT_KINDS, START_S), ControllerClock())
     (tmp_path / "scan001-Xp-a.nc").touch()
     number = saving.next_number()
     paths = [saving.free(ending, number) for ending in ("Xp-a.nc", "Xp-b.nc")]

@@ -12,7 +12,7 @@ from benchmarks.fuzz.gxsm import GxsmFuzzer
 from fake_clock import FakeClock
 from rotation import ALL
 
-from afspm.emulation import Faults, SimulatedInstrument
+from afspm.emulation import ControllerClock, Faults, SimulatedInstrument
 from afspm.plugins.gxsm.emulator import GxsmEmulator
 from afspm.plugins.gxsm.emulator.program import GxsmProgram, GxsmSettings
 
@@ -43,7 +43,9 @@ def program(tmp_path: Path) -> GxsmProgram:
         display_units={},
         channels_set=True,
     )
-    found = GxsmProgram(rig, Faults([], GxsmEmulator.all_faults(), clock.t_s), clock, tmp_path, settings)
+    found = GxsmProgram(
+        rig, Faults([], GxsmEmulator.all_faults(), clock.t_s), clock, ControllerClock(), tmp_path, settings
+    )
     found.entries.set("PointsX", "8")
     return found
 

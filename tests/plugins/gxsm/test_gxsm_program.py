@@ -22,7 +22,7 @@ from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_to_line, scan_u
 from tests.plugins.gxsm.raw_clients import MemoryClient, SocketClient, client
 
 from afspm import read
-from afspm.emulation import Crashed, Faults
+from afspm.emulation import ControllerClock, Crashed, Faults
 from afspm.plugins.gxsm.emulator.block import FAULT_KINDS, SharedMemoryBlock
 from afspm.plugins.gxsm.emulator.file_writer import GxsmFileWriter
 
@@ -482,7 +482,7 @@ def test_impossible_scan_does_not_start(bench: Make) -> None:
 
 
 def test_files_are_counted_beyond_three_digits(tmp_path: Path) -> None:
-    saving = GxsmFileWriter(tmp_path, Faults([], {}, 0.0))
+    saving = GxsmFileWriter(tmp_path, Faults([], {}, 0.0), ControllerClock())
     saving.counted([tmp_path / "scan1000-M-Xp-Topo.nc"])
     assert saving.counter == 1001
 

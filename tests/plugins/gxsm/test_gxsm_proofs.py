@@ -109,10 +109,10 @@ def of_last_week(made: Bench) -> Path:
     path = made.folder / "scan001-M-Xp-ZSmTopo.nc"
 
     def save(emulator: Any) -> None:
-        program = emulator.program
-        program.panel.behind_s = 7 * 86400.0
-        program.save_as(path)
-        program.panel.behind_s = 0.0
+        clock = emulator.file_clock
+        clock.shown_s = lambda time_s: time_s - 7 * 86400.0
+        emulator.program.save_as(path)
+        del clock.shown_s
 
     made.at_panel(save)
     return path
@@ -162,7 +162,7 @@ def test_scan_after_a_jump_of_gxsms_clock_is_unproved_and_published(bench: Make)
 
 
 def set_behind(emulator: Any, behind_s: float) -> None:
-    emulator.program.panel.behind_s = behind_s
+    emulator.file_clock.jump(-behind_s - emulator.file_clock.off_s, emulator.clock.now_s())
 
 
 FIRST, SECOND = "between057-M-Xp-ZSmTopo.nc", "between057-Xp-ImTunnel.nc"

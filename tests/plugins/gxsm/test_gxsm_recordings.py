@@ -38,7 +38,7 @@ def test_repeated_scans_are_separated_by_their_lines_alone(tmp_path: Path) -> No
 
 
 UNSAVED = {
-    SHAPE[0]: "it came to its end, but the next one began and GXSM had saved no file: is it a frame of a Movie?",
+    SHAPE[0]: "it came to its end, but the next one began and GXSM had saved no file: Movie or Multi Layer?",
     SHAPE[0] // 2: "another one began before it was saved: it was stopped, or GXSM saved no file of it",
 }
 """Reasons by the rows of each scan."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deadlines import DEADLINE_S
 from tests.plugins.gxsm.gxsm_bench import Bench, hold_scan, scan_to_line, scan_until_line
 from tests.plugins.gxsm.raw_clients import client
 from tests.plugins.vendor_bench import FLAT, SHAPE, TURNED, Peer, moved, ready, scanned, scans, states
@@ -23,6 +25,7 @@ from afspm.model import (
     Feedback,
     ProbePosition,
     Region,
+    Response,
     ScanLines,
     ScanParameters,
     ScopeState,
@@ -569,6 +572,19 @@ def test_a_spectrum_is_stopped_where_the_hardware_can(bench: Make, settings: dic
     assert not any(isinstance(one, Spectrum) for one in received)
 
 
+def test_offset_of_a_frame_has_a_range_of_its_own(bench: Make) -> None:
+    # results T2
+    peer = bench().start(parameters={"x-scan-center-x": {"range": ["-100 nm", "100 nm"]}})
+    ready(peer)
+    place = ScanParameters(Region((90e-9, 0.0), (200e-9, 200e-9)), (16, 16), "")
+    assert peer.ask(ControlRequest.SET_SCAN_PARAMS, place).ok
+    assert float(peer.get("x-scan-center-x")) == pytest.approx(90e-9)
+    beyond = ScanParameters(Region((110e-9, 0.0), (100e-9, 100e-9)), (16, 16), "")
+    reason = peer.ask(ControlRequest.SET_SCAN_PARAMS, beyond).reason
+    assert "its centre is at 110 nm in x, beyond the scanner's -100 to 100 nm" in reason
+    assert "move the frame by -10 nm in x" in reason
+
+
 def test_spectrum_can_be_stopped_during_the_move_to_it(bench: Make) -> None:
     made = bench(speed=5.0)
     peer = made.start()
@@ -656,6 +672,41 @@ def test_scans_repeated_at_the_panel_are_published_one_by_one_and_a_stopped_one_
     assert not scans(received)
 
 
+def test_start_is_refused_after_scans_that_gxsm_repeats_by_itself(bench: Make) -> None:
+    # results X5: with Multi Layer each scan of the run becomes ten, until its tries were used up
+    made = bench(speed=10.0)
+    peer = made.start(saving="gxsm", result_timeout_s=RESULT_S)
+    ready(peer, shape=(24, 32))
+
+    def repeat(emulator: Any) -> None:  # no action switches Multi Layer off
+        emulator.program.panel.repeats = True
+        scan_until_line(emulator.program, 24)
+
+    def stop(emulator: Any) -> None:
+        emulator.program.panel.repeats = False
+        emulator.program.stop_scan()
+
+    def start() -> Response:  # once GXSM is free
+        while (response := peer.act(names.START_SCAN)).code == ControlResponse.NOT_FREE:
+            peer.get(names.SPEC_KIND)
+        return response
+
+    for number in (1, 2):
+        made.at_panel(lambda emulator: hold_scan(emulator.program, 1, 2))
+        assert start().ok
+        peer.until(ScopeState.SCANNING)
+        made.at_panel(repeat)
+        until_s = time.monotonic() + DEADLINE_S
+        while made.log_text().count("another scan was begun at GXSM's panel") < number:
+            assert time.monotonic() < until_s
+            peer.get(names.SPEC_KIND)
+        made.at_panel(stop)
+    response = start()
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "Repeat, Movie or Multi Layer is on at its panel" in response.reason
+    assert peer.act(names.START_SCAN).ok
+
+
 def completed(made: Bench, peer: Peer) -> list[Any]:
     """Complete a held scan, and return the packets up to its end.
 
@@ -730,17 +781,18 @@ def test_a_scan_ends_though_repeat_is_on_at_the_panel(bench: Make) -> None:
     assert len(scanned(peer)) == 4
 
 
+def set_clock(emulator: Any, off_s: float) -> None:
+    emulator.file_clock.jump(off_s - emulator.file_clock.off_s, emulator.clock.now_s())
+
+
 def test_clock_of_gxsms_computer_may_differ_and_be_set(bench: Make) -> None:
     # An hour back is more than a scan: each scan seems to have started before its predecessor.
     made = bench(speed=20.0)
     peer = made.start()
     ready(peer)
 
-    def set_behind(emulator: Any, behind_s: float) -> None:
-        emulator.program.panel.behind_s = behind_s
-
     for behind_s in (0.0, 3600.0, 3600.0, 7200.0, 60.0):
-        made.at_panel(partial(set_behind, behind_s=behind_s))
+        made.at_panel(partial(set_clock, off_s=-behind_s))
         assert len(scanned(peer)) == 4
 
 
@@ -750,9 +802,9 @@ def test_scan_with_a_shorter_start_delay_counts_as_new(bench: Make) -> None:
     peer = made.start()
     ready(peer, shape=(64, 32))
     late_s = 30.0
-    made.at_panel(lambda emulator: setattr(emulator.program.panel, "behind_s", -late_s))
+    made.at_panel(partial(set_clock, off_s=late_s))
     assert len(scanned(peer)) == 4
-    made.at_panel(lambda emulator: setattr(emulator.program.panel, "behind_s", 0.0))
+    made.at_panel(partial(set_clock, off_s=0.0))
     last = made.emulator.program.scan.activity
     assert last is not None
     assert made.clock.now_s() > last.start_s + late_s, "else the clock seems to have been set back"

@@ -11,7 +11,7 @@ from benchmarks.fuzz import fuzz
 from benchmarks.fuzz.nanonis import NanonisFuzzer
 from fake_clock import FakeClock
 
-from afspm.emulation import Faults, SimulatedInstrument
+from afspm.emulation import ControllerClock, Faults, SimulatedInstrument
 from afspm.plugins.nanonis.emulator import NanonisEmulator
 from afspm.plugins.nanonis.emulator.dispatch import FunctionRefused
 from afspm.plugins.nanonis.emulator.software import NanonisSoftware
@@ -40,6 +40,8 @@ def software(tmp_path: Path, clock: FakeClock) -> NanonisSoftware:
         release=NanonisEmulator().release,
         rows_as_recorded=False,
         unscanned=math.nan,
+        clips_frames=False,
+        file_clock=ControllerClock(),
         log=logging.getLogger(),
     )
 

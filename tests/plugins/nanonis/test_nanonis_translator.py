@@ -28,6 +28,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
+from afspm.plugins.nanonis.emulator.scans import ScanProperties
 from afspm.plugins.nanonis.z_controller import unit_of
 from afspm.translator.trace import FILE, TracedExchange, read_trace
 
@@ -121,7 +122,7 @@ def test_pixels_that_nanonis_would_round_are_refused(bench: Make) -> None:
     ready(peer)
     response = peer.set(names.SCAN_RESOLUTION_X, 100)
     assert response.code == ControlResponse.PARAM_ERROR
-    assert "96 or 112, not 100" in response.reason
+    assert "100 is no multiple of 16: set 96 or 112" in response.reason
     assert peer.get(names.SCAN_RESOLUTION_X) == "32"
 
 
@@ -186,25 +187,40 @@ def test_z_controller_of_unknown_unit_is_named(bench: Make) -> None:
     made.until_logged("the active z controller is unknown")
 
 
-def test_a_frame_beyond_the_scanner_is_refused_and_the_old_one_stays(bench: Make) -> None:
+@pytest.mark.parametrize(
+    ("frame", "what"),
+    [
+        (Region((0.45e-6, 0.0), (300e-9, 100e-9)), "its corners are at 300 to 600 nm in x"),
+        (
+            Region((0.0, 0.0), (900e-9, 900e-9), math.radians(45)),
+            "make it smaller, or turn it: they are 272.79 nm too far",
+        ),
+    ],
+    ids=["beside", "turned"],
+)
+def test_a_frame_beyond_the_scanner_is_refused_and_the_old_one_stays(bench: Make, frame: Region, what: str) -> None:
+    # results T2: the controller takes such a frame, and returns it as set
     peer = bench(range_m=1e-6).start()
     ready(peer)
-    far = Region((0.45e-6, 0.0), (300e-9, 100e-9))
-    response = peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(far, SHAPE, ""))
+    response = peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(frame, SHAPE, ""))
     assert response.code == ControlResponse.PARAM_ERROR
-    assert "the former values were restored" in response.reason
+    assert what in response.reason
+    assert "beyond the scanner's -500 to 500 nm (set in Nanonis, module Piezo)" in response.reason
     assert float(peer.get(names.SCAN_TOP_LEFT_X)) == pytest.approx(TURNED.top_left_m[0], rel=1e-13)
 
 
-def test_a_size_beyond_the_scanner_is_refused_and_the_frame_stays_where_it_is(bench: Make) -> None:
-    made = bench(range_m=2e-6)
-    peer = made.start()
+def test_range_of_the_scanner_is_the_present_one_or_a_narrower_one_of_the_file(bench: Make) -> None:
+    made = bench(range_m=1e-6)
+    narrow = {"range": ["-300 nm", "300 nm"]}
+    peer = made.start(parameters={names.PROBE_POS_X: narrow})
     ready(peer)
-    before = made.emulator.software.scans.frame
-    response = peer.set(names.SCAN_SIZE_X, 3e-6)
-    assert response.code == ControlResponse.PARAM_ERROR
-    assert "the former values were restored" in response.reason
-    assert made.emulator.software.scans.frame == pytest.approx(before, rel=1e-6)
+    wide = ScanParameters(Region((0.0, 0.0), (500e-9, 500e-9)), SHAPE, "")
+    assert peer.ask(ControlRequest.SET_SCAN_PARAMS, wide).ok
+    wider = ScanParameters(Region((0.0, 0.0), (700e-9, 500e-9)), SHAPE, "")
+    assert "-300 to 300 nm (set in the experiment file" in peer.ask(ControlRequest.SET_SCAN_PARAMS, wider).reason
+    made.at_panel(lambda emulator: setattr(emulator.software.core, "range_m", (400e-9, 400e-9, 1e-6)))
+    assert "-200 to 200 nm" in peer.ask(ControlRequest.SET_SCAN_PARAMS, wide).reason
+    assert "beyond the scanner's -200 to 200 nm" in peer.set(names.PROBE_POS_X, 250e-9).reason
 
 
 def test_settings_are_reported_to_the_last_digit_despite_float32(bench: Make) -> None:
@@ -359,9 +375,9 @@ def test_setting_is_read_before_and_after_it_once(bench: Make) -> None:
     assert peer.set(names.TIP_BIAS_VOLTAGE, "0.1").ok
     asked = [one.what for one in read_trace(made.folder / FILE) if isinstance(one, TracedExchange)]
     frame_set, bias_set = asked.index("Scan.FrameSet"), asked.index("Bias.Set")
-    before = asked[frame_set - 6 : frame_set]
-    assert before[:3] == ["Scan.BufferGet", "Scan.FrameGet", "Scan.SpeedGet"]
-    assert before[3:] == ["Scan.BufferGet", "Scan.BufferSet", "Scan.SpeedGet"], asked
+    before = asked[frame_set - 7 : frame_set]
+    assert before[:4] == ["Scan.BufferGet", "Scan.FrameGet", "Scan.SpeedGet", "Piezo.RangeGet"]
+    assert before[4:] == ["Scan.BufferGet", "Scan.BufferSet", "Scan.SpeedGet"], asked
     assert asked[frame_set + 1 : frame_set + 3] == ["Scan.BufferGet", "Scan.FrameGet"]
     assert asked[bias_set - 1 :] == ["Bias.Get", "Bias.Set", "Bias.Get"]
 
@@ -396,6 +412,29 @@ def test_pulse_crash_retract_and_engage(bench: Make) -> None:
     assert peer.act(names.ENGAGE).ok
     peer.until(FREE)
     assert made.emulator.rig.engaged
+
+
+@pytest.mark.parametrize("action", [names.PULSE, names.CRASH])
+def test_treatment_ends_once_the_feedback_holds_the_current(bench: Make, action: str) -> None:
+    # results T4: the request was over before the tip was back
+    made = bench(speed=5.0, feedback={"mode": "current", "setpoint": 1e-10})
+    peer = made.start()
+    ready(peer)
+    made.at_panel(lambda emulator: setattr(emulator.software.z_controller, "state", "off"))
+    assert peer.act(action).ok  # the feedback was off: the clock counts alone
+    peer.until(FREE)
+    made.at_panel(lambda emulator: setattr(emulator.software.z_controller, "state", "on"))
+    assert peer.act(action).ok
+    began_s = made.clock.now_s()
+    made.at_panel(lambda emulator: setattr(emulator.software.z_controller, "state", "off"))
+    peer.until(FREE)
+    assert made.clock.now_s() - began_s >= 5.0
+    made.until_logged(f"5 s after {action} the current is not at its setpoint: the feedback is off")
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert f"after {action} the feedback is off: bring the tip back" in response.reason
+    made.at_panel(lambda emulator: setattr(emulator.software.z_controller, "state", "on"))
+    assert peer.act(names.START_SCAN).ok
 
 
 def test_retracting_stops_a_scan(bench: Make) -> None:
@@ -504,6 +543,20 @@ def test_parameters_and_actions_of_the_experiment_file(bench: Make) -> None:
     assert "the arguments of Bias.Set are f" in response.reason
 
 
+def test_measured_value_is_compared_within_the_resolution_of_its_row(bench: Make) -> None:
+    # spectra F4: the read-back of z has noise
+    z = {"vendor": "ZCtrl.ZPos", "unit": "m"}
+    made = bench()
+    peer = made.start(parameters={"x-z": {**z, "resolution": "1 nm"}, "x-exact-z": z})
+    ready(peer)
+    assert peer.set(names.FEEDBACK_ON, "false").ok
+    held_m = float(peer.get("x-z"))
+    assert peer.set("x-z", held_m + 5e-9, "m").ok
+    assert float(peer.get("x-z")) == pytest.approx(held_m + 5e-9, rel=1e-9)
+    refused = [peer.set("x-exact-z", held_m + step * 1e-9, "m") for step in range(5)]
+    assert any("the former values were restored" in one.reason for one in refused)
+
+
 # --- at the panel ---
 
 
@@ -519,6 +572,21 @@ def test_continuous_scan_without_saving_is_switched_off(bench: Make) -> None:
     assert scanned(peer)["Z Forward"].filename.endswith(".sxm")
     left_behind = made.emulator.software.scans.properties
     assert (left_behind.continuous, left_behind.bouncy, left_behind.autosave) == (False, False, "all")
+
+
+def test_start_is_refused_while_the_continuous_scan_stays_on(bench: Make) -> None:
+    # results T5: the switch was set, and never read back
+    class Stuck(ScanProperties):
+        continuous = property(lambda _: True, lambda *_: None)
+
+    made = bench()
+    made.at_panel(lambda emulator: setattr(emulator.software.scans.properties, "__class__", Stuck))
+    peer = made.start()
+    ready(peer)
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "the continuous scan stays on at Nanonis' panel (Scan Control)" in response.reason
+    assert made.emulator.software.scans.running is None
 
 
 def test_every_whole_frame_of_a_continuous_scan_at_the_panel_is_published(bench: Make) -> None:

@@ -190,6 +190,25 @@ def test_client_stops_a_scan_which_ends_the_wait(client: Any) -> None:
     assert ask(client, "Scan_StatusGet") == [0]
 
 
+@pytest.mark.parametrize("clips_frames", [False, True])
+def test_frame_beyond_the_range_is_kept_or_clipped(tmp_path: Path, *, clips_frames: bool) -> None:
+    # results T2
+    with connected(tmp_path, 100.0, range_m=1e-6, clips_frames=clips_frames) as client:
+        ask(client, "Scan_FrameSet", 4e-7, 0.0, 5e-7, 2e-6, 0.0)
+        frame = ask(client, "Scan_FrameGet")
+        ask(client, "Scan_BufferSet", [14], 16, 8)
+        ask(client, "Scan_Action", 0, 1)
+        ask(client, "Scan_WaitEndOfScan", -1)
+        values = ask(client, "Scan_FrameDataGrab", 14, 1)[4]
+    expected = [2.5e-7, 0.0, 5e-7, 1e-6, 0.0] if clips_frames else [4e-7, 0.0, 5e-7, 2e-6, 0.0]
+    assert frame == pytest.approx(expected)
+    (file,) = tmp_path.glob("*.sxm")
+    region = read(file).scans[0].region
+    assert region.center_m == pytest.approx(expected[:2])
+    is_at_edge = np.ptp(np.concatenate([values[:2, -5:], values[-2:, -5:]], axis=1)) < 1e-10
+    assert is_at_edge is not clips_frames
+
+
 @pytest.mark.parametrize("unscanned", ["nan", "zeros"])
 def test_rows_not_yet_scanned_are_in_memory_as_set_and_missing_in_files(tmp_path: Path, unscanned: str) -> None:
     # results Z1, T1

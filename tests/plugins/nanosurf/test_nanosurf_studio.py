@@ -41,6 +41,14 @@ def test_curves_with_an_impossible_setpoint_end_as_if_stopped(tmp_path: Path, ca
     assert "the curves were interrupted: feedback: a setpoint is above zero, not -1" in caplog.text
 
 
+def test_setpoint_and_gain_of_the_panel_are_in_force_at_once(tmp_path: Path) -> None:
+    program = studio(FakeClock(), tmp_path)
+    program.put("z_control.setpoint", 0.5)
+    program.put("z_control.i_gain", 2000)
+    feedback = program.rig.setup.feedback
+    assert (feedback.setpoint, feedback.integral_gain) == (0.5, 1000.0)
+
+
 def test_next_curve_of_a_grid_waits_for_the_feedback(tmp_path: Path) -> None:
     clock = FakeClock()
     program = studio(clock, tmp_path, feedback={"hold_s": 5.0})

@@ -115,6 +115,7 @@ def test_frame_changed_in_a_scan_leaves_it_without_a_result(bench: Make) -> None
         ("zservo.setpoint.value", 0.5, names.ZCTRL_SETPOINT),
         ("zservo.gain", {"i": 0.25}, names.ZCTRL_IGAIN),
         ("bias.tip", 0.25, names.TIP_BIAS_VOLTAGE),
+        ("bias.sample", 1.5, names.SAMPLE_BIAS),  # results M4
         ("scan.rate", 2.5, names.SCAN_SPEED),
     ],
 )

@@ -7,6 +7,7 @@ import math
 import pytest
 
 from afspm.plugins.secop.channel import Approach, Channel, ModuleState, PolledValue, ReportedTarget, described
+from afspm.plugins.secop.lines import SecopLine
 
 NEAR_K = 0.1
 
@@ -85,3 +86,25 @@ def test_new_target_forgets_that_afspm_led_the_value_to_the_former() -> None:
     approach.note(4.3, 9.0)
     assert (approach.nearest, approach.is_led) == (pytest.approx(4.7), False)
     assert math.isnan(Approach().target)
+
+
+@pytest.mark.parametrize(
+    ("state", "value_k", "measured_s", "now_s", "is_on_its_way"),
+    [
+        (ModuleState(), 20.0, 10.1, 10.2, True),
+        (ModuleState(answered_s=10.1), 19.9, 10.1, 10.2, False),
+        (ModuleState(answered_s=10.1), 4.2, 10.1, 10.2, True),
+        (ModuleState(answered_s=10.1), 19.9, 9.9, 10.2, True),
+        (ModuleState(answered_s=10.1), 4.2, 10.1, 13.1, False),
+        (ModuleState(answered_s=10.9, busy_s=10.5), 18.0, 10.9, 11.0, False),
+        (ModuleState(is_busy=True, answered_s=99.0, busy_s=99.0), 20.0, 99.0, 99.0, True),
+    ],
+    ids=["status unknown", "arrived", "idle too early", "old value", "idle for 3 s", "was busy", "busy"],
+)
+def test_idle_module_is_believed_unless_its_value_is_away_from_a_new_target(
+    state: ModuleState, value_k: float, measured_s: float, now_s: float, is_on_its_way: bool
+) -> None:
+    channel = Channel("cryo.t", "tt", "", value=PolledValue(value_k, measured_s=measured_s), state=state)
+    channel.described = described(_modules(status={}), "tt", "")
+    channel.target.take(SecopLine("changed", "tt:target", [20.0, {}]), 4.2, 10.0)
+    assert channel.is_on_its_way(now_s) is is_on_its_way

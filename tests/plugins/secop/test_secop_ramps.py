@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from tests.plugins.secop.ramp_night import FAULTS, RATE_K_S, Cryostat, RampNight
 
-from afspm.model import InstrumentOrder, Parameter
+from afspm.model import ControlResponse, InstrumentOrder, Parameter
 from afspm.plugins.secop.lines import SecopLine
 from afspm.plugins.secop.secop_client import SecopClient
 from afspm.scheduler.instruments import known_instruments
@@ -153,6 +153,42 @@ def test_order_has_no_outcome_if_the_server_describes_itself_again_before_the_ta
     assert bench.client.outcomes() == ()
     bench.exchange(bench.client.order(order, bench.now_s))
     assert bench.changes
+
+
+def test_order_to_measure_is_answered_by_a_request_sent_after_it(bench: Bench) -> None:
+    (_, *_), before = bench.client.tick(bench.now_s + 1.0), bench.cryostat.answer("read tt:value")
+    bench.now_s += 1.5
+    (read,) = bench.client.order(InstrumentOrder(1, "series/1", Parameter("cryo.t")), bench.now_s)
+    bench.client.take(before[0], bench.now_s)
+    assert bench.client.outcomes() == ()
+    bench.cryostat.run(1.0)
+    bench.exchange([read])
+    assert [one.response for one in bench.client.outcomes()] == [ControlResponse.SUCCESS]
+    assert bench.client.readings(bench.now_s)[0].age_s == 0.0
+
+
+def test_order_to_measure_waits_while_the_server_repeats_an_old_value(bench: Bench) -> None:
+    bench.later(1.0)
+    bench.cryostat.fault = "frozen module"
+    bench.now_s += 0.1
+    bench.exchange(bench.client.order(InstrumentOrder(1, "series/1", Parameter("cryo.t")), bench.now_s))
+    bench.later(1.0)
+    assert bench.client.outcomes() == ()
+    bench.cryostat.fault = "none"
+    bench.later(1.0)
+    assert [one.response for one in bench.client.outcomes()] == [ControlResponse.SUCCESS]
+
+
+@pytest.mark.parametrize("fault", ["error", "nan", "away"])
+def test_order_to_measure_is_refused_with_the_reason_of_the_server(bench: Bench, fault: str) -> None:
+    bench.later(1.0)
+    bench.cryostat.fault = fault
+    if fault == "away":
+        bench.client.lost("the server restarts")
+    bench.exchange(bench.client.order(InstrumentOrder(1, "series/1", Parameter("cryo.t")), bench.now_s))
+    (refused,) = bench.client.outcomes()
+    assert refused.response == ControlResponse.PARAM_ERROR
+    assert "cryo.t is not known: " in refused.reason
 
 
 def test_error_of_the_server_that_names_no_parameter_ends_no_order(bench: Bench) -> None:

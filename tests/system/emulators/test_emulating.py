@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import subprocess
@@ -81,6 +82,34 @@ def test_taken_port_is_reported_in_one_sentence(vendor: str, tmp_path: Path) -> 
     said = "".join(filter(None, told)).strip()
     assert f"another program listens at port {port}" in said
     assert "Traceback" not in said
+
+
+@pytest.mark.parametrize(
+    ("vendor", "setting", "reason"),
+    [
+        ("nanonis", "range_m=2.6 V", "range_m: V can't be converted to m"),
+        ("nanonis", "range_m=-1 um", "range_m"),
+        ("gxsm", "reach_m=400", "reach_m: without a unit this means 400 m"),
+        ("park", "start_s=soon", "start_s: 'soon' is not a number with a unit"),
+        ("asylum", "clock_off_s=2 um", "clock_off_s"),
+    ],
+)
+def test_impossible_quantity_is_refused_before_listening(
+    vendor: str, setting: str, reason: str, tmp_path: Path
+) -> None:
+    # results T7
+    with started("afspm", "emulate", vendor, setting, cwd=tmp_path) as process:
+        out, err = process.communicate(timeout=DEADLINE_S)
+    assert (process.returncode, out) == (1, "")
+    assert reason in err
+
+
+def test_quantity_on_the_command_line_has_a_unit(tmp_path: Path) -> None:
+    with started("afspm", "emulate", "echo.Echo", "clock_off_s=-2 min", "-o", "files", cwd=tmp_path) as process:
+        assert process.stdout is not None
+        assert "listening" in process.stdout.readline()
+    start, clock, *_ = map(json.loads, (tmp_path / "files" / "truth.jsonl").read_text(encoding="utf-8").splitlines())
+    assert (start["event"], clock["event"], clock["off_s"]) == ("start", "clock of the controller", -120.0)
 
 
 def test_unknown_fault_is_refused_before_listening(tmp_path: Path) -> None:

@@ -177,7 +177,7 @@ def test_tip_treatment_is_in_the_truth_and_not_on_the_wire(run: Any) -> None:
     lines = running.truth()
     ledger = [line for line in lines if line["event"] == "ledger"][-1]
     assert (ledger["pulses"], ledger["crashes"]) == (1, 1)
-    events = [line for line in lines if line["event"] != "ledger"]
+    events = [line for line in lines if "truth" in line]
     assert [event["event"] for event in events] == ["start", "pulse", "crash", "scan starts", "scan"]
     assert (events[1]["voltage_v"], events[1]["duration_s"]) == (8.0, pytest.approx(0.05))
     assert (events[2]["speed_m_per_s"], events[2]["depth_m"]) == (pytest.approx(2e-8), pytest.approx(1e-8))

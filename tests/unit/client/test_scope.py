@@ -63,6 +63,24 @@ def test_control_is_requested_and_released_by_each_call(lab: Lab, scope: Scope) 
     assert lab.count(ControlRequest.REQUEST_CTRL) == lab.count(ControlRequest.RELEASE_CTRL) == 1
 
 
+def test_words_of_a_person_about_the_feedback_need_no_control_and_may_be_refused(lab: Lab, scope: Scope) -> None:
+    answers = [Response(ControlResponse.SUCCESS), Response(ControlResponse.NOT_IN_CONTROL, reason="only a person")]
+    asked = []
+
+    def answer(request: Request) -> Response | str:
+        if request.kind != ControlRequest.ACTION:
+            return "go on"
+        asked.append(request.subject)
+        return answers.pop(0)
+
+    lab.intercept = answer
+    scope.feedback_may_be_off()
+    with pytest.raises(Refused, match="only a person"):
+        scope.feedback_may_be_off()
+    assert asked == [model.names.FEEDBACK_MAY_BE_OFF] * 2
+    assert lab.count(ControlRequest.REQUEST_CTRL) == 0
+
+
 def test_an_explicit_block_keeps_control_over_several_calls(lab: Lab, scope: Scope) -> None:
     with scope.control():
         scope.scan(REGION)
@@ -1079,6 +1097,14 @@ def test_second_thread_is_refused_while_one_waits_in_a_call(lab: Lab, scope: Sco
     assert scope.scan(REGION).interruptions == ()
     assert refused
     assert scope.get("tip-bias-voltage") == 0.5
+
+
+def test_read_lets_an_instrument_measure_and_asks_the_microscope_as_get_does(lab: Lab, scope: Scope) -> None:
+    lab.values["source.bias"] = "0.25"
+    asked = []
+    lab.intercept = lambda request: asked.append(request.subject.name) or "go on"
+    assert (scope.read("source.bias"), scope.read("tip-bias-voltage")) == (0.25, 0.5)
+    assert asked == ["source.bias.now", "tip-bias-voltage"]
 
 
 def test_wait_accepts_a_target_that_the_instrument_has_rounded(lab: Lab, scope: Scope) -> None:

@@ -15,16 +15,16 @@ WIDTH_M = 70e-9
 
 
 class ParticleLab(Lab):
-    """Scans show `PARTICLES`; zooms about places with x above `limit_m` are refused.
+    """Scans show `PARTICLES`; zooms about places with x above `limit_m` are refused (`zoom_alone`: never the survey).
 
     Attributes:
         regions: of the finished scans.
         spots: of the spectra.
     """
 
-    def __init__(self, limit_m: float = 1.0) -> None:
+    def __init__(self, limit_m: float = 1.0, *, zoom_alone: bool = False) -> None:
         super().__init__("survey")
-        self.limit_m = limit_m
+        self.limit_m, self.zoom_alone = limit_m, zoom_alone
         self.spots: list[tuple[float, float]] = []
         self.intercept = self._limited
 
@@ -35,6 +35,7 @@ class ParticleLab(Lab):
             and isinstance(wanted, ScanParameters)
             and isinstance(wanted.region, Region)
             and wanted.region.center_m[0] > self.limit_m
+            and not (self.zoom_alone and not self.finished)
         )
         if is_beyond:
             return Response(ControlResponse.PARAM_ERROR, reason="the region leaves the limits")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from client_lab import REGION, Lab, run
@@ -156,6 +157,17 @@ def test_search_stays_within_its_allowed_width(most_m: float, widths: list[float
     assert run(Rescanner(), lab) == ExitCode.ENDED
     assert [region.size_m[0] for region in lab.finished] == pytest.approx(widths)
     assert lab.problems == ()
+
+
+@pytest.mark.parametrize(
+    ("settings", "shape", "wider"),
+    [({}, (128, 64), (256, 128)), ({}, (9, 9), (17, 17)), ({"most_pixels": 200}, (128, 208), (192, 208))],
+)
+def test_wider_search_keeps_to_multiples_of_sixteen_pixels(
+    settings: dict[str, Any], shape: tuple[int, int], wider: tuple[int, int]
+) -> None:
+    # Nanonis refuses 255 columns, so that no search was wider
+    assert Rescanner(**settings)._wider(REGION, shape, 1)[1] == wider
 
 
 @pytest.mark.parametrize(("kind", "left"), [(RescanKind.SEARCH, (MALFUNCTION,)), (RescanKind.AGAIN, ())])

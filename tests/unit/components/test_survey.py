@@ -72,6 +72,17 @@ def test_target_outside_limits_is_refused_in_the_table_and_the_next_follows(ran:
     assert len(lab.finished) == 3
 
 
+def test_survey_whose_targets_are_all_refused_ends_with_the_reason(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    # paper F4: it ended with 0
+    lab = ParticleLab(limit_m=-2e-6, zoom_alone=True)
+    assert run(survey(), lab, tmp_path / "state", run_dir=str(tmp_path)) == ExitCode.OWN_FAULT
+    assert "the region leaves the limits" in caplog.text
+    assert "no target could be zoomed: all 3 were refused" in caplog.text
+    assert [row["outcome"] for row in table(tmp_path)] == ["refused"] * 3
+
+
 def test_survey_without_targets_logs_that_and_ends(ran: Any, caplog: pytest.LogCaptureFixture) -> None:
     rows = ran(ParticleLab(), survey(min_height=1e-6))
     assert rows == []

@@ -90,6 +90,8 @@ def test_a_region_may_be_turned(write: Write) -> None:
         ('[limits]\nforbid = ["scan-speed > 1"]\n', "scan-speed and 1 have different units: m/s and no unit"),
         ('[limits]\nforbid = ["scan-speed > scan-angle"]\n', "different units: m/s and rad"),
         ('[limits]\nforbid = ["x-feedback-on > 1"]\n', "is on or off, and can't be compared"),
+        ('[limits]\nforbid = ["abs(scan-speed - scan-angle) > 1 um/s"]\n', "scan-angle is compared in rad and in m/s"),
+        ('[limits]\nforbid = ["abs(scan-speed - x-feedback-on) > 1 um/s"]\n', "x-feedback-on is on or off"),
         ('[limits]\nforbid = ["SCANNING > 1"]\n', "is on or off, and can't be compared"),
         ('[limits]\nforbid = ["scan-speed"]\n', "scan-speed is a number, and is compared with nothing"),
         ('[limits]\nforbid = ["x-spec-kind"]\n', "x-spec-kind is a text"),

@@ -98,6 +98,43 @@ def test_plan_is_checked_against_the_microscope(write: Write, plan: str, what: s
     assert errors(write(plan)) == [], "of a command nothing is known"
 
 
+NANONIS = SIMULATED.replace("Simulator", "Nanonis")
+REACH = "".join(f'[microscope.parameters.probe-pos-{axis}]\nrange = ["-1 um", "1 um"]\n' for axis in "xy")
+ANGLE = 'angle = "45 deg"\n'
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        SERIES + SIZE + "pixels = [24, 24]\n",
+        LIST + "pixels = [24, 24]\n",
+        GRID + "pixels = [24, 24]\n",
+        SURVEY + 'zoom = "1 um"\nzoom_pixels = [24, 24]\n',
+    ],
+)
+def test_pixels_that_are_no_multiple_of_the_makers_are_an_error(write: Write, plan: str) -> None:
+    # paper F4: refused at the run only
+    assert "scan-resolution-x: 24 is no multiple of 16: set 16 or 32" in only_error(write(plan, frame=NANONIS)).what
+    assert not errors(write(plan, frame=SIMULATED))
+
+
+@pytest.mark.parametrize(
+    ("plan", "angle", "line"),
+    [
+        (SERIES + 'size = ["1.5 um", "1.5 um"]\n', ANGLE, "[series]"),
+        (GRID + 'spacing = ["500 nm", "900 nm"]\n', ANGLE, "[grid]"),
+        (LIST.replace("[0, 0]", '["600 nm", "0 nm"]'), "", "regions"),
+        (SURVEY.replace("4 um", "1.9 um") + 'zoom = "1 um"\n', ANGLE, "[survey]"),
+    ],
+)
+def test_frame_that_sticks_out_of_the_scanner_is_one_error(write: Write, plan: str, angle: str, line: str) -> None:
+    experiment = write(plan + angle + REACH, frame=NANONIS)
+    error = only_error(experiment)
+    assert "plans what its microscope refuses: scan frame: its corners are at" in error.what
+    assert "beyond the scanner's -1 to 1 µm (set in the experiment file" in error.what
+    assert error.place.line == line_of(experiment, line)
+
+
 @pytest.mark.parametrize("setting", ['poll_period_s = "0 s"', 'poll_period_s = "-1 s"', 'approach_s = "-1 s"'])
 def test_a_duration_of_the_microscope_is_not_below_zero(write: Write, setting: str) -> None:
     experiment = write("", frame=SIMULATED + setting + "\n")

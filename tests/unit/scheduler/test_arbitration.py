@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import chain
 from types import MappingProxyType
 
@@ -70,7 +71,8 @@ def test_every_row_can_apply() -> None:
     roles = RoleTable(end_experiment=("boss",), set_mode=("boss",), clear_problems=("boss",), operate=("boss",))
     met = set()
     stopping = Rules(problems=ProblemNames({STOPPED_BY_AGENT: 99}), agents=frozenset({"a"}))
-    for rules in (RULES, Rules(roles), Rules(end_on=frozenset({TIP})), Rules(shadow=True), stopping):
+    approving = Rules(RoleTable(approve=("boss",)))
+    for rules in (RULES, Rules(roles), approving, Rules(end_on=frozenset({TIP})), Rules(shadow=True), stopping):
         for control in _states():
             for event in ArbitrationEvent:
                 for who in ("a", "b", "boss"):
@@ -250,6 +252,17 @@ def test_an_operator_commands_in_manual_only() -> None:
     assert after(mode(MANUAL), command, rules=rules)[1].response is None
     assert after(command, rules=rules)[1].response is ControlResponse.NOT_IN_CONTROL
     assert after(mode(MANUAL), command)[1].response is ControlResponse.NOT_IN_CONTROL
+
+
+@pytest.mark.parametrize("who", ["terminal:ada", "dashboard:Ada"])
+def test_person_says_in_manual_alone_that_the_feedback_is_off(who: str) -> None:
+    rules = Rules(RoleTable(operate=("dashboard",), approve=("dashboard", "terminal")), agents=frozenset({"agent"}))
+    said = ControlInput(ArbitrationEvent.FEEDBACK_OFF, who)
+    assert after(mode(MANUAL), said, rules=rules)[1].response is None
+    assert after(said, rules=rules)[1].response is ControlResponse.NOT_IN_CONTROL
+    assert after(request(who), said, rules=rules)[1].response is ControlResponse.NOT_IN_CONTROL
+    shadow = replace(rules, shadow=True)
+    assert after(mode(MANUAL), said, rules=shadow)[1].response is ControlResponse.NOT_IN_CONTROL
 
 
 def test_an_operator_adjusts_beside_the_holder_while_no_problem_is_flagged() -> None:

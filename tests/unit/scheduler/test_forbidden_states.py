@@ -29,7 +29,7 @@ from afspm.scheduler.settings import SchedulerSettings
 
 BIAS, SETPOINT = "tip-bias-voltage", "zctrl-setpoint"
 RULE = "abs(tip-bias-voltage) > 1 V and zctrl-setpoint > 100 pA"
-UNITS = {BIAS: "V", SETPOINT: "A", "scan-speed": "m/s", "cryo.t": "K"}
+UNITS = {BIAS: "V", "x-sample-bias": "V", SETPOINT: "A", "scan-speed": "m/s", "cryo.t": "K"}
 
 
 def limits(rule: str = RULE, units: dict[str, str] = UNITS) -> ExperimentLimits:
@@ -69,6 +69,9 @@ def action(name: str) -> Request:
         ("(a > 1", 6, "the rule ends where `)` is expected"),
         ("abs(1) > 1", 4, "'1' where the name of a quantity is expected"),
         ("abs(a)", 6, "the rule ends where <, <=, > or >= is expected"),
+        ("abs(a - 1) > 1", 8, "'1' where the name of a quantity is expected"),
+        ("abs(a - b - c) > 1", 10, "'-' where `)` is expected"),
+        ("a - b > 1", 2, "'-' where"),
         ("a > 1 degC", 4, "does not count from zero"),
         ("(" * 30 + "a" + ")" * 30, 20, "nested"),
         ("a" * 1001, 0, "at most 1000 characters"),
@@ -92,6 +95,10 @@ def test_wrong_rule_is_refused_with_its_place(rule: str, at: int, said: str) -> 
         ("a > 1 or b > 1", {"a": 2}, True),
         ("abs(a) >= 1", {"a": -1.0}, True),
         ("a > 1", {"a": 1 + 1e-8}, False),  # rounded by a controller
+        ("abs(a - b) > 3", {"a": 2.0, "b": -2.0}, True),
+        ("abs(a - b) > 3", {"a": 2.0, "b": 2.0}, False),
+        ("abs(a - b) > 3", {"a": 9.0}, None),
+        ("not abs(a - b) > c", {"a": 0.0, "b": 4.0, "c": 5.0}, True),
         ("-1.5 <= a", {"a": -1.5}, True),
     ],
 )
@@ -105,6 +112,19 @@ def test_request_into_a_forbidden_state_is_refused_with_rule_values_and_remedy()
         "tip-bias-voltage = -2 V is forbidden while zctrl-setpoint = 150 pA: abs(tip-bias-voltage) > 1 V and"
         " zctrl-setpoint > 100 pA (night.toml:7); first bring zctrl-setpoint to at most 100 pA"
     )
+
+
+@pytest.mark.parametrize(
+    ("bias", "sample_v", "is_refused"), [("2 V", -2.0, True), ("2 V", 0.5, False), ("1 V", -4.0, False)]
+)
+def test_voltage_between_tip_and_sample_may_have_a_limit(bias: str, sample_v: float, is_refused: bool) -> None:
+    # results M4: a limit of 3 V on the tip allowed 4.5 V
+    rule = "abs(tip-bias-voltage - x-sample-bias) > 3 V"
+    now = present(tip_bias_voltage=1.5, x_sample_bias=sample_v)
+    why = refusal(limits(rule), set_(BIAS, *bias.split()), now)
+    assert bool(why) is is_refused
+    if is_refused:
+        assert why.startswith("tip-bias-voltage = 2 V is forbidden while x-sample-bias = -2 V: abs(tip-bias-voltage - ")
 
 
 @pytest.mark.parametrize(

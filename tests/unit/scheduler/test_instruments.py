@@ -69,6 +69,7 @@ class Cryo:
         self.step(TranslatorCaughtUp())
         question = self.forwards.pop()
         self.step(TranslatorReply(question.number, Response(int(ControlResponse.SUCCESS))))
+        self.later(1.0)  # no reading is from before the start
 
     def step(self, event: Any) -> None:
         for effect in self.core.step(event, self.now_s, self.now_ns):
@@ -98,14 +99,24 @@ class Cryo:
         answer = self.answers[self.ask(kind, subject, name)]
         return answer.code, answer.reason
 
-    def report(
-        self, value: float | None = 4.2, unit: str = "K", *outcomes: OrderOutcome, **reading: Any
-    ) -> InstrumentOrders:
+    def send_report(
+        self,
+        value: float | None = 4.2,
+        unit: str = "K",
+        *outcomes: OrderOutcome,
+        patience_s: float = 0.0,
+        **reading: Any,
+    ) -> str:
         reading = {"age_s": 0.1, "target": 4.2, **reading}
         readings = (InstrumentReading(T, value, unit, **reading),)
-        report = InstrumentReadings(self.now_ns, "cryo", readings, outcomes, self.token)
-        answer = self.answers[self.ask(RELAY_REQUEST, RelayedMessage(*wire.encode(report)), "cryo")]
-        orders = wire.decode_instrument_orders(answer.payload)
+        report = InstrumentReadings(self.now_ns, "cryo", readings, outcomes, self.token, patience_s)
+        return self.ask(RELAY_REQUEST, RelayedMessage(*wire.encode(report)), "cryo")
+
+    def report(self, *given: Any, **reading: Any) -> InstrumentOrders:
+        return self.orders_of(self.send_report(*given, **reading))
+
+    def orders_of(self, report: str) -> InstrumentOrders:
+        orders = wire.decode_instrument_orders(self.answers[report].payload)
         self.token = orders.token
         return orders
 
@@ -200,6 +211,71 @@ def test_values_are_read_from_the_last_report(cryo: Cryo) -> None:
     assert found == [Parameter(T, "4.2", "K"), Parameter(f"{T}.target", "4.2", "K"), Parameter(f"{T}.busy", "true")]
     cryo.later(4.1)
     assert "older than 4 s" in cryo.answer_to(ControlRequest.PARAM, Parameter(T))[1]
+
+
+def test_value_is_measured_again_after_a_set_of_the_run(cryo: Cryo) -> None:
+    # spectra F7: the reading of before a set looked fresh
+    cryo.known()
+    assert cryo.ask(ControlRequest.PARAM, Parameter(T)) in cryo.answers
+    for name, wanted in (("tip-bias-voltage", Parameter("tip-bias-voltage", "1", "V")), (T, Parameter(T, "20", "K"))):
+        cryo.ask(ControlRequest.PARAM, wanted)
+        if name == T:
+            (order,) = cryo.report(4.2).orders
+            cryo.report(4.2, "K", OrderOutcome(order.number, 0), target=20.0)
+        else:
+            cryo.step(TranslatorReply(cryo.forwards.pop().number, Response(int(ControlResponse.SUCCESS))))
+        cryo.later(0.05)
+        asked = cryo.ask(ControlRequest.PARAM, Parameter(T))
+        assert asked not in cryo.answers
+        (order,) = cryo.report(4.3).orders
+        assert (order.is_reading, order.parameter, order.id) == (True, Parameter(T), asked)
+        assert cryo.report(4.4).orders == (order,)
+        cryo.report(19.0, "K", OrderOutcome(order.number, 0), age_s=0.0)
+        assert wire.decode_parameter(cryo.answers[asked].payload) == Parameter(T, "19.0", "K")
+        cryo.later(1.0)
+        cryo.known(18.0)
+        assert cryo.ask(ControlRequest.PARAM, Parameter(T)) in cryo.answers  # from after the set
+
+
+def test_part_now_is_measured_and_part_age_is_the_longest_time_since(cryo: Cryo) -> None:
+    cryo.known()
+    cryo.later(2.0)
+    age = wire.decode_parameter(cryo.answers[cryo.ask(ControlRequest.PARAM, Parameter(f"{T}.age"))].payload)
+    assert (float(age.value or "nan"), age.unit) == (pytest.approx(2.1), "s")
+    now = cryo.ask(ControlRequest.PARAM, Parameter(f"{T}.now"), "watcher")  # needs no control
+    (order,) = cryo.report().orders
+    cryo.report(None, "K", OrderOutcome(order.number, int(ControlResponse.PARAM_ERROR), "no sensor"), reason="x")
+    assert (cryo.answers[now].code, cryo.answers[now].reason) == (ControlResponse.PARAM_ERROR, "no sensor")
+    assert "is not known" in cryo.answer_to(ControlRequest.PARAM, Parameter(f"{T}.now"), "watcher")[1]
+    asked = cryo.ask(ControlRequest.PARAM, Parameter(f"{T}.now", "5", "K"))
+    cryo.report()
+    assert "can only be read" in cryo.answers[asked].reason
+
+
+def test_measuring_ends_without_an_answer_of_the_instrument(cryo: Cryo) -> None:
+    cryo.known()
+    asked = cryo.ask(ControlRequest.PARAM, Parameter(f"{T}.now"))
+    assert len(cryo.report().orders) == 1
+    cryo.later(5.1)
+    assert "cryo has sent no new value of cryo.t" in cryo.answers[asked].reason
+    assert cryo.report().orders == ()
+
+
+def test_answer_to_a_patient_report_waits_for_an_order(cryo: Cryo) -> None:
+    cryo.known()
+    for kind in (Parameter(f"{T}.now"), Parameter(T, "20", "K")):
+        held = cryo.send_report(patience_s=0.2)
+        assert held not in cryo.answers
+        asked = cryo.ask(ControlRequest.PARAM, kind)
+        (order,) = cryo.orders_of(held).orders
+        assert order.id == asked
+        cryo.report(4.2, "K", OrderOutcome(order.number, 0), target=20.0)
+        assert cryo.answers[asked].ok
+    held = cryo.send_report(patience_s=0.2)
+    cryo.later(0.1)
+    assert held not in cryo.answers
+    cryo.later(0.11)
+    assert cryo.orders_of(held).orders == ()
 
 
 def test_report_that_waited_in_a_queue_is_as_old_as_its_token(cryo: Cryo) -> None:

@@ -21,6 +21,7 @@ from afspm.model import (
     Request,
     ResponseDetail,
     ScopeState,
+    names,
 )
 from afspm.scheduler.control.arbitration import RoleTable, Rules
 from afspm.scheduler.events import (
@@ -480,6 +481,21 @@ def test_an_operator_commands_in_manual() -> None:
     assert lab.says("console", ACTION, "start-scan") is NOT_IN_CONTROL
     lab.mode("console", ControlMode.MANUAL)
     assert kinds(lab.ask("console", ACTION, "start-scan")) == ["SaveState", "Forward"]
+
+
+# a component, an agent or a program at the gateway can't say why the feedback is off: results point 1
+@pytest.mark.parametrize("who", ["terminal:ada", "series", "agent", "gateway:me"])
+def test_only_a_person_says_that_the_feedback_is_off_by_intention(who: str) -> None:
+    roles = RoleTable(operate=("dashboard",), approve=("dashboard", "terminal", "agent"))
+    lab = Lab(SchedulerSettings(rules=Rules(roles, agents=frozenset({"agent"}))))
+    lab.translator()
+    refusals = {NOT_IN_CONTROL, ControlResponse.FAILURE}  # an agent has no grant for it
+    assert lab.says(who, ACTION, names.FEEDBACK_MAY_BE_OFF) in refusals
+    lab.take_control("series")
+    assert lab.says(who, ACTION, names.FEEDBACK_MAY_BE_OFF) in refusals
+    lab.mode("terminal:ada", ControlMode.MANUAL)
+    effects = lab.ask(who, ACTION, names.FEEDBACK_MAY_BE_OFF)
+    assert any(isinstance(effect, Forward) for effect in effects) is (who == "terminal:ada")
 
 
 def test_only_adjustable_parameters_are_set_beside_the_holder() -> None:

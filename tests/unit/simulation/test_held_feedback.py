@@ -137,6 +137,32 @@ def test_change_in_a_scan_during_the_hold(*, is_off: bool) -> None:
     assert flat.tolist() == [True] * 3 + [is_off] * 5
 
 
+@DELAYS_S
+def test_hold_is_noted_with_its_times(hold_s: float) -> None:
+    bench = Bench(hold_s=hold_s)
+    end_s = bench.rig.start_spectrum("IV", START_S).end_s
+    bench.rig.account(end_s + 1.0)
+    told = [(time_s, event, facts.get("held")) for time_s, event, facts in bench.lines]
+    assert told == [
+        (START_S, "conditions", False),
+        (START_S, "spectrum starts", None),
+        (START_S, "conditions", True),
+        (end_s, "spectrum ends", None),
+        (end_s + hold_s, "conditions", False),
+    ]
+
+
+def test_switch_during_the_hold_ends_it_in_the_truth() -> None:
+    bench = Bench(hold_s=0.3)
+    end_s = bench.rig.start_spectrum("IV", START_S).end_s
+    bench.rig.switch_feedback(end_s + 0.1, on=False)
+    bench.rig.account(end_s + 1.0)
+    conditions = [
+        (time_s, one["held"], one["feedback"]["on"]) for time_s, name, one in bench.lines if name == "conditions"
+    ]
+    assert conditions == [(START_S, False, True), (START_S, True, True), (end_s + 0.1, False, False)]
+
+
 def test_unknown_reading_of_a_held_feedback_is_refused() -> None:
     with pytest.raises(ConfigError, match="unknown: 'maybe'"):
         World.from_settings({"feedback": {"hold_reads": "maybe"}}, 1, 0.0)

@@ -479,7 +479,7 @@ def test_events_are_noted_with_the_truth(clock: Any) -> None:
     noted: list[tuple[float, str, bool]] = []
 
     def note(time_s: float, event: str, facts: Mapping[str, Any]) -> None:
-        if event != "ledger":
+        if event not in ("ledger", "conditions", "scan ends", "spectrum ends"):
             noted.append((time_s, event, "drift_m" in facts["truth"]))
 
     rig = SimulatedInstrument({}, 3, clock.t_s, note=note)
@@ -492,3 +492,68 @@ def test_events_are_noted_with_the_truth(clock: Any) -> None:
     rig.crash(1e-9, 1e-8, 1005.0)
     events = ("scan starts", "scan stopped", "spectrum starts", "spectrum stopped", "pulse", "crash")
     assert noted == [(1000.0 + number, event, True) for number, event in enumerate(events)]
+
+
+def noting(clock: Any, **world: Any) -> tuple[SimulatedInstrument, list[tuple[float, str, Any]]]:
+    """Return an instrument with the list of its events, in the order of time."""
+    noted: list[tuple[float, str, Any]] = []
+    rig = SimulatedInstrument(world, 3, clock.t_s, note=lambda *line: noted.append(line))
+    rig.setup.shape, rig.setup.line_s = (4, 4), 0.5
+    return rig, noted
+
+
+def facts_of(noted: list[tuple[float, str, Any]], event: str) -> list[tuple[float, Any]]:
+    return [(time_s, facts) for time_s, name, facts in noted if name == event]
+
+
+def test_conditions_of_a_scan_are_noted_at_their_times(clock: Any) -> None:
+    rig, noted = noting(clock)
+    rig.start_scan(1000.0)
+    rig.switch_feedback(1000.5, on=False)
+    rig.setup.bias_v = 0.25
+    rig.note_changes(1001.0)
+    rig.note_changes(1001.5)
+    rig.account(1002.5)
+    rig.withdraw(1003.0)
+    conditions = facts_of(noted, "conditions")
+    assert [
+        (time_s, one["engaged"], one["held"], one["feedback"]["on"], one["bias_v"]) for time_s, one in conditions
+    ] == [
+        (1000.0, True, False, True, 0.1),
+        (1000.5, True, False, False, 0.1),
+        (1001.0, True, False, False, 0.25),
+        (1003.0, False, False, False, 0.25),
+    ]
+    assert conditions[0][1]["feedback"] == {
+        "on": True, "proportional_gain": 0.1, "integral_gain": 1500.0, "setpoint": 0.7,
+    }  # fmt: skip
+    assert facts_of(noted, "scan ends") == [(1002.0, {"number": 1, "stopped": False, "lines": 4})]
+    names = [name for _, name, _ in noted]
+    assert names.index("conditions") < names.index("scan starts"), "the conditions at its start are known"
+
+
+def test_end_of_a_stopped_measurement_is_noted_once(clock: Any) -> None:
+    rig, noted = noting(clock)
+    rig.start_scan(1000.0)
+    rig.stop_scan(1001.2)
+    rig.start_spectrum("IV", 1002.0)
+    rig.stop_spectrum(1003.0)
+    rig.start_spectrum("IV", 1004.0)
+    rig.account(1010.0)
+    rig.account(1011.0)
+    assert facts_of(noted, "scan ends") == [(1001.2, {"number": 1, "stopped": True, "lines": 2})]
+    assert facts_of(noted, "spectrum ends") == [
+        (1003.0, {"number": 1, "stopped": True}),
+        (1006.0, {"number": 2, "stopped": False}),
+    ]
+
+
+def test_end_of_a_scan_after_a_kill_is_noted(clock: Any) -> None:
+    rig, _ = noting(clock)
+    rig.start_scan(1000.0)
+    kept = json.loads(json.dumps(rig.state()))
+    again, noted = noting(clock)
+    again.restore(kept)
+    again.account(1010.0)
+    assert facts_of(noted, "scan ends") == [(1002.0, {"number": 1, "stopped": False, "lines": 4})]
+    assert len(facts_of(noted, "conditions")) == 1

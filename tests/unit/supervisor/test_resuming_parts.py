@@ -75,6 +75,15 @@ def test_part_is_resumed_with_its_own_processes(options: RunOptions, tmp_path: P
         facts = facts_to_resume(expanded, starts, again)
 
 
+def test_translator_alone_gets_the_words_about_the_feedback(tmp_path: Path) -> None:
+    (tmp_path / "night.toml").write_text(PARTS, encoding="utf-8")
+    experiment = load(tmp_path / "night.toml")
+    texts = {one.launch.name: one.launch.feedback_off for one in dry_run(experiment, RunOptions(feedback_off=True))}
+    assert [name for name, text in texts.items() if text] == ["microscope"]
+    with pytest.raises(ConfigError, match="no translator is started here"):
+        dry_run(experiment, RunOptions(only=("series",), feedback_off=True))
+
+
 def test_component_added_at_a_resume_runs_in_that_life(tmp_path: Path) -> None:
     overlay = tmp_path / "overlay.toml"
     overlay.write_text('[dashboard]\ncomponent = true\nclass = "Dashboard"\n', encoding="utf-8")

@@ -196,11 +196,11 @@ class Bench:
         self.microscope = FakeMicroscope(**(settings or {}))
         self.start()
 
-    def start(self, *, retracts: bool = True) -> None:
+    def start(self, *, retracts: bool = True, feedback_off: str = "") -> None:
         """Start the translator's process, or restart it after a kill: only the disk survives."""
         self.port = FakePort(self.clock)
         memory, log = Memory(self.folder / "translator.json"), logging.getLogger("test")
-        run = TranslatorRun(self.folder, retracts=retracts)
+        run = TranslatorRun(self.folder, retracts=retracts, feedback_off=feedback_off)
         self.translator = Translator(self.microscope, self.port, memory, run, log)
         self.translator.look()
 

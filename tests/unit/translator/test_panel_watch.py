@@ -62,6 +62,19 @@ def test_a_value_changed_at_the_panel_is_published_once_with_old_and_new_value(b
     assert (change.parameter, float(change.before), float(change.after)) == ("zctrl-setpoint", 1e-9, 2e-9)
 
 
+def test_a_row_of_the_table_may_be_watched(make_bench: Any) -> None:
+    # results M4: the second electrode
+    rows = {"x-sample-bias": {"vendor": "P", "unit": "V", "watched": True}, "x-other": {"vendor": "Bias", "unit": "V"}}
+    bench = make_bench({"parameters": rows})
+    bench.look()
+    bench.microscope.values |= {"P": 2.5, "Bias": 3.0}
+    bench.look()
+    bench.heard()
+    changes = [change for one in bench.beside if isinstance(one, ActByHand) for change in one.changes]
+    assert ChangedValue("x-sample-bias", "1", "2.5", "V") in changes
+    assert "x-other" not in {change.parameter for change in changes}
+
+
 def test_a_value_set_by_the_run_is_no_act_by_hand(bench: Any) -> None:
     assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(setpoint=2e-9)).code == OK
     bench.look()

@@ -77,7 +77,7 @@ def test_series_of_curves_stops_once_the_feedback_is_off(bench: Any, off_at: str
     assert "FREE" not in bench.heard(), "the controller may hold the feedback still"
     for _ in range(7):
         bench.look()
-    assert bench.heard() == ["INTERRUPTED", "FREE"]
+    assert bench.heard() == ["INTERRUPTED", "FREE", "ZCtrlParameters"]
     assert acts(bench) == [PanelAct.FEEDBACK_OFF]
     assert bench.ask(ACTION, names.START_SPEC).code == NOT_FREE
 
@@ -160,6 +160,25 @@ def test_feedback_off_before_a_run_forbids_a_start_where_the_tip_is_not_shown(ma
     assert "off since before this run" in refused.reason
     assert bench.ask(ACTION, names.FEEDBACK_MAY_BE_OFF).code == OK
     assert bench.ask(ACTION, names.START_SCAN).code == OK
+
+
+def test_person_who_begins_a_run_with_feedback_off_says_so_once_for_each_start(make_bench: Any, caplog: Any) -> None:
+    bench = make_bench()
+    (bench.folder / "translator.json").unlink(missing_ok=True)
+    bench.microscope.values["Loop"] = False
+    bench.start(feedback_off="1")
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+    assert bench.ask(ACTION, names.STOP_SCAN).code == OK
+    bench.look()
+    assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True)).code == OK
+    bench.start(feedback_off="1")  # restarted: the run wishes it on since, and the text is of its start
+    bench.microscope.values["Loop"] = False
+    bench.look()
+    assert bench.ask(ACTION, names.START_SCAN).code == NOT_FREE
+    bench.start(feedback_off="2")  # resumed
+    bench.look()
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+    assert caplog.text.count("off by intention: so says the person") == 2
 
 
 @pytest.mark.parametrize("says", [True, False])

@@ -493,7 +493,9 @@ def test_a_turned_frame_whose_corner_is_out_of_reach_is_refused(bench: Any) -> N
     region = Region((9e-6, 0.0), (2e-6, 2e-6), math.radians(45))
     response = bench.ask(FRAME, ScanParameters(region))
     assert response.code == PARAM_ERROR
-    assert "reaches" in response.reason
+    assert "its corners are at -1.4142 to 1.4142 µm in y" not in response.reason
+    assert "its corners are at 7.5858 to 10.414 µm in x, beyond the scanner's -10 to 10 µm" in response.reason
+    assert "move the frame by -414.21 nm in x" in response.reason
     assert bench.ask(FRAME, ScanParameters(Region((9e-6, 0.0), (2e-6, 2e-6)))).code == OK
 
 

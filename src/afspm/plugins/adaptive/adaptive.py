@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import ClassVar, Final
 
 from afspm import Component, OutageLog, PlannedWork, write_atomic
-from afspm.basics import Angle, ConfigError, Length, counted, quantity
+from afspm.basics import Angle, ConfigError, Length, MeasurementFailed, counted, quantity
 from afspm.model import Region, names
 from afspm.plugins.adaptive.mapping import (
     MOST_SPECTRA,
@@ -127,6 +127,8 @@ class Adaptive(Component):
                 self.scope.forget(f"map-{number}")
             self._report(found)
         self.log.info("%s: %s%s", self._state(found), why, self._failures(found))
+        if failed and not found.measured:
+            raise MeasurementFailed(f"none of the {len(failed)} positions of the map gave a value")
         if self.end_when_done:
             self.scope.end_experiment()
 

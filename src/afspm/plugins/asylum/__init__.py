@@ -30,6 +30,7 @@ from afspm.plugins.asylum.session import Session
 from afspm.plugins.asylum.settings import NAMES, FeedbackSwitch, FrameSettings, TipPlace
 from afspm.plugins.asylum.xop import XopError
 
+_LAST_SCAN: Final = "LastScan"
 _AT_FIRST: Final[dict[str, Value]] = {
     names.SCAN_DIRECTION: names.UP,
     names.SPEC_KIND: FORCE,
@@ -104,6 +105,7 @@ class Asylum(ScriptedDriver[Session, AsylumActivity]):
             raise ConfigError(f"{spots!r} is no origin of spots", where="spots", hint=" or ".join(_SPOTS))
         if spots == "none":
             self.table = self.table.without(POSITION)
+        self._whole_table = self.table
         self._reply_timeout_s = reply_timeout_s
         self._kept = KeptSettings(_AT_FIRST)
         image = (lambda: self.activity.image) if spots == "image" else None
@@ -134,6 +136,12 @@ class Asylum(ScriptedDriver[Session, AsylumActivity]):
             take_curve=self._take_curve,
         )
         session.doing()
+        self.table = self._whole_table
+        try:
+            session.values([self.table[names.SAMPLE_BIAS].vendor])
+        except Refused as refused:
+            self.log.warning("the bias of the sample is neither set nor watched: %s", refused.reason)
+            self.table = self.table.without([names.SAMPLE_BIAS])
         if not session.at_once:
             self.log.warning(
                 "Igor does not include afspm.ipf: values are read one by one, and the feedback can't be switched"
@@ -184,14 +192,19 @@ class Asylum(ScriptedDriver[Session, AsylumActivity]):
     def start_scan(self) -> None:
         """Scan the frame once, in the direction `x-scan-direction`."""
         self.activity.saves(SCAN)
+        # with LastScan 0 Asylum scans the frame again and again
+        self.session().put({_LAST_SCAN: 1})
+        if not self.session().values([_LAST_SCAN])[_LAST_SCAN]:
+            why = (
+                "LastScan stays 0, although it was set: Asylum would scan the frame again and again. Set it to 1 there"
+            )
+            raise Refused(ControlResponse.ACTION_ERROR, why)
         # before the start: the spot still counts from the corner of the image that the scan will replace
         probe_m = self._place.xy_m() if self._spots == "image" else None
         self.activity.begin(SCAN)
         up = self._kept[names.SCAN_DIRECTION] == names.UP
-        # with LastScan 0 Asylum scans the frame again and again
-        self.session().put({"LastScan": 1})
         self._begin(SCAN, "DoScanFunc", "UpScan" if up else "DownScan")
-        self.session().put({"LastScan": 1})  # again, in case the start has reset it
+        self.session().put({_LAST_SCAN: 1})  # again, in case the start has reset it
         self.activity.await_begin(SCAN)
         # spots count from the corner of the new image now: the same position is another spot
         if probe_m is not None:

@@ -34,7 +34,7 @@ class AsylumShadow(ShadowDriver, Asylum):
 
     def connect(self) -> None:
         self._spots, self._base_name = "none", ""
-        self.table = self.table.without(POSITION)
+        self._whole_table = self._whole_table.without(POSITION)
         super().connect()
         try:
             saves = self.session().values([_SAVES])[_SAVES]

@@ -25,6 +25,7 @@ from typing import Any, ClassVar, Final
 
 from afspm.basics import ConfigError, Duration, Refused
 from afspm.driver import (
+    CENTER,
     FEEDBACK_ON,
     FRAME,
     POSITION,
@@ -67,6 +68,8 @@ from afspm.plugins.gxsm.settings import (
     user_unit_m,
 )
 
+_SIGNALS: Final = "f"
+"""Code of `rtquery` for frequency shift in Hz, current in nA, and a third value."""
 _AT_FIRST: Final[dict[str, Value]] = {names.SPEC_KIND: "IV", names.PULSE_VOLTAGE: 4.0, names.PULSE_DURATION: 0.1}
 _SAVERS: Final = ("afspm", "gxsm")
 _CHANNELS: Final = both_ways(
@@ -102,7 +105,7 @@ class Gxsm(Driver):
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
-    translated = (*FRAME, *POSITION, FEEDBACK_ON, names.CONTROLLER, *_AT_FIRST)
+    translated = (*FRAME, *CENTER, *POSITION, FEEDBACK_ON, names.CONTROLLER, *_AT_FIRST)
     channel_roles = _CHANNELS
     maker: ClassVar[str] = "Gxsm project"
     software: ClassVar[str] = "Gxsm"
@@ -326,6 +329,12 @@ class Gxsm(Driver):
     @action(names.STOP_SPEC)
     def stop_spec(self) -> None:
         self._activity.stop_curve()
+
+    def current_a(self) -> float | None:
+        if self._asking is None or self._offered.hardware is Hardware.SIMULATOR:
+            return None
+        _, current_na, *_ = self._asking.numbers("rtquery", _SIGNALS)
+        return current_na * 1e-9
 
     @action(names.PULSE, state=ScopeState.BUSY_PARAM)
     def pulse(self) -> None:

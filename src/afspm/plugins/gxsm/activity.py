@@ -41,6 +41,11 @@ _MOVED: Final = (
     "the frame was moved or turned during the scan, at GXSM's panel (opening a file sets it, too) or by another program"
 )
 _MULTI_LAYER: Final = "Multi Layer is on at GXSM's panel, and makes several scans of one: switch it off"
+_REPEATS: Final = (
+    "right after each of the last two scans of this run GXSM has begun another one by itself: Repeat, Movie or Multi "
+    "Layer is on at its panel: switch it off"
+)
+_MOST_REPEATS: Final = 2
 _ONLY_A_PART: Final = "SubScan is on at GXSM's panel and scans a part of the frame ({}): switch it off"
 
 
@@ -205,6 +210,7 @@ class GxsmActivity(Activity):
         self._looked_ns = 0  # time of the last poll
         self._shows_until_s = 0.0
         self._scan = ScanProgress()
+        self._repeats = 0  # scans of the run in a row after which GXSM has begun another one by itself
         self._seen_last: tuple[tuple[int, int], Rows | None] = (0, 0), None
 
     # --- start and stop ---
@@ -231,10 +237,13 @@ class GxsmActivity(Activity):
         """Start a scan.
 
         Raises:
-            Refused: *SubScan* restricts the scan to a part of the frame.
+            Refused: *SubScan* restricts the scan to a part of the frame, or GXSM repeats scans by itself.
             ControllerLost: see `require_channels`.
         """
         self.require_channels()
+        if self._repeats >= _MOST_REPEATS:
+            self._repeats = 0  # a person may have switched it off; GXSM does not report it
+            raise Refused(ControlResponse.ACTION_ERROR, _REPEATS)
         part = self._part(self._set_frame()[1])
         if part:
             raise Refused(ControlResponse.ACTION_ERROR, _ONLY_A_PART.format(part))
@@ -341,6 +350,7 @@ class GxsmActivity(Activity):
         if what == SCAN and not self._is_settled(now_s):
             return ScopeStatus(ScopeState.SCANNING)
         if what:
+            self._repeats = 0 if what == SCAN and self._files.is_own else self._repeats
             self.end()
         self._autosave.switch(on=True)
         if doing.approaching:
@@ -398,6 +408,7 @@ class GxsmActivity(Activity):
         # GXSM's memory already holds the next scan: only files that GXSM saved show whether the previous scan was
         # complete.
         self._log.warning("another scan was begun at GXSM's panel before the last one was seen to end")
+        self._repeats += self._files.is_own
         channels, folder, before = self._channels(), self._folder(), self._before()
         if self._files.is_own and has_layers(self.gxsm.ask):
             self._files.spoil(_MULTI_LAYER)

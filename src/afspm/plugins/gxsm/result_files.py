@@ -379,7 +379,7 @@ class GxsmFiles(ResultFiles):
 
     def _missing(self, ended: Entry) -> str:
         if "names" in ended and ended.get("near_end"):
-            return "it came to its end, but the next one began and GXSM had saved no file: is it a frame of a Movie?"
+            return "it came to its end, but the next one began and GXSM had saved no file: Movie or Multi Layer?"
         if "names" in ended:
             return "another one began before it was saved: it was stopped, or GXSM saved no file of it"
         folder = _folder(ended)

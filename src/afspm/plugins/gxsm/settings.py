@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from afspm.basics import AfspmError, Refused, convert, position_text
-from afspm.driver import FEEDBACK_ON, FRAME, POSITION, Kept, SettingsGroup, Value, frame, frame_values
+from afspm.driver import CENTER, FEEDBACK_ON, FRAME, POSITION, Kept, SettingsGroup, Value, frame, frame_values
 from afspm.model import ControlResponse, Region, names
 from afspm.plugins.gxsm.errors import BadReply, GxsmError
 from afspm.plugins.gxsm.hardware import Doing
@@ -142,7 +142,7 @@ class FrameSettings(SettingsGroup):
         is_led: True if the tip follows a change of the frame, and GXSM does not report this move.
     """
 
-    names = FRAME
+    names = (*FRAME, *CENTER)
 
     def __init__(self, scan_frame: ScanFrame, tip: TipPlace, *, is_led: bool) -> None:
         self._frame = scan_frame
@@ -150,7 +150,8 @@ class FrameSettings(SettingsGroup):
         self._is_led = is_led
 
     def read(self) -> dict[str, Value]:
-        return self._frame.read()
+        found = self._frame.read()
+        return found | dict(zip(CENTER, frame(found)[0].center_m, strict=True))
 
     def write(self, values: Mapping[str, Value]) -> None:
         moves = self._is_led and not values.keys() <= PIXELS

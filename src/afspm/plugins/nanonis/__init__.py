@@ -22,7 +22,20 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.basics import ConfigError, Duration, FileError, Refused
-from afspm.driver import FRAME, SCAN, Driver, Entry, KeptSettings, Stated, Value, action, as_region, connected, frame
+from afspm.driver import (
+    FRAME,
+    SCAN,
+    Driver,
+    Entry,
+    KeptSettings,
+    ParameterSpec,
+    Stated,
+    Value,
+    action,
+    as_region,
+    connected,
+    frame,
+)
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.nanonis import fetched, geometry, parameter_groups, protocol, z_controller
 from afspm.plugins.nanonis.activity import SAFE_TIP, WITHDRAWING, NanonisActivity
@@ -37,9 +50,16 @@ _AT_FIRST: Final[dict[str, Value]] = {
     names.CRASH_SPEED: 10e-9,
     names.CRASH_DEPTH: 1e-9,
 }
+_CONTINUOUS: Final = (
+    "the continuous scan stays on at Nanonis' panel (Scan Control), although it was switched off: one scan would "
+    "follow the other without end. Switch it off there"
+)
 _AT_ONCE: Final = 0
 """Argument of functions that could also wait for the end of their action."""
 _NO_TIMEOUT: Final = -1
+_LATE_S: Final = 1.0
+"""Time beyond the duration of a pulse or tip shaping, experiment time: a real Nanonis begins up to 0.33 s late, moves
+the tip up to 0.5 s later, and its preamplifier needs up to 0.45 s to leave saturation; it reports no end."""
 _BY_VALUE: Final = (
     geometry.ScanFrame,
     parameter_groups.ScanSpeed,
@@ -163,7 +183,10 @@ class Nanonis(Driver):
         return self._session is not None and self._activity.reports_end()
 
     def same(self, name: str, a: Value, b: Value, among: Mapping[str, Value]) -> bool:
-        return geometry.same_float32(name, a, b, among)
+        return super().same(name, a, b, among) or geometry.same_float32(name, a, b, among)
+
+    def reach(self) -> Mapping[str, ParameterSpec]:
+        return self._probe.within(super().reach())
 
     def get(self, vendor: str) -> Value:
         """Return a value by the prefix of a pair of functions: "Bias." means Bias.Get."""
@@ -195,6 +218,12 @@ class Nanonis(Driver):
 
     def stated(self, result: str) -> Stated:
         return self._files.stated(result)
+
+    def current_a(self) -> float | None:
+        try:
+            return float(parameter_groups.numbers(self._ask, "Current.Get")[0])
+        except protocol.NanonisError:
+            return None
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
         return self._files.load(result)
@@ -255,7 +284,7 @@ class Nanonis(Driver):
         """Pulse the bias to `x-pulse-voltage` for `x-pulse-duration`, with the z controller on hold."""
         duration_s = self._kept.number(names.PULSE_DURATION)
         hold, absolute = 1, 2
-        with self._activity.occupied(ScopeState.BUSY_PARAM, duration_s):
+        with self._activity.occupied(ScopeState.BUSY_PARAM, duration_s + _LATE_S):
             self._ask("Bias.Pulse", _AT_ONCE, duration_s, self._kept.number(names.PULSE_VOLTAGE), hold, absolute)
 
     @action(names.CRASH, state=ScopeState.MOVING)
@@ -269,7 +298,7 @@ class Nanonis(Driver):
         same_bias, settle_s, restore = 2, 0.1, 1
         before = (settle_s, same_bias, bias_v)
         self._ask("TipShaper.PropsSet", *before, -depth_m, ramp_s, bias_v, settle_s, depth_m, ramp_s, settle_s, restore)
-        with self._activity.occupied(ScopeState.MOVING, 2 * ramp_s + 4 * settle_s):
+        with self._activity.occupied(ScopeState.MOVING, 2 * ramp_s + 4 * settle_s + _LATE_S):
             self._ask("TipShaper.Start", _AT_ONCE, _NO_TIMEOUT)
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
@@ -310,6 +339,9 @@ class Nanonis(Driver):
             modules = rest[0] if rest else []
             autosave = save_all if save else no_change
             self._ask("Scan.PropsSet", off, off, autosave, series, comment, modules, no_change)
+            # another program or the panel may switch it on again, and a reply of PropsSet is no proof
+            if self._ask("Scan.PropsGet")[0]:
+                raise Refused(ControlResponse.ACTION_ERROR, _CONTINUOUS)
 
 
 def _argument(code: str, word: str) -> object:

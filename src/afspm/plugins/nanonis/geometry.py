@@ -11,12 +11,11 @@ from collections.abc import Callable, Mapping
 from typing import ClassVar, Final
 
 from afspm.basics import lengths_text
-from afspm.driver import FRAME, POSITION, Value, frame, frame_values, refuse_value
+from afspm.driver import FRAME, POSITION, ParameterSpec, Value, frame, frame_values, refuse_value
 from afspm.model import Region, names
 from afspm.plugins.nanonis.parameter_groups import Ask, Group, MoveSpeed, keep_speed
 from afspm.plugins.nanonis.protocol import BadReply, NanonisError
 
-_PIXELS_AT_ONCE: Final = 16
 _DIGITS: Final = 1e-6  # relative precision of float32, with a margin
 _ADDED_UP: Final = frozenset(FRAME) - {names.SCAN_ANGLE, names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y}
 """Parameters calculated from centre and size: the rounding error of the largest value applies to each."""
@@ -39,14 +38,6 @@ class ScanFrame(Group):
 
     def write(self, values: Mapping[str, Value]) -> None:
         region, (rows, columns) = frame(self.merged(values))
-        # Nanonis would round the number of pixels silently
-        if columns % _PIXELS_AT_ONCE:
-            below = max(columns // _PIXELS_AT_ONCE, 1) * _PIXELS_AT_ONCE
-            raise refuse_value(
-                names.SCAN_RESOLUTION_X,
-                f"Nanonis scans multiples of {_PIXELS_AT_ONCE} pixels a line: "
-                f"{below} or {below + _PIXELS_AT_ONCE}, not {columns}",
-            )
         if names.SCAN_RESOLUTION_X in values or names.SCAN_RESOLUTION_Y in values:
             self._ask("Scan.BufferSet", self._ask("Scan.BufferGet")[0], columns, rows)
         # a frame set wider with the time per line kept would be scanned faster, beyond any limit of the speed
@@ -87,6 +78,7 @@ class Probe(Group):
         self._goal_m: tuple[float, float] | None = None
         self._seen_m: tuple[float, float] | None = None
         self._range_m: tuple[float, ...] = (math.inf, math.inf)
+        self._unknown_range = "it was not asked"
 
     def xy_m(self, *, between_scans: bool = False) -> tuple[float, float]:
         """Return the position of the tip, (x, y) in m; for moves and scans, see the class.
@@ -111,23 +103,29 @@ class Probe(Group):
         # the values are read right before they are set, by the translator
         before_m = self._goal_m or self._seen_m or self.xy_m()
         x, y = (float(values.get(name, was)) for name, was in zip(self.names, before_m, strict=True))
-        # Nanonis would clip the position to the range without an error.
-        try:
-            self._range_m = self._numbers("Piezo.RangeGet")[:2]
-        except NanonisError as error:
-            what = f"Nanonis does not report the scanner's range ({error}), so that no position can be checked"
-            raise refuse_value(self.names[0], f"{what}; move the tip at the panel") from error
-        for name, value, whole in zip(self.names, (x, y), self._range_m, strict=True):
-            if abs(value) > whole / 2:
-                raise refuse_value(
-                    name,
-                    f"{lengths_text([value])} is beyond the scanner's {lengths_text((-whole / 2, whole / 2), ' to ')}",
-                )
+        # Nanonis would clip a position beyond its range without an error.
+        if why := self._unknown_range:
+            what = f"Nanonis does not report the scanner's range ({why}), so that no position can be checked"
+            raise refuse_value(self.names[0], f"{what}; move the tip at the panel")
         at_once = 0
         self._ask("FolMe.XYPosSet", x, y, at_once)
         self._goal_m = (x, y)
         speed_m_s = float(MoveSpeed(self._ask).read()[names.MOVE_SPEED])
         self.arrives_s = self._now_s() + (math.dist(before_m, (x, y)) / speed_m_s if speed_m_s > 0.0 else 0.0)
+
+    def within(self, reach: Mapping[str, ParameterSpec]) -> Mapping[str, ParameterSpec]:
+        """Return rows of positions with the scanner's range as Nanonis reports it now, or a narrower one of the file.
+
+        A person may change the range at the panel, and Nanonis takes a frame beyond it without an error: it clips the
+        voltages while it scans.
+        """
+        try:
+            self._range_m, self._unknown_range = self._numbers("Piezo.RangeGet")[:2], ""
+        except NanonisError as error:
+            self._unknown_range = str(error)
+            return reach
+        rows = zip(self.names, self._range_m, strict=True)
+        return {name: reach[name].within((-whole / 2, whole / 2), "Nanonis, module Piezo") for name, whole in rows}
 
     def arrived(self) -> bool:
         """Return True if no move is pending, or if the tip has reached the target."""

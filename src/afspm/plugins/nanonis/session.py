@@ -125,7 +125,11 @@ class Session:
         try:
             self.ask("Piezo.RangeGet")
         except NanonisError as error:
-            self._log.warning("Nanonis has no module Piezo, so positions of the probe will be refused: %s", error)
+            text = (
+                "Nanonis has no module Piezo, so positions of the probe will be refused, and no frame is compared with "
+                "the scanner's range: %s"
+            )
+            self._log.warning(text, error)
 
     def _open(self, module: str) -> bool:
         try:

@@ -115,6 +115,9 @@ class Park(ScriptedDriver[Session, SmartScanActivity]):
         if not self._gains.are_reported():
             self.log.warning("SmartScan does not report the gains of its feedback: they are not supported")
             self.table = self.table.without(Gains.names)
+        if not session.is_number(self._whole_table[names.SAMPLE_BIAS].vendor):
+            self.log.warning("SmartScan does not report the bias of the sample: it is neither set nor watched")
+            self.table = self.table.without([names.SAMPLE_BIAS])
         for group in (self._kept, self._place):
             group.kept_in(self.memory)
         self._files = ParkFiles(self.memory, self.log, self.clock.monotonic_s)

@@ -21,7 +21,10 @@ from afspm.plugins.secop import lines
 from afspm.plugins.secop.lines import SecopLine, number_in
 
 BUSY_S = 3.0
-"""A new target counts as on its way for at least this time: some servers report "idle" until their next cycle."""
+"""An idle module whose value is still away from a new target is not believed for this time: some servers report "idle"
+until their next cycle."""
+ARRIVED = 0.05
+"""Distance from a new target, as a part of the way to it, at which an idle module is believed at once."""
 ROUNDED = 1e-6
 """Relative difference of equal numbers: a server may keep a value in single precision."""
 _IDLE, _BUSY, _ERROR = 100, 300, 400
@@ -170,19 +173,19 @@ class PolledValue:
     Attributes:
         number: None before the first value.
         fault: reason why there is no value.
-        asked_s: time of the unanswered request; None if there is none.
+        asked_s: times of the unanswered requests, oldest first: a server answers in order.
         measured_s: time of the request for the newest value.
         last_answer: (server's own time, value) of the last answer.
     """
 
     number: float | None = None
     fault: str = "not connected yet"
-    asked_s: float | None = None
+    asked_s: list[float] = field(default_factory=list)
     measured_s: float = -math.inf
     last_answer: tuple[object, float] | None = None
 
     def lost(self, why: str) -> None:
-        self.asked_s, self.fault = None, why
+        self.asked_s, self.fault = [], why
 
     def age_s(self, now_s: float) -> float | None:
         return now_s - self.measured_s if math.isfinite(self.measured_s) else None
@@ -194,9 +197,7 @@ class PolledValue:
             is_setting: whether the value may keep the time of its last change.
         """
         is_answer = line.action in ("reply", "error_read")
-        asked_s = self.asked_s if is_answer else None
-        if is_answer:
-            self.asked_s = None
+        asked_s = self.asked_s.pop(0) if is_answer and self.asked_s else None
         if line.is_error:
             self.fault = line.error or "the server reports an error"
             return False
@@ -221,24 +222,23 @@ class ReportedTarget:
 
     Attributes:
         number: None if unknown.
-        changed_s: time of the last answer to a change by afspm.
+        changed_s: time of the last answer to a change by afspm; -inf before.
         answered_s: time of the last answer to a request for the target.
+        way: distance of the value from the target when afspm has changed it.
     """
 
     number: float | None = None
     changed_s: float = -math.inf
     answered_s: float = -math.inf
+    way: float = 0.0
 
-    def take(self, line: SecopLine, now_s: float) -> None:
+    def take(self, line: SecopLine, value: float | None, now_s: float) -> None:
         self.number = line.number
         if line.action == "changed":
             self.changed_s = now_s
+            self.way = 0.0 if value is None or self.number is None else abs(self.number - value)
         if line.action == "reply":
             self.answered_s = now_s
-
-    def is_new(self, now_s: float) -> bool:
-        """Return whether the module may still report "idle" for a target just set."""
-        return now_s - self.changed_s < BUSY_S
 
 
 @dataclass
@@ -248,18 +248,23 @@ class ModuleState:
     Attributes:
         is_controlled: whether the module regulates to its target (`control_active`).
         fault: reason to distrust the value, from the status.
+        answered_s: time of the last answer to a request for the status.
+        busy_s: time of the last report that the module is busy.
     """
 
     is_busy: bool = False
     is_controlled: bool = True
     fault: str = ""
+    answered_s: float = -math.inf
+    busy_s: float = -math.inf
 
-    def take_status(self, status: object) -> None:
+    def take_status(self, status: object, now_s: float) -> None:
         code, text = (status[0], str(status[1])) if isinstance(status, list) and len(status) > 1 else (status, "")
         if not isinstance(code, int):
             self.fault = f"the server answers the status {escaped(repr(status))}"
             return
         self.is_busy = _BUSY <= code < _ERROR
+        self.busy_s = now_s if self.is_busy else self.busy_s
         is_well = _IDLE <= code < _ERROR
         self.fault = "" if is_well else f"status {code}: {escaped(text) or 'no text'}"
 
@@ -327,15 +332,37 @@ class Channel:
         self.value.lost(why)
         self.target.number = None
 
+    def is_on_its_way(self, now_s: float) -> bool:
+        """Return whether the value is on its way to a target."""
+        target, state = self.target, self.state
+        if state.is_busy or (self.described.status and state.answered_s < target.changed_s):
+            return True
+        if now_s - target.changed_s >= BUSY_S or state.busy_s > target.changed_s:
+            return False
+        value, number = self.value, target.number
+        if value.number is None or number is None or value.measured_s < target.changed_s:
+            return True
+        return abs(value.number - number) > max(ARRIVED * target.way, ROUNDED * abs(number))
+
     def poll(self, now_s: float) -> list[str]:
-        """Return the requests for value, status and target, unless the previous request is unanswered."""
-        if self.value.asked_s is not None:
-            return []
-        self.value.asked_s = now_s
-        return [
-            lines.read(self.described.value),
-            *map(lines.read, filter(None, (self.described.status, self.described.target))),
-        ]
+        """Return the requests for value, status and target, unless an earlier request is unanswered."""
+        return [] if self.value.asked_s else self.ask(now_s)
+
+    def ask(self, now_s: float) -> list[str]:
+        """Return the requests for value, target and status; the last one's answer has the specifier `last_asked`."""
+        at = self.described
+        others = [one for one in (at.target, at.status) if one and one != at.value]
+        return [self.measure(now_s), *map(lines.read, others)]
+
+    @property
+    def last_asked(self) -> str:
+        at = self.described
+        return at.status or at.target or at.value
+
+    def measure(self, now_s: float) -> str:
+        """Return the request for the value."""
+        self.value.asked_s.append(now_s)
+        return lines.read(self.described.value)
 
     def take(self, line: SecopLine, now_s: float) -> None:
         """Process a report of the server on any of its parameters."""
@@ -346,10 +373,12 @@ class Channel:
         if line.is_error:
             return
         if specifier == self.described.target:
-            self.target.take(line, now_s)
+            self.target.take(line, self.value.number, now_s)
             self._note_approach()
         elif specifier == self.described.status:
-            self.state.take_status(line.value)
+            self.state.take_status(line.value, now_s)
+            if line.action == "reply":
+                self.state.answered_s = now_s
         elif specifier == f"{self.module}:control_active":
             self.state.is_controlled = line.value is not False
 

@@ -21,6 +21,10 @@ PORT = 10767
 AGAIN_S = 2.0
 CONNECT_S = 1.0
 DESCRIBED_S = 5.0
+PATIENCE_S = 0.2
+"""Real time for which the scheduler keeps the answer to a report until it has an order, or the server an answer to an
+order. Meanwhile the lines of the server wait."""
+LONGEST_TICK_S = 1.0
 GOES_ON_WITHIN_S = 60.0
 """Real time after which a restarted process does not continue steps of a target: a person may have seen them halt."""
 _KEPT_AGAIN_S = 20.0  # real time: unchanged steps must not look older than GOES_ON_WITHIN_S after a kill
@@ -41,7 +45,7 @@ class Instrument(Component):
 
     is_instrument: ClassVar[bool] = True
     listens: ClassVar[tuple[str, ...]] = ("ControlState",)
-    period_s = 0.25
+    period_s = 0.05  # a tick of an idle instrument takes PATIENCE_S
     period_time: Literal["experiment", "real"] = "real"
 
     def __init__(self, address: str, parameters: dict[str, str]) -> None:
@@ -85,14 +89,29 @@ class Instrument(Component):
         self._client.go_on_with(kept["of"])
 
     def on_tick(self) -> None:
-        """Exchange lines with the server, then report to the scheduler."""
+        """Exchange lines with the server and report to the scheduler, as long as there are orders."""
+        until_s = self.clock.monotonic_s() + LONGEST_TICK_S
+        while self._exchange() and self._client.is_working and self.clock.monotonic_s() < until_s:
+            pass
+
+    def _exchange(self) -> bool:
+        # returns whether the scheduler had orders
         self._serve(self._receive)
         self._serve(lambda: self._client.tick(self.clock.monotonic_s()))
+        self._await_outcome()
         for text in self._client.log:
             self.log.warning("%s", text)
         self._client.log.clear()
         self._keep_steps()
-        self._report()
+        return self._report()
+
+    def _await_outcome(self) -> None:
+        until_s = self.clock.monotonic_s() + PATIENCE_S
+        while self._client.is_working and self._lines is not None:
+            left_s = until_s - self.clock.monotonic_s()
+            if left_s <= 0.0 or not self._lines.wait(left_s):
+                return
+            self._serve(self._receive)
 
     def on_end(self) -> None:
         """Disconnect; the server keeps the targets (setpoints) of its modules, and steps of a target halt."""
@@ -102,16 +121,18 @@ class Instrument(Component):
         if self._lines is not None:
             self._lines.close()
 
-    def _report(self) -> None:
+    def _report(self) -> bool:
         client = self._client
         outcomes = client.outcomes()
         readings = client.readings(self.clock.monotonic_s())
-        report = InstrumentReadings(self.clock.now_ns(), self.name, readings, outcomes, self._token)
+        patience_s = 0.0 if client.is_working else PATIENCE_S
+        report = InstrumentReadings(self.clock.now_ns(), self.name, readings, outcomes, self._token, patience_s)
         answer = self.scope.report_readings(report)
         client.delivered(outcomes)
         self._token = answer.token
         for order in answer.orders:
             self._serve(lambda order=order: client.order(order, self.clock.monotonic_s()))  # type: ignore[misc]
+        return bool(answer.orders)
 
     def _keep_steps(self) -> None:
         kept, steps = self.memory.get(_STEPS) or {"of": {}, "at_ns": 0}, self._client.unfinished()
@@ -182,9 +203,9 @@ class LineSocket:
         *whole, self._in = self._in.split(b"\n")
         return [line.decode("utf-8", "replace") for line in whole if line.strip()]
 
-    def wait(self, within_s: float) -> None:
-        """Wait for data of the server, at most for `within_s`."""
-        select.select([self._socket], [], [], within_s)
+    def wait(self, within_s: float) -> bool:
+        """Wait for data of the server, at most for `within_s`; return whether there is some."""
+        return bool(select.select([self._socket], [], [], within_s)[0])
 
     def send(self, lines: list[str]) -> None:
         self._out += "".join(f"{line}\n" for line in lines).encode()

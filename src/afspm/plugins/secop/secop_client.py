@@ -61,6 +61,7 @@ class OrderInProgress:
         wanted: the value to send.
         ramp: the steps that begin with `wanted`; None if `wanted` is final.
         ramp_limit: ramp rate that the server must confirm, in the server's unit; None if none was sent.
+        since_s: time since when the value must be measured, for an order to measure.
     """
 
     order: InstrumentOrder
@@ -69,6 +70,7 @@ class OrderInProgress:
     wanted: float
     ramp: RampInSteps | None = None
     ramp_limit: float | None = None
+    since_s: float = -math.inf
 
 
 @dataclass
@@ -113,6 +115,11 @@ class SecopClient:
             channel.lost(why)
         for ramp in self._ramps.values():
             ramp.is_interrupted, ramp.in_flight = True, False
+
+    @property
+    def is_working(self) -> bool:
+        """Whether an answer of the server is awaited for an order."""
+        return self._progress is not None
 
     def is_silent(self, now_s: float) -> bool:
         """Return whether the server has sent nothing for more than 3 s."""
@@ -197,7 +204,7 @@ class SecopClient:
             channel.described.unit,
             channel.value.age_s(now_s),
             target if target is not None and math.isfinite(target) else None,
-            channel.state.is_busy or ramp is not None or channel.target.is_new(now_s),
+            ramp is not None or channel.is_on_its_way(now_s),
             reason,
         )
 
@@ -228,8 +235,16 @@ class SecopClient:
         if channel is None:
             self._finish(order, ControlResponse.PARAM_NOT_SUPPORTED, f"there is no parameter {order.parameter.name!r}")
             return []
-        if not self.is_described:
+        if not self.is_described and not order.is_reading:
             return []  # the order comes again until it has an outcome, or its client gives up
+        reading = self._reading(channel, now_s)
+        if order.is_reading and reading.value is not None:
+            self._progress = OrderInProgress(order, channel, f"reply {channel.described.value}", math.nan)
+            self._progress.since_s = now_s
+            return [channel.measure(now_s)]
+        if order.is_reading:
+            self._finish(order, ControlResponse.PARAM_ERROR, f"{channel.name} is not known: {reading.reason}")
+            return []
         try:
             number, rate_per_s = _in_unit(order, channel)
         except UnitError as error:
@@ -238,7 +253,6 @@ class SecopClient:
         if not channel.described.target:
             self._finish(order, ControlResponse.PARAM_NOT_SUPPORTED, f"{channel.name} can only be read")
             return []
-        reading = self._reading(channel, now_s)
         if reading.value is None:
             self._finish(order, ControlResponse.PARAM_ERROR, f"{channel.name} is not known: {reading.reason}")
             return []
@@ -268,11 +282,15 @@ class SecopClient:
         return [lines.change(at.target, number)]
 
     def _go_on(self, line: SecopLine, now_s: float) -> list[str]:
-        progress, text = self._progress, f"{line.action} {line.specifier}"
+        progress, action = self._progress, "reply" if line.action == "error_read" else line.action
+        text = f"{action} {line.specifier}"
         if line.action in ("error_change", "error_do") or line.action.startswith("error_change"):
             return self._take_refusal(line, now_s)
         if line.action == "changed":
             self._take_step(line, now_s)
+        if progress is not None and progress.order.is_reading:
+            self._take_reading(progress)
+            return []
         if progress is None or text != progress.waits_for:
             return []
         channel, at = progress.channel, progress.channel.described
@@ -286,12 +304,18 @@ class SecopClient:
                 start = progress.wanted if confirmed is None else confirmed
                 ramp = progress.ramp
                 self._ramps[channel.name] = RampInSteps(ramp.final, ramp.rate_per_s, start, now_s, ramp.ideal)
-            if at.status:
-                # the module is busy before it answers; its status comes next, after the target as the module rounded it
-                progress.waits_for = f"reply {at.status}"
-                return [lines.read(at.target), lines.read(at.status)]
+            # the module is busy before it answers; value, the target as the module rounded it, and status come next
+            progress.waits_for = f"reply {channel.last_asked}"
+            return channel.ask(now_s)
         self._finish(progress.order, ControlResponse.SUCCESS)
         return []
+
+    def _take_reading(self, progress: OrderInProgress) -> None:
+        channel = progress.channel
+        if channel.fault:
+            self._finish(progress.order, ControlResponse.PARAM_ERROR, f"{channel.name} is not known: {channel.fault}")
+        elif channel.value.measured_s >= progress.since_s:  # a server that repeats an old value is polled again
+            self._finish(progress.order, ControlResponse.SUCCESS)
 
     def _ramp_set(
         self, progress: OrderInProgress, ramp: ServerRamp, limit: float, confirmed: float | None

@@ -38,6 +38,7 @@ class ArbitrationEvent(Enum):
     END = "ends the experiment"
     COMMAND = "commands the microscope"
     ADJUST = "sets a parameter of [control] adjustable"
+    FEEDBACK_OFF = "says that the feedback is off by intention"
     READ = "asks the microscope for a value"
     DEAD = "is dead"
     IDLE = "has let its lease run out"
@@ -139,9 +140,10 @@ class RoleTable:
         operate: command the microscope in MANUAL mode, and set an `adjustable` parameter. Without the key: the
             dashboard, and other components through which a person commands the microscope.
         restart: restart a process.
-        approve: approve plans of agents, give grants, revoke both, and clear `stopped-by-agent`. No agent has this
-            role. Without the key: the dashboard and other components through which a person commands the microscope,
-            and `afspm approve` on this computer.
+        approve: approve plans of agents, give grants, revoke both, clear `stopped-by-agent`, and say that the
+            feedback is off by intention (`afspm continue --feedback-off`). No agent has this role. Without the key: the
+            dashboard and other components through which a person commands the microscope, and the terminal of this
+            computer.
     """
 
     end_experiment: tuple[str, ...] | None = None
@@ -255,6 +257,10 @@ IS_NOTED = Condition(
 IS_OPERATOR = Condition(
     "the mode is manual and it has the role `operate`",
     lambda c, a, r: c.mode is ControlMode.MANUAL and may(r.roles.operate or (), a.who),
+)
+IS_PERSON = Condition(
+    "the mode is manual and it has the role `approve`",
+    lambda c, a, r: c.mode is ControlMode.MANUAL and r.may_approve(a.who),
 )
 IS_ADJUSTER = Condition(
     "it has the role `operate` and no problem is flagged",
@@ -425,6 +431,15 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
             _R.NOT_IN_CONTROL,
             "{who} is not in control, {holder} is; beside it only the role operate may adjust this,"
             " and while no problem is flagged",
+        ),
+    ),
+    ArbitrationEvent.FEEDBACK_OFF: (
+        _refuse(IS_SHADOW, _R.NOT_IN_CONTROL, "a shadow only watches a person's work: nothing is sent"),
+        _without_answer(IS_PERSON, (_D.FORWARD,), "a person knows why it is off, and the holder can't know"),
+        _refuse(
+            OTHERWISE,
+            _R.NOT_IN_CONTROL,
+            "only a person with the role approve says that the feedback is off by intention, in the mode MANUAL",
         ),
     ),
     ArbitrationEvent.READ: (

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from afspm.basics.frozen import replace
 from afspm.model import ControlResponse, InstrumentOrder, InstrumentReading, InstrumentReadings, OrderOutcome, Parameter
 from afspm.model.instruments import GivenOrder, instrument_of
+from afspm.scheduler.events import RequestIn
 from afspm.scheduler.instruments.conditions import OLDEST_S, ConditionState, InstrumentSettings, MeasuringCondition
 from afspm.scheduler.requests.forwarder import ForwardedRequest
 
@@ -30,7 +31,7 @@ class KnownReading:
 
 @dataclass(frozen=True)
 class OpenOrder:
-    """A set request for an instrument.
+    """A request for an instrument, to set or to measure.
 
     Attributes:
         job: the request of the client.
@@ -52,6 +53,7 @@ class KnownInstrument:
     Attributes:
         token: the token of the last answer to a report; given_s: the real time of that answer.
         published: the readings published last; published_s: their time, real.
+        held: the last report, while its answer is held back; held_until_s: at the latest until then, real.
     """
 
     token: int = 0
@@ -60,6 +62,8 @@ class KnownInstrument:
     open: tuple[OpenOrder, ...] = ()
     published: tuple[InstrumentReading, ...] = ()
     published_s: float = _NEVER_S
+    held: RequestIn | None = None
+    held_until_s: float = _NEVER_S
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,7 @@ class Instruments:
         states: the states of the conditions, by name.
         given: the orders that may still be carried out, or whose value is on its way.
         awaited_until_s: the real time until which a first reading is awaited; None: conditions were not evaluated yet.
+        changed_s: the real time of the last answer to a request that may have changed something, or of the start.
     """
 
     settings: InstrumentSettings = field(default_factory=InstrumentSettings)
@@ -81,6 +86,7 @@ class Instruments:
     states: Mapping[str, ConditionState] = field(default_factory=dict)
     given: tuple[GivenOrder, ...] = ()
     awaited_until_s: float | None = None
+    changed_s: float = _NEVER_S
 
     # --- readings ---
 
@@ -97,6 +103,19 @@ class Instruments:
             return known.reading
         why = known.reading.reason or f"its last reading is older than {OLDEST_S:g} s"
         return replace(known.reading, value=None, reason=why)
+
+    def age_s(self, parameter: str, now_s: float) -> float:
+        """Return the longest time since a parameter can have been measured; inf: never."""
+        known = self._of(instrument_of(parameter)).readings.get(parameter)
+        return now_s - (_NEVER_S if known is None else known.measured_s)
+
+    def is_from_before_a_change(self, parameter: str, now_s: float) -> bool:
+        """Return whether a parameter may have been measured before the last change of anything by the run."""
+        return self.age_s(parameter, now_s) > now_s - self.changed_s
+
+    def changed(self, now_s: float) -> Instruments:
+        """Store that something may have changed until now: older readings are no answer to a later request."""
+        return replace(self, changed_s=now_s)
 
     def candidates(self, parameter: str, now_s: float) -> tuple[Parameter, ...] | str:
         """Return the values between which a parameter may be: reading, target, and a target that is being set.
@@ -213,11 +232,9 @@ class Instruments:
         """Store that the instrument was given its first order."""
         known = self._of(instrument)
         changed = self._with(instrument, replace(known, open=(order, *known.open[1:])))
-        return (
-            changed
-            if order.order is None
-            else replace(changed, given=(*self.given, GivenOrder(order.order))[-_MOST_PARAMETERS:])
-        )
+        if order.order is None or order.order.is_reading:
+            return changed
+        return replace(changed, given=(*self.given, GivenOrder(order.order))[-_MOST_PARAMETERS:])
 
     def reported_outcome(self, outcome: OrderOutcome) -> Instruments:
         """Store the outcome of an order: a success replaces earlier targets, a refusal leaves them."""
@@ -283,8 +300,20 @@ class Instruments:
     def answered(self, instrument: str, now_s: float) -> Instruments:
         """Store that a report is being answered, under a new token."""
         token = self.number + 1
-        known = replace(self._of(instrument), token=token, given_s=now_s)
+        known = replace(self._of(instrument), token=token, given_s=now_s, held=None)
         return replace(self._with(instrument, known), number=token)
+
+    def held(self, instrument: str, report: RequestIn, until_s: float) -> Instruments:
+        """Store a report whose answer waits for an order."""
+        return self._with(instrument, replace(self._of(instrument), held=report, held_until_s=until_s))
+
+    def held_report(self, instrument: str) -> RequestIn | None:
+        """Return the report whose answer waits for an order."""
+        return self._of(instrument).held
+
+    def held_too_long(self, now_s: float) -> list[str]:
+        """Return the instruments whose reports must be answered now."""
+        return [name for name, known in self.known.items() if known.held is not None and now_s >= known.held_until_s]
 
     def token(self, instrument: str) -> int:
         """Return the token of the answer to an instrument's last report."""
@@ -295,6 +324,7 @@ class Instruments:
     def due_s(self) -> float | None:
         """Return the next real time at which a condition or an order must be checked; None: no deadline."""
         dues = [order.job.deadline_s for known in self.known.values() for order in known.open]
+        dues += [known.held_until_s for known in self.known.values() if known.held is not None]
         if self.settings.problems and self.awaited_until_s is not None and self.awaited_until_s > _NEVER_S:
             dues.append(self.awaited_until_s + _JUST_AFTER_S)
         for name, condition in self.settings.conditions.items():

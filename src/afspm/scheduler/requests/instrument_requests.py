@@ -4,6 +4,10 @@ A request to set a parameter waits for the next report of its instrument. When t
 authorised again and checked against its limits and approvals. The answer to the report carries it as an order. An order
 is repeated in each answer until a report contains its outcome; the instrument carries out an id once. A limited rate is
 not checked here: the order carries the rate, and the instrument keeps to the rate on its way to the target.
+
+A request to read is answered from the last report, unless a request of the run may have changed something since then:
+then an order to measure goes to the instrument. So does a request for the part "now". An instrument with `patience_s`
+gets the answer to its report once there is an order, so that an order does not wait for the next report.
 """
 
 from __future__ import annotations
@@ -15,7 +19,6 @@ from afspm.model import (
     ControlRequest,
     ControlResponse,
     InstrumentOrder,
-    InstrumentReading,
     InstrumentReadings,
     OrderOutcome,
     Parameter,
@@ -26,7 +29,7 @@ from afspm.model import (
     component_of,
 )
 from afspm.model.idempotency_cache import RequestStatus
-from afspm.model.instruments import PARTS, InstrumentOrders, instrument_of
+from afspm.model.instruments import NOW, InstrumentOrders, instrument_of, split
 from afspm.model.problems import CONDITIONS
 from afspm.scheduler.control import control_change
 from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlInput
@@ -42,6 +45,7 @@ from afspm.scheduler.safety.present_state import present_state
 from afspm.scheduler.state import SchedulerState, StateDraft
 from afspm.wire.messages import INSTRUMENT_READINGS
 
+_LONGEST_HOLD_S = 1.0
 MaySend = Callable[[StateDraft, ForwardedRequest], Response | None]
 """A function that returns the refusal of a request whose client may no longer send it, else None."""
 
@@ -52,39 +56,47 @@ def is_for_instrument(draft: StateDraft, event: RequestIn) -> bool:
     return isinstance(subject, Parameter) and draft.instruments.owns(subject.name)
 
 
-def ask(draft: StateDraft, event: RequestIn, job: ForwardedRequest) -> None:
-    """Answer a read request from the last report, or queue a set request for the next report."""
-    if is_get(event.request):
-        _answer_get(draft, event)
+def ask(draft: StateDraft, event: RequestIn, job: ForwardedRequest, may_send: MaySend) -> None:
+    """Answer a request from the last report, or queue it for the next report."""
+    if is_get(event.request) and not _is_to_be_measured(draft, event):
+        code, why, payload = _value(draft, event.request)
+        answers.answer(draft, event, code, why, payload)
         return
     job = job._replace(deadline_s=draft.now_s + draft.env.settings.control.request_timeout_s)
     draft.idempotency = draft.idempotency.noted(event.name, event.request, RequestStatus.PENDING)
     draft.instruments = draft.instruments.asked(job)
-    _has_read(draft, instrument_of(event.request.subject.name))
+    _offer(draft, instrument_of(event.request.subject.name), may_send)
 
 
-def _answer_get(draft: StateDraft, event: RequestIn) -> None:
-    name = event.request.subject.name
-    base, _, part = name.rpartition(".")
-    if part not in PARTS:
-        base, part = name, ""
-    reading = draft.instruments.reading(base, draft.now_s)
-    value = _part(reading, part)
-    if value is None:
-        why = f"{name} is not known: {reading.reason or 'it has none'}"
-        answers.answer(draft, event, ControlResponse.PARAM_ERROR, why)
+def _offer(draft: StateDraft, instrument: str, may_send: MaySend) -> None:
+    # an order that can be given now is not kept for the next report
+    if not _has_read(draft, instrument) or (held := draft.instruments.held_report(instrument)) is None:
         return
-    found = Parameter(name, value, None if part == "busy" else reading.unit or None)
-    answers.answer(draft, event, ControlResponse.SUCCESS, payload=draft.env.codec.encode(found))
+    if (order := _next_order(draft, instrument, may_send)) is not None:
+        _answer_report(draft, held, instrument, order)
 
 
-def _part(reading: InstrumentReading, part: str) -> str | None:
-    if reading.value is None:
-        return None
-    if part == "busy":
-        return "true" if reading.busy else "false"
+def _is_to_be_measured(draft: StateDraft, event: RequestIn) -> bool:
+    name, part = split(event.request.subject.name)
+    if draft.instruments.reading(name, draft.now_s).value is None:
+        return False  # refused with the reason, at once
+    return part == NOW or (not part and draft.instruments.is_from_before_a_change(name, draft.now_s))
+
+
+def _value(draft: StateDraft, request: Request) -> tuple[ControlResponse, str, bytes]:
+    name, part = split(request.subject.name)
+    reading = draft.instruments.reading(name, draft.now_s)
     number = reading.target if part == "target" else reading.value
-    return None if number is None else repr(number)
+    if reading.value is None or number is None:
+        why = f"{request.subject.name} is not known: {reading.reason or 'it has none'}"
+        return ControlResponse.PARAM_ERROR, why, b""
+    if part == "busy":
+        found = Parameter(request.subject.name, "true" if reading.busy else "false")
+    elif part == "age":
+        found = Parameter(request.subject.name, repr(draft.instruments.age_s(name, draft.now_s)), "s")
+    else:
+        found = Parameter(request.subject.name, repr(number), reading.unit or None)
+    return ControlResponse.SUCCESS, "", draft.env.codec.encode(found)
 
 
 # --- reports --------------------------------------------------------------------------------------------------------
@@ -119,8 +131,16 @@ def take_report(draft: StateDraft, event: RequestIn, report: InstrumentReadings,
             draft.limits = draft.limits.in_force(target, draft.now_ns, was_read=True)
     _publish(draft, report)
     order = _next_order(draft, name, may_send)
-    draft.instruments = draft.instruments.answered(name, draft.now_s)
-    orders = InstrumentOrders(draft.instruments.token(name), () if order is None else (order,))
+    if order is None and report.patience_s > 0.0:
+        until_s = draft.now_s + min(report.patience_s, _LONGEST_HOLD_S)
+        draft.instruments = draft.instruments.held(name, event, until_s)
+        return
+    _answer_report(draft, event, name, order)
+
+
+def _answer_report(draft: StateDraft, event: RequestIn, instrument: str, order: InstrumentOrder | None) -> None:
+    draft.instruments = draft.instruments.answered(instrument, draft.now_s)
+    orders = InstrumentOrders(draft.instruments.token(instrument), () if order is None else (order,))
     answers.answer(draft, event, ControlResponse.SUCCESS, payload=draft.env.codec.encode(orders))
 
 
@@ -138,6 +158,8 @@ def _next_order(draft: StateDraft, instrument: str, may_send: MaySend) -> Instru
     while (first := draft.instruments.first(instrument)) is not None:
         if first.order is not None:
             return first.order
+        if not first.job.command:
+            return _hand_out_reading(draft, instrument, first)
         if not _has_read(draft, instrument):
             return None
         refusal = may_send(draft, first.job) or _limit_refusal(draft, first) or approvals.refusal(draft, first.job)
@@ -153,7 +175,7 @@ def _has_read(draft: StateDraft, instrument: str) -> bool:
     # Whether the values of the microscope that forbidden states need are there for the first order. They are read in
     # the line of the commands; a command that may change them makes them void (`present_state.sending`).
     first = draft.instruments.first(instrument)
-    if first is None or first.order is not None:
+    if first is None or first.order is not None or not first.job.command:
         return True
     needed = to_read(judging(draft.limits.limits, first.job.request))
     if not needed or not draft.forwarder.up:
@@ -167,17 +189,19 @@ def _has_read(draft: StateDraft, instrument: str) -> bool:
     return False
 
 
-def take_read_value(draft: StateDraft, purpose: ReadForOrder, response: Response) -> None:
+def take_read_value(draft: StateDraft, purpose: ReadForOrder, response: Response, may_send: MaySend) -> None:
     """Store a value of the microscope, or that it could not be read, for an order that waits for it."""
     answered = draft.env.codec.decode_parameter(response.payload) if response.ok and response.payload else None
     answered = answered if answered is not None and answered.name == purpose.name else None
     draft.instruments = draft.instruments.was_read(purpose.number, purpose.name, answered)
+    for name in draft.instruments.settings.instruments:
+        _offer(draft, name, may_send)
 
 
 def _limit_refusal(draft: StateDraft, waiting: OpenOrder) -> Response | None:
     job, request = waiting.job, waiting.job.request
-    base, _, part = request.subject.name.rpartition(".")
-    if part in PARTS and draft.instruments.owns(base):
+    base, part = split(request.subject.name)
+    if part:
         why = f"{request.subject.name} can only be read: set {base}"
         return Response(int(ControlResponse.PARAM_NOT_SUPPORTED), b"", why, request.id)
     reading = draft.instruments.reading(request.subject.name, draft.now_s)
@@ -187,6 +211,13 @@ def _limit_refusal(draft: StateDraft, waiting: OpenOrder) -> Response | None:
     refusal = draft.limits.check(job.client, request, draft.now_ns, is_repeated=job.is_repeated)
     read = waiting.read if draft.forwarder.up else {}
     return refusal or draft.limits.check_forbidden(request, present_state(draft, read))
+
+
+def _hand_out_reading(draft: StateDraft, instrument: str, waiting: OpenOrder) -> InstrumentOrder:
+    job, (name, _) = waiting.job, split(waiting.job.request.subject.name)
+    order = InstrumentOrder(job.number, job.request.id or str(job.number), Parameter(name))
+    draft.instruments = draft.instruments.handed_out(instrument, OpenOrder(job, order))
+    return order
 
 
 def _hand_out(draft: StateDraft, instrument: str, waiting: OpenOrder) -> InstrumentOrder:
@@ -213,6 +244,13 @@ def _settle(draft: StateDraft, instrument: str, found: OpenOrder, outcome: Order
     job, wanted = found.job, found.job.request.subject
     draft.instruments = draft.instruments.settled(instrument, job.number)
     payload = b""
+    if not job.command:
+        code, why = outcome.response, outcome.reason
+        if code == ControlResponse.SUCCESS:
+            code, why, payload = _value(draft, job.request)
+        answers.finish(draft, job, Response(int(code), payload, why, job.request.id))
+        return
+    draft.instruments = draft.instruments.changed(draft.now_s)
     if outcome.response == ControlResponse.SUCCESS:
         draft.limits = draft.limits.carried_out(job.request, draft.now_ns, who=job.client)
         approvals.done(draft, job)
@@ -231,9 +269,17 @@ def _settle(draft: StateDraft, instrument: str, found: OpenOrder, outcome: Order
 def expire(draft: StateDraft) -> None:
     """Answer the instrument requests whose deadline has passed, and evaluate the conditions."""
     timeout_s = draft.env.settings.control.request_timeout_s
+    for name in draft.instruments.held_too_long(draft.now_s):
+        held = draft.instruments.held_report(name)
+        assert held is not None
+        _answer_report(draft, held, name, None)
     for name, one in draft.instruments.overdue(draft.now_s):
         draft.instruments = draft.instruments.settled(name, one.job.number)
         request_id = one.job.request.id
+        if one.order is not None and not one.job.command:
+            why = f"{name} has sent no new value of {one.order.parameter.name} within {timeout_s:g} s"
+            answers.answer_unsent(draft, one.job, Response(int(ControlResponse.NO_RESPONSE), b"", why, request_id))
+            continue
         if one.order is None:
             why, detail = f"not sent: {name} has not reported for {timeout_s:g} s", ResponseDetail.NOT_SENT
             response = Response(int(ControlResponse.NO_RESPONSE), b"", why, request_id, detail)
@@ -242,6 +288,7 @@ def expire(draft: StateDraft) -> None:
         why = f"outcome unknown: {name} did not answer within {timeout_s:g} s"
         response = Response(int(ControlResponse.NO_RESPONSE), b"", why, request_id, ResponseDetail.OUTCOME_UNKNOWN)
         draft.limits = draft.limits.unknown(one.job.request)
+        draft.instruments = draft.instruments.changed(draft.now_s)
         answers.finish(draft, one.job, response, RequestStatus.UNKNOWN)
     draft.instruments = draft.instruments.evaluated(draft.now_s, draft.now_ns)
 

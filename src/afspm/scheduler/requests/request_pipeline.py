@@ -224,6 +224,8 @@ def _refusal_to_continue(draft: StateDraft, event: RequestIn) -> str:
 def _microscope_event(request: Request, rules: Rules) -> ArbitrationEvent:
     if reads(request):
         return ArbitrationEvent.READ
+    if request.kind == _ACTION and request.subject == names.FEEDBACK_MAY_BE_OFF:
+        return ArbitrationEvent.FEEDBACK_OFF
     is_adjustable = request.kind == _PARAM and request.subject.name in rules.adjustable
     return ArbitrationEvent.ADJUST if is_adjustable else ArbitrationEvent.COMMAND
 
@@ -268,7 +270,7 @@ def _reason_to_stay(draft: StateDraft) -> str:
 def enqueue(draft: StateDraft, event: RequestIn) -> None:
     """Queue a request for the translator or an instrument, or refuse a request that can't be sent now.
 
-    A read of an instrument's parameter is answered at once.
+    A read of an instrument's parameter is answered at once, if the last reading is new enough.
     """
     name, request, is_command = event.name, event.request, not reads(event.request)
     if is_command and (why := _refusal_for_tip(draft)) is not None:
@@ -277,7 +279,7 @@ def enqueue(draft: StateDraft, event: RequestIn) -> None:
     is_repeated = draft.idempotency.look_up(name, request) is RequestStatus.UNKNOWN
     job = ForwardedRequest.of(event, command=is_command, is_repeated=is_repeated)
     if instrument_requests.is_for_instrument(draft, event):
-        instrument_requests.ask(draft, event, job)
+        instrument_requests.ask(draft, event, job, _not_allowed_now)
         return
     draft.forwarder, refused = draft.forwarder.ask(job, draft.now_s)
     if refused is None:
@@ -402,10 +404,6 @@ def _not_allowed_now(draft: StateDraft, job: ForwardedRequest) -> Response | Non
     if ControlChange.FORWARD not in row.do:
         code = ControlResponse.NOT_IN_CONTROL if row.response is None else row.response
         return Response(int(code), b"", reason(row, draft.control, ask, rules), job.request.id)
-    says_off = job.request.kind == _ACTION and job.request.subject == names.FEEDBACK_MAY_BE_OFF
-    if says_off and draft.control.mode is not ControlMode.MANUAL:
-        why_not = "only a person says that the feedback is off by intention, while the mode is MANUAL"
-        return Response(int(ControlResponse.NOT_IN_CONTROL), b"", why_not, job.request.id)
     if (why := _refusal_for_tip(draft)) is not None:
         return Response(int(ControlResponse.NOT_FREE), b"", why, job.request.id)
     return None
@@ -561,6 +559,8 @@ def settle(draft: StateDraft, settled: SettledRequest) -> None:
     # it may have been carried out: its values are read before the next request that depends on them
     if job.command and end is not ForwardOutcome.NOT_SENT and _is_unknown(response):
         draft.limits = draft.limits.unknown(job.outgoing)
+    if end is not ForwardOutcome.NOT_SENT and not reads(job.request):
+        draft.instruments = draft.instruments.changed(draft.now_s)
     if not job.client:
         _settle_own(draft, job, end, response)
     elif end is ForwardOutcome.NOT_SENT:
@@ -600,7 +600,7 @@ def _serve_purpose(draft: StateDraft, purpose: OwnPurpose, response: Response) -
         case ReadForTurn():
             _take_read_value(draft, purpose.number, purpose.name, response)
         case ReadForOrder():
-            instrument_requests.take_read_value(draft, purpose, response)
+            instrument_requests.take_read_value(draft, purpose, response, _not_allowed_now)
         case MoveForTurn():
             _take_move_result(draft, purpose.number, response)
         case AskForFrame():

@@ -5,7 +5,7 @@
 | part | form |
 | --- | --- |
 | comparison | two terms with `<`, `<=`, `>` or `>=`; at least one is a quantity |
-| term | a name, `abs(name)`, or a number with its unit |
+| term | a name, `abs(name)`, `abs(name - name)`, or a number with its unit |
 | switch | a name alone: a switch of the microscope (`x-feedback-on`), or its state (`SCANNING`) |
 
 There is no equality: controllers round. `parse` moves every `not` into the comparisons, so that a tree has only `and`
@@ -58,6 +58,7 @@ class RuleTerm:
         name: the name of the quantity; empty for a number.
         number: the number in `unit`, which is an SI unit; "" without a unit, also for a quantity.
         absolute: whether the amount of the quantity counts.
+        minus: the name of a quantity that is subtracted before; empty without one.
         at: the place in the rule.
     """
 
@@ -65,16 +66,23 @@ class RuleTerm:
     number: float = 0.0
     unit: str = ""
     absolute: bool = False
+    minus: str = ""
     at: int = 0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(filter(None, (self.name, self.minus)))
 
     def value(self, known: Known) -> float | None:
         if not self.name:
             return self.number
-        value = known.get(self.name)
-        return None if value is None else abs(value) if self.absolute else float(value)
+        value, less = known.get(self.name), known.get(self.minus) if self.minus else 0.0
+        if value is None or less is None:
+            return None
+        return abs(value - less) if self.absolute else float(value)
 
     def __str__(self) -> str:
-        return f"abs({self.name})" if self.absolute else self.name or quantity(self.number, self.unit, 6)
+        return f"abs({' - '.join(self.names)})" if self.absolute else self.name or quantity(self.number, self.unit, 6)
 
 
 @dataclass(frozen=True)
@@ -87,7 +95,7 @@ class RuleComparison:
 
     @property
     def names(self) -> frozenset[str]:
-        return frozenset(term.name for term in (self.left, self.right) if term.name)
+        return frozenset((*self.left.names, *self.right.names))
 
     def excess(self, known: Known) -> float | None:
         """Return how far the comparison is from its border, above zero where it is true; None if unknown."""
@@ -259,14 +267,21 @@ class _Parser:
             return self._number(token)
         if token.text == "abs":
             self._require("(")
-            name = self._take()
-            if name.kind != "word" or name.text in _WORDS:
-                raise self._unexpected("the name of a quantity", name)
+            name, minus = self._quantity(), ""
+            if self._here.text == "-":
+                self._take()
+                minus = self._quantity().text
             self._require(")")
-            return RuleTerm(name.text, absolute=True, at=name.at)
+            return RuleTerm(name.text, absolute=True, minus=minus, at=name.at)
         if token.kind != "word" or token.text in _WORDS:
             raise self._unexpected("a name or a number", token)
         return RuleTerm(token.text, at=token.at)
+
+    def _quantity(self) -> _Token:
+        name = self._take()
+        if name.kind != "word" or name.text in _WORDS or name.text == "-":
+            raise self._unexpected("the name of a quantity", name)
+        return name
 
     def _number(self, token: _Token) -> RuleTerm:
         unit = ""

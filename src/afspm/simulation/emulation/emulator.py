@@ -23,7 +23,9 @@ from afspm.basics.errors import AfspmError, ConfigError, ErrorCollector, Transpo
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.plain_data import PlainMapping
 from afspm.basics.requirements import require
+from afspm.basics.units import Unit
 from afspm.simulation.background import in_background
+from afspm.simulation.emulation.controller_clock import ControllerClock
 from afspm.simulation.faults import Fault, Faults
 from afspm.simulation.instrument import SimulatedInstrument
 from afspm.simulation.truth import Truth
@@ -44,6 +46,11 @@ _TAKEN = {100, 10013, 10048} if sys.platform == "win32" else {errno.EADDRINUSE}
 sockets: WSAEACCES, if the other program uses the port exclusively, and WSAEADDRINUSE."""
 _LOOKS_S = 0.2
 """Interval between checks of a button's file, real time."""
+_COMMON_FAULTS = {
+    "hang": "the whole program hangs for the duration (real time)",
+    "clock-ahead": "the clock of the controller's computer is set ahead by the duration",
+    "clock-back": "the clock of the controller's computer is set back by the duration",
+}
 FAREWELL_S = 0.5
 """Real seconds that a controller stays after the end of the experiment, so that the translator can stop the tip."""
 
@@ -81,6 +88,9 @@ class Emulator(ABC):
     Args:
         port: the port to listen on; 0: any free port.
         seed: seed of all random numbers.
+        clock_off_s: lead of the clock of the controller's computer, whose times stand in its files; negative: it is
+            behind.
+        dates_files: True if that clock also gives the files their modification times, as on a disk of that computer.
         faults: each a text as on the command line (`KIND[@SECONDS][,count=N][,duration=SECONDS]`) or a table of
             `kind`, `at_s`, `count`, `duration_s`.
         world: `surface`, `tip`, `drift` … of the simulated world, as in `World.from_settings`.
@@ -89,6 +99,7 @@ class Emulator(ABC):
         clock, log: of the experiment; set before `open`, like all following attributes.
         folder: where the controller saves its files.
         rig: the instrument.
+        file_clock: the clock of the controller's computer, whose times stand in its files.
         faults: queried at each point where something can go wrong.
         woken: becomes readable when `serve` must return; include its `fileno` in the wait of `serve`.
         listening: publishes an address; if it changes, call with "" before the old socket is closed, then with the new
@@ -116,6 +127,7 @@ class Emulator(ABC):
     log: logging.Logger
     folder: Path
     rig: SimulatedInstrument
+    file_clock: ControllerClock
     faults: Faults
     woken: WakeUp[None]
     listening: Callable[[str], None]
@@ -125,11 +137,14 @@ class Emulator(ABC):
         *,
         port: Annotated[int, Listens()] = 0,
         seed: int = 1,
+        clock_off_s: Annotated[float, Unit("s")] = 0.0,
+        dates_files: bool = False,
         faults: Sequence[str | PlainMapping | Fault] = (),
         **world: object,
     ) -> None:
         self.port = port
         self.seed = seed
+        self._clock_off_s, self._dates_files = clock_off_s, dates_files
         self._world_settings = world
         self._faults = [Fault.of(fault) for fault in faults]
         self._stop = threading.Event()
@@ -158,7 +173,7 @@ class Emulator(ABC):
     @classmethod
     def all_faults(cls) -> dict[str, str]:
         """Return every fault with its effect: faults of the class and faults common to all emulators."""
-        return {**cls.fault_kinds, "hang": "the whole program hangs for the duration (real time)"}
+        return {**cls.fault_kinds, **_COMMON_FAULTS}
 
     # -- what one writes
 
@@ -241,6 +256,9 @@ class Emulator(ABC):
         )
         truth.note(clock.now_s(), "start", {"settings": self._world_settings, "seed": self.seed})
         self.faults = Faults(self._faults, self.all_faults(), clock.now_s())
+        self.file_clock = ControllerClock(self._clock_off_s, dates_files=self._dates_files)
+        if self._clock_off_s:
+            self.rig.note(clock.now_s(), "clock of the controller", {"off_s": self._clock_off_s})
         folder.mkdir(parents=True, exist_ok=True)
         self.woken = WakeUp()
         self.rig.drawing.wake, self.rig.drawing.log, self.rig.drawing.clock = self.woken.post, log, clock
@@ -249,6 +267,7 @@ class Emulator(ABC):
             listening(self._open())
             while not self._stop.is_set() and clock.monotonic_s() < self._leave_at_s:
                 wait_s = self._wait_s()
+                self.rig.note_changes(clock.now_s())  # of a person at the panel, before the wait
                 due.close()  # after the tick: on a busy computer the wait may end late
                 self.rig.drawing.release()
                 ends_s = self.rig.next_change_s(clock.now_s())
@@ -375,12 +394,21 @@ class Emulator(ABC):
         if hang is not None:
             self.log.warning("an emulated fault: %s", hang)
             self._stop.wait(hang.duration_s)
+        self._set_clock()
         now_s = self.clock.now_s()
         times = (self._call_guarded(self.tick, now_s), self.rig.next_change_s(now_s), self.faults.next_s(now_s))
         due_s = min((at_s for at_s in times if at_s is not None), default=math.inf)
         leave_in_s = self._leave_at_s - self.clock.monotonic_s()
         longest_s = LONGEST_WAIT_S if self._button is None else _LOOKS_S
         return max(0.0, min(longest_s, leave_in_s, self.clock.real_s(due_s - now_s)))
+
+    def _set_clock(self) -> None:
+        now_s = self.clock.now_s()
+        for kind, sign in (("clock-ahead", 1.0), ("clock-back", -1.0)):
+            jump = self.faults.strikes(kind, now_s)
+            if jump is not None:
+                self.file_clock.jump(sign * jump.duration_s, now_s)
+                self.rig.note(now_s, "clock of the controller", {"off_s": self.file_clock.off_s})
 
     def _look_for_button(self) -> None:
         button = self._button

@@ -6,6 +6,8 @@ import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from afspm.simulation.emulation.controller_clock import ControllerClock
+
 
 @dataclass(frozen=True)
 class FilePart:
@@ -20,7 +22,8 @@ class FilePart:
 class PendingWrites:
     """The file parts to be written."""
 
-    def __init__(self) -> None:
+    def __init__(self, file_clock: ControllerClock) -> None:
+        self._file_clock = file_clock
         self._writes: list[FilePart] = []
 
     def save(self, path: Path, content: bytes, at_s: float, rest_at_s: float) -> None:
@@ -42,4 +45,5 @@ class PendingWrites:
                     write.path.parent.mkdir(parents=True, exist_ok=True)
                     with write.path.open("wb" if write.begins else "ab") as file:
                         file.write(write.content)
+                    self._file_clock.date(write.path)
         return self._writes[0].at_s if self._writes else None

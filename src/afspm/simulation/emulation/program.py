@@ -12,6 +12,7 @@ from typing import ClassVar
 from afspm.basics.clock import Clock
 from afspm.basics.errors import AfspmError
 from afspm.simulation.activities import ScanActivity, SpectrumActivity
+from afspm.simulation.emulation.controller_clock import ControllerClock
 from afspm.simulation.emulation.pending_writes import PendingWrites
 from afspm.simulation.faults import INSTRUMENT_FAULTS, Faults
 from afspm.simulation.instrument import InstrumentBusy, SimulatedInstrument, busy_with
@@ -27,9 +28,11 @@ class MakerProgram(ABC):
         folder: folder for saved files.
         start_s: duration of the ramp to the first line, experiment time.
         file_s: delay between the end and the first half of a file; the second half follows after the same delay.
+        file_clock: clock of the controller's computer. Default: the experiment's clock.
 
     Attributes:
         rig: the instrument.
+        file_clock: clock of the controller's computer.
         repeats: True if another scan starts after each complete scan.
         saves_partial: True if an interrupted scan is saved.
 
@@ -50,6 +53,7 @@ class MakerProgram(ABC):
         *,
         start_s: float,
         file_s: float,
+        file_clock: ControllerClock | None = None,
     ) -> None:
         if missing := [kind for kind in self.fault_kinds if kind not in faults.known]:
             lacks = f"the emulator's fault_kinds lack {', '.join(missing)}"
@@ -61,7 +65,8 @@ class MakerProgram(ABC):
         self.repeats = self.saves_partial = False
         self._log = log
         self._start_s, self._file_s = start_s, file_s
-        self._disk = PendingWrites()
+        self.file_clock = file_clock or ControllerClock()
+        self._disk = PendingWrites(self.file_clock)
         self._starts_at_s = math.inf
         self._scan: ScanActivity | None = None
         self._curve: SpectrumActivity | None = None
@@ -82,12 +87,16 @@ class MakerProgram(ABC):
         """Copy the panel's values to `rig.setup`, right before a curve."""
 
     @abstractmethod
-    def scan_files(self, scan: ScanActivity, now_s: float) -> Sequence[NamedFile]:
-        """Return the files of an ended scan; empty: the scan is not saved."""
+    def scan_files(self, scan: ScanActivity, shown_s: float) -> Sequence[NamedFile]:
+        """Return the files of an ended scan; empty: the scan is not saved.
+
+        Args:
+            shown_s: the time that the controller's clock shows.
+        """
 
     @abstractmethod
-    def curve_files(self, curve: SpectrumActivity, now_s: float) -> Sequence[NamedFile]:
-        """Return the files of an ended curve; empty: the curve is not saved."""
+    def curve_files(self, curve: SpectrumActivity, shown_s: float) -> Sequence[NamedFile]:
+        """Return the files of an ended curve, like `scan_files`; empty: the curve is not saved."""
 
     # -- what goes on
 
@@ -127,7 +136,7 @@ class MakerProgram(ABC):
             self._watch_scan(self._scan, now_s)
         if self._curve is not None and not self._curve.running(now_s):
             ended, self._curve = self._curve, None
-            self._save(self.curve_files(ended, now_s), now_s)
+            self._save(self.curve_files(ended, self.file_clock.shown_s(now_s)), now_s)
         due_s = self._disk.advance(now_s, there=True)
         return min((at_s for at_s in (due_s, self._starts_at_s) if at_s is not None and at_s > now_s), default=None)
 
@@ -143,7 +152,7 @@ class MakerProgram(ABC):
         if ended is not None:
             self.rig.stop_scan(now_s)
             if self.saves_partial:
-                self._save(self.scan_files(ended, now_s), now_s)
+                self._save(self.scan_files(ended, self.file_clock.shown_s(now_s)), now_s)
 
     def start_curve(self, kind: str, now_s: float) -> None:
         """Start a curve at the tip's position. Raises InstrumentBusy, InvalidValue."""
@@ -198,7 +207,7 @@ class MakerProgram(ABC):
     def _watch_scan(self, scan: ScanActivity, now_s: float) -> None:
         if not scan.running(now_s):
             self._scan = None
-            self._save(self.scan_files(scan, now_s), now_s)
+            self._save(self.scan_files(scan, self.file_clock.shown_s(now_s)), now_s)
             if self.repeats:
                 self._starts_at_s = now_s + self._start_s
         elif self.faults.strikes("stopped", now_s):

@@ -173,6 +173,7 @@ class SimulatedController:
         self._kept["values"].update(values)
         after = self._si()
         self._put_in_force()
+        self.instrument.note_changes(now_s)
         rate_m_s = (float(after[names.DRIFT_RATE_X]), float(after[names.DRIFT_RATE_Y]))
         if rate_m_s != (float(before[names.DRIFT_RATE_X]), float(before[names.DRIFT_RATE_Y])):
             self.instrument.follow(rate_m_s, now_s)

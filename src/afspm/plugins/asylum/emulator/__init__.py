@@ -97,7 +97,9 @@ class AsylumEmulator(Emulator):
         path = self._settings.save_path or f"{self.folder.drive.rstrip(':')}:{':'.join(self.folder.parts[1:])}:"
         texts = {"SaveImage": path, "SaveForce": path, "BaseName": self._settings.base_name}
         values = IgorValues(texts)
-        self.controller = AsylumController(self.rig, self.faults, values, self.folder, self._settings, self.log)
+        self.controller = AsylumController(
+            self.rig, self.faults, values, self.folder, self._settings, self.file_clock, self.log
+        )
         self._functions = self.functions()
         self._delayed: deque[DelayedMessage] = deque()
         self._idle_at_s = -math.inf

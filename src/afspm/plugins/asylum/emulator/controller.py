@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from afspm.basics import AfspmError, InvalidValue
-from afspm.emulation import Faults, PendingWrites, SimulatedInstrument
+from afspm.emulation import ControllerClock, Faults, PendingWrites, SimulatedInstrument
 from afspm.model import Region
 from afspm.plugins.asylum.emulator import files
 from afspm.plugins.asylum.emulator.values import IgorValues
@@ -60,6 +60,7 @@ class AsylumController:
 
     Args:
         folder: destination of files, independent of the folder name in Igor's texts.
+        file_clock: clock of Igor's computer.
     """
 
     def __init__(
@@ -69,6 +70,7 @@ class AsylumController:
         values: IgorValues,
         folder: Path,
         settings: AsylumSettings,
+        file_clock: ControllerClock,
         log: logging.Logger,
     ) -> None:
         self.rig = rig
@@ -77,7 +79,8 @@ class AsylumController:
         self._folder = folder
         self._settings = settings
         self._log = log
-        self._disk = PendingWrites()
+        self._file_clock = file_clock
+        self._disk = PendingWrites(file_clock)
         self._starts_at_s = math.inf
         self._bias_since_s = -math.inf
         self._curve_running = self._engages = False
@@ -89,11 +92,13 @@ class AsylumController:
         values.put("AmplitudeSetpointMeters", metres_per_volt * values.get("AmplitudeSetpointVolts"))
         fast, slow = values.size()
         self.spots_m: list[tuple[float, float]] = [(fast / 2, slow / 2)]
+        self._apply()
 
     def put(self, names: str, value: float, now_s: float) -> None:
         """Execute PV. A bias voltage that is changed again within a minute counts as a bias pulse."""
         before_v = self.values.get("TipVoltage")
         self.values.put(names, value)
+        self._apply()
         if self.values.get("TipVoltage") == before_v:
             return
         if now_s - self._bias_since_s < _PULSE_S and math.isfinite(before_v):
@@ -197,19 +202,25 @@ class AsylumController:
             and all(2 <= values.get(name) <= _MOST_POINTS for name in ("ScanLines", "ScanPoints"))
         )
 
+    def _apply(self) -> None:
+        # values that PV accepts and no hardware can have stay without effect
+        bias_v, gain, setpoint = (
+            self.values.get(name) for name in ("TipVoltage", "IntegralGain", "AmplitudeSetpointVolts")
+        )
+        setup = self.rig.setup
+        if math.isfinite(bias_v):
+            setup.bias_v = bias_v
+        if math.isfinite(gain) and math.isfinite(setpoint):
+            gain *= _INTEGRAL_GAIN
+            setup.feedback = replace(setup.feedback, integral_gain=gain, setpoint=setpoint)
+
     def _start(self, now_s: float) -> None:
         values, rig = self.values, self.rig
         rig.setup.region = self._frame()
         rig.setup.shape = (round(values.get("ScanLines")), round(values.get("ScanPoints")))
         rig.setup.line_s = 1.0 / values.get("ScanRate")
         rig.setup.upwards = not values.get("ScanDown")
-        rig.setup.bias_v = values.get("TipVoltage")
-        rig.setup.feedback = replace(
-            rig.setup.feedback,
-            on=True,
-            integral_gain=_INTEGRAL_GAIN * values.get("IntegralGain"),
-            setpoint=values.get("AmplitudeSetpointVolts"),
-        )
+        rig.setup.feedback = replace(rig.setup.feedback, on=True)
         rig.start_scan(now_s)
         self._image = rig.setup.region
 
@@ -220,7 +231,9 @@ class AsylumController:
     def _image_done(self, now_s: float) -> None:
         scan = self.rig.scan
         if scan is not None:
-            self._save("SaveImage", now_s, lambda name: files.image(name, scan, self.values, now_s))
+            self._save(
+                "SaveImage", now_s, lambda name: files.image(name, scan, self.values, self._file_clock.shown_s(now_s))
+            )
         # LastScan 0: the next frame follows in the other direction, until a person stops it
         if not self.values.get("LastScan"):
             self.scan(now_s, not self.values.get("ScanDown"))
@@ -236,7 +249,9 @@ class AsylumController:
         self.values.put("ScanStatus", 0)
         scan = self.rig.scan
         if running and self._settings.saves_partial and scan is not None:
-            self._save("SaveImage", now_s, lambda name: files.image(name, scan, self.values, now_s))
+            self._save(
+                "SaveImage", now_s, lambda name: files.image(name, scan, self.values, self._file_clock.shown_s(now_s))
+            )
 
     # --- force curves ---
 
@@ -282,7 +297,11 @@ class AsylumController:
         self._curve_running = False
         spectrum = self.rig.spectrum
         if spectrum is not None:
-            self._save("SaveForce", now_s, lambda name: files.curve(name, spectrum, self.values, now_s))
+            self._save(
+                "SaveForce",
+                now_s,
+                lambda name: files.curve(name, spectrum, self.values, self._file_clock.shown_s(now_s)),
+            )
 
     # --- files ---
 

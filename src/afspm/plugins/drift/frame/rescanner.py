@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from typing import TYPE_CHECKING, ClassVar
 
 from afspm import Component, Events, wire
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 WANTED, MAPPINGS = "DriftRescan", "DriftMapping"
 FLAGGED_WITHIN_S = 5.0
 BACK_WITHIN_S = 60.0
+_PIXELS_AT_ONCE = 16
 _DIRECTION_BEFORE, _FRAME_BEFORE = "direction_before", "frame_before"
 Pixels = tuple[int, int] | None
 
@@ -170,8 +172,13 @@ class Rescanner(Component):
         wider = Region(region.center_m, (width * factor, height * factor), region.angle_rad)
         if shape is None:
             return wider, None
-        rows, columns = (min(round((n - 1) * factor) + 1, max(self.most_pixels, n)) for n in shape)
+        rows, columns = (self._more_pixels(n, factor) for n in shape)
         return wider, (rows, columns)
+
+    def _more_pixels(self, n: int, factor: float) -> int:
+        # a controller that takes multiples of 16 pixels has taken n
+        step = math.gcd(n, _PIXELS_AT_ONCE)
+        return min(round(((n - 1) * factor + 1) / step), max(self.most_pixels, n) // step) * step
 
     def _restore_region(
         self, x: float, y: float, width: float, height: float, angle: float, shape: list[int] | None

@@ -111,7 +111,7 @@ class GxsmEmulator(Emulator):
         files.prepare(self._settings.version)
         self.silent = False
         self.unanswered.clear()
-        self.program = GxsmProgram(self.rig, self.faults, self.clock, self.folder, self._settings)
+        self.program = GxsmProgram(self.rig, self.faults, self.clock, self.file_clock, self.folder, self._settings)
         self._calls = GxsmFunctions(self.program, self._feedback_actions)
         if self._transport == "shm":
             self._block = SharedMemoryBlock(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from afspm.emulation import Faults
+from afspm.emulation import ControllerClock, Faults
 
 FAULT_KINDS: Final[Mapping[str, str]] = {
     "file-late": "a file appears only after the duration",
@@ -33,8 +33,9 @@ class GxsmFileWriter:
         done_s: time at which all files are written, without faults.
     """
 
-    def __init__(self, folder: Path, faults: Faults) -> None:
+    def __init__(self, folder: Path, faults: Faults, file_clock: ControllerClock) -> None:
         self.folder = folder
+        self._file_clock = file_clock
         self._faults = faults
         self._writes: list[_Write] = []
         self.counter = 1
@@ -80,4 +81,5 @@ class GxsmFileWriter:
         self._writes = [write for write in self._writes if write.at_s > now_s]
         for write in due:
             write.path.write_bytes(write.content)
+            self._file_clock.date(write.path)
         return min((write.at_s for write in self._writes), default=None)

@@ -13,7 +13,7 @@ import numpy as np
 from afspm import read
 from afspm.basics import NS_PER_S, Clock, InvalidValue, Plain
 from afspm.driver import FileContent
-from afspm.emulation import Faults, ScanActivity, SimulatedInstrument, SpectrumActivity
+from afspm.emulation import ControllerClock, Faults, ScanActivity, SimulatedInstrument, SpectrumActivity
 from afspm.model import Region
 from afspm.plugins.gxsm.emulator import files
 from afspm.plugins.gxsm.emulator.entries import GxsmEntries, GxsmEntry, lengths, simulated_3, subscan
@@ -75,7 +75,6 @@ class GxsmPanel:
         auto_save, probe_auto_save: automatic saving of scans, of spectra.
         repeats: True if each complete scan is followed by another scan.
         layers: number of scans that *Multi Layer* makes of one; they are saved together, after the last.
-        behind_s: lag of the clock of GXSM's computer, whose times are in files; that clock may be set at any time.
         original: path of the file that was opened last; empty: none since the start of GXSM.
         subscan: first column, columns, first row and rows of *SubScan*; zeros: off.
         movie: number of columns and rows of the pictures of the last *Movie*; None: there was none.
@@ -85,7 +84,6 @@ class GxsmPanel:
     probe_auto_save: bool
     repeats: bool = False
     layers: int = 1
-    behind_s: float = 0.0
     original: str = ""
     subscan: list[int] = field(default_factory=lambda: [0, 0, 0, 0])
     movie: tuple[int, int] | None = None
@@ -147,9 +145,16 @@ class GxsmProgram:
     """
 
     def __init__(
-        self, rig: SimulatedInstrument, faults: Faults, clock: Clock, folder: Path, settings: GxsmSettings
+        self,
+        rig: SimulatedInstrument,
+        faults: Faults,
+        clock: Clock,
+        file_clock: ControllerClock,
+        folder: Path,
+        settings: GxsmSettings,
     ) -> None:
         self.rig, self.faults, self.clock, self.folder = rig, faults, clock, folder
+        self._file_clock = file_clock
         self.version, self.card = version, card = settings.version, settings.card
         self.dialogs: list[str] = []
         self.panel = GxsmPanel(settings.auto_save, settings.probe_auto_save)
@@ -167,7 +172,7 @@ class GxsmProgram:
         # Unattended nights go on after a crash: with scans from before it, a person has also begun a scan since then.
         self._is_named = settings.channels_set and any(folder.glob("*.nc"))
         self.has_crashed = False
-        self.saving = GxsmFileWriter(folder, faults)
+        self.saving = GxsmFileWriter(folder, faults, file_clock)
         self.scan = GxsmScan()
         self._pictures: dict[GxsmChannel, list[np.ndarray]] = {}  # opened since the start, each a time element
         self.curve: SpectrumActivity | None = None
@@ -198,7 +203,10 @@ class GxsmProgram:
         rig.drawing.wait()
         rig.drawing.rewind()
         rig.drawing.start(moved, rig.drawing.prepared(moved, engaged=rig.engaged))
-        self.scan.elsewhere.append((scan.lines_done(now_s), moved))
+        line, region = scan.lines_done(now_s), moved.region
+        self.scan.elsewhere.append((line, moved))
+        facts = {"center_m": region.center_m, "size_m": region.size_m, "angle_rad": region.angle_rad}
+        rig.note(now_s, "scan moved", {"number": scan.number, "from_line": line, **facts})
 
     def _scanned(self, region: Region) -> Region:
         # the real simulator turns its picture against the direction of the frame
@@ -264,7 +272,7 @@ class GxsmProgram:
         if self.scan.runs and self.faults.strikes("panel-stop", now_s):
             self.rig.stop_scan(now_s)
         if self.scan.runs and self.scan.activity is not None and not self.scan.activity.running(now_s):
-            self.scan.runs, self.scan.ended_s = False, self.scan.activity.end_s - self.panel.behind_s
+            self.scan.runs, self.scan.ended_s = False, self._file_clock.shown_s(self.scan.activity.end_s)
             is_whole = self.scan.activity.stopped_s is None
             self.scan.layer = (self.scan.layer + 1) % self.panel.layers if is_whole else 0
             if self.panel.auto_save and not self.scan.layer:
@@ -465,7 +473,6 @@ class GxsmProgram:
         scan = self.scan.activity
         assert scan is not None
         image, opened = self.image(channel), self.scan.opened.get(channel)
-        start_s = scan.start_s - self.panel.behind_s
         saved = files.GxsmScanFile(
             str(path),
             channel.label,
@@ -473,8 +480,8 @@ class GxsmProgram:
             channel.dz,
             channel.unit,
             self.scan.frame,
-            start_s if opened is None else (opened.start_ns or 0) / NS_PER_S,
-            scan.end_s - self.panel.behind_s if finished else self.scan.ended_before_s,
+            self._file_clock.shown_s(scan.start_s) if opened is None else (opened.start_ns or 0) / NS_PER_S,
+            self._file_clock.shown_s(scan.end_s) if finished else self.scan.ended_before_s,
             CARDS[self.card],
             scan.bias_v,
             self.panel.original,
@@ -531,7 +538,8 @@ class GxsmProgram:
             path = self._curve_path()
         offset = self.entries["OffsetX"], self.entries["OffsetY"]
         version = "00.03" if self.card == "RPSPMC" else "00.02"
-        saved = files.GxsmSpectrumFile(str(path), self.columns(curve), now_s, offset, self.rig.setup.bias_v, version)
+        shown_s, bias_v = self._file_clock.shown_s(now_s), self.rig.setup.bias_v
+        saved = files.GxsmSpectrumFile(str(path), self.columns(curve), shown_s, offset, bias_v, version)
         self.saving.write([(path, files.vpdata(saved))], now_s)
 
     def _curve_path(self) -> Path:

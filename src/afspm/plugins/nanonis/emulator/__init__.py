@@ -74,6 +74,8 @@ class NanonisEmulator(Emulator):
         one_each: True if a port serves one client at a time, like a real controller's port.
         session_path: path of the session folder on the controller's computer, e.g. "D:\\Data". Default: the local path.
         range_m: range of the scanner in x and y.
+        clips_frames: True if a frame beyond the range is clipped when it is set. False: it is kept as set, and the tip
+            stays at the edge of the range.
         bare_errors: True if replies with an error have no results; False: results of zeros.
         grabbed_rows: order of rows of scans in `Scan.FrameDataGrab`: "top-first" or as "recorded".
         unscanned: values of rows not yet scanned in `Scan.FrameDataGrab`: "nan" or "zeros"; saved files have NaN.
@@ -123,6 +125,7 @@ class NanonisEmulator(Emulator):
         bare_errors: bool = False,
         grabbed_rows: str = "top-first",
         unscanned: str = "nan",
+        clips_frames: bool = False,
         **settings: Any,
     ) -> None:
         super().__init__(**{**settings, "feedback": _of_stm(settings.get("feedback", {}))})
@@ -140,7 +143,9 @@ class NanonisEmulator(Emulator):
         ):
             if value not in known:
                 raise ConfigError(f"unknown value {value!r}", where=name, hint=f"one of {', '.join(known)}")
-        self._grabbed_rows, self._unscanned = grabbed_rows, unscanned
+        if not range_m > 0.0:
+            raise ConfigError(f"a scanner of {range_m:g} m", where="range_m", hint="its range is above 0")
+        self._grabbed_rows, self._unscanned, self._clips_frames = grabbed_rows, unscanned, clips_frames
 
     def open(self) -> str:
         ports = [self.port + i if self.port else 0 for i in range(self._ports)]
@@ -163,6 +168,8 @@ class NanonisEmulator(Emulator):
             release=self.release,
             rows_as_recorded=self._grabbed_rows == "recorded",
             unscanned=_UNSCANNED[self._unscanned],
+            clips_frames=self._clips_frames,
+            file_clock=self.file_clock,
             log=self.log,
         )
         return f"{LOOPBACK}:{','.join(map(str, self._server.ports))}"

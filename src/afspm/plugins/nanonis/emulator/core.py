@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from afspm.basics import Clock, Plain
-from afspm.emulation import Faults, SimulatedInstrument
+from afspm.emulation import ControllerClock, Faults, SimulatedInstrument
 from afspm.plugins.nanonis.emulator.dispatch import Answer, DeferredResult
 from afspm.plugins.nanonis.emulator.registers import Registers
 from afspm.plugins.nanonis.emulator.session import SessionFolder
@@ -26,6 +26,7 @@ class NanonisCore:
     """The state shared by all modules.
 
     Attributes:
+        file_clock: clock of the controller's computer.
         range_m: range of the scanner in x, y and z, from end to end.
         release: release of the software.
         log: of the experiment.
@@ -36,6 +37,7 @@ class NanonisCore:
     rig: SimulatedInstrument
     faults: Faults
     clock: Clock
+    file_clock: ControllerClock
     session: SessionFolder
     range_m: tuple[float, float, float]
     release: int

@@ -85,7 +85,7 @@ class ScanFiles:
         gains = (feedback.proportional_gain or 0.0, feedback.integral_gain or 0.0)
         content = files.SxmContent(
             path=path,
-            start_s=scan.start_s,
+            start_s=self._core.file_clock.shown_s(scan.start_s),
             duration_s=scan.end_s - scan.start_s,
             center_m=ended.frame[:2],
             range_m=ended.frame[2:4],
@@ -124,6 +124,7 @@ class ScanModule:
     Args:
         rows_as_recorded: True if `Scan.FrameDataGrab` returns rows as recorded, False for the top row first.
         unscanned: value of rows not yet scanned in `Scan.FrameDataGrab`.
+        clips_frames: True if frames are clipped to the scanner's range when they are set.
 
     Attributes:
         frame: x, y, width, height in m, angle clockwise in degrees.
@@ -134,9 +135,12 @@ class ScanModule:
         ends: number of ended scans, completed or stopped.
     """
 
-    def __init__(self, core: NanonisCore, signals: Signals, *, rows_as_recorded: bool, unscanned: float) -> None:
+    def __init__(
+        self, core: NanonisCore, signals: Signals, *, rows_as_recorded: bool, unscanned: float, clips_frames: bool
+    ) -> None:
         self._core, self._signals, self._files = core, signals, ScanFiles(core, signals)
         self._rows_as_recorded, self._unscanned = rows_as_recorded, unscanned
+        self._clips_frames = clips_frames
         self.channels = sorted(CHANNELS[name] for name in core.rig.channels if name in CHANNELS)
         self.pixels, self.lines = 128, 128
         self.frame = (0.0, 0.0, 1e-6, 1e-6, 0.0)
@@ -167,6 +171,7 @@ class ScanModule:
         size_m = (width * (self.pixels - 1) / self.pixels, height * max(self.lines - 1, 1) / self.lines)
         rig.setup.region = Region((x, y), size_m, -math.radians(clockwise_deg))
         rig.setup.shape = (self.lines, self.pixels)
+        rig.setup.reach_m = (self._core.range_m[0] / 2, self._core.range_m[1] / 2)
         forward_s, backward_s = self.speed[2:4]
         rig.setup.line_s, rig.setup.upwards = forward_s + backward_s, upwards
         scan = rig.start_scan(self._core.now_s)
@@ -277,20 +282,22 @@ class ScanModule:
 
     @answers("Scan.FrameSet")
     def set_frame(self, x: float, y: float, width: float, height: float, angle_deg: float) -> Answer:
-        """Set the frame, clipped to the scanner's range like the real controller.
+        """Set the frame, also beyond the scanner's range unless `clips_frames`: the output of a scan is clipped.
 
-        (!) The real controller's answer to a frame smaller than an atom is unknown; the emulator refuses it.
+        A real one clips the voltages while it scans; the emulator scans the frame as it was set. (!) The real
+        controller's answer to a frame smaller than an atom is unknown; the emulator refuses it.
         """
         if not (min(width, height) >= _SMALLEST_M and all(map(math.isfinite, (x, y, width, height, angle_deg)))):
             raise FunctionRefused(
                 f"a frame of {width:g} m x {height:g} m can't be scanned: its sides must be at least {_SMALLEST_M:g} m"
             )
-        range_m = self._core.range_m[:2]
-        width, height = min(width, range_m[0]), min(height, range_m[1])
-        x, y = (
-            float(np.float32(np.clip(value, (size - whole) / 2, (whole - size) / 2)))
-            for value, size, whole in zip((x, y), (width, height), range_m, strict=True)
-        )
+        if self._clips_frames:
+            range_m = self._core.range_m[:2]
+            width, height = min(width, range_m[0]), min(height, range_m[1])
+            x, y = (
+                float(np.float32(np.clip(value, (size - whole) / 2, (whole - size) / 2)))
+                for value, size, whole in zip((x, y), (width, height), range_m, strict=True)
+            )
         self.frame = (x, y, width, height, angle_deg)
         self._adapt_speed(*self.speed)
         return ()

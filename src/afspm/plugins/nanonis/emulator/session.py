@@ -7,7 +7,7 @@ from pathlib import Path, PureWindowsPath
 from typing import Final
 
 from afspm.basics import InvalidValue
-from afspm.emulation import Faults
+from afspm.emulation import ControllerClock, Faults
 
 _NO_FILE_NAME: Final = frozenset('\\/:*?"<>|') | {chr(number) for number in range(32)}
 _LONGEST_NAME: Final = 200
@@ -21,10 +21,12 @@ class SessionFolder:
         path: path on the controller's computer, as clients see it.
     """
 
-    def __init__(self, folder: Path, path: str, faults: Faults, log: logging.Logger) -> None:
+    def __init__(
+        self, folder: Path, path: str, faults: Faults, file_clock: ControllerClock, log: logging.Logger
+    ) -> None:
         self.folder, self.path = folder, path or str(folder)
         self._root, self._root_path = self.folder, self.path
-        self._faults, self._log = faults, log
+        self._faults, self._file_clock, self._log = faults, file_clock, log
         self._numbers: dict[tuple[str, str], int] = {}
         self._late: list[tuple[float, Path, bytes]] = []
 
@@ -85,6 +87,7 @@ class SessionFolder:
     def _write(self, path: Path, content: bytes) -> bool:
         try:
             path.write_bytes(content)
+            self._file_clock.date(path)
         except OSError as error:
             self._log.warning("%s can't be written: %s", path, error)
             return False

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from afspm.basics import Clock
-from afspm.emulation import Faults, SimulatedInstrument
+from afspm.emulation import ControllerClock, Faults, SimulatedInstrument
 from afspm.plugins.nanonis.emulator.core import NanonisCore
 from afspm.plugins.nanonis.emulator.dispatch import Answer, Dispatcher, FunctionRefused, answers, chosen
 from afspm.plugins.nanonis.emulator.files import read_dat
@@ -31,7 +31,7 @@ class NanonisSoftware:
     Args:
         session_path: session folder's path on the controller's computer; empty: the path of `folder`.
         range_m: range of the scanner in x and y.
-        rows_as_recorded, unscanned: see `ScanModule`.
+        rows_as_recorded, unscanned, clips_frames: see `ScanModule`.
     """
 
     def __init__(
@@ -46,12 +46,20 @@ class NanonisSoftware:
         release: int,
         rows_as_recorded: bool,
         unscanned: float,
+        clips_frames: bool,
+        file_clock: ControllerClock,
         log: logging.Logger,
     ) -> None:
-        session = SessionFolder(folder, session_path, faults, log)
-        self.core = NanonisCore(rig, faults, clock, session, (range_m, range_m, _RANGE_Z_M), release, log)
+        session = SessionFolder(folder, session_path, faults, file_clock, log)
+        self.core = NanonisCore(rig, faults, clock, file_clock, session, (range_m, range_m, _RANGE_Z_M), release, log)
         self.signals = Signals(self.core)
-        self.scans = ScanModule(self.core, self.signals, rows_as_recorded=rows_as_recorded, unscanned=unscanned)
+        self.scans = ScanModule(
+            self.core,
+            self.signals,
+            rows_as_recorded=rows_as_recorded,
+            unscanned=unscanned,
+            clips_frames=clips_frames,
+        )
         self.spectra = SpectroscopyModules(self.core, self.signals)
         self.z_controller = ZController(self.core, self.scans, self.signals)
         modules = (

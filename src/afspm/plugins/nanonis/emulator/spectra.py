@@ -119,16 +119,16 @@ class SpectroscopyModules:
         return replace(curve, names=tuple(names), units=tuple(units), values=np.stack(columns, axis=1))
 
     def _header(self, module: str, curve: SpectrumActivity, now_s: float) -> dict[str, str]:
-        (x, y), number = curve.position_m, files.engineering
+        (x, y), number, shown_s = curve.position_m, files.engineering, self._core.file_clock.shown_s
         return {
             "Experiment": _TITLES[module],
-            "Saved Date": files.moment(now_s),
+            "Saved Date": files.moment(shown_s(now_s)),
             "User": "",
             "Date": "",
             "X (m)": number(x),
             "Y (m)": number(y),
             "Z (m)": number(0.0),
-            "Start time": files.moment(curve.start_s),
+            "Start time": files.moment(shown_s(curve.start_s)),
             "Bias>Bias (V)": number(self._core.rig.setup.bias_v),
         }
 

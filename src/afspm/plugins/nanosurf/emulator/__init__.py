@@ -72,7 +72,9 @@ class NanosurfEmulator(ScriptedEmulator):
     def make_program(self) -> MakerProgram:
         self._levels: dict[Client, int | None] = {}
         self._client: Client = None
-        program = StudioProgram(self.rig, self.faults, self.clock, self.folder, self.log, **self._times)
+        program = StudioProgram(
+            self.rig, self.faults, self.clock, self.folder, self.log, file_clock=self.file_clock, **self._times
+        )
         self._tree = CommandTree(program, self._release, self._image_buffer, self._select, self.log)
         return program
 

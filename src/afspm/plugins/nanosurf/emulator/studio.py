@@ -239,6 +239,7 @@ class StudioProgram(MakerProgram):
                 raise InvalidValue(f"{path}: {value!r} is not within {low:g} to {high:g}")
             value = type(row.at_first)(value / self.scale(path))
         self.values[path] = value
+        self._apply_feedback()
 
     def advance(self, now_s: float) -> float | None:
         again_s = super().advance(now_s)
@@ -379,16 +380,18 @@ class StudioProgram(MakerProgram):
         self.prepare_curve()
 
     def prepare_curve(self) -> None:
-        gain = _INTEGRAL_GAIN * self.values["z_control.i_gain"]
-        self.rig.setup.feedback = replace(
-            self.rig.setup.feedback, setpoint=self.values[SETPOINT], integral_gain=gain, on=True
-        )
+        self._apply_feedback()
+        self.rig.setup.feedback = replace(self.rig.setup.feedback, on=True)
 
-    def scan_files(self, scan: ScanActivity, now_s: float) -> Sequence[NamedFile]:
-        return self._files(lambda: files.image(scan, now_s, self.values["mode.name"]), now_s)
+    def _apply_feedback(self) -> None:
+        gain, setup = _INTEGRAL_GAIN * self.values["z_control.i_gain"], self.rig.setup
+        setup.feedback = replace(setup.feedback, setpoint=self.values[SETPOINT], integral_gain=gain)
 
-    def curve_files(self, curve: SpectrumActivity, now_s: float) -> Sequence[NamedFile]:
-        return self._files(lambda: files.curves([curve], (1, 1), now_s, self.values["mode.name"]), now_s)
+    def scan_files(self, scan: ScanActivity, shown_s: float) -> Sequence[NamedFile]:
+        return self._files(lambda: files.image(scan, shown_s, self.values["mode.name"]), shown_s)
+
+    def curve_files(self, curve: SpectrumActivity, shown_s: float) -> Sequence[NamedFile]:
+        return self._files(lambda: files.curves([curve], (1, 1), shown_s, self.values["mode.name"]), shown_s)
 
     def _start_grid(self, grid: CurveGrid, now_s: float) -> None:
         self._refuse_busy()
@@ -414,27 +417,27 @@ class StudioProgram(MakerProgram):
                 grid.at_point = True
             else:
                 self._grid = None
-                self._save(self._grid_files(grid, now_s), now_s)
+                self._save(self._grid_files(grid, self.file_clock.shown_s(now_s)), now_s)
                 return
 
-    def _grid_files(self, grid: CurveGrid, now_s: float) -> Sequence[NamedFile]:
-        return self._files(lambda: files.curves(grid.curves, grid.shape, now_s, self.values["mode.name"]), now_s)
+    def _grid_files(self, grid: CurveGrid, shown_s: float) -> Sequence[NamedFile]:
+        return self._files(lambda: files.curves(grid.curves, grid.shape, shown_s, self.values["mode.name"]), shown_s)
 
-    def _files(self, made: Callable[[], bytes], now_s: float) -> Sequence[NamedFile]:
+    def _files(self, made: Callable[[], bytes], shown_s: float) -> Sequence[NamedFile]:
         values = self.values
         if not values["data.storage.nhf_backend_enabled"] or values["data.storage.nhf_auto_store_mode"] == 0:
             return []
-        while (self.folder / (name := self._next_name(now_s))).exists():
+        while (self.folder / (name := self._next_name(shown_s))).exists():
             pass
         return [(name, made())]
 
-    def _next_name(self, now_s: float) -> str:
+    def _next_name(self, shown_s: float) -> str:
         # A file never leaves its folder.
         index = self.values["data.storage.next_file_index"]
         self.values["data.storage.next_file_index"] = index + 1
         base = _fit_for_a_name(self.values["data.storage.file_basename"])
         marked = base if "[INDEX]" in base else f"{base}_[INDEX]"
-        written = datetime.fromtimestamp(now_s, UTC).astimezone()
+        written = datetime.fromtimestamp(shown_s, UTC).astimezone()
         for mark, text in (
             ("[INDEX]", f"{index:05d}"),
             ("[DATE]", f"{written:%Y-%m-%d}"),

@@ -73,7 +73,9 @@ class ParkEmulator(ScriptedEmulator):
 
     def make_program(self) -> MakerProgram:
         self._scripts: dict[Script, bool] = {}  # True: its reply was sent already
-        self._smartscan = SmartScanProgram(self.rig, self.faults, self.clock, self.folder, self.log, **self._times)
+        self._smartscan = SmartScanProgram(
+            self.rig, self.faults, self.clock, self.folder, self.log, file_clock=self.file_clock, **self._times
+        )
         self._smartscan.reports_gains = self._reports_gains
         return self._smartscan
 

@@ -44,7 +44,7 @@ class Wait:
 Ask = Callable[[str, str, list[object]], object]
 """A function that executes a script's request: "get", "set" or "call", a path below `spm`, and the arguments.
 
-The request "now" returns the experiment time in ms. Raises AfspmError."""
+The request "now" returns the time of the controller's clock in ms. Raises AfspmError."""
 
 
 class Script:

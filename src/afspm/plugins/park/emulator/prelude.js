@@ -23,7 +23,7 @@
     holder(path)[path.split(".").pop()] = function () { return asked("call", path, Array.prototype.slice.call(arguments)); };
   });
   global.print = function () {};
-  Date.now = function () { return asked("now", "", []); };  // scripts wait by it, in the experiment's time
+  Date.now = function () { return asked("now", "", []); };  // scripts wait by it, at the experiment's speed
   // the value of a script as it is, and as text; an object's text is not its content
   global.__run = function (script) {
     var value = (0, eval)(script);

@@ -155,9 +155,12 @@ class SmartScanProgram(MakerProgram):
         return json.dumps({"values": [*self._values, *self._reported], "methods": list(self._methods)})
 
     def ask(self, kind: str, path: str, given: list[object]) -> object:
-        """Execute a request of a script, in the form of `Ask`. Raises AfspmError; TypeError: wrong arguments."""
+        """Execute a request of a script, in the form of `Ask`. Raises AfspmError; TypeError: wrong arguments.
+
+        A script sees the time of the controller's clock.
+        """
         if kind == "now":
-            return round(self.now_s * 1e3)
+            return round(self.file_clock.shown_s(self.now_s) * 1e3)
         if kind == "call":
             return self._methods[path](*given)
         if kind == "set":
@@ -355,13 +358,13 @@ class SmartScanProgram(MakerProgram):
 
     def prepare_curve(self) -> None: ...
 
-    def scan_files(self, scan: ScanActivity, now_s: float) -> Sequence[NamedFile]:
+    def scan_files(self, scan: ScanActivity, shown_s: float) -> Sequence[NamedFile]:
         name = self._next_name()
-        made = files.images(scan, now_s, "NCM", self._recorded)
+        made = files.images(scan, shown_s, "NCM", self._recorded)
         return [(f"{name}_{_plain(channel)}.tiff", content) for channel, content in made]
 
-    def curve_files(self, curve: SpectrumActivity, now_s: float) -> Sequence[NamedFile]:
-        return [(f"{self._next_name()}_{curve.kind}.tiff", files.curve(curve, now_s, "NCM"))]
+    def curve_files(self, curve: SpectrumActivity, shown_s: float) -> Sequence[NamedFile]:
+        return [(f"{self._next_name()}_{curve.kind}.tiff", files.curve(curve, shown_s, "NCM"))]
 
     def _next_name(self) -> str:
         location = self._values["dataLocation"]
