@@ -57,7 +57,7 @@ SHAPE: Final = (8, 16)
 ASIDE_M: Final = 90e-9
 """How far the person moves the frame."""
 SCAN_S: Final = 0.4
-WAITS_S: Final = 6.0
+WAITS_S: Final = 30.0
 """How long the run waits for a microscope that is not free, or for a measurement that does not end: real seconds."""
 DELAYS_MS: Final = (0, 5, 20, 50, 100)
 _OFF_AGAIN_S: Final = 0.03
@@ -575,6 +575,10 @@ class Published:
     packet: Scan | Spectrum
     told_before: tuple[ActByHand, ...]
 
+    @property
+    def is_of_its_kind(self) -> bool:
+        return isinstance(self.packet, Spectrum if self.wanted.kind == "curve" else Scan)
+
 
 class Run:
     """A peer that measures as a component does, and what it received."""
@@ -643,7 +647,7 @@ class Run:
                 self._kill_and_start_again(again)
             else:
                 self._until_end(again)
-            if len(self.results) > before:
+            if any(one.is_of_its_kind for one in self.results[before:]):
                 self.measured += 1
                 return
             if self.is_over:
@@ -797,11 +801,8 @@ def judged(run: Run, case: Case) -> Verdict:
     truth, person = run.truth, run.person
     acted_s = None if person.refused and case.act not in ("own", "replace") else person.acted_s
     after = [] if acted_s is None else [one for one in truth.taken if one.end_s >= acted_s]
-    spoiled = any(
-        not (look.on and look.engaged)
-        for one in after
-        for look in (truth.at(one.activity.start_s), truth.at(one.end_s))
-    )
+    ends = [truth.at(one.end_s) for one in after]
+    spoiled = any(not (look.on and look.engaged) for look in ends)
     stopped = any(not one.is_complete for one in after) or any(one.by_hand for one in after)
     trace = {"off and on": spoiled, "stop": stopped, "own": stopped, "replace": stopped}.get(
         case.act, acted_s is not None
@@ -826,6 +827,9 @@ def judged(run: Run, case: Case) -> Verdict:
 def _faults(one: Published, run: Run, case: Case) -> Iterator[tuple[str, str]]:
     truth, wanted, packet = run.truth, one.wanted, one.packet
     name = f"{wanted.kind} {wanted.number}"
+    if not one.is_of_its_kind:
+        yield "apart", f"{name}: a {type(packet).__name__.lower()} came instead of it"
+        return
     found = _measurement_of(packet, truth.taken)
     if found is None:
         yield "unmatched", f"{name}: {Path(packet.filename).name} is like no measurement"
@@ -839,7 +843,9 @@ def _faults(one: Published, run: Run, case: Case) -> Iterator[tuple[str, str]]:
         yield "wrong", f"{name}: it is measurement {number}, which began before the run asked for one"
     if not taken.is_complete:
         yield "wrong", f"{name}: measurement {number} was stopped"
-    if not begin.on:
+    if not begin.on and end.on and truth.at(taken.begin.time_s + _BRIEF_S).on:
+        yield "apart", f"{name}: the feedback was off at its begin, and on again soon after"
+    elif not begin.on:
         yield "wrong", f"{name}: the feedback was off at its begin"
     elif not end.on and truth.at(taken.end_s + _BRIEF_S).on:
         yield "apart", f"{name}: the feedback was off at its end, and on again soon after"
