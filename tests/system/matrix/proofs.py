@@ -171,12 +171,18 @@ def controlled(found: Evidence) -> str:
     return "" if all(row.holder for row in found.rows.values()) else "a scan without a component in control"
 
 
+def _is_drawn(found: Evidence, name: str) -> bool:
+    if not (found.folder / name).exists():
+        raise NotFinished(f"{name} was not drawn before its component was stopped")
+    return (found.folder / name).read_bytes().startswith(b"\x89PNG")
+
+
 def drawn(found: Evidence) -> str:
     """Prove that the picture of the night has each scan, as it was."""
     (file,) = (found.folder / "state").glob("*.night.jsonl")
     lines = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
     shots = [one for one in lines if one["kind"] == "scan"]
-    if not (found.folder / "night.png").read_bytes().startswith(b"\x89PNG") or len(shots) != len(found.truth.scans):
+    if not _is_drawn(found, "night.png") or len(shots) != len(found.truth.scans):
         return f"{len(shots)} of {len(found.truth.scans)} scans are drawn"
     for number, shot in enumerate(shots):
         levels = np.frombuffer(base64.b64decode(shot["picture"]), np.uint8).reshape(shot["shape"]).astype(float)
@@ -376,7 +382,7 @@ def held(holder: str, size_m: float, pixels: int) -> Proof:
 
 def drift_drawn(found: Evidence) -> str:
     """Prove that the figures have each scan at its true time: another one draws an error that is not there."""
-    if not (found.folder / "drift_offset.png").read_bytes().startswith(b"\x89PNG"):
+    if not _is_drawn(found, "drift_offset.png"):
         return "no figure"
     times_s = [float(one["time_s"]) for one in _drift_rows(found)]
     late_s = statistics.median(time_s - found.truth.scans[_at_middle(found, time_s)].mid_s for time_s in times_s)

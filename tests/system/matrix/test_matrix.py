@@ -75,7 +75,8 @@ def test_job_has_the_recorded_outcome(afspm_run: Run, tmp_path: Path, job: str, 
         assert one.end() == 0, f"not finished: {one.output}"
         found = outcomes(job, one.folder)
         if {*found.values()} == {DONE}:
-            assert not [line for line in one.lines if re.search(r" CRITICAL |Traceback", line)], one.output
+            errors = [line for line in one.lines if re.search(r" CRITICAL |Traceback", line)]
+            assert not errors, f"not finished without errors: {one.output}"
     if WRITTEN:
         Path(WRITTEN).mkdir(parents=True, exist_ok=True)
         (Path(WRITTEN) / f"{job}-{instrument}.json").write_text(json.dumps([job, instrument, found]), encoding="utf-8")
