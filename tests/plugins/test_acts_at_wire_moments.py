@@ -33,7 +33,8 @@ def test_run_without_a_person_has_no_acts_and_no_repeats(maker: str, tmp_path: P
     found = carried_out(Case.of(maker, len(acts_of(maker)) - 1).without_a_person(), tmp_path)
     assert not is_bad(found), shown(found)
     assert found.results == found.case.measurements
-    assert found.repeats == 0
+    # a killed translator may lose the measurement that lasts as long as its command
+    assert found.repeats <= bool(found.case.killed_share)
 
 
 @each_maker
