@@ -155,6 +155,7 @@ def test_a_killed_gateway_continues_its_scans_and_its_clients_their_events(start
 
 def test_spectra_from_before_a_restart_are_served_from_the_record(started: Started) -> None:
     run = started("[cache]\nhistory = { Spec1d = 1 }\n")  # of which the scheduler would replay only the last
+    run.wait_up("recorder", 1)  # as would be all that it gets, if it joined after the third curve
     ada = run.client("ada")
     ada.done("POST", "/control", {"lease_s": 60})
     for number in range(3):
