@@ -15,7 +15,12 @@ import sys
 import threading
 
 from afspm.basics.exit_codes import ExitCode
-from afspm.transport.process.parent import end_within, leave_interrupts_to_parent, take_standard_input
+from afspm.transport.process.parent import (
+    call_at_signal,
+    end_within,
+    leave_interrupts_to_parent,
+    take_standard_input,
+)
 
 ASK_S = 0.6  # from the end of standard input to SIGTERM
 TERMINATE_S = 0.4  # from SIGTERM to SIGKILL
@@ -31,7 +36,7 @@ def main(arguments: list[str]) -> int:
     leave_interrupts_to_parent()
     # a signal that arrives before the command has started must still end it
     wished = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: wished.set())
+    call_at_signal(signal.SIGTERM, wished.set)
     try:
         # in our process group, so that a supervisor that kills us, or finds us killed, kills the command too
         child = subprocess.Popen(command, stdin=subprocess.PIPE)
@@ -39,9 +44,7 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"ERROR {command[0]} can't be started: {error} (is it installed and executable?)\n")
         return ExitCode.CONFIG
     program = _ForeignProgram(child, take_standard_input())
-    signal.signal(signal.SIGTERM, lambda *_: program.end_soon())
-    if wished.is_set():
-        program.end_soon()
+    threading.Thread(target=program.end_when, args=(wished,), name="end", daemon=True).start()
     threading.Thread(target=program.pass_on, name="stdin", daemon=True).start()
     code = child.wait()
     program.sweep()
@@ -74,9 +77,10 @@ class _ForeignProgram:
                     self._child.stdin.flush()
         self._end()
 
-    def end_soon(self) -> None:
-        """End the child without waiting, as a signal handler must."""
-        threading.Thread(target=self._end, name="end", daemon=True).start()
+    def end_when(self, wished: threading.Event) -> None:
+        """Wait for the event, then end the child."""
+        wished.wait()
+        self._end()
 
     def sweep(self) -> None:
         """Kill processes that the command left behind, if the parent is dead; a living parent does that itself."""

@@ -25,7 +25,7 @@ from afspm.transport.process.context import (
     new_session,
 )
 from afspm.transport.process.loading import load
-from afspm.transport.process.parent import ParentWatch, StopRequested
+from afspm.transport.process.parent import ParentWatch, StopRequested, call_at_signal
 from afspm.transport.zmq_port import open_port
 from afspm.wire.message_types import register_all
 
@@ -48,7 +48,7 @@ def run(launch_line: bytes, pipe: int) -> int:
     _allow_many_connections()
     parent = ParentWatch(pipe, ExitCode.ORPHAN)
     parent.watch()
-    signal.signal(signal.SIGTERM, lambda *_: parent.let_go())
+    call_at_signal(signal.SIGTERM, parent.let_go)
     try:
         return _host(launch, logger, parent)
     except ConfigError as error:

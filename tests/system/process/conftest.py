@@ -29,7 +29,7 @@ class Child:
             stderr=subprocess.PIPE,
             env={**os.environ, "PYTHONPATH": str(HERE), "PYTHONUNBUFFERED": "1"},
         )
-        self.lines: Queue[str] = Queue()
+        self.lines: Queue[str | None] = Queue()
         self.errors = bytearray()
         self._readers = [
             threading.Thread(target=self._read_lines, daemon=True),
@@ -53,6 +53,7 @@ class Child:
             line = self.lines.get(timeout=DEADLINE_S)
         except Empty:
             raise AssertionError(f"no line {text!r} came; {self.errors.decode()}") from None
+        assert line is not None, f"it ended with {self.popen.wait()} before {text!r}; {self.errors.decode()}"
         assert line.startswith(text), f"{line!r}; {self.errors.decode()}"
         return line
 
@@ -85,6 +86,7 @@ class Child:
         assert self.popen.stdout is not None
         for line in self.popen.stdout:
             self.lines.put(line.decode().rstrip("\r\n"))
+        self.lines.put(None)
 
     def _read_errors(self) -> None:
         assert self.popen.stderr is not None

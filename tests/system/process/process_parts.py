@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import threading
 from pathlib import Path
@@ -25,6 +26,19 @@ class Diary(Component):
 
     def on_end(self) -> None:
         say("end")
+
+
+class SignalledElsewhere(Diary):
+    """A component whose SIGTERM ends no wait of its main thread, like one that comes right before the wait."""
+
+    def on_start(self) -> None:
+        super().on_start()
+        threading.Thread(target=self._terminate, args=(threading.get_ident(),), daemon=True).start()
+
+    def _terminate(self, main: int) -> None:
+        while "poll" not in sys._current_frames()[main].f_code.co_name:
+            threading.Event().wait(0.001)
+        signal.pthread_kill(threading.get_ident(), signal.SIGTERM)
 
 
 class NeedsThreshold(Component):

@@ -60,6 +60,14 @@ def test_sigterm_ends_a_component_cleanly(host: Host) -> None:
     assert child.exit_code() == ExitCode.ORPHAN
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of Unix")
+def test_sigterm_right_before_a_wait_ends_it(host: Host) -> None:
+    child = host(part("SignalledElsewhere"))
+    child.expect("start")
+    child.expect("end")
+    assert child.exit_code() == ExitCode.ORPHAN
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="asking for another's limits")
 def test_a_process_may_have_as_many_connections_as_the_system_allows(host: Host) -> None:
     import resource

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 
 END_WITHIN_S = 1.5
 TIP_WITHIN_S = 14.0  # time to withdraw the tip: the controller may answer slowly, or need a new connection
@@ -48,6 +50,30 @@ def read_launch_line(pipe: int) -> bytes:
     while (chunk := os.read(pipe, _CHUNK)) and b"\n" not in chunk:
         line += chunk
     return bytes(line + chunk).partition(b"\n")[0]
+
+
+def call_at_signal(number: int, callback: Callable[[], object]) -> None:
+    """Call a function in another thread at each signal of this number. To be called in the main thread, once.
+
+    Python runs a handler between two of its own instructions. A signal that comes right before a wait in C would be
+    noticed when the wait ends, perhaps never, and a handler that starts a thread hangs if the main thread is starting
+    one. The descriptor is written to at once.
+    """
+    reader, writer = socket.socketpair()
+    writer.settimeout(0)
+
+    def tell(*_: object) -> None:  # again, if a library has replaced the descriptor
+        with suppress(OSError):
+            writer.send(bytes([number]))
+
+    def listen() -> None:
+        while heard := reader.recv(_CHUNK):
+            if number in heard:
+                callback()
+
+    threading.Thread(target=listen, name="signals", daemon=True).start()
+    signal.signal(number, tell)
+    signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
 
 
 class StopRequested(BaseException):
@@ -99,18 +125,7 @@ class ParentWatch:
         self._tip_in_danger = whether
 
     def let_go(self) -> None:
-        """Behave as if the parent had gone. May be called from a signal handler."""
-        threading.Thread(target=self._went, name="let-go", daemon=True).start()
-
-    def _watch(self) -> None:
-        try:
-            while os.read(self._pipe, _CHUNK):
-                pass  # the parent writes nothing after the launch line
-        except OSError:
-            pass
-        self._went()
-
-    def _went(self) -> None:
+        """Behave as if the parent had gone."""
         with self._lock:
             if self.gone:
                 return
@@ -119,6 +134,14 @@ class ParentWatch:
         end_within(TIP_WITHIN_S if self._tip_in_danger() else END_WITHIN_S, self._code)
         for callback in callbacks:
             callback()
+
+    def _watch(self) -> None:
+        try:
+            while os.read(self._pipe, _CHUNK):
+                pass  # the parent writes nothing after the launch line
+        except OSError:
+            pass
+        self.let_go()
 
 
 def end_within(seconds: float, code: int) -> None:
