@@ -65,6 +65,7 @@ class Peer:
         for prefix in (b"", b"ScanLines"):  # by the first a plain socket means what version 1 has
             self._packets.subscribe(prefix)
         self._packets.connect(publish)
+        self._newest_ns: dict[bytes, int] = {}
         for each in (self._request, self._packets):
             each.setsockopt(zmq.LINGER, 0)
             each.setsockopt(zmq.RCVTIMEO, int(DEADLINE_S * 1000))
@@ -103,9 +104,14 @@ class Peer:
         return bool(self._packets.poll(round(1000.0 * within_s)))
 
     def next(self) -> Any:
-        """Return the next published packet."""
-        envelope, payload, *_ = self._packets.recv_multipart()
-        return wire.decode(envelope.decode(), payload)
+        """Return the next published packet; one that a replay repeats, or that is older than what came, is skipped."""
+        while True:
+            envelope, payload, stamp = self._packets.recv_multipart()
+            time_ns = wire.frames.decode_time(stamp)
+            # a plain socket that has just joined gets what is kept after what is published meanwhile
+            if time_ns > self._newest_ns.get(envelope, 0):
+                self._newest_ns[envelope] = time_ns
+                return wire.decode(envelope.decode(), payload)
 
     def until(self, wanted: Callable[[Any], bool] | ScopeState) -> list[Any]:
         """Return all published packets up to the first wanted one."""
