@@ -9,11 +9,11 @@ from afspm.model import ActByHand, MeasurementConditions, Parameter, Request, Ti
 from afspm.translator.driver_base import DriverBase
 from afspm.translator.judge import Claim, ResultVerdict, Stated, Witness, judge
 from afspm.translator.parameters import FEEDBACK_ON, Value
-from afspm.translator.setting_groups import FRAME, POSITION
+from afspm.translator.setting_groups import FRAME, POSITION, frame
 from afspm.translator.state import Kept
 
 _PROVED_ELSEWHERE = frozenset((*FRAME, *POSITION, FEEDBACK_ON))
-"""The frame and the place are compared with the file, and the feedback with the wish of the run."""
+"""The frame and the place are compared with the result, and the feedback with the wish of the run."""
 
 
 class Claims:
@@ -60,11 +60,19 @@ class Claims:
             for name in own:
                 self._kept["running"]["values"].pop(name, None)
 
-    def asks(self, request: Request) -> None:
-        """Read the settings in force right before a measurement is asked for."""
+    def asks(self, request: Request, values: Mapping[str, Value]) -> None:
+        """Note the settings in force right before a measurement is asked for.
+
+        Args:
+            values: the settings just read.
+        """
         holder = request.id.partition("/")[0] or "a program without a name"
         coming = dict(self._kept["next"])
-        self._kept["asked"] = Claim(0, holder, values=coming, begin=self._read(coming)).kept()
+        claim = Claim(0, holder, values=coming, begin=self._read(coming))
+        if request.subject == names.START_SCAN and values.keys() >= {*FRAME} - {names.SCAN_ANGLE}:
+            region, shape = frame(values)
+            claim = replace(claim, frame=region, shape=shape)
+        self._kept["asked"] = claim.kept()
 
     def is_refused(self) -> None:
         """Note that the measurement asked for was not begun."""

@@ -127,7 +127,7 @@ class FolderFiles(ResultFiles):
         return read_result(path)
 
     def check(self, path: Path, one: Scan | Spectrum, measured: Entry) -> None:
-        """Check the first scan or spectrum of a new file; by default there is no check."""
+        """Look at the first scan or spectrum of a new file."""
 
     def _has_none_yet(self, running: Entry) -> None:
         # all files until now are of the scan before

@@ -12,16 +12,20 @@ A contradicted result is not complete. An unproved one is published, and says wh
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 from afspm.basics.clock import NS_PER_S
-from afspm.model import TipStatus
+from afspm.basics.formatting import area_text, position_text
+from afspm.model import Region, TipStatus
 from afspm.translator.parameters import Value
 
 RESOLUTION_NS: Final = 2 * NS_PER_S
 """Of times in files, which have whole seconds, with a margin."""
+_PART: Final = 1e-3
+"""Of the frame's larger side, and in rad: a reader gives the set frame for one that is equal within a file's digits."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,7 @@ class Claim:
         tip: at its begin; None: not read.
         values: the settings that the run has set for it, as read back then, in SI.
         begin: the same settings at its begin.
+        frame, shape: of a scan, right before it was asked for; None: not known.
     """
 
     began_ns: int
@@ -41,6 +46,8 @@ class Claim:
     tip: TipStatus | None = None
     values: Mapping[str, Value] = field(default_factory=dict)
     begin: Mapping[str, Value] = field(default_factory=dict)
+    frame: Region | None = None
+    shape: tuple[int, int] | None = None
 
     def kept(self) -> dict[str, Any]:
         tip = None if self.tip is None else [self.tip.engaged, self.tip.feedback_on]
@@ -50,12 +57,19 @@ class Claim:
             "tip": tip,
             "values": dict(self.values),
             "begin": dict(self.begin),
+            "frame": None if self.frame is None else [*self.frame.center_m, *self.frame.size_m, self.frame.angle_rad],
+            "shape": self.shape,
         }
 
     @classmethod
     def of(cls, kept: Mapping[str, Any]) -> Claim:
         tip = None if kept["tip"] is None else TipStatus(*kept["tip"])
-        return cls(kept["began_ns"], kept["holder"], tip, kept["values"], kept["begin"])
+        # a process of an earlier version kept no frame
+        x, y, width, height, angle_rad = kept.get("frame") or (math.nan,) * 5
+        frame = None if math.isnan(x) else Region((x, y), (width, height), angle_rad)
+        rows, columns = kept.get("shape") or (0, 0)
+        shape = (rows, columns) if rows else None
+        return cls(kept["began_ns"], kept["holder"], tip, kept["values"], kept["begin"], frame, shape)
 
 
 @dataclass(frozen=True)
@@ -65,6 +79,7 @@ class Stated:
     Attributes:
         began_ns, ended_ns: start and end by each file, in the clock of the files.
         earlier: the starts of earlier results in the same clock, each with the end of its measurement in ours.
+        frame, shape: of a scan; None: not known.
         pictures: the largest number of pictures of one channel.
         at_most_ns: the longest duration of the measurement by our clock; None: it can't be compared with the files.
         unproved: what these files could have shown and do not, in words.
@@ -73,6 +88,8 @@ class Stated:
     began_ns: tuple[int, ...] = ()
     ended_ns: tuple[int, ...] = ()
     earlier: Mapping[int, int] = field(default_factory=dict)
+    frame: Region | None = None
+    shape: tuple[int, int] | None = None
     pictures: int = 1
     at_most_ns: int | None = None
     unproved: tuple[str, ...] = ()
@@ -148,6 +165,27 @@ def _own_start(claim: Claim, witness: Witness, stated: Stated) -> str:
     return f"its file states a start {off_ns / NS_PER_S:.0f} s before it could have begun: it is of another measurement"
 
 
+def _own_frame(claim: Claim, witness: Witness, stated: Stated) -> str:
+    if claim.frame is None or stated.frame is None:
+        return ""
+    if claim.shape and stated.shape and claim.shape != stated.shape:
+        rows, columns = stated.shape
+        return (
+            f"it has {columns} x {rows} pixels, and {claim.shape[1]} x {claim.shape[0]} were set when it was asked for"
+        )
+    asked, had, slack_m = claim.frame, stated.frame, _PART * max(claim.frame.size_m)
+    sides = zip((*asked.center_m, *asked.size_m), (*had.center_m, *had.size_m), strict=True)
+    turn_rad = math.remainder(asked.angle_rad - had.angle_rad, math.tau)
+    if all(abs(a - b) <= slack_m for a, b in sides) and abs(turn_rad) <= _PART:
+        return ""
+    return f"its frame is {_frame_text(had)}, and {_frame_text(asked)} was set when it was asked for"
+
+
+def _frame_text(frame: Region) -> str:
+    turned = f" at {math.degrees(frame.angle_rad):.5g}°" if frame.angle_rad else ""
+    return f"{area_text(frame.size_m)} around {position_text(frame.center_m)}{turned}"
+
+
 def _tip_at_sample(claim: Claim, witness: Witness, stated: Stated) -> str:
     was, is_now = claim.tip, witness.tip
     withdrawn = was is not None and is_now is not None and was.engaged is True and is_now.engaged is False
@@ -164,6 +202,7 @@ RULES: Mapping[str, Callable[[Claim, Witness, Stated], str]] = {
     "new start": _new_start,
     "end after start": _end_after_start,
     "own start": _own_start,
+    "own frame": _own_frame,
     "tip at the sample": _tip_at_sample,
     "values in force": _values_in_force,
 }

@@ -42,8 +42,11 @@ from afspm.translator.temporary_settings import TemporarySettings
 from afspm.translator.wished_feedback import FeedbackLevel, WishedFeedback
 from afspm.transport.port import ServerPort
 
+_TIP = (names.ENGAGED, FEEDBACK_ON)
 _AGAIN_S = 0.1
 """Real time until the feedback is read again, once it was found off though on is wished."""
+_SELDOM_S = 1.0
+"""Real time: the longest one without a reading of all settings, in a series of short measurements."""
 _ROUNDING_S = 1e-5
 """More than the rounding of an experiment time, which has 16 digits since 1970."""
 
@@ -87,7 +90,7 @@ class Observer:
         self._acts: list[ActByHand] = []
         self._others_told = False
         self._polled_for = ScopeState.UNDEFINED
-        self._all_at_s = 0.0
+        self._all_at_s = self._all_read_s = 0.0
         self._result_since_s: float | None = None
         self._replayed = False
         self._overdue = OverdueScan()
@@ -205,7 +208,7 @@ class Observer:
         gives_back = self._is_after_spectrum and status.state is ScopeState.FREE
         if is_over or gives_back:
             # after the state: the tip may have been withdrawn between the reading of the values and the end
-            if self._tip_has_changed():
+            if self._has_changed(*_TIP):
                 self._observe_values(())
             values = True
         if values:
@@ -224,7 +227,8 @@ class Observer:
             is_whole = True if self._is_of_earlier_scan(status, results) else self._driver.followed()
             steps = [] if is_whole is None else self._state.sequence.follow(is_whole=is_whole)
             is_followed = bool(steps)
-            steps += sequence.observe(status, results and not steps, self._clock.now_s())
+            of_another = not self._outbox.is_of(was.state)
+            steps += sequence.observe(status, results and not steps, self._clock.now_s(), of_another=of_another)
             self._tell(self._acts_shown_by(steps, was, is_requested=is_requested))
             self.play(self._without_spoiled(steps, is_at_end=not is_followed))
             if is_over and sequence.published.state not in MEASURING:
@@ -270,12 +274,13 @@ class Observer:
 
     def look_before_start(self, request: Request) -> None:
         """Publish all changes, and what a person has just done to the tip, before a measurement is begun."""
-        before, is_changed = self.values, self._tip_has_changed()
+        frame = setting_groups.FRAME if request.subject == names.START_SCAN else ()
+        before, is_changed = self.values, self._has_changed(*_TIP, *frame)
         self.observe(values=is_changed)
         if not is_changed:  # the same reading again is a second one
             acts = self.panel.read(before, self.values, self._state.sequence.published.state, self._clock.now_ns())
             self._tell(acts)
-        self.claims.asks(request)
+        self.claims.asks(request, self.values)
 
     def _judge_feedback(self) -> None:
         # of a measurement of the run: what a person measures by hand is his own
@@ -307,7 +312,8 @@ class Observer:
             acts += [ActByHand(now_ns, PanelAct.STOP, evidence)] if evidence else []
         if is_requested and states[0].paused and not was.paused:
             acts.append(ActByHand(now_ns, PanelAct.PAUSE))
-        begun = next((one.state for one in states if one.state in MEASURING and was.state is ScopeState.FREE), None)
+        others = MEASURING - {was.state} if was.state in (ScopeState.FREE, *MEASURING) else ()
+        begun = next((one.state for one in states if one.state in others), None)
         if begun is not None and not self._others_told:
             self._others_told = True  # a panel that repeats scans would tell each
             acts.append(ActByHand(now_ns, PanelAct.SCAN if begun is ScopeState.SCANNING else PanelAct.SPECTRUM))
@@ -373,9 +379,10 @@ class Observer:
             self._published_last[kind] = thing
             self._port.publish(*wire.encode(thing), self._state.stamp()[0])
 
-    def _tip_has_changed(self) -> bool:
-        shown = [name for name in (names.ENGAGED, FEEDBACK_ON) if name in self._driver.table]
-        return any(self.values.get(name) != value for name, value in self._driver.in_force(shown).items())
+    def _has_changed(self, *shown: str) -> bool:
+        table, old = self._driver.table, self.values
+        values = self._driver.in_force([name for name in shown if name in table])
+        return any(name not in old or not table[name].same(old[name], value) for name, value in values.items())
 
     def _conditions(self, time_ns: int, filename: str) -> MeasurementConditions:
         return self.claims.conditions(time_ns, filename, self._acts, self._unproved)
@@ -459,6 +466,7 @@ class Observer:
         self._plan_reading()
 
     def _plan_reading(self) -> None:
+        self._all_read_s = self._clock.monotonic_s()
         wait_s, next_s = self._driver.common.poll_period_s, self._driver.next_change_s()
         if self.panel.feedback.is_in_question:
             wait_s = min(wait_s, _AGAIN_S)
@@ -504,7 +512,9 @@ class Observer:
             self._polling.ended(now_s, as_expected=state is ScopeState.FREE and before in MEASURING)
             if before in MEASURING:
                 # the next scan is asked for at once, and would wait for a dozen questions about values
-                self._all_at_s = max(self._all_at_s, now_s + self._driver.common.poll_period_s)
+                period_s = self._driver.common.poll_period_s
+                latest_s = self._all_read_s + max(_SELDOM_S, period_s)
+                self._all_at_s = min(max(self._all_at_s, now_s + period_s), latest_s)
         else:
             self._polling.moved(now_s)
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.plain_data import Plain
-from afspm.model import MeasurementConditions, Scan, Spectrum
+from afspm.model import MeasurementConditions, Scan, ScopeState, Spectrum
 from afspm.translator.driver_base import DriverBase
 from afspm.translator.judge import Stated
 from afspm.wire import encode
@@ -31,9 +31,10 @@ class Outgoing(NamedTuple):
 
 
 class _Loaded(NamedTuple):
-    """A result as messages, with the time and the file of its measurement."""
+    """A result as messages, with the kind, the time and the file of its measurement."""
 
     messages: list[tuple[str, bytes]]
+    kind: ScopeState
     time_ns: int | None
     filename: str
 
@@ -95,6 +96,10 @@ class Outbox:
                 self._read[result] = loaded
         return bool(self._read)
 
+    def is_of(self, state: ScopeState) -> bool:
+        """Return whether a new result is of the measurement of this state: a scan, or a spectrum."""
+        return any(loaded.kind is state for loaded in self._read.values())
+
     def stated(self) -> list[Stated]:
         """Return what the new results say of their measurements."""
         return [self._microscope.stated(result) for result in self._read]
@@ -131,7 +136,8 @@ class Outbox:
                 self._log.warning("%s has no value in %s: NaN alone", result, ", ".join(blank))
             first_ns = next((one.time_ns for one in found if one.time_ns is not None), None)
             filename = next((one.filename for one in found if one.filename), result)
-            return _Loaded([encode(one) for one in found], first_ns, filename)
+            kind = ScopeState.SCANNING if any(isinstance(one, Scan) for one in found) else ScopeState.SPEC
+            return _Loaded([encode(one) for one in found], kind, first_ns, filename)
         except Exception as error:  # a reader may raise anything; a bad file must not end the process
             if result not in self._complained:
                 why = error if isinstance(error, AfspmError | OSError) else f"{type(error).__name__}: {error}"

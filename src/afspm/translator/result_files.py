@@ -141,7 +141,10 @@ class ResultFiles(ABC):
         began_ns, ended_ns = entry.get("stated", ((), ()))
         earlier = {start_ns: end_ns for start_ns, end_ns, of in self._kept["started"] if of != result}
         unproved, most_ns = tuple(entry.get("unproved", ())), entry.get("at_most_ns")
-        return Stated(tuple(began_ns), tuple(ended_ns), earlier, entry.get("pictures", 1), most_ns, unproved)
+        frame = as_region(entry["region"]) if "region" in entry else None
+        shape = tuple(entry["pixels"]) if "pixels" in entry else None
+        times = tuple(began_ns), tuple(ended_ns), earlier
+        return Stated(*times, frame, shape, entry.get("pictures", 1), most_ns, unproved)
 
     def _add(
         self,
@@ -157,6 +160,8 @@ class ResultFiles(ABC):
         stated = [began_ns, [one.end_ns for one in files if one.end_ns is not None]]
         taken: Entry = {key: measured[key] for key in _OF_A_RESULT if key in measured}
         entry: Entry = {"result": result} | taken | dict(facts) | {"stated": stated}
+        if scan := next((one for one in content if isinstance(one, Scan)), None):
+            entry |= {"region": as_list(scan.region), "pixels": list(scan.shape)}
         self._kept["results"] = [*self._kept["results"], entry][-_LISTED:]
         started = [[start_ns, measured["end_ns"], result] for start_ns in {*began_ns}]
         self._kept["started"] = [*self._kept["started"], *started][-_MOST_STARTS:]

@@ -82,13 +82,16 @@ class StatusSequence:
             return [PublishResults(), *self._publish(free)]
         return [*self._publish(_INTERRUPTED), DiscardResults(), *self._publish(free)]
 
-    def observe(self, seen: ScopeStatus, results: bool, now_s: float) -> list[SequenceStep]:
+    def observe(
+        self, seen: ScopeStatus, results: bool, now_s: float, *, of_another: bool = False
+    ) -> list[SequenceStep]:
         """Return the steps that follow from the status just read from the controller.
 
         Args:
             seen: the status of the controller.
             results: whether there are unpublished results.
             now_s: experiment time.
+            of_another: whether none of the results is of the kind of the published measurement.
         """
         if self.published.state is ScopeState.INTERRUPTED:
             return self._after_interruption(seen, now_s)
@@ -98,6 +101,8 @@ class StatusSequence:
         if self.published.state not in MEASURING or seen.state is self.published.state:
             # results that are there already belong to a measurement that began and ended between two looks
             return (self._unseen_scan(results) if seen.state is ScopeState.FREE else []) + self._publish(seen)
+        if results and of_another:
+            return self._replaced(seen)
         return self._after_measuring(seen, results, now_s)
 
     def _unseen_scan(self, results: bool) -> list[SequenceStep]:
@@ -116,6 +121,13 @@ class StatusSequence:
             return []
         text = "a scan or spectrum ended without a result: it was stopped at the controller, or its file is missing"
         return [LogError(text), *self._publish(_INTERRUPTED), DiscardResults(), *self._publish(seen)]
+
+    def _replaced(self, seen: ScopeStatus) -> list[SequenceStep]:
+        # a person at the panel stopped a curve, and took a scan at once (or the reverse)
+        another = ScopeState.SCANNING if self.published.state is ScopeState.SPEC else ScopeState.SPEC
+        states = (_INTERRUPTED, ScopeStatus(ScopeState.FREE), ScopeStatus(another))
+        steps = [step for status in states for step in self._publish(status)]
+        return [*steps, PublishResults(), *self._publish(seen)]
 
     def _after_interruption(self, seen: ScopeStatus, now_s: float) -> list[SequenceStep]:
         if seen.state is ScopeState.INTERRUPTED:

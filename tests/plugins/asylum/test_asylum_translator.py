@@ -196,15 +196,17 @@ def test_scan_that_outlives_the_translator_is_published_by_the_next(bench: Make)
     assert {Path(scan.filename).name for scan in scans} == {"Image0001.ibw"}
 
 
-def test_frame_changed_by_asylum_is_logged(bench: Make) -> None:
+def test_scan_of_another_frame_than_the_set_one_is_not_complete(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
     # as if the ratios meant something else: what its panels say, and what it scans
     made.at_panel(lambda emulator: emulator.controller.values.put("FastRatio", 1.0))
-    scan = scanned(peer)["HeightTrace"]
-    assert scan.region.size_m[1] > 2 * TURNED.size_m[1]
-    made.until_logged("has the frame 300 x 300 nm at (40, -25) nm, 30° instead of 300 x 100 nm at (40, -25) nm, 30°")
+    assert peer.act(names.START_SCAN).ok
+    assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
+    made.until_logged(
+        "its frame is 300 x 300 nm around (40, -25) nm at 30°, and 300 x 100 nm around (40, -25) nm at 30°"
+    )
 
 
 # --- parameters ---

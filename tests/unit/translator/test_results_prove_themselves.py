@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 from typing import Any
 
 import numpy as np
@@ -15,10 +17,13 @@ from afspm.model import (
     MeasurementConditions,
     PanelAct,
     Parameter,
+    Region,
     ScopeState,
     Spectrum,
+    TipStatus,
     names,
 )
+from afspm.translator import judge as judging
 from afspm.translator.judge import RULES, Claim, Stated, Witness, judge
 
 OK, NOT_FREE = ControlResponse.SUCCESS, ControlResponse.NOT_FREE
@@ -210,18 +215,35 @@ def test_scan_at_constant_height_with_the_feedback_found_on_is_not_complete(benc
 S = 1_000_000_000
 
 
+OF = Region((0.0, 0.0), (1e-7, 1e-7), 0.5)
+CLAIM = Claim(100 * S, "series", TipStatus(True, True), {"bias": 1.0}, frame=OF, shape=(32, 64))
+AWAY = Region((2e-10, 0.0), (1e-7, 1e-7), 0.5)
+TURNED = Region((0.0, 0.0), (1e-7, 1e-7), 0.502)
+NEAR = Region((5e-11, 0.0), (1e-7, 1e-7), 0.5 + math.tau)
+
+
+@pytest.mark.parametrize("without", [False, True])
 @pytest.mark.parametrize(
-    ("rule", "stated"),
+    ("rule", "stated", "witness"),
     [
-        ("one start", Stated((10 * S, 40 * S))),
-        ("new start", Stated((10 * S,), earlier={10 * S: 20 * S})),
-        ("end after start", Stated((10 * S,), (5 * S,))),
-        ("one picture", Stated((10 * S,), (30 * S,), pictures=2)),
-        ("own start", Stated((10 * S,), (30 * S,), at_most_ns=6 * S)),
-        ("", Stated((10 * S, 10 * S), (30 * S,), {5 * S: 20 * S}, at_most_ns=19 * S)),
-        ("", Stated((10 * S, 10 * S), (10 * S,), {10 * S: 99 * S})),  # short scans of one second
+        ("one start", Stated((10 * S, 40 * S)), Witness()),
+        ("new start", Stated((10 * S,), earlier={10 * S: 20 * S}), Witness()),
+        ("end after start", Stated((10 * S,), (5 * S,)), Witness()),
+        ("one picture", Stated((10 * S,), (30 * S,), pictures=2), Witness()),
+        ("own start", Stated((10 * S,), (30 * S,), at_most_ns=6 * S), Witness()),
+        ("own frame", Stated(frame=AWAY, shape=(32, 64)), Witness()),
+        ("own frame", Stated(frame=TURNED, shape=(32, 64)), Witness()),
+        ("own frame", Stated(frame=OF, shape=(64, 64)), Witness()),
+        ("tip at the sample", Stated(), Witness(TipStatus(False, True))),
+        ("values in force", Stated(), Witness(TipStatus(True, True), {"bias": "bias was 2 V at its end"})),
+        ("", Stated((10 * S, 10 * S), (30 * S,), {5 * S: 20 * S}, NEAR, (32, 64), at_most_ns=19 * S), Witness()),
+        ("", Stated((10 * S, 10 * S), (10 * S,), {10 * S: 99 * S}), Witness()),  # short scans of one second
     ],
 )
-def test_file_that_does_not_prove_itself_is_no_result(rule: str, stated: Stated) -> None:
-    assert judge(Claim(100 * S, "series"), Witness(), stated).rule == rule
+def test_result_that_does_not_prove_itself_is_none(
+    rule: str, stated: Stated, witness: Witness, monkeypatch: pytest.MonkeyPatch, *, without: bool
+) -> None:
     assert rule in {"", *RULES}
+    if without:  # no other rule would find it
+        monkeypatch.setattr(judging, "RULES", {name: one for name, one in RULES.items() if name != rule})
+    assert judge(Claim.of(json.loads(json.dumps(CLAIM.kept()))), witness, stated).rule == ("" if without else rule)

@@ -10,7 +10,7 @@ from afspm.translator.driver_base import MEASURING
 from afspm.translator.sequence import DiscardResults, LogError, PublishResults, PublishStatus, StatusSequence
 
 SEEN = [state for state in ScopeState if state is not ScopeState.UNDEFINED]
-LOOKS = st.tuples(st.sampled_from(SEEN), st.booleans(), st.floats(0.0, 20.0))
+LOOKS = st.tuples(st.sampled_from(SEEN), st.booleans(), st.floats(0.0, 20.0), st.booleans())
 ASKED = st.one_of(st.just("stop"), st.sampled_from([ScopeState.SCANNING, ScopeState.SPEC, ScopeState.MOVING]))
 
 
@@ -21,9 +21,9 @@ def test_a_measurement_ends_with_its_results_or_as_interrupted_and_with_nothing_
     delivered = False
     for event in events:
         if isinstance(event, tuple):
-            state, results, after_s = event
+            state, results, after_s, of_another = event
             now_s += after_s
-            steps = sequence.observe(ScopeStatus(state), results, now_s)
+            steps = sequence.observe(ScopeStatus(state), results, now_s, of_another=of_another)
         elif event == "stop":
             steps = sequence.interrupt() if said in MEASURING else []
         else:
@@ -44,12 +44,12 @@ def test_a_measurement_ends_with_its_results_or_as_interrupted_and_with_nothing_
 
 
 @given(st.lists(LOOKS, max_size=20))
-def test_controller_at_rest_is_published_as_free(looks: list[tuple[ScopeState, bool, float]]) -> None:
+def test_controller_at_rest_is_published_as_free(looks: list[tuple[ScopeState, bool, float, bool]]) -> None:
     sequence = StatusSequence(ScopeStatus(ScopeState.UNDEFINED), result_timeout_s=10.0)
     now_s = 0.0
-    for state, results, after_s in looks:
+    for state, results, after_s, of_another in looks:
         now_s += after_s
-        sequence.observe(ScopeStatus(state), results, now_s)
+        sequence.observe(ScopeStatus(state), results, now_s, of_another=of_another)
     for _ in range(3):
         now_s += 11.0
         sequence.observe(ScopeStatus(ScopeState.FREE), False, now_s)
@@ -69,6 +69,15 @@ def test_measurement_begun_at_the_panel_after_an_interruption_is_published_separ
     assert sequence.observe(broken_off, False, 1.0) == [PublishStatus(broken_off)]
     assert sequence.observe(ScopeStatus(ScopeState.SPEC), False, 2.0) == [], "it has not stopped yet"
     assert sequence.observe(scanning, False, 3.0) == [DiscardResults(), PublishStatus(scanning)]
+
+
+def test_scan_begun_at_the_panel_after_a_stopped_curve_is_not_its_result() -> None:
+    # results M2: the curve ended with the pictures of a scan
+    sequence, seen = StatusSequence(ScopeStatus(ScopeState.SPEC), result_timeout_s=10.0), []
+    for status in (ScopeStatus(ScopeState.SCANNING), ScopeStatus(ScopeState.FREE)):
+        steps = sequence.observe(status, status.state is ScopeState.FREE, 1.0, of_another=True)
+        seen += [step.status.state.name if isinstance(step, PublishStatus) else type(step).__name__ for step in steps]
+    assert seen == ["INTERRUPTED", "FREE", "SCANNING", "PublishResults", "FREE"]
 
 
 def test_measurement_followed_at_once_by_another_is_published_separately() -> None:

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
 from typing import Final
 
-from afspm.basics import ConfigError, PlainMapping, area_text, position_text
-from afspm.driver import Entry, FilePrecision, FolderFiles, as_region, modified_ns
-from afspm.model import Region, Scan, Spectrum
+from afspm.basics import ConfigError, PlainMapping
+from afspm.driver import Entry, FilePrecision, FolderFiles, modified_ns
 
 _NUMBERED: Final = re.compile(r".*\d{4}\.ibw", re.IGNORECASE)
 
@@ -59,16 +58,6 @@ class AsylumFiles(FolderFiles):
         self._kept["taken"] += 1
         return f"{self._kept['taken']}: {path.name}"
 
-    def check(self, path: Path, one: Scan | Spectrum, measured: Entry) -> None:
-        """Log a warning if the file's frame differs from the set frame beyond `precision`; the file's frame is kept."""
-        if isinstance(one, Scan) and one.region != (wanted := as_region(measured["frame"])):
-            self._log.warning(
-                "%s has the frame %s instead of %s, which was set; it is published with the file's frame",
-                path.name,
-                _frame_text(one.region),
-                _frame_text(wanted),
-            )
-
     def _has_none_yet(self, running: Entry) -> None:
         if modified_ns(_target(running).path) not in (0, running["there_ns"]):
             # Asylum had not saved the scan before, and not counted on, when this scan began
@@ -90,10 +79,6 @@ class AsylumFiles(FolderFiles):
 
     def _files(self, folder: Path) -> list[Path]:
         return _numbered(folder)
-
-
-def _frame_text(region: Region) -> str:
-    return f"{area_text(region.size_m)} at {position_text(region.center_m)}, {math.degrees(region.angle_rad):.5g}°"
 
 
 def free_suffix(folder: Path, base: str) -> int:
