@@ -54,7 +54,7 @@ if TYPE_CHECKING:  # one maker's controller has it today, and another's may
     from afspm.translator.driver_base import LOST, Introduction
     from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
     from afspm.translator.parameters import ParameterSpec, ParameterTable, refuse_value
-    from afspm.translator.result_files import NEW_FRAME, missing_text, newest
+    from afspm.translator.result_files import missing_text, newest
     from afspm.translator.setting_groups import CENTER
     from afspm.translator.trace import TCP, TRACE
 
@@ -64,7 +64,6 @@ __all__ = [
     "FEEDBACK_ON",
     "FRAME",
     "LOST",
-    "NEW_FRAME",
     "POSITION",
     "SCAN",
     "TCP",

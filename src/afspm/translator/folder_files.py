@@ -11,7 +11,6 @@ from afspm.basics.plain_data import PlainMapping
 from afspm.model import Scan, Spectrum
 from afspm.storage.formats import FileContent
 from afspm.translator.result_files import (
-    NEW_FRAME,
     SCAN,
     Content,
     Entry,
@@ -153,10 +152,6 @@ class FolderFiles(ResultFiles):
             return False
         if missing := missing_text(content):  # the controller saved an interrupted scan
             self.broken_off, self.missing = True, missing
-            return True
-        if measured.get("new_frame"):
-            self._log.error("%s is not published: %s", paths[0].name, NEW_FRAME)
-            self.broken_off = True
             return True
         self.check(paths[0], content[0], measured)
         self.newest_ns(Path(measured["folder"]), paths)

@@ -80,6 +80,7 @@ class Stated:
         began_ns, ended_ns: start and end by each file, in the clock of the files.
         earlier: the starts of earlier results in the same clock, each with the end of its measurement in ours.
         frame, shape: of a scan; None: not known.
+        disturbed: what was done to the measurement while it ran, in words; empty: nothing.
         pictures: the largest number of pictures of one channel.
         at_most_ns: the longest duration of the measurement by our clock; None: it can't be compared with the files.
         unproved: what these files could have shown and do not, in words.
@@ -90,6 +91,7 @@ class Stated:
     earlier: Mapping[int, int] = field(default_factory=dict)
     frame: Region | None = None
     shape: tuple[int, int] | None = None
+    disturbed: str = ""
     pictures: int = 1
     at_most_ns: int | None = None
     unproved: tuple[str, ...] = ()
@@ -165,6 +167,10 @@ def _own_start(claim: Claim, witness: Witness, stated: Stated) -> str:
     return f"its file states a start {off_ns / NS_PER_S:.0f} s before it could have begun: it is of another measurement"
 
 
+def _undisturbed(claim: Claim, witness: Witness, stated: Stated) -> str:
+    return stated.disturbed
+
+
 def _own_frame(claim: Claim, witness: Witness, stated: Stated) -> str:
     if claim.frame is None or stated.frame is None:
         return ""
@@ -203,6 +209,7 @@ RULES: Mapping[str, Callable[[Claim, Witness, Stated], str]] = {
     "end after start": _end_after_start,
     "own start": _own_start,
     "own frame": _own_frame,
+    "undisturbed": _undisturbed,
     "tip at the sample": _tip_at_sample,
     "values in force": _values_in_force,
 }

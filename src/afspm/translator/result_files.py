@@ -24,9 +24,9 @@ from afspm.translator.trace import TRACE
 
 SCAN: Final = "scan"
 """The kind of a scan; a spectrum has the name of its own kind."""
-NEW_FRAME: Final = "its frame was changed at the panel while it ran"
+_NEW_FRAME: Final = "its frame was changed at the panel while it ran"
 _LISTED: Final = 16
-_OF_A_RESULT: Final = ("what", "frame", "position", "end_ns")
+_OF_A_RESULT: Final = ("what", "frame", "position", "end_ns", "new_frame")
 _MOST_STARTS: Final = 500
 
 Content = Sequence[Scan | Spectrum]
@@ -85,7 +85,7 @@ class ResultFiles(ABC):
     def see_frame(self, region: Region) -> None:
         """Register the frame in force during a scan, for a controller that may move the running scan to a new frame.
 
-        A scan during which the frame was changed ("new_frame") has no result.
+        A scan during which the frame was changed ("new_frame") is not complete.
         """
         running = self._kept["running"]
         if running is None or running["what"] != SCAN:
@@ -144,7 +144,8 @@ class ResultFiles(ABC):
         frame = as_region(entry["region"]) if "region" in entry else None
         shape = tuple(entry["pixels"]) if "pixels" in entry else None
         times = tuple(began_ns), tuple(ended_ns), earlier
-        return Stated(*times, frame, shape, entry.get("pictures", 1), most_ns, unproved)
+        disturbed = _NEW_FRAME if entry.get("new_frame") else ""
+        return Stated(*times, frame, shape, disturbed, entry.get("pictures", 1), most_ns, unproved)
 
     def _add(
         self,

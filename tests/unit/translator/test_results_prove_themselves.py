@@ -234,6 +234,7 @@ NEAR = Region((5e-11, 0.0), (1e-7, 1e-7), 0.5 + math.tau)
         ("own frame", Stated(frame=AWAY, shape=(32, 64)), Witness()),
         ("own frame", Stated(frame=TURNED, shape=(32, 64)), Witness()),
         ("own frame", Stated(frame=OF, shape=(64, 64)), Witness()),
+        ("undisturbed", Stated(disturbed="its frame was changed"), Witness()),
         ("tip at the sample", Stated(), Witness(TipStatus(False, True))),
         ("values in force", Stated(), Witness(TipStatus(True, True), {"bias": "bias was 2 V at its end"})),
         ("", Stated((10 * S, 10 * S), (30 * S,), {5 * S: 20 * S}, NEAR, (32, 64), at_most_ns=19 * S), Witness()),

@@ -12,7 +12,6 @@ import numpy as np
 from afspm.basics import AfspmError, FileError
 from afspm.driver import (
     LOST,
-    NEW_FRAME,
     SCAN,
     Content,
     Entry,
@@ -163,11 +162,7 @@ class NanonisFiles(ResultFiles):
         elif ended is not None:
             file = self._file(ended)
             if file is not None and (content := self._whole(file)) is not None:
-                if ended.get("new_frame"):
-                    self._log.error("%s is not published: %s", file, NEW_FRAME)
-                    self._kept["ended"], self.broken_off = None, True
-                else:
-                    self._take(file, ended, content)
+                self._take(file, ended, content)
             elif now_s >= ended["fetch_at_s"]:
                 self._kept["ended"] = None
                 self._fetch(fetch, ended, file)
@@ -190,8 +185,6 @@ class NanonisFiles(ResultFiles):
             if missing := missing_text(content) or _points_missing(content):
                 self.missing = missing
                 raise FileError(missing)
-            if ended.get("new_frame"):
-                raise FileError(NEW_FRAME)
         except LOST:
             self._kept["ended"] = dict(ended)  # to fetch after the next connection
             raise
@@ -212,10 +205,7 @@ class NanonisFiles(ResultFiles):
 
     def _take_followed(self, followed: Entry, now_s: float) -> None:
         file = self._file(followed)
-        if followed.get("new_frame"):
-            self._kept["followed"] = None
-            self._log.error("the scan before the present one is not published: %s", NEW_FRAME)
-        elif file is not None and (content := self._whole(file)) is not None:
+        if file is not None and (content := self._whole(file)) is not None:
             self._add(str(file), followed, {}, _as_set(content, followed), [content])
             self._kept["followed"], self._has_followed = None, True
         elif now_s >= followed["fetch_at_s"]:

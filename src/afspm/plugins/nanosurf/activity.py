@@ -170,11 +170,6 @@ class StudioActivity(Activity):
         running = self._files.running
         if running is not None and running["what"] == SCAN:
             self._by_hand = self._why_by_hand(running)
-            if self.is_moved:
-                self._log.error("the scan has no result: %s", _MOVED)
-                self._failed = True
-                self.forget()
-                return
         self._files.end(self._clock.now_ns())
 
     def _why_by_hand(self, running: Entry) -> str:
