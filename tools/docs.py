@@ -6,6 +6,7 @@ In a page, what stands between `<!-- from the code: NAME -->` and `<!-- end -->`
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import inspect
 import re
 import sys
@@ -40,6 +41,7 @@ from afspm.simulation.surfaces import KINDS
 from afspm.simulation.world import WorldSettings
 from afspm.testing.commissioning.report import TRIED_ON, InstrumentReport
 from afspm.testing.commissioning.steps import OPERATIONS
+from afspm.translator.judge import WITNESSES
 
 ROOT = Path(__file__).resolve().parents[1]
 SET_BY_AFSPM = ("unit", "source")  # of a limit: no keys of the file
@@ -99,6 +101,18 @@ def channels() -> str:
         cells = [", ".join(of.names.get(role, ())) for of in every.values()]
         lines.append("| " + " | ".join([role, *cells]) + " |")
     return "\n".join(lines) + "\n"
+
+
+def witnesses() -> str:
+    """The table of what proves a result: by maker each witness, or the reason why the controller never shows it."""
+    drivers = [entry_points.load(entry_points.DRIVERS, name) for name in [*quality.drivers(), "Simulator"]]
+    sys.path.append(str(ROOT / "packages/afspm-nion/src"))
+    drivers.append(importlib.import_module("afspm_nion").Nion)
+    if silent := [one.__name__ for one in drivers if one.never_shows is None]:
+        sys.exit(f"{', '.join(silent)}: has no `never_shows`; name each of WITNESSES that the controller never shows")
+    lacking = [one.without_witness({}) for one in drivers]
+    rows = [(witness, *(one.get(witness, "yes") for one in lacking)) for witness in WITNESSES]
+    return _markdown(("witness", *(f"`{one.__name__}`" for one in drivers)), rows)
 
 
 def matrix() -> str:
@@ -351,6 +365,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "instruments": instruments,
     "controllers": controllers,
     "channels": channels,
+    "witnesses": witnesses,
     "matrix": matrix,
     "quality": quality.scale_tables,
     "quality-rules": quality.rules_table,

@@ -11,6 +11,7 @@ from afspm.basics.errors import FileError
 from afspm.testing.commissioning.progress import outcome_of
 from afspm.testing.commissioning.report import InstrumentReport
 from afspm.testing.commissioning.steps import OPERATIONS
+from afspm.translator.judge import WITNESSES
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "reference" / "instruments.md"
@@ -43,3 +44,14 @@ def test_malformed_report_is_refused(change: tuple[str, str], tmp_path: Path) ->
     file.write_text(REPORTS[0].read_text(encoding="utf-8").replace(*change), encoding="utf-8")
     with pytest.raises(FileError, match="not a commissioning report"):
         InstrumentReport.read(file)
+
+
+def test_each_maker_shows_a_witness_or_says_why_not() -> None:
+    page = PAGE.with_name("what-proves-a-result.md").read_text(encoding="utf-8").partition("| witness | `Asylum`")[2]
+    rows = [[cell.strip() for cell in row.strip("|").split("|")] for row in page.splitlines() if row.startswith("| ")]
+    makers = ["Asylum", "Gxsm", "Nanonis", "Nanosurf", "Park", "Simulator"]
+    assert [name for name, *_ in rows[1:]] == list(WITNESSES)
+    assert all(cells.count("") == 0 and len(cells) >= 1 + len(makers) for cells in rows[1:])
+    known = {name for name, shown_by in WITNESSES.items() if not shown_by}
+    for maker in makers:  # a parameter is shown by the table, and not declared twice
+        assert entry_points.load(entry_points.DRIVERS, maker).never_shows.keys() <= known

@@ -19,7 +19,7 @@ from tests.plugins.by_hand import acts
 from tests.plugins.vendor_bench import TURNED, VendorBench, benches, ready, scanned, scans, small, states
 
 from afspm import read
-from afspm.basics import AfspmError
+from afspm.basics import AfspmError, load_plugin
 from afspm.driver import FileContent
 from afspm.model import ControlResponse, PanelAct, ScopeState, names
 
@@ -106,6 +106,7 @@ def until_file(maker: Maker, folder: Path, before: set[Path]) -> tuple[Path, Fil
 @each
 @pytest.mark.parametrize("dates_files", [False, True])
 def test_times_in_files_follow_the_clock_of_the_controller(maker: Maker, bench: Make, *, dates_files: bool) -> None:
+    driver = load_plugin("afspm.drivers", maker.name.capitalize())
     made = bench(speed=20.0, clock_off_s=-300.0, dates_files=dates_files)
     small(made)
     made.kill()  # only the emulated controller is tested here
@@ -116,6 +117,7 @@ def test_times_in_files_follow_the_clock_of_the_controller(maker: Maker, bench: 
         end_s = made.clock.now_s()
         times_ns = [one for one in (content.start_ns, content.end_ns) if one is not None]
         assert times_ns
+        assert (content.end_ns is None) == ("end in the file" in driver.never_shows)
         for time_ns in times_ns:  # in whole seconds
             assert begin_s - 1.0 <= time_ns * 1e-9 - off_s <= end_s + 1.0
         modified_s = file.stat().st_mtime - (off_s if dates_files else 0.0)

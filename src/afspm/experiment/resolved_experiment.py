@@ -116,6 +116,16 @@ class ResolvedExperiment:
         translators = self.with_role(Role.TRANSLATOR)
         return (_metadata_of_class(translators[0]) if translators else {}) | given
 
+    def never_shown(self) -> dict[str, str]:
+        """Return what the controller never shows of a measurement, with the reasons; empty if it is simulated."""
+        from afspm.translator.driver import Driver
+
+        for translator in self.with_role(Role.TRANSLATOR)[:1]:
+            kind = translator.component
+            if kind is not None and issubclass(kind, Driver) and not kind.simulated:
+                return kind.without_witness(translator.settings)
+        return {}
+
     def error(self, what: str, *path: str | int, hint: str = "") -> None:
         self.document.error(what, *path, hint=hint)
 

@@ -25,6 +25,7 @@ from afspm.record.run_json import (
     ENDED,
     FEEDBACK_OFF,
     METADATA,
+    NEVER_SHOWN,
     PLANNED,
     REAL_S,
     SOLVES,
@@ -148,6 +149,7 @@ def go(
             facts[FEEDBACK_OFF] = said
         facts |= own_runs.signed(folder, [*map(str, experiment.folders)])
         facts[METADATA] = before.get(METADATA) or experiment.resolved.metadata() | dict(options.metadata)
+        facts[NEVER_SHOWN] = experiment.resolved.never_shown()
         works = experiment.planned_work().items()
         facts[PLANNED] = before.get(PLANNED) or {name: work and work.as_dict() for name, work in works}
         if before.get(ENDED) and REAL_S in before:

@@ -16,7 +16,7 @@ from afspm.basics.errors import AfspmError, ConfigError, InvalidValue, Refused
 from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.basics.units import Duration, PollPeriod
 from afspm.model import ChannelRoles, ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
-from afspm.translator.judge import Stated
+from afspm.translator.judge import WITNESSES, Stated
 from afspm.translator.parameters import ParameterSpec, ParameterTable, Value
 from afspm.translator.polling import EAGER_S
 from afspm.translator.setting_groups import SettingsGroup, reach_in
@@ -232,6 +232,10 @@ class DriverBase(ABC):
     has_tip: ClassVar[bool] = True
     """False for a microscope that scans by a beam: before a check or a commissioning, nothing is asked about a tip."""
 
+    never_shows: ClassVar[Mapping[str, str] | None] = None
+    """The witnesses of a measurement (`WITNESSES`) that the controller never shows, with the reasons, except those
+    that are parameters, which the table has or lacks. None: the driver does not say."""
+
     start_engages: ClassVar[bool] = False
     """True if the start of a scan brings a withdrawn tip to the sample."""
 
@@ -300,6 +304,14 @@ class DriverBase(ABC):
         """
         table = ParameterTable.from_toml(cls.parameters_file)
         return table.extended(changed, where="the experiment file", translated=cls.translated)
+
+    @classmethod
+    def without_witness(cls, settings: PlainMapping) -> dict[str, str]:
+        """Return what the controller never shows of a measurement with these settings, with the reasons."""
+        table = cls.parameter_table(cls.rows(settings))
+        missing = {name: [one for one in shown_by if one not in table] for name, shown_by in WITNESSES.items()}
+        unread = {name: f"{', '.join(some)} can't be read" for name, some in missing.items() if some}
+        return unread | dict(cls.never_shows or {})
 
     @classmethod
     def declared_channels(cls, settings: PlainMapping) -> ChannelRoles:

@@ -13,19 +13,43 @@ A contradicted result is not complete. An unproved one is published, and says wh
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.formatting import area_text, position_text
-from afspm.model import Region, TipStatus
-from afspm.translator.parameters import Value
+from afspm.model import Region, TipStatus, names
+from afspm.translator.parameters import FEEDBACK_ON, Value
+from afspm.translator.setting_groups import FRAME
 
 RESOLUTION_NS: Final = 2 * NS_PER_S
 """Of times in files, which have whole seconds, with a margin."""
 _PART: Final = 1e-3
 """Of the frame's larger side, and in rad: a reader gives the set frame for one that is equal within a file's digits."""
+SETTINGS: Final = (
+    names.ZCTRL_SETPOINT,
+    names.ZCTRL_PGAIN,
+    names.ZCTRL_IGAIN,
+    names.TIP_BIAS_VOLTAGE,
+    names.SCAN_SPEED,
+)
+WITNESSES: Final[Mapping[str, Sequence[str]]] = {
+    "tip at the sample": (names.ENGAGED,),
+    "feedback on": (FEEDBACK_ON,),
+    "settings in force": SETTINGS,
+    "frame in force": FRAME,
+    "which measurement it is": (),
+    "another one begun": (),
+    "start in the file": (),
+    "end in the file": (),
+    "frame in the file": (),
+    "missing rows": (),
+    "one start in all channels": (),
+    "stop of a scan": (),
+    "stop of a spectrum": (),
+}
+"""What proves a result, with the parameters that show it; without any, the driver says what its controller lacks."""
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from typing import Final
 from afspm.basics.clock import NS_PER_S
 from afspm.model import ActByHand, ChangedValue, PanelAct, ScopeState, TipStatus, names
 from afspm.model.microscope_status import STARTS
+from afspm.translator.judge import SETTINGS
 from afspm.translator.parameters import FEEDBACK_ON, ParameterTable, Value
 from afspm.translator.setting_groups import FRAME, POSITION
 from afspm.translator.state import Kept
@@ -34,13 +35,7 @@ _STILL: Final = CALM | {ScopeState.SPEC}
 """States in which the controller does not move the tip away in the course of its work."""
 _STARTED: Final = {names.START_SCAN: ScopeState.FREE, names.START_SPEC: ScopeState.SPEC}
 """The state from which the tip is watched after a start: spectra may switch the feedback off."""
-_SETTINGS: Final = frozenset(FRAME) | {
-    names.ZCTRL_SETPOINT,
-    names.ZCTRL_PGAIN,
-    names.ZCTRL_IGAIN,
-    names.TIP_BIAS_VOLTAGE,
-    names.SCAN_SPEED,
-}
+_SETTINGS: Final = frozenset((*FRAME, *SETTINGS))
 EXTRA: Final = (names.TIP_BIAS_VOLTAGE, names.SCAN_SPEED)
 """Settings that are read for the watch alone: no message publishes them."""
 _NOT_ASKED: Final = "and no request of the run caused it"

@@ -29,6 +29,18 @@ def test_metadata_come_from_the_class_of_the_microscope(tmp_path: Path, text: st
     assert told["software"]
 
 
+def test_run_of_a_controller_has_what_that_never_shows(tmp_path: Path) -> None:
+    file = tmp_path / "e.toml"
+    shown = '[microscope.parameters.x-engaged]\nvendor = "tip"\ntype = "bool"\n'
+    found = []
+    for text in (SIMULATOR, SIMULATOR.replace("Simulator", "Park"), SIMULATOR.replace("Simulator", "Park") + shown):
+        file.write_text(text, encoding="utf-8")
+        found.append(load(file).resolved.never_shown())
+    assert found[0] == {}
+    assert found[1].pop("tip at the sample") == "x-engaged can't be read"
+    assert found[1] == found[2] != {}
+
+
 def test_metadata_of_the_file_override_the_class(tmp_path: Path) -> None:
     said = '[metadata]\ntechnique = "STM"\nvendor = "Unisoku"\nsample = "Au(111)"\norcid = "0000-0002-1694-233X"\n\n'
     told = metadata(tmp_path, said + NANONIS)

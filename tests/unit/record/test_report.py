@@ -156,7 +156,8 @@ def told(run: Path) -> story.RunStory:
 
 
 def test_result_shows_its_claim_and_the_facts_left_unproved(tmp_path: Path) -> None:
-    (tmp_path / "run.json").write_text("{}", encoding="utf-8")
+    facts = {"never_shown": {"tip at the sample": "<no> value"}, "metadata": {"software": "Gxsm"}}
+    (tmp_path / "run.json").write_text(json.dumps(facts), encoding="utf-8")
     store = RecordStore(tmp_path, RecordSettings({"experiment": "night"}))
     begin, end = ((model.Parameter("tip-bias-voltage", text, "V"),) for text in ("0.2", "0.3"))
     shown = model.MeasurementConditions(
@@ -177,8 +178,9 @@ def test_result_shows_its_claim_and_the_facts_left_unproved(tmp_path: Path) -> N
     assert (first["asked_by"], first["unproved"]) == ("series", ["its file states <no> start"])
     assert second == {}
     text = write(tmp_path).read_text(encoding="utf-8")
-    for words in ("Results not wholly proved", "states &lt;no&gt; start", "tip-bias-voltage 0.2 V (at the end 0.3 V)"):
+    for words in ("What proves the results", "states &lt;no&gt; start", "tip-bias-voltage 0.2 V (at the end 0.3 V)"):
         assert words in text
+    assert "Gxsm never shows: tip at the sample (&lt;no&gt; value)." in text
     assert text.count("<dt>asked for by</dt><dd>series</dd>") == 1
 
 

@@ -46,6 +46,15 @@ class Nion(Driver):
     has_tip: ClassVar[bool] = False
     memory_is_all: ClassVar[bool] = True
     program_s: ClassVar[float] = 2.0
+    never_shows: ClassVar = {
+        "another one begun": "Nion's software runs without a panel",
+        "start in the file": "afspm writes the file",
+        "end in the file": "afspm writes the file",
+        "frame in the file": "afspm writes the file, with the frame that was set",
+        "missing rows": "a stopped scan hands over nothing",
+        "stop of a scan": "Nion's software runs without a panel",
+        "stop of a spectrum": "it takes no spectra",
+    }
 
     def __init__(
         self,

@@ -81,6 +81,10 @@ class Asylum(ScriptedDriver[Session, AsylumActivity]):
     program: ClassVar[str] = "Igor"
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
+    never_shows: ClassVar = {
+        "another one begun": "a stop and a start between two looks seem one scan, if none shows the tip in the air",
+        "start in the file": "a note has the time of saving; the start follows from the line rate",
+    }
     start_engages: ClassVar[bool] = True
     shadow: ClassVar[str] = "afspm.plugins.asylum.shadow.AsylumShadow"
     link: ClassVar[type[Link]] = Link

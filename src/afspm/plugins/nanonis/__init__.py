@@ -108,6 +108,9 @@ class Nanonis(Driver):
     counts_clockwise: ClassVar[bool] = True
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
+    never_shows: ClassVar = {
+        "another one begun": "a stop and a start between two looks seem one scan, unless the stop saves a file",
+    }
     shadow: ClassVar[str] = "afspm.plugins.nanonis.shadow.NanonisShadow"
     session_class: ClassVar[type[Session]] = Session
     activity_class: ClassVar[type[NanonisActivity]] = NanonisActivity

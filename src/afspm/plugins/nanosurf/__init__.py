@@ -71,6 +71,12 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
     program: ClassVar[str] = StudioActivity.program
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
+    never_shows: ClassVar = {
+        "which measurement it is": "Studio names no file: the newest is taken",
+        "another one begun": "a stop and a start between two looks seem one scan",
+        "stop of a scan": "Studio shows only that no scan runs: an end that comes too soon counts as a stop",
+        "stop of a spectrum": "Studio shows nothing of it",
+    }
     shadow: ClassVar[str] = "afspm.plugins.nanosurf.shadow.NanosurfShadow"
     link: ClassVar[type[Link]] = Link
 

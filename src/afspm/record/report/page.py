@@ -44,7 +44,7 @@ def html(
         section("Problems and repairs", _problems(story, clock)),
         section("Critical messages", _alarms(story, clock)),
         section("Files that could not be read", table(["scans and spectra"], [[escape(one)] for one in unread])),
-        section("Results not wholly proved", proofs.html(story.proofs, story.measured, clock)),
+        section("What proves the results", proofs.html(story.proofs, story.measured, clock)),
         section("Treatments of the tip", _treatments(story)),
         section("Parameters changed", parameters.html(story.changes, clock)),
         section("Other instruments", _instruments(story)),

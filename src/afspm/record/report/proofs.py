@@ -9,15 +9,21 @@ from afspm.model import MeasurementConditions, Parameter
 from afspm.record.report import markup
 from afspm.record.report.markup import PageTimes
 from afspm.record.run import Run
+from afspm.record.run_json import NEVER_SHOWN
 from afspm.record.tables import ScanRow, SpectrumRow
 
 MOST_ROWS = 200
 
 
 class ResultProofs:
-    """The published conditions of all results; none for results of other translators and of earlier versions."""
+    """The published conditions of all results; none for results of other translators and of earlier versions.
 
-    def __init__(self, conditions: Sequence[MeasurementConditions] = ()) -> None:
+    Attributes:
+        never_shown: what the controller never shows of a measurement, with its name and the reasons, as a sentence.
+    """
+
+    def __init__(self, conditions: Sequence[MeasurementConditions] = (), never_shown: str = "") -> None:
+        self.never_shown = never_shown
         self._by_time = {one.time_ns: one for one in conditions}
         self._by_file = {one.filename: one for one in conditions if one.filename}
 
@@ -35,11 +41,13 @@ class ResultProofs:
 
 
 def read(run: Run) -> ResultProofs:
-    return ResultProofs([one for _, _, one in run.messages(("MeasurementConditions",))])
+    never = "; ".join(f"{witness} ({why})" for witness, why in run.facts.get(NEVER_SHOWN, {}).items())
+    sentence = f"{run.metadata.get('software', 'The controller')} never shows: {never}." if never else ""
+    return ResultProofs([one for _, _, one in run.messages(("MeasurementConditions",))], sentence)
 
 
 def html(proofs: ResultProofs, rows: Sequence[ScanRow | SpectrumRow], clock: PageTimes) -> str:
-    """Return the table of the results with unproved facts; empty without any."""
+    """Return what the controller never shows, and the table of the results with unproved facts; empty without any."""
     found = [(row, one.unproved) for row in rows if (one := proofs.of(row)) is not None and one.unproved]
     cells = [
         [
@@ -51,7 +59,8 @@ def html(proofs: ResultProofs, rows: Sequence[ScanRow | SpectrumRow], clock: Pag
     ]
     left_out = len(found) - len(cells)
     more = f'<p class="note">{left_out} more are in the record.</p>' if left_out else ""
-    return markup.table(["result", "finished", "the controller could have shown, and did not"], cells) + more
+    never = f'<p class="note">{escape(proofs.never_shown)}</p>' if proofs.never_shown else ""
+    return never + markup.table(["result", "finished", "the controller could have shown, and did not"], cells) + more
 
 
 def _settings(one: MeasurementConditions) -> str:

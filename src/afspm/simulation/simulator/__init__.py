@@ -121,6 +121,13 @@ class Simulator(Driver):
     simulated: ClassVar[bool] = True
     live_real_s: ClassVar[float | None] = 0.5
     memory_is_all: ClassVar[bool] = True
+    never_shows: ClassVar = {
+        "another one begun": "a stop and a start between two looks seem one scan",
+        "start in the file": "a file has the end; the start follows from the speed",
+        "missing rows": "a stopped scan has no file",
+        "stop of a scan": "the simulation shows only that no scan runs",
+        "stop of a spectrum": "the simulation shows only that no spectrum runs",
+    }
 
     def __init__(
         self,
