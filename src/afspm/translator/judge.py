@@ -227,13 +227,13 @@ def _values_in_force(claim: Claim, witness: Witness, stated: Stated) -> str:
 
 
 RULES: Mapping[str, Callable[[Claim, Witness, Stated], str]] = {
+    "undisturbed": _undisturbed,
     "one picture": _one_picture,
     "one start": _one_start,
     "new start": _new_start,
     "end after start": _end_after_start,
     "own start": _own_start,
     "own frame": _own_frame,
-    "undisturbed": _undisturbed,
     "tip at the sample": _tip_at_sample,
     "values in force": _values_in_force,
 }
