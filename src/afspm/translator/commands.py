@@ -193,8 +193,11 @@ class Commands:
                 # a person has begun the run so, for example to commission the controller
                 self._log.warning("the tip has been withdrawn since before this run: the measurement is in the air")
                 return
-            reason = self._driver.withdrew_tip() or "the tip is withdrawn: bring it to the sample first"
-            raise Refused(ControlResponse.ACTION_ERROR, reason)
+            reason = self._driver.withdrew_tip()
+            # unknown, as while the controller was lost: only a person can bring it back
+            is_unknown = not reason and not self._panel.is_withdrawn_by_run
+            code = ControlResponse.NOT_FREE if is_unknown else ControlResponse.ACTION_ERROR
+            raise Refused(code, reason or "the tip is withdrawn: bring it to the sample first")
 
     def _find_action(self, name: str) -> Action:
         if name not in self.actions:

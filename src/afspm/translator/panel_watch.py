@@ -76,7 +76,8 @@ class PanelWatch:
         self._settings = _SETTINGS | set(table.watched)
         self._last: ScopeState | None = None
         self._still: ScopeState | None = None
-        self._tip_is_moved = self._is_lost = False
+        self._tip_is_moved = bool(kept.get("tip_is_moved"))
+        self._is_lost = False
         self._before_spectrum: dict[str, Value] = {}
         self._by_hand: dict[str, Value] = {}
         self._in_request: list[tuple[tuple[ChangedValue, ...], str]] = []
@@ -89,6 +90,11 @@ class PanelWatch:
     def was_engaged(self) -> bool:
         """Whether the tip was at the sample at any reading of this run."""
         return bool(self._kept.get("was_engaged"))
+
+    @property
+    def is_withdrawn_by_run(self) -> bool:
+        """Whether an action of this run since its last measurement may have withdrawn the tip."""
+        return self._tip_is_moved
 
     def asked(self, action: str = "", *, sets: Collection[str] | None = None) -> None:
         """Note that the run changes something: what the next reading shows may be its doing.

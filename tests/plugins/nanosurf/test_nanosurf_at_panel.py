@@ -17,7 +17,7 @@ from tests.plugins.nanosurf.nanosurf_bench import Bench
 from tests.plugins.vendor_bench import TURNED, Peer, moved, ready, scans, small, states
 
 from afspm.driver import SCAN
-from afspm.model import ActByHand, PanelAct, Region, Scan, ScopeState, names
+from afspm.model import ActByHand, ControlResponse, PanelAct, Region, Scan, ScopeState, names
 from afspm.plugins.nanosurf.activity import NanosurfFiles
 
 Make = Callable[..., Bench]
@@ -259,3 +259,18 @@ def test_own_requests_are_no_acts_by_hand(bench: Make) -> None:
     assert scans(received)
     made.kill()
     assert "by hand" not in made.log_text()
+
+
+# results M5
+@pytest.mark.parametrize("action", [names.START_SCAN, names.START_SPEC])
+def test_start_during_a_sweep_of_a_person_waits_for_its_end(bench: Make, action: str) -> None:
+    made = bench()
+    peer = small(made)
+    sweep = "probe.frequency_sweep.run"
+    made.at_panel(lambda emulator: emulator.rig.occupy(sweep, 1e4, emulator.clock.now_s()))
+    response = peer.act(action)
+    assert response.code == ControlResponse.NOT_FREE
+    assert f"busy with a {sweep}" in response.reason
+    made.at_panel(lambda emulator: emulator.rig.stop(sweep, emulator.clock.now_s()))
+    assert peer.act(action).ok
+    peer.until(FREE)

@@ -372,6 +372,30 @@ def test_a_tip_withdrawn_by_the_run_is_no_act_by_hand(bench: Any) -> None:
     assert "bring it to the sample" in refused.reason
 
 
+# results M5
+def test_tip_found_withdrawn_after_a_lost_controller_is_waited_for(bench: Any) -> None:
+    begin_scan(bench)
+    bench.microscope.state = ScopeState.FREE
+    bench.look()
+    bench.microscope.lost = True
+    bench.look()
+    bench.microscope.values["Engaged"], bench.microscope.lost = False, False
+    bench.look(60.0)
+    refused = bench.ask(ACTION, names.START_SCAN)
+    assert refused.code == ControlResponse.NOT_FREE
+    assert "bring it to the sample" in refused.reason
+    assert acts(bench) == []
+
+
+def test_tip_withdrawn_by_the_run_before_a_restart_is_an_error(bench: Any) -> None:
+    assert bench.ask(ACTION, names.RETRACT).code == OK
+    bench.microscope.values["Engaged"] = False
+    bench.look()
+    bench.start()
+    assert bench.ask(ACTION, names.START_SCAN).code == ControlResponse.ACTION_ERROR
+    assert acts(bench) == []
+
+
 def test_a_run_begun_with_a_withdrawn_tip_measures_in_the_air_until_the_tip_was_engaged(
     bench: Any, scan: Any, caplog: Any
 ) -> None:

@@ -203,7 +203,7 @@ class StudioActivity(Activity):
         """Start a scan of the frame.
 
         Raises:
-            Refused: ACTION_ERROR: Studio reports an error, or shows no scan within `settles_s`.
+            Refused: Studio reports an error, or shows no scan within `settles_s`.
         """
         # A short scan may be over before the next poll: then the count of started scans has risen.
         before = self._session.scanning().started
@@ -218,10 +218,13 @@ class StudioActivity(Activity):
         """Move the tip to its target position, where `status` takes a force curve on arrival.
 
         Raises:
-            Refused: ACTION_ERROR: Studio does not move the tip.
+            Refused: Studio does not move the tip.
         """
         self._stopping = False
-        self._place.go()
+        try:
+            self._place.go()
+        except Refused as refused:
+            raise self.not_started(refused) from refused
         self.curve_awaited = FORCE
 
     def _take_curve(self) -> None:

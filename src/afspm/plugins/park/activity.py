@@ -132,7 +132,7 @@ class SmartScanActivity(Activity):
         """Start a scan of the frame.
 
         Raises:
-            Refused: ACTION_ERROR: SmartScan reports an error, or shows no scan within `settles_s`.
+            Refused: SmartScan reports an error, or shows no scan within `settles_s`.
         """
         self.started(SCAN, lambda: self._session.do(START), lambda: self._session.scanning() or self._files.has_file())
         self._goes_on()
