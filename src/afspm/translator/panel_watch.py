@@ -162,9 +162,9 @@ class PanelWatch:
         acts += self._feedback_acts(now, state, now_ns, withdrew)
         in_request, self._in_request = self._in_request, []
         acts += [ActByHand(now_ns, PanelAct.VALUES, why, changes) for changes, why in in_request]
-        # a running scan moves the tip, and a spectrum may
+        # a running scan moves the tip, and a spectrum may; a translator that begins in a scan reads it on its way
         watched = self._settings
-        if state is not ScopeState.SCANNING and not is_after_spectrum:
+        if ScopeState.SCANNING not in (last, state) and not is_after_spectrum:
             watched = watched | set(POSITION)
         if last in CALM and state in CALM and (changes := self._changes(before, now, watched)):
             acts.append(ActByHand(now_ns, PanelAct.VALUES, changes=tuple(changes.values())))

@@ -295,6 +295,21 @@ def test_value_that_the_controller_rounds_is_set_twice_and_no_act(bench: Any, mo
     assert acts(bench) == []
 
 
+# results m2
+def test_translator_that_begins_in_a_scan_takes_the_way_of_its_tip_for_no_act(bench: Any, scan: Any) -> None:
+    begin_scan(bench)
+    bench.microscope.values["PX"] = 0.046
+    bench.start()
+    bench.look()
+    bench.microscope.values["PX"] = 0.0
+    end_scan(bench, scan)
+    bench.look()
+    assert acts(bench) == []
+    bench.microscope.values["PX"] = 0.1  # by a person
+    bench.look()
+    assert acts(bench) == [PanelAct.VALUES]
+
+
 def test_a_withdrawal_that_takes_time_gives_one_act(bench: Any) -> None:
     bench.microscope.state = ScopeState.COARSE_MOTOR
     bench.look()
