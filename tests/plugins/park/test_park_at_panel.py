@@ -96,6 +96,17 @@ def test_scan_stopped_before_the_first_poll_is_begun_once_more(bench: Make, monk
     assert scanned(peer)
 
 
+# results M3
+def test_scan_made_faster_and_then_stopped_is_stopped_by_hand(bench: Make) -> None:
+    made = bench(**SLOW)
+    peer = scanning(made)
+    made.at_panel(lambda emulator: put("scan.rate", 100.0, emulator))
+    made.at_panel(stop)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert PanelAct.STOP in acts(received)
+
+
 def test_stop_by_request_is_no_act_by_hand(bench: Make) -> None:
     peer = scanning(bench(**SLOW))
     assert peer.act(names.STOP_SCAN).ok
