@@ -102,8 +102,8 @@ def test_scan_stopped_at_the_panel_is_by_hand_and_nothing_is_done_afterwards(
     bench: Make, release: int, saves_partial: bool, how: str
 ) -> None:
     made = bench(release=release)
-    made.at_panel(partial(put, path="data.storage.save_partial_measurements", value=saves_partial))
     peer, scripts = slow_scan(made, release=release)
+    made.at_panel(lambda emulator: setattr(emulator.program, "saves_partial", saves_partial))
     scripts.asked.clear()
     made.at_panel(partial(press, button=how))
     received = peer.until(FREE)
@@ -274,3 +274,33 @@ def test_start_during_a_sweep_of_a_person_waits_for_its_end(bench: Make, action:
     made.at_panel(lambda emulator: emulator.rig.stop(sweep, emulator.clock.now_s()))
     assert peer.act(action).ok
     peer.until(FREE)
+
+
+# results M3
+def test_first_scan_of_a_size_stopped_late_or_made_faster_is_stopped_by_hand(bench: Make) -> None:
+    made = bench()
+    peer, _ = slow_scan(made)
+
+    def hurry_and_stop(emulator: Any) -> None:
+        put(emulator, "imaging.line_rate", 10.0)
+        scan = emulator.program.rig.scan
+        scan.paused_s = -0.6 * LINES * LINE_S  # beyond 45 % of the lines
+        press(emulator, "stop_scan")
+
+    made.at_panel(hurry_and_stop)
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "INTERRUPTED", "FREE"]
+    assert PanelAct.STOP in acts(received)
+
+
+# results m3
+def test_saving_switched_off_in_a_scan_loses_that_scan_alone(bench: Make) -> None:
+    made = bench()
+    peer = small(made, result_timeout_s=20.0)
+    off = "data.storage.nhf_backend_enabled"
+    made.at_panel(partial(put, path=off, value=False))
+    assert peer.act(names.START_SCAN).ok
+    made.until_logged("did not save each measurement to a new .nhf file; it does from now on")
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "FREE"]
+    assert scans(received)
