@@ -92,11 +92,11 @@ class ActByHand:
     changes: tuple[ChangedValue, ...] = ()
 
     def __str__(self) -> str:
+        why = f" ({self.evidence})" if self.evidence else ""
         if self.act is PanelAct.VALUES:
-            return f"set at the microscope: {', '.join(map(str, self.changes))}"
+            return f"set at the microscope: {', '.join(map(str, self.changes))}{why}"
         if self.act is PanelAct.CONTRADICTION:
             return f"{_IN_WORDS[self.act]}: {self.evidence}"
-        why = f" ({self.evidence})" if self.evidence else ""
         return f"{_IN_WORDS[self.act]} at the microscope{why}"
 
 

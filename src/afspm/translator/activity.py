@@ -23,7 +23,7 @@ from __future__ import annotations
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import ClassVar
+from typing import ClassVar, Final
 
 from afspm.basics.clock import Clock
 from afspm.basics.errors import AfspmError, Refused
@@ -31,6 +31,10 @@ from afspm.basics.plain_data import Plain
 from afspm.model import ControlResponse, ScopeState, ScopeStatus
 from afspm.translator.long_call import LongCall
 from afspm.translator.result_files import SCAN, ResultFiles
+
+_MOST_REFUSALS: Final = 2
+"""Refusals of a start that may be a person's doing: the program does not report what a person lets it do, such as a
+sweep, nor a scan stopped at the panel within its first poll. The client asks again after some seconds."""
 
 
 class Activity(ABC):
@@ -56,6 +60,7 @@ class Activity(ABC):
         self._clock = clock
         self._log = log
         self._stopping = self._failed = False
+        self._refusals = 0
         self._why_last_ended = ""
         self.call: LongCall | None = None
         self.curve_awaited = ""
@@ -110,16 +115,22 @@ class Activity(ABC):
         """Begin a measurement on request.
 
         Raises:
-            Refused: the measurement was not started. Also the errors of `do`.
+            Refused: the measurement was not started. The first `_MOST_REFUSALS` in a row are NOT_FREE.
         """
         self._stopping, self._why_last_ended = False, ""
         self.begin(what)
         try:
             do()
-        except Refused:
+            self.settle(what, is_seen)
+        except Refused as refused:
             self.forget()
-            raise
-        self.settle(what, is_seen)
+            raise self.not_started(refused) from refused
+        self._refusals = 0
+
+    def not_started(self, refused: Refused) -> Refused:
+        """Return the refusal of a start: NOT_FREE instead for the first `_MOST_REFUSALS` in a row."""
+        self._refusals = (self._refusals + 1) % (_MOST_REFUSALS + 1)
+        return Refused(ControlResponse.NOT_FREE, refused.reason) if self._refusals else refused
 
     def stopped(self) -> None:
         """Record that a request has stopped the measurement, which has no result."""

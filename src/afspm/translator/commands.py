@@ -20,13 +20,15 @@ from afspm.translator.driver_base import LOST, Action, DriverBase
 from afspm.translator.panel_watch import PanelWatch
 from afspm.translator.parameters import Value
 from afspm.translator.sequence import SequenceStep, StatusSequence
-from afspm.translator.setters import apply, wanted_values
+from afspm.translator.setters import PersonActs, apply, wanted_values
 from afspm.translator.setting_groups import MOVES, of_message
 from afspm.translator.temporary_settings import TemporarySettings, state_for
 from afspm.wire import declared, encode
 
 _ANNOUNCED = {one.set_by: one.name for one in declared() if one.set_by is not None}
 _SETTERS = (*_ANNOUNCED, ControlRequest.PARAM)
+_MOST_CONTENDED = 2
+"""Requests in a row that a client repeats because a person keeps changing the same values."""
 
 
 @dataclass
@@ -70,6 +72,7 @@ class Commands:
         self._about_to_act = about_to_act
         self._is_set = is_set
         self._log = log
+        self._contended = 0
         driver.for_a_while = temporary.begin
         self.actions = driver.own_actions() | self._added_actions(driver.common.actions)
         if names.FEEDBACK_ON in driver.table and not driver.only_reads:
@@ -126,7 +129,7 @@ class Commands:
     def _set(self, request: Request, values: Mapping[str, Value]) -> CommandOutcome:
         driver = self._driver
         self._refuse_if_busy(all(name in driver.adjustable or driver.table[name].while_busy for name in values))
-        read_back = apply(driver, values, lambda: self._about_to_act(request)) if values else {}
+        read_back = self._apply(values, lambda: self._about_to_act(request)) if values else {}
         self._is_set({name: read_back[name] for name in values})
         steps = self._sequence.begin(ScopeState.MOVING) if MOVES & values.keys() else []
         done = self._success(request, read_back)
@@ -137,6 +140,18 @@ class Commands:
         else:
             done.announce = (_ANNOUNCED[ControlRequest(request.kind)],)
         return done
+
+    def _apply(self, values: Mapping[str, Value], about_to_act: Callable[[], None] = lambda: None) -> dict[str, Value]:
+        try:
+            read_back = apply(self._driver, values, about_to_act, self._panel.seen_in_request)
+        except PersonActs as contended:
+            self._contended += 1
+            if self._contended <= _MOST_CONTENDED:
+                raise
+            self._contended = 0
+            raise Refused(ControlResponse.PARAM_ERROR, contended.reason) from contended
+        self._contended = 0
+        return read_back
 
     def _act(self, request: Request) -> CommandOutcome:
         action = self._find_action(request.subject)
@@ -178,8 +193,11 @@ class Commands:
                 # a person has begun the run so, for example to commission the controller
                 self._log.warning("the tip has been withdrawn since before this run: the measurement is in the air")
                 return
-            reason = self._driver.withdrew_tip() or "the tip is withdrawn: bring it to the sample first"
-            raise Refused(ControlResponse.ACTION_ERROR, reason)
+            reason = self._driver.withdrew_tip()
+            # unknown, as while the controller was lost: only a person can bring it back
+            is_unknown = not reason and not self._panel.is_withdrawn_by_run
+            code = ControlResponse.NOT_FREE if is_unknown else ControlResponse.ACTION_ERROR
+            raise Refused(code, reason or "the tip is withdrawn: bring it to the sample first")
 
     def _find_action(self, name: str) -> Action:
         if name not in self.actions:
@@ -222,7 +240,7 @@ class Commands:
         if for_s is not None:
             self._temporary.begin(values, for_s)
         elif values:
-            apply(self._driver, values)
+            self._apply(values)
         if command is not None:
             self._driver.command(command)
 

@@ -38,6 +38,8 @@ _STARTED: Final = {names.START_SCAN: ScopeState.FREE, names.START_SPEC: ScopeSta
 _SETTINGS: Final = frozenset((*FRAME, *SETTINGS))
 EXTRA: Final = (names.TIP_BIAS_VOLTAGE, names.SCAN_SPEED)
 """Settings that are read for the watch alone: no message publishes them."""
+_IN_REQUEST: Final = "in the middle of a request that sets it"
+_SET_AGAIN: Final = "set again by the request in which a person acted"
 _NOT_ASKED: Final = "and no request of the run caused it"
 
 
@@ -69,9 +71,11 @@ class PanelWatch:
         self._settings = _SETTINGS | set(table.watched)
         self._last: ScopeState | None = None
         self._still: ScopeState | None = None
-        self._tip_is_moved = self._is_lost = False
+        self._tip_is_moved = bool(kept.get("tip_is_moved"))
+        self._is_lost = False
         self._before_spectrum: dict[str, Value] = {}
         self._by_hand: dict[str, Value] = {}
+        self._in_request: list[tuple[tuple[ChangedValue, ...], str]] = []
         self.is_certain = False
         # a withdrawal while no translator ran is seen at the first reading
         self._was_left_at_sample = kept.get("engaged") is True and not kept.get("tip_is_moved")
@@ -81,6 +85,11 @@ class PanelWatch:
     def was_engaged(self) -> bool:
         """Whether the tip was at the sample at any reading of this run."""
         return bool(self._kept.get("was_engaged"))
+
+    @property
+    def is_withdrawn_by_run(self) -> bool:
+        """Whether an action of this run since its last measurement may have withdrawn the tip."""
+        return self._tip_is_moved
 
     def asked(self, action: str = "", *, sets: Collection[str] | None = None) -> None:
         """Note that the run changes something: what the next reading shows may be its doing.
@@ -101,6 +110,14 @@ class PanelWatch:
             self._by_hand = {name: self._by_hand[name] for name in kept}
         if action != names.START_SPEC:
             self._before_spectrum = {}
+
+    def seen_in_request(self, before: Mapping[str, Value], after: Mapping[str, Value]) -> None:
+        """Note a change of values in the middle of a request that sets them: the next reading reports it."""
+        watched = [name for name in after if name in self._settings or name in POSITION]
+        changes = tuple(self._change(name, before[name], after[name]) for name in watched)
+        is_set_again = all(self._written(name, after[name]) for name in watched)
+        if changes:
+            self._in_request.append((changes, _SET_AGAIN if is_set_again else _IN_REQUEST))
 
     def may_be_off(self) -> None:
         """Note that a person says that the z feedback is off by intention."""
@@ -138,9 +155,11 @@ class PanelWatch:
         if was_engaged and now.get(names.ENGAGED) is False and not withdrew and not self._tip_is_moved:
             acts.append(self._tip_act(PanelAct.WITHDRAW, now_ns))
         acts += self._feedback_acts(now, state, now_ns, withdrew)
-        # a running scan moves the tip, and a spectrum may
+        in_request, self._in_request = self._in_request, []
+        acts += [ActByHand(now_ns, PanelAct.VALUES, why, changes) for changes, why in in_request]
+        # a running scan moves the tip, and a spectrum may; a translator that begins in a scan reads it on its way
         watched = self._settings
-        if state is not ScopeState.SCANNING and not is_after_spectrum:
+        if ScopeState.SCANNING not in (last, state) and not is_after_spectrum:
             watched = watched | set(POSITION)
         if last in CALM and state in CALM and (changes := self._changes(before, now, watched)):
             acts.append(ActByHand(now_ns, PanelAct.VALUES, changes=tuple(changes.values())))

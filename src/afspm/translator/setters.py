@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import Final
 
@@ -55,15 +55,24 @@ def wanted_values(request: Request, driver: DriverBase) -> dict[str, Value] | No
 
 
 def apply(
-    driver: DriverBase, values: Mapping[str, Value], about_to_act: Callable[[], None] = lambda: None
+    driver: DriverBase,
+    values: Mapping[str, Value],
+    about_to_act: Callable[[], None] = lambda: None,
+    by_hand: Callable[[Mapping[str, Value], Mapping[str, Value]], None] = lambda before, after: None,
 ) -> dict[str, Value]:
     """Set values and return them as read back; after an error, unless the controller is lost, restore the former ones.
 
+    A value read back that is neither the wanted nor the former one may be a person's, set at this moment. It is set
+    once more: a controller that rounds or clamps values gives the same one again, and is refused.
+
     Args:
         about_to_act: called after all checks, right before the first change.
+        by_hand: called with values before and after each change by a person meanwhile, and before and after they are
+            set again.
 
     Raises:
-        Refused: PARAM_ERROR: the values do not fit together, or the controller set other values.
+        Refused: PARAM_ERROR: the values do not fit together, or the controller set other values. NOT_FREE: a person
+            keeps changing them; nothing is restored.
         an error in `LOST`: the outcome is unknown.
         other errors of the driver.
     """
@@ -78,22 +87,56 @@ def apply(
     if framed or not values.keys().isdisjoint(POSITION):
         check_together(wanted, driver.reach(), driver.max_pixels)
     former = {name: value for name, value in before.items() if not table[name].read_only}
+
+    def other(now: Mapping[str, Value], than: Mapping[str, Value]) -> dict[str, Value]:
+        return {name: now[name] for name in whole if not driver.same(name, now[name], than[name], now)}
+
     about_to_act()
     try:
-        driver.put_in_force(values)
-        after = driver.in_force(whole)
-    except LOST:
+        after, refused = _set(driver, values, whole)
+        found = other(after, wanted)
+        # a part of the frame that is not set, and a value that stays, are the controller's doing
+        is_possible = found.keys() <= other(after, before).keys() & values.keys()
+        if found and is_possible and not any(table[name].measured for name in found):
+            first, (after, refused) = after, _set(driver, values, whole)
+            found_again = other(after, wanted)
+            if not found_again and refused is None:
+                by_hand(wanted, found)
+                by_hand(found, {name: wanted[name] for name in found})
+            elif found_again and other(after, first):
+                by_hand(wanted, found_again)
+                raise PersonActs(", ".join(sorted(found_again)))
+        if refused is not None:
+            raise refused
+    except (*LOST, PersonActs):
         raise
     except Exception:  # a driver may raise anything, and must not leave a frame half set
         with contextlib.suppress(Exception):  # a driver may raise anything; the first error is reported
             driver.put_in_force(former)
         raise
-    for name in whole:
-        if not driver.same(name, after[name], wanted[name], after):
-            driver.put_in_force(former)
-            made, asked = (table[name].quantity(one) for one in (after[name], wanted[name]))
-            raise refuse_value(name, f"the controller set {made} instead of {asked}; the former values were restored")
+    for name in other(after, wanted):
+        driver.put_in_force(former)
+        made, asked = (table[name].quantity(one) for one in (after[name], wanted[name]))
+        raise refuse_value(name, f"the controller set {made} instead of {asked}; the former values were restored")
     return after
+
+
+class PersonActs(Refused):
+    """The refusal of values that a person keeps changing at the panel; afspm does not set them back."""
+
+    def __init__(self, changed: str) -> None:
+        super().__init__(ControlResponse.NOT_FREE, f"{changed}: a person at the panel keeps changing it")
+
+
+def _set(
+    driver: DriverBase, values: Mapping[str, Value], whole: Collection[str]
+) -> tuple[dict[str, Value], Refused | None]:
+    refused = None
+    try:
+        driver.put_in_force(values)
+    except Refused as error:  # also of a driver that reads back by itself
+        refused = error
+    return driver.in_force(whole), refused
 
 
 def _values_in(subject: object) -> dict[str, Parameter | Value]:

@@ -17,7 +17,7 @@ from tests.plugins.nanosurf.nanosurf_bench import Bench
 from tests.plugins.vendor_bench import TURNED, Peer, moved, ready, scans, small, states
 
 from afspm.driver import SCAN
-from afspm.model import ActByHand, PanelAct, Region, Scan, ScopeState, names
+from afspm.model import ActByHand, ControlResponse, PanelAct, Region, Scan, ScopeState, names
 from afspm.plugins.nanosurf.activity import NanosurfFiles
 
 Make = Callable[..., Bench]
@@ -102,8 +102,8 @@ def test_scan_stopped_at_the_panel_is_by_hand_and_nothing_is_done_afterwards(
     bench: Make, release: int, saves_partial: bool, how: str
 ) -> None:
     made = bench(release=release)
-    made.at_panel(partial(put, path="data.storage.save_partial_measurements", value=saves_partial))
     peer, scripts = slow_scan(made, release=release)
+    made.at_panel(lambda emulator: setattr(emulator.program, "saves_partial", saves_partial))
     scripts.asked.clear()
     made.at_panel(partial(press, button=how))
     received = peer.until(FREE)
@@ -259,3 +259,48 @@ def test_own_requests_are_no_acts_by_hand(bench: Make) -> None:
     assert scans(received)
     made.kill()
     assert "by hand" not in made.log_text()
+
+
+# results M5
+@pytest.mark.parametrize("action", [names.START_SCAN, names.START_SPEC])
+def test_start_during_a_sweep_of_a_person_waits_for_its_end(bench: Make, action: str) -> None:
+    made = bench()
+    peer = small(made)
+    sweep = "probe.frequency_sweep.run"
+    made.at_panel(lambda emulator: emulator.rig.occupy(sweep, 1e4, emulator.clock.now_s()))
+    response = peer.act(action)
+    assert response.code == ControlResponse.NOT_FREE
+    assert f"busy with a {sweep}" in response.reason
+    made.at_panel(lambda emulator: emulator.rig.stop(sweep, emulator.clock.now_s()))
+    assert peer.act(action).ok
+    peer.until(FREE)
+
+
+# results M3
+def test_first_scan_of_a_size_stopped_late_or_made_faster_is_stopped_by_hand(bench: Make) -> None:
+    made = bench()
+    peer, _ = slow_scan(made)
+
+    def hurry_and_stop(emulator: Any) -> None:
+        put(emulator, "imaging.line_rate", 10.0)
+        scan = emulator.program.rig.scan
+        scan.paused_s = -0.6 * LINES * LINE_S  # beyond 45 % of the lines
+        press(emulator, "stop_scan")
+
+    made.at_panel(hurry_and_stop)
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "INTERRUPTED", "FREE"]
+    assert PanelAct.STOP in acts(received)
+
+
+# results m3
+def test_saving_switched_off_in_a_scan_loses_that_scan_alone(bench: Make) -> None:
+    made = bench()
+    peer = small(made, result_timeout_s=20.0)
+    off = "data.storage.nhf_backend_enabled"
+    made.at_panel(partial(put, path=off, value=False))
+    assert peer.act(names.START_SCAN).ok
+    made.until_logged("did not save each measurement to a new .nhf file; it does from now on")
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "FREE"]
+    assert scans(received)

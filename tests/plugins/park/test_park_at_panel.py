@@ -17,9 +17,9 @@ from tests.plugins.by_hand import (
     until_act,
 )
 from tests.plugins.park.park_bench import Bench, Emulated
-from tests.plugins.vendor_bench import Peer, moved, scans, small, states
+from tests.plugins.vendor_bench import Peer, moved, scanned, scans, small, states
 
-from afspm.model import ActByHand, PanelAct, ScopeState, names
+from afspm.model import ActByHand, ControlResponse, PanelAct, ScopeState, names
 from afspm.plugins.park.emulator.smartscan import SmartScanProgram
 
 Make = Callable[..., Bench]
@@ -76,6 +76,35 @@ def test_scan_ended_by_a_person_is_one_act_and_nothing_follows(
     (told,) = (one for one in received if isinstance(one, ActByHand))
     assert ("of its 8 lines were not scanned" if saves_partial else "and left no complete file") in told.evidence
     assert called == []
+
+
+# results M5
+def test_scan_stopped_before_the_first_poll_is_begun_once_more(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = bench(speed=10.0, start_s=0.0)
+    peer = small(made)
+    plain, left = program(made.emulator).start_scan, [stop]
+
+    def start(now_s: float) -> None:
+        plain(now_s)
+        if left:
+            left.pop()(made.emulator)
+
+    monkeypatch.setattr(program(made.emulator), "start_scan", start)
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.NOT_FREE
+    assert "did not begin the scan that it was asked for" in response.reason
+    assert scanned(peer)
+
+
+# results M3
+def test_scan_made_faster_and_then_stopped_is_stopped_by_hand(bench: Make) -> None:
+    made = bench(**SLOW)
+    peer = scanning(made)
+    made.at_panel(lambda emulator: put("scan.rate", 100.0, emulator))
+    made.at_panel(stop)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert PanelAct.STOP in acts(received)
 
 
 def test_stop_by_request_is_no_act_by_hand(bench: Make) -> None:

@@ -72,9 +72,11 @@ def test_refusal_has_smartscans_own_text(bench: Make, variant: Settings) -> None
     made = bench(**variant)
     peer = small(made)
     made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4, emulator.clock.now_s()))
-    response = peer.act(names.START_SCAN)
-    assert response.code == ControlResponse.ACTION_ERROR
-    assert "busy with a calibration" in response.reason
+    # results M5: SmartScan does not report a person's other work, so the run waits for its end at first
+    for code in [ControlResponse.NOT_FREE] * 2 + [ControlResponse.ACTION_ERROR]:
+        response = peer.act(names.START_SCAN)
+        assert response.code == code
+        assert "busy with a calibration" in response.reason
 
 
 @pytest.mark.parametrize("replies", ["at-end", "at-once"])

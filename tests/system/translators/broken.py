@@ -216,7 +216,7 @@ class Clamps(Broken):
 
         plainly = parameters.ParameterSpec.checked
         parameters.ParameterSpec.checked = checked  # type: ignore[method-assign]
-        REPLACEABLE.apply = lambda driver, values, about_to_act=None: driver.write(values) or dict(values)
+        REPLACEABLE.apply = lambda driver, values, *_: driver.write(values) or driver.in_force(values)
 
 
 class AcceptsNaN(Broken):
@@ -248,7 +248,7 @@ class BusyNotRefused(Broken):
 
 class SuccessWithoutChange(Broken):
     def spoil(self) -> None:
-        REPLACEABLE.apply = lambda driver, values, about_to_act=None: dict(values)
+        REPLACEABLE.apply = lambda driver, values, *_: dict(values)
 
 
 class KnowsEveryAction(Broken):

@@ -16,6 +16,8 @@ from afspm.model import (
     MeasurementConditions,
     PanelAct,
     Parameter,
+    Region,
+    ScanParameters,
     ScopeState,
     ScopeStatus,
     Spectrum,
@@ -228,6 +230,86 @@ def test_a_tip_withdrawn_just_after_a_request_is_by_hand(bench: Any) -> None:
     assert acts(bench) == [PanelAct.WITHDRAW]
 
 
+def person_after_each_set(bench: Any, monkeypatch: pytest.MonkeyPatch, *acts_of_person: dict[str, float]) -> None:
+    """Let a person set values right after each setting by a request, in turn."""
+    plain, left = bench.microscope.set, list(acts_of_person)
+
+    def both(values: Any) -> None:
+        plain(values)
+        if left:
+            bench.microscope.values.update(left.pop(0))
+
+    monkeypatch.setattr(bench.microscope, "set", both)
+
+
+# results M5
+def test_value_set_by_a_person_in_the_middle_of_a_request_is_an_act_and_the_request_succeeds(
+    bench: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    person_after_each_set(bench, monkeypatch, {"Bias": 1000.0})
+    assert bench.ask(PARAM, Parameter("tip-bias-voltage", "0.3", "V")).code == OK
+    assert bench.microscope.values["Bias"] == 300.0
+    bench.look()
+    bench.heard()
+    assert [one.changes for one in bench.beside if isinstance(one, ActByHand)] == [
+        (ChangedValue("tip-bias-voltage", "0.3", "1", "V"),),
+        (ChangedValue("tip-bias-voltage", "1", "0.3", "V"),),
+    ]
+
+
+# results M5
+def test_frame_moved_by_a_person_in_the_middle_of_a_request_is_an_act_and_the_request_succeeds(
+    bench: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    person_after_each_set(bench, monkeypatch, {"X": 300.0})
+    wanted = ScanParameters(Region((0.0, 0.0), (1e-6, 0.5e-6)), (4, 8))
+    assert bench.ask(ControlRequest.SET_SCAN_PARAMS, wanted).code == OK
+    assert bench.microscope.values["X"] == -500.0
+    assert acts(bench) == [PanelAct.VALUES, PanelAct.VALUES]
+
+
+# results M5
+def test_person_who_keeps_changing_a_value_is_waited_for_twice_and_never_set_back(
+    bench: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    person_after_each_set(bench, monkeypatch, *({"Bias": 500.0 + number} for number in range(6)))
+    wanted = Parameter("tip-bias-voltage", "0.3", "V")
+    answers = [bench.ask(PARAM, wanted) for _ in range(4)]
+    assert [one.code for one in answers] == [
+        *[ControlResponse.NOT_FREE] * 2,
+        ControlResponse.PARAM_ERROR,
+        OK,
+    ]
+    assert answers[2].reason == "tip-bias-voltage: a person at the panel keeps changing it"
+    bench.look()
+    assert acts(bench) == [PanelAct.VALUES] * 3
+
+
+def test_value_that_the_controller_rounds_is_set_twice_and_no_act(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    rounded = {"Bias": 250.0}
+    person_after_each_set(bench, monkeypatch, rounded, rounded)
+    refused = bench.ask(PARAM, Parameter("tip-bias-voltage", "0.3", "V"))
+    assert refused.code == ControlResponse.PARAM_ERROR
+    assert "set 250 mV instead of 300 mV; the former values were restored" in refused.reason
+    assert bench.microscope.values["Bias"] == 100.0
+    assert acts(bench) == []
+
+
+# results m2
+def test_translator_that_begins_in_a_scan_takes_the_way_of_its_tip_for_no_act(bench: Any, scan: Any) -> None:
+    begin_scan(bench)
+    bench.microscope.values["PX"] = 0.046
+    bench.start()
+    bench.look()
+    bench.microscope.values["PX"] = 0.0
+    end_scan(bench, scan)
+    bench.look()
+    assert acts(bench) == []
+    bench.microscope.values["PX"] = 0.1  # by a person
+    bench.look()
+    assert acts(bench) == [PanelAct.VALUES]
+
+
 def test_a_withdrawal_that_takes_time_gives_one_act(bench: Any) -> None:
     bench.microscope.state = ScopeState.COARSE_MOTOR
     bench.look()
@@ -303,6 +385,30 @@ def test_a_tip_withdrawn_by_the_run_is_no_act_by_hand(bench: Any) -> None:
     refused = bench.ask(ACTION, names.START_SCAN)
     assert refused.code == ControlResponse.ACTION_ERROR
     assert "bring it to the sample" in refused.reason
+
+
+# results M5
+def test_tip_found_withdrawn_after_a_lost_controller_is_waited_for(bench: Any) -> None:
+    begin_scan(bench)
+    bench.microscope.state = ScopeState.FREE
+    bench.look()
+    bench.microscope.lost = True
+    bench.look()
+    bench.microscope.values["Engaged"], bench.microscope.lost = False, False
+    bench.look(60.0)
+    refused = bench.ask(ACTION, names.START_SCAN)
+    assert refused.code == ControlResponse.NOT_FREE
+    assert "bring it to the sample" in refused.reason
+    assert acts(bench) == []
+
+
+def test_tip_withdrawn_by_the_run_before_a_restart_is_an_error(bench: Any) -> None:
+    assert bench.ask(ACTION, names.RETRACT).code == OK
+    bench.microscope.values["Engaged"] = False
+    bench.look()
+    bench.start()
+    assert bench.ask(ACTION, names.START_SCAN).code == ControlResponse.ACTION_ERROR
+    assert acts(bench) == []
 
 
 def test_a_run_begun_with_a_withdrawn_tip_measures_in_the_air_until_the_tip_was_engaged(

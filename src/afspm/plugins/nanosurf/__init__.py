@@ -34,6 +34,8 @@ SAVES: Final[dict[str, Value]] = {
     f"{_STORAGE}.nhf_auto_store_mode": _NEW_FILE,
 }
 """The settings with which Studio saves each measurement to a new file."""
+PARTS: Final = f"{_STORAGE}.save_partial_measurements"
+"""The setting with which Studio saves a stopped scan as well: its missing lines show that it was stopped."""
 _CHANNELS: Final = both_ways(
     {
         "height": ["Height", "Topography", "Z-Axis"],
@@ -101,6 +103,7 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
         self._release, self._session_name = release, session
         self._gallery_dir, self._image_buffer = gallery_dir, image_buffer
         self._reply_timeout_s = reply_timeout_s
+        self._parts: dict[str, Value] = {}
         self._kept = KeptSettings(_AT_FIRST)
         late = "the tip did not reach the position that it was sent to"
         self._place = TipPlace(self.session, lambda: self.clock.now_s(), lambda: self.log.error(late))
@@ -120,6 +123,7 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
             text = "before Studio %d curves of force and positions of the tip are not supported: %s"
             self.log.warning(text, commands.WITH_THIS_TREE, commands.LACKING)
         self._check_table(session)
+        self._parts = {} if session.missing([PARTS]) else {PARTS: True}
         self._kept.kept_in(self.memory)
         self._files = NanosurfFiles(self.memory, self.log)
         self._activity = StudioActivity(
@@ -144,6 +148,7 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
     @action(names.START_SCAN)
     def start_scan(self) -> None:
         """Scan the frame once, in the direction `x-scan-direction`."""
+        self._save_files(self.session())  # a person may have switched it off
         wanted = direction(str(self._kept[names.SCAN_DIRECTION]))
         self.session().put({DIRECTION: wanted, "imaging.scan_mode": _ONE_FRAME})
         self.activity.start_scan()
@@ -156,6 +161,7 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
     @action(names.START_SPEC)
     def start_spec(self) -> None:
         """Take a force curve at the tip's target position, with the cycle selected in Studio."""
+        self._save_files(self.session())
         self.activity.start_curve()
 
     @action(names.STOP_SPEC)
@@ -198,9 +204,14 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
 
     def _save_files(self, session: Session) -> None:
         # The other modes append to the current file or save nothing, and results are recognised by new files.
-        if session.values(list(SAVES)) != SAVES:
+        found = session.values([*SAVES, *self._parts])
+        if found == {**SAVES, **self._parts}:
+            return
+        if any(found[path] != value for path, value in SAVES.items()):
             self.log.warning("Studio did not save each measurement to a new .nhf file; it does from now on")
-            session.put(SAVES)
+        else:
+            self.log.info("Studio saves stopped scans, too, from now on: so a stop differs from an end")
+        session.put({**SAVES, **self._parts})
 
     def _look_at_folder(self) -> None:
         folder = self._folder()

@@ -109,7 +109,7 @@ class StudioActivity(Activity):
         super().__init__(files, clock, log)
         self._session, self._files, self._place = session, files, place
         self._folder, self._scan_time = folder, scan_time
-        self._by_hand = ""
+        self._by_hand, self._is_short = "", False
         self._kept = kept
         if what := kept.pop("call", ""):
             # Studio reports the end of a command only on the connection of this command
@@ -140,7 +140,7 @@ class StudioActivity(Activity):
         return self.at_rest() if arrived else ScopeStatus(ScopeState.MOVING)
 
     def begin(self, what: str) -> None:
-        self._by_hand = ""
+        self._by_hand, self._is_short = "", False
         if what != SCAN:
             self._files.begin(what, self._folder(), {"position": list(self._place.xy_m())})
             return
@@ -175,17 +175,18 @@ class StudioActivity(Activity):
     def _why_by_hand(self, running: Entry) -> str:
         # Studio reports only that no scan runs any more. A scan that ends within its first line may have failed.
         lines, line_s = running["lines"]
-        now = self._scan_time()  # a person may have made the scan faster
-        if running["first_s"] is None or running["seen_s"] - running["first_s"] < line_s:
+        self._is_short = running["first_s"] is None or running["seen_s"] - running["first_s"] < line_s
+        if self._is_short:
             return ""
-        shortest_s = self._files.shortest_s(min(lines, now.lines), min(line_s, now.line_s))
+        # by the lines as it was begun: a person who has made it faster since, and whose scan left no file, is at work
+        shortest_s = self._files.shortest_s(lines, line_s)
         lasted_s = self._clock.now_s() - running["begun_s"]
         if lasted_s >= shortest_s:
             return ""
         return f"the scan ended after {lasted_s:.0f} s of at least {shortest_s:.0f} s, and no request had stopped it"
 
     def at_rest(self, state: ScopeState = ScopeState.FREE) -> ScopeStatus:
-        if self._files.broken_off:
+        if self._files.broken_off and not self._is_short:
             self._by_hand = self._by_hand or _PARTIAL
         return super().at_rest(state)
 
@@ -198,7 +199,7 @@ class StudioActivity(Activity):
         """Start a scan of the frame.
 
         Raises:
-            Refused: ACTION_ERROR: Studio reports an error, or shows no scan within `settles_s`.
+            Refused: Studio reports an error, or shows no scan within `settles_s`.
         """
         # A short scan may be over before the next poll: then the count of started scans has risen.
         before = self._session.scanning().started
@@ -213,10 +214,13 @@ class StudioActivity(Activity):
         """Move the tip to its target position, where `status` takes a force curve on arrival.
 
         Raises:
-            Refused: ACTION_ERROR: Studio does not move the tip.
+            Refused: Studio does not move the tip.
         """
         self._stopping = False
-        self._place.go()
+        try:
+            self._place.go()
+        except Refused as refused:
+            raise self.not_started(refused) from refused
         self.curve_awaited = FORCE
 
     def _take_curve(self) -> None:

@@ -129,6 +129,7 @@ _BEFORE: Final = {
     "data.storage.gallery_directory": "storage.property.gallery_directory",
     "data.storage.nhf_backend_enabled": "storage.property.nhf_backend_enabled",
     "data.storage.nhf_auto_store_mode": "storage.property.nhf_auto_store_mode",
+    "data.storage.save_partial_measurements": "storage.property.auto_save_partial_measurements",
     START: "imaging.start_imaging",
     STOP: "imaging.stop_imaging",
     APPROACH: "approach.start_approach",

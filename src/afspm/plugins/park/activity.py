@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -34,24 +33,24 @@ class ScanDuration:
 
     Attributes:
         began_s: experiment time right before the start.
-        at_least_s: shortest duration by the lines and line rates seen so far.
+        at_least_s: duration by the slowest lines seen so far; 0 if unknown. Whether a change moves a running scan is
+            unknown (!); if it made the scan faster, and it left no file, a person is at work.
         is_under_way: whether SmartScan has reported the scan as running.
         ended_early: how much too early it ended, in words; empty: not, or not yet.
     """
 
     began_s: float = 0.0
-    at_least_s: float = math.inf
+    at_least_s: float = 0.0
     is_under_way: bool = False
     ended_early: str = ""
 
     def see(self, rows: int, lines_per_s: float) -> None:
-        # a person may have made the running scan faster
         if rows > 0 and lines_per_s > 0.0:
-            self.at_least_s = min(self.at_least_s, rows / lines_per_s)
+            self.at_least_s = max(self.at_least_s, rows / lines_per_s)
 
     def end(self, now_s: float) -> None:
         lasted_s = now_s - self.began_s
-        if math.isfinite(self.at_least_s) and lasted_s < _WHOLE * self.at_least_s:
+        if lasted_s < _WHOLE * self.at_least_s:
             took = f"after {lasted_s:.0f} s instead of {self.at_least_s:.0f} s, and left no complete file"
             self.ended_early = f"SmartScan ended it without a request of the run, {took}"
 
@@ -132,7 +131,7 @@ class SmartScanActivity(Activity):
         """Start a scan of the frame.
 
         Raises:
-            Refused: ACTION_ERROR: SmartScan reports an error, or shows no scan within `settles_s`.
+            Refused: SmartScan reports an error, or shows no scan within `settles_s`.
         """
         self.started(SCAN, lambda: self._session.do(START), lambda: self._session.scanning() or self._files.has_file())
         self._goes_on()
