@@ -125,7 +125,8 @@ class PersonActs(Refused):
     """The refusal of values that a person keeps changing at the panel; afspm does not set them back."""
 
     def __init__(self, changed: str) -> None:
-        super().__init__(ControlResponse.NOT_FREE, f"{changed}: a person at the panel keeps changing it")
+        why = "a person at the panel keeps changing it, or its reading has noise: then its row needs a `resolution`"
+        super().__init__(ControlResponse.NOT_FREE, f"{changed}: {why}")
 
 
 def _set(

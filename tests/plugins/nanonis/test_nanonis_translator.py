@@ -554,7 +554,10 @@ def test_measured_value_is_compared_within_the_resolution_of_its_row(bench: Make
     assert peer.set("x-z", held_m + 5e-9, "m").ok
     assert float(peer.get("x-z")) == pytest.approx(held_m + 5e-9, rel=1e-9)
     refused = [peer.set("x-exact-z", held_m + step * 1e-9, "m") for step in range(5)]
-    assert any("the former values were restored" in one.reason for one in refused)
+    assert ControlResponse.PARAM_ERROR in [one.code for one in refused]
+    assert all(
+        "its row needs a `resolution`" in one.reason for one in refused if one.code == ControlResponse.PARAM_ERROR
+    )
 
 
 # --- at the panel ---

@@ -89,7 +89,7 @@ def test_changed_value_is_written_down_and_kept() -> None:
     hand(lab, PanelAct.VALUES, bias(5.0))
     assert (lab.holder, lab.forwarded) == ("experiment", [])
     (entry,) = (one for one in lab.entries() if one.event is ControlEvent.BY_HAND)
-    assert entry.what == "set at the microscope: tip-bias-voltage = 5 V (before: 1 V)"
+    assert entry.what == "set at the microscope: tip-bias-voltage = 5 V (before: 1 V) (seen)"
     asked = scanning(changed_by_hand="pause")
     hand(asked, PanelAct.VALUES, bias(5.0))
     assert asked.core.control.mode is MANUAL
