@@ -7,11 +7,13 @@ from collections.abc import Callable
 
 from afspm.basics.clock import Clock
 from afspm.basics.errors import AfspmError, ConfigError
-from afspm.translator.driver_base import LOST, ControllerLost, DriverBase
+from afspm.translator.driver_base import LOST, ControllerLost, ControllerSilent, DriverBase
 from afspm.translator.emulated_controller import EmulatedController
 from afspm.transport.process.failure import place_of
 
 RETRY_S = 1.0  # real; decision 0016
+_OFTEN_SILENT = 3
+_LONGEST_RETRY_S = 16.0
 _STARTUP_S = 2.0
 """Real time in which a controller that starts together with its translator (an emulated one) may be missing: until then
 connecting is retried every `_STARTUP_RETRY_S`, and nothing is logged."""
@@ -50,6 +52,7 @@ class Connection:
         self.why_lost = self._logged = ""
         self.ever_stood = self._loss_published = False
         self._retry_at_s = 0.0
+        self._silent = 0  # connections in a row that were accepted, and in which a question was not answered
         self._began_s = clock.monotonic_s()
 
     def establish(self) -> bool:
@@ -58,6 +61,7 @@ class Connection:
             return False
         self.reach()
         self.stands = self.ever_stood = True
+        self._silent = 0
         if self._logged:
             self._logged = ""
             self._log.info("the controller answers again")
@@ -123,7 +127,13 @@ class Connection:
         """Record the loss; publish a loss once, and log each reason once."""
         now_s = self._clock.monotonic_s()
         starts = isinstance(error, LOST) and not self.ever_stood and now_s - self._began_s < _STARTUP_S
-        self._retry_at_s = now_s + (_STARTUP_RETRY_S if starts else RETRY_S)
+        self._silent = self._silent + 1 if isinstance(error, ControllerSilent) else 0
+        # others report of a real controller that a port is silent until the restart: each attempt may prolong it
+        longer = 2.0 ** max(0, self._silent - _OFTEN_SILENT)
+        self._retry_at_s = now_s + (_STARTUP_RETRY_S if starts else min(RETRY_S * longer, _LONGEST_RETRY_S))
+        if self._silent == _OFTEN_SILENT:
+            text = "a port accepts connections and answers nothing: it may be wedged, or a dialog waits; restart %s"
+            self._log.error(text, type(self._driver).__name__)
         stood, self.stands, self.is_reached = self.stands, False, False
         self.why_lost = _reason(error)
         if not starts and (stood or self.why_lost != self._logged):

@@ -32,6 +32,10 @@ class ControllerLost(AfspmError):
     code = "controller-lost"
 
 
+class ControllerSilent(ControllerLost):
+    """The error that the controller has accepted a connection, and does not answer."""
+
+
 def connected(link: T | None, program: str, address: str = "") -> T:
     """Return the connection to a maker's program.
 

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import socket
+import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Final, TypeVar
 
 from afspm.basics.errors import ConfigError
-from afspm.translator.driver_base import ControllerLost
+from afspm.translator.driver_base import ControllerLost, ControllerSilent
 from afspm.translator.trace import TCP, TRACE, TracedAnswer
 
 _AT_ONCE: Final = 1 << 20  # bounds the buffer of one `recv`: a reply may announce any size
 _SLOWEST_BYTES_PER_S: Final = 1e6  # a whole scan may take longer than the timeout of a small answer
+
+_DRAIN_S: Final = 2.0
 
 T = TypeVar("T")
 
@@ -85,6 +89,7 @@ class TcpConnection:
     ) -> None:
         self._timeout_s = timeout_s
         self._monotonic_s = monotonic_s
+        self._awaits_answer = self._is_closed = False
         self._silent_hint = hints[1]
         self.where = f"{address[0]}:{address[1]}"
         try:
@@ -122,6 +127,7 @@ class TcpConnection:
 
         def send() -> None:
             self._socket.settimeout(self._timeout_s)
+            self._awaits_answer = True
             self._socket.sendall(message)
 
         self._trace.asked(what, None if is_secret else message)
@@ -135,13 +141,14 @@ class TcpConnection:
             longer_s: added to the usual timeout.
 
         Raises:
-            ControllerLost: no answer, or a malformed one; the connection is closed.
+            ControllerSilent: no answer in time. ControllerLost: a malformed one. The connection is closed.
         """
         timeout_s = self._timeout_s + longer_s
         with self._trace.answering() as traced:
             receiver = Receiver(self._socket, self._monotonic_s, self._monotonic_s() + timeout_s, what, traced)
             found = self._guarded(what, timeout_s, lambda: read(receiver))
             traced.is_whole = True
+            self._awaits_answer = False
             return found
 
     def has_answer(self, within_s: float = 0.0) -> bool:
@@ -161,7 +168,7 @@ class TcpConnection:
         except TimeoutError as error:
             self.close()
             message = f"no answer to {what} within {timeout_s:g} s"
-            raise ControllerLost(message, where=self.where, hint=self._silent_hint) from error
+            raise ControllerSilent(message, where=self.where, hint=self._silent_hint) from error
         except OSError as error:
             self.close()
             message = f"the connection was lost during {what}: {error}"
@@ -172,9 +179,32 @@ class TcpConnection:
             raise
 
     def close(self) -> None:
-        """Close the connection, from any thread; a waiting thread gets ControllerLost."""
+        """Close the connection, from any thread; a waiting thread gets ControllerLost.
+
+        While an answer is awaited it is only half-closed, and a thread reads what still comes until the controller
+        closes its half, for at most `_DRAIN_S`. Others report of a real Nanonis that a port whose client resets the
+        connection in mid-answer stays silent until Nanonis is restarted.
+        """
+        if self._is_closed:
+            return
+        self._is_closed = True
         with suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
+            self._socket.shutdown(socket.SHUT_WR)
+        if self._awaits_answer:
+            # no daemon: the end of the process waits for it, too
+            threading.Thread(target=self._drain, name=f"draining {self.where}").start()
+        else:
+            self._socket.close()
+
+    def _drain(self) -> None:
+        until_s = time.monotonic() + _DRAIN_S
+        with suppress(OSError):
+            while (left_s := until_s - time.monotonic()) > 0.0:
+                self._socket.settimeout(left_s)
+                if not self._socket.recv(_AT_ONCE):
+                    break
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)  # wakes a thread that waits for an answer
         self._socket.close()
 
 

@@ -19,6 +19,7 @@ from afspm.model import (
     Scan,
     ScanLines,
     ScopeState,
+    ScopeStatus,
     Spectrum,
     names,
 )
@@ -65,6 +66,28 @@ def test_dialog_on_the_screen_silences_the_controller(bench: Make) -> None:
     assert "the controller can't be reached" in response.reason
     peer.until(FREE)
     made.until_logged("Nanonis is silent while a dialog waits for an answer on its screen")
+
+
+def test_pulse_that_is_answered_at_its_end_is_awaited(bench: Make) -> None:
+    # results T8: the connection was reset in the middle of the pulse
+    made = bench(speed=1.0)
+    peer = small(made, **SOON)
+    assert peer.set(names.PULSE_DURATION, 4.0).ok
+    made.strike("blocks", duration_s=60.0)
+    assert peer.act(names.PULSE).ok
+    assert UNDEFINED not in [one.state for one in peer.until(FREE) if isinstance(one, ScopeStatus)]
+
+
+def test_silent_port_is_called_by_its_name(bench: Make) -> None:
+    # results Z2
+    made = bench(speed=1.0)
+    peer = small(made, reply_timeout_s=0.5)
+    made.strike("dialog", duration_s=6.0)
+    peer.until(UNDEFINED)
+    made.until_logged(
+        "a port accepts connections and answers nothing: it may be wedged, or a dialog waits; restart Nanonis"
+    )
+    peer.until(FREE)
 
 
 def test_slow_reply_is_awaited(bench: Make) -> None:

@@ -174,8 +174,8 @@ class Nanonis(Driver):
     def _there(self) -> Session:
         return connected(self._session, "Nanonis")
 
-    def _ask(self, name: str, *arguments: object) -> tuple[object, ...]:
-        return self._there.ask(name, *arguments)
+    def _ask(self, name: str, *arguments: object, longer_s: float = 0.0) -> tuple[object, ...]:
+        return self._there.ask(name, *arguments, longer_s=longer_s)
 
     def status(self) -> ScopeStatus:
         return self._activity.status()
@@ -289,7 +289,8 @@ class Nanonis(Driver):
         duration_s = self._kept.number(names.PULSE_DURATION)
         hold, absolute = 1, 2
         with self._activity.occupied(ScopeState.BUSY_PARAM, duration_s + _LATE_S):
-            self._ask("Bias.Pulse", _AT_ONCE, duration_s, self._kept.number(names.PULSE_VOLTAGE), hold, absolute)
+            pulse = (_AT_ONCE, duration_s, self._kept.number(names.PULSE_VOLTAGE), hold, absolute)
+            self._ask("Bias.Pulse", *pulse, longer_s=duration_s)  # others report releases that answer at its end
 
     @action(names.CRASH, state=ScopeState.MOVING)
     def crash(self) -> None:
@@ -302,8 +303,9 @@ class Nanonis(Driver):
         same_bias, settle_s, restore = 2, 0.1, 1
         before = (settle_s, same_bias, bias_v)
         self._ask("TipShaper.PropsSet", *before, -depth_m, ramp_s, bias_v, settle_s, depth_m, ramp_s, settle_s, restore)
-        with self._activity.occupied(ScopeState.MOVING, 2 * ramp_s + 4 * settle_s + _LATE_S):
-            self._ask("TipShaper.Start", _AT_ONCE, _NO_TIMEOUT)
+        lasts_s = 2 * ramp_s + 4 * settle_s
+        with self._activity.occupied(ScopeState.MOVING, lasts_s + _LATE_S):
+            self._ask("TipShaper.Start", _AT_ONCE, _NO_TIMEOUT, longer_s=lasts_s)
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:

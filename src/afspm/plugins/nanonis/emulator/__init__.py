@@ -107,6 +107,7 @@ class NanonisEmulator(Emulator):
         "autosave-off": "scans and spectra are not saved for the duration, despite the settings",
         "late-start": "a scan begins, and is reported as running, only after the duration",
         "no-start": "a scan does not begin, without an error",
+        "blocks": "for the duration, a pulse or a shaping of the tip is answered at its end, although no one waits",
         "ends-at-once": "for the duration, waiting for the end of a scan returns at once if none runs",
         "safe-tip": "the safe tip withdraws the tip and ends the scan",
         "safe-tip-unnoticed": "the safe tip withdraws the tip, and the scan goes on in the air",
