@@ -84,6 +84,19 @@ def test_half_scan_saved_under_another_name_is_not_published(bench: Make, kind: 
     assert is_truth(made, list(scanned(peer).values()))
 
 
+# results X2
+def test_half_scan_of_before_in_a_new_folder_is_not_named(bench: Make, tmp_path: Path) -> None:
+    made = bench()
+    peer = small(made)
+    half, other = tmp_path / "zz030-M-Xp-ZSmTopo.nc", tmp_path / "other"
+    other.mkdir()
+    assert scans(with_person(made, peer, lambda program: program.save_as(half)))
+    (other / half.name).write_bytes(half.read_bytes())  # newer than all files in the folder of before
+    made.at_panel(lambda emulator: setattr(emulator.program.saving, "folder", other))
+    assert is_truth(made, list(scanned(peer).values()))
+    assert "is left out" not in made.log_text()
+
+
 # results X1
 @each_kind
 @pytest.mark.parametrize("before", [1, 2, 3])

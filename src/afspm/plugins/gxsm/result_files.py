@@ -334,9 +334,11 @@ class GxsmFiles(ResultFiles):
             self._half.discard(file)
             if content is None:
                 continue
+            is_before = self._is_of_before(content, ended["begun_ns"])
             if _is_half(content):
-                self._half.add(file)
-            elif self._is_of_before(content, ended["begun_ns"]):
+                if not is_before:  # in a folder that GXSM has not named before, all files are new
+                    self._half.add(file)
+            elif is_before:
                 self._before[file] = content
             else:
                 found[file] = content
