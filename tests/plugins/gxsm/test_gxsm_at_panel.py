@@ -231,7 +231,6 @@ def test_scan_with_the_feedback_switched_off_by_the_run_is_published(bench: Make
         ("dsp-fbs-ci", 20.0, names.ZCTRL_IGAIN),
         ("dsp-fbs-scan-speed-scan", 12345.0, names.SCAN_SPEED),
         ("PointsY", 12.0, names.SCAN_RESOLUTION_Y),
-        ("dsp-adv-scan-slope-x", 0.05, names.SAMPLE_SLOPE_X),  # results m4
     ],
 )
 def test_value_set_at_the_panel_during_a_scan_is_published_once_with_old_and_new_value(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -232,7 +231,6 @@ def test_frame_changed_in_a_scan_leaves_it_without_a_result(bench: Make) -> None
         ("ZCtrl.GainSet", (0.25, 1.0, 0.25), names.ZCTRL_PGAIN, 0.25),
         ("Scan.SpeedSet", (4e-6, 4e-6, 1.0, 1.0, 1, 1.0), names.SCAN_SPEED, 4e-6),
         ("Scan.FrameSet", (0.0, 0.0, 1e-6, 1e-6, -20.0), names.SCAN_ANGLE, 20.0),
-        ("Piezo.TiltSet", (3.0, 0.0), names.SAMPLE_SLOPE_X, math.tan(math.radians(3.0))),  # results m4
     ],
 )
 def test_changed_setting_is_published_once(

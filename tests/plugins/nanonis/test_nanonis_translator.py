@@ -344,7 +344,7 @@ def test_spectrum_has_its_position(bench: Make, kind: str, first: str, fetch: bo
 
 
 @pytest.mark.parametrize(
-    ("action", "start", "most"), [(names.START_SPEC, "BiasSpectr.Start", 37), (names.START_SCAN, "Scan.Action", 40)]
+    ("action", "start", "most"), [(names.START_SPEC, "BiasSpectr.Start", 35), (names.START_SCAN, "Scan.Action", 40)]
 )
 def test_measurement_costs_few_questions(bench: Make, action: str, start: str, most: int) -> None:
     # without polls at rest: all questions are of the requests, and of the reported end
