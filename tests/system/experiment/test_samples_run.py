@@ -52,7 +52,7 @@ SAYS = {
         "is too slow",
         "tuner +integral gain 1280: the feedback follows",
         "oscillates",
-        "integral gain 3125$",
+        "integral gain 3120$",
     )
 }
 """What the log has to say, in this order."""
