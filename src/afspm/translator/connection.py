@@ -13,7 +13,8 @@ from afspm.transport.process.failure import place_of
 
 RETRY_S = 1.0  # real; decision 0016
 _OFTEN_SILENT = 3
-_LONGEST_RETRY_S = 16.0
+_MOST_DOUBLED = 4
+"""A port that stays silent is tried each `RETRY_S` · 2 ** 4 = 16 s at last."""
 _STARTUP_S = 2.0
 """Real time in which a controller that starts together with its translator (an emulated one) may be missing: until then
 connecting is retried every `_STARTUP_RETRY_S`, and nothing is logged."""
@@ -129,8 +130,8 @@ class Connection:
         starts = isinstance(error, LOST) and not self.ever_stood and now_s - self._began_s < _STARTUP_S
         self._silent = self._silent + 1 if isinstance(error, ControllerSilent) else 0
         # others report of a real controller that a port is silent until the restart: each attempt may prolong it
-        longer = 2.0 ** max(0, self._silent - _OFTEN_SILENT)
-        self._retry_at_s = now_s + (_STARTUP_RETRY_S if starts else min(RETRY_S * longer, _LONGEST_RETRY_S))
+        doubled = min(max(0, self._silent - _OFTEN_SILENT), _MOST_DOUBLED)
+        self._retry_at_s = now_s + (_STARTUP_RETRY_S if starts else RETRY_S * 2**doubled)
         if self._silent == _OFTEN_SILENT:
             text = "a port accepts connections and answers nothing: it may be wedged, or a dialog waits; restart %s"
             self._log.error(text, type(self._driver).__name__)
