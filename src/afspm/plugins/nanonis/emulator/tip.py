@@ -183,7 +183,7 @@ class TipModules:
         rig.setup.move_speed_m_s = self._own_speed_m_s if self._has_own_speed else self._scans.speed[0]
         reach_x, reach_y = self._core.range_m[0] / 2, self._core.range_m[1] / 2
         rig.move_probe((float(np.clip(x, -reach_x, reach_x)), float(np.clip(y, -reach_y, reach_y))), self._core.now_s)
-        return self._core.until_free(wait or self._blocks())
+        return self._core.until_free(wait)
 
     @answers("FolMe.XYPosGet")
     def _get_position(self, wait: int) -> Answer:
@@ -304,7 +304,7 @@ class TipModules:
         at_m = self._motor_at_m(now_s)
         self._core.rig.occupy("motor", abs(steps) * _STEP_S, self._core.now_s)
         self._motor_m, self._motor_walk = at_m, (direction // 2, -steps if direction % 2 else steps, now_s)
-        return self._core.until_free(wait or self._blocks())
+        return self._core.until_free(wait)
 
     @answers("Motor.StopMove")
     def _stop_motor(self) -> Answer:
