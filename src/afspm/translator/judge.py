@@ -14,14 +14,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.formatting import area_text, position_text
 from afspm.model import Region, TipStatus, names
 from afspm.translator.parameters import FEEDBACK_ON, Value
-from afspm.translator.setting_groups import FRAME
+from afspm.translator.setting_groups import FRAME, as_list, as_region
 
 RESOLUTION_NS: Final = 2 * NS_PER_S
 """Of times in files, which have whole seconds, with a margin."""
@@ -81,19 +81,18 @@ class Claim:
             "tip": tip,
             "values": dict(self.values),
             "begin": dict(self.begin),
-            "frame": None if self.frame is None else [*self.frame.center_m, *self.frame.size_m, self.frame.angle_rad],
+            "frame": None if self.frame is None else as_list(self.frame),
             "shape": self.shape,
         }
 
     @classmethod
     def of(cls, kept: Mapping[str, Any]) -> Claim:
         tip = None if kept["tip"] is None else TipStatus(*kept["tip"])
-        # a process of an earlier version kept no frame
-        x, y, width, height, angle_rad = kept.get("frame") or (math.nan,) * 5
-        frame = None if math.isnan(x) else Region((x, y), (width, height), angle_rad)
-        rows, columns = kept.get("shape") or (0, 0)
-        shape = (rows, columns) if rows else None
-        return cls(kept["began_ns"], kept["holder"], tip, kept["values"], kept["begin"], frame, shape)
+        claim = cls(kept["began_ns"], kept["holder"], tip, kept["values"], kept["begin"])
+        if kept.get("frame") is None:  # a process of an earlier version kept none
+            return claim
+        rows, columns = kept["shape"]
+        return replace(claim, frame=as_region(kept["frame"]), shape=(rows, columns))
 
 
 @dataclass(frozen=True)

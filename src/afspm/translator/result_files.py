@@ -20,6 +20,7 @@ from afspm.basics.plain_data import Plain
 from afspm.model import Region, Scan, Spectrum
 from afspm.storage.formats import FileContent, read
 from afspm.translator.judge import Stated
+from afspm.translator.setting_groups import as_list, as_region
 from afspm.translator.trace import TRACE
 
 SCAN: Final = "scan"
@@ -225,17 +226,6 @@ def read_result(path: Path | str) -> FileContent:
     content = read(path)
     TRACE.file(Path(path))
     return content
-
-
-def as_list(region: Region) -> list[float]:
-    """Return a frame as a list for JSON."""
-    return [*region.center_m, *region.size_m, region.angle_rad]
-
-
-def as_region(kept: Sequence[float]) -> Region:
-    """Return the frame of a list made by `as_list`."""
-    x, y, width, height, angle_rad = kept
-    return Region((x, y), (width, height), angle_rad)
 
 
 def lines_missing(content: Iterable[Scan | Spectrum]) -> int:

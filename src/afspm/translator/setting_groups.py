@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Final
 
 from afspm.basics.errors import InvalidValue, Refused
@@ -145,6 +145,17 @@ def frame(values: Mapping[str, Value]) -> tuple[Region, tuple[int, int]]:
     region = Region.from_top_left(corner, size, _number(values, names.SCAN_ANGLE, 0.0))
     shape = (int(_number(values, names.SCAN_RESOLUTION_Y)), int(_number(values, names.SCAN_RESOLUTION_X)))
     return region, shape
+
+
+def as_list(region: Region) -> list[float]:
+    """Return a frame as a list for JSON."""
+    return [*region.center_m, *region.size_m, region.angle_rad]
+
+
+def as_region(kept: Sequence[float]) -> Region:
+    """Return the frame of a list made by `as_list`."""
+    x, y, width, height, angle_rad = kept
+    return Region((x, y), (width, height), angle_rad)
 
 
 def frame_values(region: Region, shape: tuple[int, int]) -> dict[str, Value]:

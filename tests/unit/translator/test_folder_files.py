@@ -12,7 +12,8 @@ import pytest
 from afspm.model import Region, Scan
 from afspm.storage.formats import FileContent
 from afspm.translator.folder_files import FolderFiles
-from afspm.translator.result_files import SCAN, FilePrecision, as_list
+from afspm.translator.result_files import SCAN, FilePrecision
+from afspm.translator.setting_groups import as_list
 
 FRAME = Region((0.0, 0.0), (1e-6, 1e-6), 0.0)
 TAKEN = {"frame": as_list(FRAME)}
