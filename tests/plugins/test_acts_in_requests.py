@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -58,16 +58,23 @@ def at_frame(peer: Peer, region: Region) -> list[Any]:
     return peer.until(ScopeState.MOVING) + peer.until(ScopeState.FREE)
 
 
+@contextmanager
+def at_rest(maker: str, folder: Path) -> Iterator[tuple[VendorBench[Any], Peer]]:
+    """Yield a maker's bench and its peer, with the tip at rest in `FRAME`."""
+    with own_home(folder), ExitStack() as stack:
+        made = import_module(f"tests.plugins.{maker}.{maker}_bench").Bench(folder, stack, 1.0, {})
+        peer = made.start(**PANELS[maker].settings)
+        peer.until(ScopeState.FREE)
+        at_frame(peer, FRAME)
+        yield made, peer
+
+
 # results M5
 def test_value_set_at_the_panel_in_a_request_is_an_act_and_no_refusal(
     maker: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     panel = PANELS[maker]
-    with own_home(tmp_path), ExitStack() as stack:
-        made = import_module(f"tests.plugins.{maker}.{maker}_bench").Bench(tmp_path, stack, 1.0, {})
-        peer = made.start(**panel.settings)
-        peer.until(ScopeState.FREE)
-        at_frame(peer, FRAME)
+    with at_rest(maker, tmp_path) as (made, peer):
         act_after(made, monkeypatch, maker, lambda emulator: panel.turn(emulator, panel.by_hand), frame=False)
         response = peer.set(panel.value, panel.values[0])
         assert response.ok, response.reason
@@ -86,11 +93,7 @@ def test_frame_moved_at_the_panel_in_a_request_is_an_act_and_no_refusal(
     maker: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     panel = PANELS[maker]
-    with own_home(tmp_path), ExitStack() as stack:
-        made = import_module(f"tests.plugins.{maker}.{maker}_bench").Bench(tmp_path, stack, 1.0, {})
-        peer = made.start(**panel.settings)
-        peer.until(ScopeState.FREE)
-        at_frame(peer, FRAME)
+    with at_rest(maker, tmp_path) as (made, peer):
         act_after(made, monkeypatch, maker, panel.move_frame, frame=True)
         center = (FRAME.center_m[0] + 0.5 * ASIDE_M, FRAME.center_m[1] - 10e-9)
         received = at_frame(peer, Region(center, FRAME.size_m, 0.0))
