@@ -432,6 +432,26 @@ class DriverBase(ABC):
         """
         return None
 
+    @property
+    def withdraws_aside(self) -> bool:
+        """Whether the controller can be asked to withdraw the tip while the working connection is silent."""
+        return False
+
+    def withdraw_elsewhere(self) -> bool:
+        """Withdraw the tip over a connection kept for this alone; return False if there is none.
+
+        Called if `x-retract` is asked for and the controller is lost.
+
+        Raises:
+            ControllerLost: this connection, too, is silent or lost.
+        """
+        return False
+
+    @classmethod
+    def lost_without(cls, settings: PlainMapping) -> Sequence[str]:
+        """Return what a real controller with these settings can't do, each with its remedy, as sentences."""
+        return ()
+
     def is_last_written(self, name: str, value: Value) -> bool:
         """Return whether the run has set this parameter last, and to this value."""
         return name in self._last_written and self.table[name].same(self._last_written[name], value)

@@ -40,8 +40,13 @@ from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatu
 from afspm.plugins.nanonis import fetched, geometry, parameter_groups, protocol, z_controller
 from afspm.plugins.nanonis.activity import SAFE_TIP, WITHDRAWING, NanonisActivity
 from afspm.plugins.nanonis.result_files import NanonisFiles
-from afspm.plugins.nanonis.session import MODULES, Session
+from afspm.plugins.nanonis.session import MODULES, Link, Ports, Session, WithdrawalPort
 
+_ADDRESS: Final = "127.0.0.1:6501,6502"
+_NO_WAY: Final = (
+    "no port is kept for withdrawing the tip: while the first port of Nanonis stays silent, the tip stays where it is; "
+    'name a third one, as in address = "127.0.0.1:6501,6502,6503"'
+)
 _AT_FIRST: Final[dict[str, Value]] = {
     names.SCAN_DIRECTION: names.UP,
     names.SPEC_KIND: "IV",
@@ -89,8 +94,9 @@ class Nanonis(Driver):
     """The driver of a microscope with a Nanonis controller.
 
     Args:
-        address: "host:port,port": two of the ports at File > Settings Options > TCP Programming Interface; each port
-            serves one client. An emulator needs a single port.
+        address: "host:port,port,port": ports at File > Settings Options > TCP Programming Interface; each serves one
+            client: for quick requests, for calls that last, and for withdrawing the tip alone; a fourth one
+            is taken if one of the first two stays silent. An emulator needs a single port.
         session_dir: local path of Nanonis' session folder. Default: the path that Nanonis reports. Data in unreachable
             files is fetched over TCP.
         release: release of Nanonis' software (Help > Info), if the software reports none or a wrong release.
@@ -118,7 +124,7 @@ class Nanonis(Driver):
     def __init__(
         self,
         *,
-        address: str = "127.0.0.1:6501,6502",
+        address: str = _ADDRESS,
         session_dir: str | None = None,
         release: int | None = None,
         reply_timeout_s: Duration = 5.0,
@@ -129,7 +135,8 @@ class Nanonis(Driver):
     ) -> None:
         super().__init__(**common)
         self.controller_at = address
-        _addresses(address)
+        self._ports = Ports(_addresses(address))
+        self._withdrawal: WithdrawalPort | None = None
         self._session_dir = None if session_dir is None else Path(session_dir)
         self._release = release
         self._reply_timeout_s = reply_timeout_s
@@ -145,9 +152,14 @@ class Nanonis(Driver):
         self._files: NanonisFiles
 
     def connect(self) -> None:
-        self.close()
-        addresses = _addresses(self.controller_at)
-        session = self._session = self.session_class(self, addresses, self._reply_timeout_s, self._release)
+        self._close_session()
+        if self._ports.named != (named := _addresses(self.controller_at)):
+            self._ports = Ports(named)
+        if self._withdrawal is None and self.withdraws_aside:
+            self._withdrawal = WithdrawalPort(self._link_to_withdraw, self.clock.monotonic_s, self.log)
+        if self._withdrawal is not None:
+            self._withdrawal.hold()
+        session = self._session = self.session_class(self, self._ports, self._reply_timeout_s, self._release)
         if not hasattr(self, "_files"):
             self._kept.kept_in(self.memory)
             own_folder = (self.run_dir / "scans").resolve()
@@ -166,9 +178,36 @@ class Nanonis(Driver):
         self._files.look(folder)
 
     def close(self) -> None:
+        self._close_session()
+        if self._withdrawal is not None:
+            self._withdrawal.close()
+
+    def _close_session(self) -> None:
         if self._session is not None:
             self._session.close()
             self._session = None
+
+    @property
+    def withdraws_aside(self) -> bool:
+        return not self.only_reads and Ports(_addresses(self.controller_at)).for_withdrawing is not None
+
+    def withdraw_elsewhere(self) -> bool:
+        if self._withdrawal is None:
+            return False
+        self._withdrawal.withdraw()
+        return True
+
+    def _link_to_withdraw(self, timeout_s: float) -> Link:
+        address = self._ports.for_withdrawing
+        assert address is not None
+        link = self.session_class.link(address, timeout_s, self.clock.monotonic_s)
+        self.prove()
+        return link
+
+    @classmethod
+    def lost_without(cls, settings: Mapping[str, object]) -> Sequence[str]:
+        address = str(settings.get("address", _ADDRESS))
+        return () if Ports(_addresses(address)).for_withdrawing else (_NO_WAY,)
 
     @property
     def _there(self) -> Session:
@@ -178,6 +217,8 @@ class Nanonis(Driver):
         return self._there.ask(name, *arguments, longer_s=longer_s)
 
     def status(self) -> ScopeStatus:
+        if self._withdrawal is not None:
+            self._withdrawal.hold()
         return self._activity.status()
 
     def next_change_s(self) -> float | None:
@@ -275,6 +316,9 @@ class Nanonis(Driver):
         """Take a spectrum of the kind `x-spec-kind` at the tip's position."""
         self._activity.refuse_safe_tip()
         kind = str(self._kept[names.SPEC_KIND])
+        if not self._there.listener.is_there:
+            reason = "no port of Nanonis is left for a second connection, which a spectrum needs"
+            raise Refused(ControlResponse.ACTION_ERROR, reason)
         if MODULES[kind] not in self._there.opened:
             raise Refused(ControlResponse.ACTION_ERROR, f"Nanonis can't open the module {MODULES[kind]}")
         self._activity.start_curve(kind)
@@ -367,5 +411,5 @@ def _addresses(text: str) -> list[tuple[str, int]]:
     except ValueError:
         found = []
     if not found:
-        raise ConfigError(f"{text!r} is not an address", where="address", hint='"host:port,port"')
+        raise ConfigError(f"{text!r} is not an address", where="address", hint='"host:port,port,port"')
     return found

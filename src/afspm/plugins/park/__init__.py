@@ -164,6 +164,10 @@ class Park(ScriptedDriver[Session, SmartScanActivity]):
         self.session().do(STOP_CURVE)
         self.activity.stopped()
 
+    @property
+    def withdraws_aside(self) -> bool:
+        return True  # each withdrawal has a connection of its own
+
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
         """Stop scan, curve and approach, and withdraw the tip: by the scanner, then by the stage if `lift` is set."""

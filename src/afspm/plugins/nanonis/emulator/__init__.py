@@ -72,6 +72,8 @@ class NanonisEmulator(Emulator):
         ports: number of ports, consecutive unless `port` is 0.
         logger_port: port of the TCP Logger's stream; 0: any free port.
         one_each: True if a port serves one client at a time, like a real controller's port.
+        wedges: True if a port stays silent for ever once its client has reset the connection in mid-answer, as others
+            report of real ones.
         session_path: path of the session folder on the controller's computer, e.g. "D:\\Data". Default: the local path.
         range_m: range of the scanner in x and y.
         clips_frames: True if a frame beyond the range is clipped when it is set. False: it is kept as set, and the tip
@@ -89,6 +91,7 @@ class NanonisEmulator(Emulator):
         "slow": "a reply comes later, by the duration",
         "dialog": "a dialog waits on the screen: nothing is answered for the duration",
         "cut": "the connection is cut instead of a reply",
+        "wedged": "the port stays silent for ever, also for later clients",
         "truncated": "half a reply, then the connection is cut",
         "error": "a reply with an error",
         "refused": "an error in reply to what sets or starts something",
@@ -121,6 +124,7 @@ class NanonisEmulator(Emulator):
         ports: int = 1,
         logger_port: int = 0,
         one_each: bool = False,
+        wedges: bool = False,
         session_path: str = "",
         range_m: Length = 100e-6,
         bare_errors: bool = False,
@@ -134,7 +138,7 @@ class NanonisEmulator(Emulator):
         self._ports = ports
         self.logger_port = logger_port
         self._chance = random.Random(self.seed)
-        self._one_each = one_each
+        self._one_each, self._wedges = one_each, wedges
         self._session_path = session_path
         self._range_m = range_m
         self._bare_errors = bare_errors
@@ -155,6 +159,7 @@ class NanonisEmulator(Emulator):
             ports,
             stream_port=self.logger_port,
             one_each=self._one_each,
+            wedges=self._wedges,
             wakes=self.woken,
             on_bytes=self._answer_all,
         )
@@ -313,6 +318,9 @@ class NanonisEmulator(Emulator):
         now_s = self.clock.now_s()
         content = wire.reply(name, body)
         if self.faults.strikes("no-reply", now_s):
+            return
+        if self.faults.strikes("wedged", now_s):
+            self._server.wedge(connection)
             return
         if self.faults.strikes("cut", now_s):
             self._server.cut(connection)
