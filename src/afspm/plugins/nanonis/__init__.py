@@ -59,6 +59,8 @@ _CONTINUOUS: Final = (
     "the continuous scan stays on at Nanonis' panel (Scan Control), although it was switched off: one scan would "
     "follow the other without end. Switch it off there"
 )
+_GRAB_SHARE: Final = 10.0
+"""Real time without a grab of lines, in times of the last grab: large scans must not fill the connection."""
 _AT_ONCE: Final = 0
 """Argument of functions that could also wait for the end of their action."""
 _NO_TIMEOUT: Final = -1
@@ -70,10 +72,9 @@ _BY_VALUE: Final = (
     parameter_groups.ScanSpeed,
     parameter_groups.Gains,
     parameter_groups.MoveSpeed,
-    parameter_groups.Slope,
-    parameter_groups.DriftRate,
 )
-_GROUPS: Final = (*_BY_VALUE, geometry.Probe, parameter_groups.FeedbackOn, parameter_groups.TipState)
+_SIDE: Final = (parameter_groups.Slope, parameter_groups.DriftRate)
+_GROUPS: Final = (*_BY_VALUE, *_SIDE, geometry.Probe, parameter_groups.FeedbackOn, parameter_groups.TipState)
 _TRANSLATED: Final = tuple(name for group in _GROUPS for name in group.names)
 _CHANNELS: Final = both_ways(
     {
@@ -143,12 +144,15 @@ class Nanonis(Driver):
         self._autosave = autosave
         self._grabbing = fetched.Grabbing(grabbed_rows, grabbed_backward)
         self._session: Session | None = None
+        self._grabs_at_s = 0.0
         self._kept = KeptSettings(_AT_FIRST)
         ask = self._ask
         self._probe = geometry.Probe(ask, lambda: self.clock.now_s())
         feedback = parameter_groups.FeedbackOn(ask, lambda holds: self.wait_for(holds, reply_timeout_s))
         self._tip = parameter_groups.TipState(ask)
-        self.groups = (*(group(ask) for group in _BY_VALUE), self._probe, feedback, self._tip, self._kept)
+        self._side = [parameter_groups.SideGroup(group(ask)) for group in _SIDE]
+        vital = (*(group(ask) for group in _BY_VALUE), self._probe, feedback, self._tip, self._kept)
+        self.groups = (*vital, *self._side)
         self._files: NanonisFiles
 
     def connect(self) -> None:
@@ -159,6 +163,7 @@ class Nanonis(Driver):
             self._withdrawal = WithdrawalPort(self._link_to_withdraw, self.clock.monotonic_s, self.log)
         if self._withdrawal is not None:
             self._withdrawal.hold()
+        self._leave_out_unreadable()
         session = self._session = self.session_class(self, self._ports, self._reply_timeout_s, self._release)
         if not hasattr(self, "_files"):
             self._kept.kept_in(self.memory)
@@ -176,6 +181,12 @@ class Nanonis(Driver):
                 folder,
             )
         self._files.look(folder)
+
+    def _leave_out_unreadable(self) -> None:
+        for group in self._side:
+            if group.unreadable and not self.table.keys().isdisjoint(group.names):
+                self.log.warning("%s: not supported from now on: %s", ", ".join(group.names), group.unreadable)
+                self.table = self.table.without(group.names)
 
     def close(self) -> None:
         self._close_session()
@@ -275,7 +286,7 @@ class Nanonis(Driver):
 
     def _fetch(self, ended: Entry) -> Sequence[Scan | Spectrum]:
         if ended["what"] == SCAN:
-            found = fetched.images(self._ask, self._grabbing)
+            found = self._images()
             return [Scan(as_region(ended["frame"]), image.name, image.unit, image.values) for image in found]
         curve, self._activity.curve = self._activity.curve, None
         if curve is None:
@@ -288,7 +299,19 @@ class Nanonis(Driver):
         kept = self._files.frame
         if kept is None or not self._files.was_seen:
             return ()  # the memory may still hold the previous scan, all of whose lines would be new
-        return fetched.new_lines(fetched.images(self._ask, self._grabbing), as_region(kept), start)
+        began_s = self.clock.monotonic_s()
+        if began_s < self._grabs_at_s:
+            return ()
+        new = fetched.new_lines(self._images(), as_region(kept), start)
+        ended_s = self.clock.monotonic_s()
+        self._grabs_at_s = ended_s + _GRAB_SHARE * (ended_s - began_s)
+        return new
+
+    def _images(self) -> list[fetched.Image]:
+        try:
+            return fetched.images(self._there.ask_for_data, self._grabbing)
+        except protocol.UnreadableReply as error:
+            raise FileError(f"the scan in Nanonis' memory can't be read: {error}") from error
 
     # --- actions ---
 

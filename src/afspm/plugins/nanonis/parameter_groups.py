@@ -42,6 +42,31 @@ class Group(SettingsGroup):
         return numbers(self._ask, name, *arguments)
 
 
+class SideGroup(SettingsGroup):
+    """A group whose values the tip's safety does not need: answers that can't be read end its use, not the contact.
+
+    Attributes:
+        unreadable: why the group is left out, after two bad answers in a row; otherwise empty.
+    """
+
+    def __init__(self, group: Group) -> None:
+        self.names = group.names
+        self._group, self._failed, self.unreadable = group, False, ""
+
+    def read(self) -> dict[str, Value]:
+        try:
+            found = self._group.read()
+        except BadReply as error:
+            self.unreadable = str(error) if self._failed else ""
+            self._failed = True
+            raise
+        self._failed = False
+        return found
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        self._group.write(values)
+
+
 def numbers(ask: Ask, name: str, *arguments: object) -> tuple[Any, ...]:
     """Return the results of a function whose numbers must be finite.
 

@@ -36,6 +36,10 @@ class BadReply(ControllerLost):
     code = "nanonis-reply"
 
 
+class UnreadableReply(BadReply):
+    """The error that a whole reply to the right function has other results than expected: later replies count."""
+
+
 class NanonisError(AfspmError):
     """An error reported by Nanonis, with its own text."""
 
@@ -128,7 +132,7 @@ def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[
 
     Raises:
         NanonisError: Nanonis reports an error.
-        BadReply: the body does not fit the function.
+        UnreadableReply: the body does not fit the function.
     """
     try:
         # The fields depend on the release: a wrong release leaves bytes over, or needs more bytes than received.
@@ -140,7 +144,7 @@ def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[
             status = 0
         if status == 0:
             hint = f"it was read as release {release} sends it" if _depends_on_release(name) else ""
-            raise BadReply(f"the reply to {name} is malformed: {whole.what}", hint=hint) from None
+            raise UnreadableReply(f"the reply to {name} is malformed: {whole.what}", hint=hint) from None
     if status:
         raise NanonisError(f"Nanonis: {text or 'no reason given'} (error {status})", where=name)
     return found

@@ -68,15 +68,17 @@ class Link:
 
         Raises:
             NanonisError: Nanonis reports an error. InvalidValue: the arguments can't be sent.
-            ControllerLost, BadReply: no answer, or a malformed answer; the connection is closed.
+            UnreadableReply: other results than expected. ControllerLost, BadReply: no answer, or one to something else;
+                the connection is closed.
         """
 
-        def read(receiver: Receiver) -> tuple[object, ...]:
+        def read(receiver: Receiver) -> bytearray:
             # A reply may exceed one segment of TCP, e.g. 128 names of signals, or a scan.
             size = protocol.body_bytes(bytes(receiver.exactly(protocol.HEADER_BYTES)), name)
-            return protocol.results(name, receiver.exactly(size), self.release)
+            return receiver.exactly(size)
 
-        return self._tcp.ask(name, protocol.request(name, arguments, self.release), read, longer_s=longer_s)
+        body = self._tcp.ask(name, protocol.request(name, arguments, self.release), read, longer_s=longer_s)
+        return protocol.results(name, body, self.release)
 
 
 Address = tuple[str, int]
@@ -87,8 +89,8 @@ class Ports:
     """Nanonis' ports; each serves one client.
 
     Attributes:
-        named: the ports as named: for quick requests, for blocking calls, for withdrawing, and a spare one. A single
-            port is an emulator's, and serves all.
+        named: the ports as named: for quick requests, for blocking calls, for withdrawing, and for the data of scans or
+            in place of a silent one. A single port is an emulator's, and serves all.
         silent: ports that have accepted a connection and answered nothing. Others report of a real Nanonis that a port
             stays so until Nanonis is restarted, after a client was killed in mid-answer.
     """
@@ -105,11 +107,11 @@ class Ports:
         some = [one for one in self.named if one != self.for_withdrawing]
         return sorted(some, key=lambda one: one in self.silent)
 
-    def besides(self, taken: Address) -> Address | None:
-        """Return the port for blocking calls beside the one that is taken for quick requests; None: there is none."""
+    def besides(self, *taken: Address | None) -> Address | None:
+        """Return the next port beside those taken; None: there is none. A single port is never taken."""
         if len(self.named) == 1:
-            return taken
-        return next((one for one in self.working() if one != taken and one not in self.silent), None)
+            return self.named[0]
+        return next((one for one in self.working() if one not in taken and one not in self.silent), None)
 
 
 class Session:
@@ -136,10 +138,12 @@ class Session:
         self._log = driver.log
         self._driver, self._timeout_s = driver, timeout_s
         self._listener: Listener | None = None
+        self._data: Link | None = None
         working = self._reach_first(ports, release)
         # each port of Nanonis serves one client, one call at a time: a blocking call needs a port of its own
         try:
             at = ports.besides(working)
+            self._data_at = ports.besides(working, at) if len(ports.named) > 1 else None
             second = None if at is None else self._connected(at, self._link.release)
             if second is None:
                 self._log.warning(_ALONE)
@@ -191,7 +195,22 @@ class Session:
     def close(self) -> None:
         if self._listener is not None:
             self._listener.close()
+        if self._data is not None:
+            self._data.close()
         self._link.close()
+
+    def ask_for_data(self, name: str, *arguments: object) -> tuple[Any, ...]:
+        """Call a function with a large answer, over a port of its own if one is left, otherwise as `ask`."""
+        if self._data_at is None:
+            return self.ask(name, *arguments)
+        try:
+            if self._data is None:
+                self._data = self._connected(self._data_at, self._link.release)
+            return self._data.ask(name, *arguments)
+        except ControllerLost as error:
+            self._log.warning("the data of scans comes over the first port from now on: %s", error)
+            self._data_at = None
+            return self.ask(name, *arguments)
 
     def _found_release(self) -> int:
         try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
@@ -74,6 +74,7 @@ class NanonisEmulator(Emulator):
         one_each: True if a port serves one client at a time, like a real controller's port.
         wedges: True if a port stays silent for ever once its client has reset the connection in mid-answer, as others
             report of real ones.
+        other_layout: functions whose replies have four bytes more than documented, such as "Scan.FrameDataGrab".
         session_path: path of the session folder on the controller's computer, e.g. "D:\\Data". Default: the local path.
         range_m: range of the scanner in x and y.
         clips_frames: True if a frame beyond the range is clipped when it is set. False: it is kept as set, and the tip
@@ -125,6 +126,7 @@ class NanonisEmulator(Emulator):
         logger_port: int = 0,
         one_each: bool = False,
         wedges: bool = False,
+        other_layout: Sequence[str] = (),
         session_path: str = "",
         range_m: Length = 100e-6,
         bare_errors: bool = False,
@@ -140,6 +142,10 @@ class NanonisEmulator(Emulator):
         self._chance = random.Random(self.seed)
         self._one_each, self._wedges = one_each, wedges
         self._session_path = session_path
+        self._other_layout = other_layout
+        if unknown := set(other_layout) - wire.functions().keys():
+            what = f"Nanonis has no function {min(unknown)!r}"
+            raise ConfigError(what, where="other_layout", hint='a list of functions, such as ["Piezo.TiltGet"]')
         self._range_m = range_m
         self._bare_errors = bare_errors
         for name, value, known in (
@@ -312,7 +318,9 @@ class NanonisEmulator(Emulator):
         padded = (*results, *(wire.ZEROS[field.code] for field in fields[len(results) :]))
         if self.faults.lasts("nonsense", now_s):
             padded = tuple(wire.senseless_value(field.code, self._chance) for field in fields)
-        self._send(connection, asked.sent, wire.body(asked.name, padded, self._wire_release(now_s), encoding))
+        body = wire.body(asked.name, padded, self._wire_release(now_s), encoding)
+        more = b"\0" * 4 if asked.name in self._other_layout else b""
+        self._send(connection, asked.sent, body + more)
 
     def _send(self, connection: ClientConnection, name: str, body: bytes) -> None:
         now_s = self.clock.now_s()
