@@ -520,6 +520,13 @@ class DriverBase(ABC):
         """
         return self._reach
 
+    def refuse_unreachable(self, values: Mapping[str, Value]) -> None:  # noqa: B027 (most have nothing to ask)
+        """Raise Refused for values that the controller would take as set, and could not bring about.
+
+        Called after the table's ranges have been checked, before anything is set. Override where the controller
+        reports present bounds.
+        """
+
     def in_force(self, wanted: Collection[str]) -> dict[str, Value]:
         """Return the values of `read`, each replaced by the last set value if equal within the precision.
 
