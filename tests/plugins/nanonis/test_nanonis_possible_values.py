@@ -9,7 +9,16 @@ import pytest
 from tests.plugins.nanonis.nanonis_bench import Bench
 from tests.plugins.vendor_bench import SHAPE, Peer, ready
 
-from afspm.model import ControlRequest, ControlResponse, Feedback, ProbePosition, Region, ScanParameters, names
+from afspm.model import (
+    ControlRequest,
+    ControlResponse,
+    Feedback,
+    ProbePosition,
+    Region,
+    ScanParameters,
+    ScopeState,
+    names,
+)
 from afspm.plugins.nanonis.preamplifier import range_a
 
 Make = Callable[..., Bench]
@@ -195,3 +204,19 @@ def test_dip_is_refused_if_other_values_are_in_force(bench: Make, monkeypatch: p
     assert response.code == ControlResponse.ACTION_ERROR
     assert "the Tip Shaper has other values than those set" in response.reason
     assert not made.emulator.rig.world.truth(made.clock.now_s())["marks"]
+
+
+# --- the coarse motor ---
+
+
+def test_step_of_the_coarse_motor_needs_a_withdrawn_tip(bench: Make) -> None:
+    # results 30: an action with Motor.StartMove had no guard
+    step = {"command": "Motor.StartMove 4 10 0 0"}
+    made, peer = lenient(bench, actions={"x-step": step})
+    response = peer.act("x-step")
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "the tip is at the sample: withdraw it first (x-retract)" in response.reason
+    assert made.emulator.rig.doing(made.clock.now_s()) == ""
+    assert peer.act(names.RETRACT).ok
+    peer.until(ScopeState.FREE)
+    assert peer.act("x-step").ok

@@ -116,6 +116,7 @@ class Nanonis(Driver):
     counts_clockwise: ClassVar[bool] = True
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
+    coarse_commands: ClassVar[str] = r"^\s*Motor\.Start"
     never_shows: ClassVar = {
         "another one begun": "a stop and a start between two looks seem one scan, unless the stop saves a file",
     }
