@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from afspm.basics import ConfigError, Duration, FileError, Refused
+from afspm.basics import ConfigError, Current, Duration, FileError, Refused, Voltage
 from afspm.driver import (
     FRAME,
     SCAN,
@@ -39,8 +39,10 @@ from afspm.driver import (
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.nanonis import fetched, geometry, parameter_groups, protocol, z_controller
 from afspm.plugins.nanonis.activity import SAFE_TIP, WITHDRAWING, NanonisActivity
+from afspm.plugins.nanonis.preamplifier import Preamplifier
 from afspm.plugins.nanonis.result_files import NanonisFiles
 from afspm.plugins.nanonis.session import MODULES, Link, Ports, Session, WithdrawalPort
+from afspm.plugins.nanonis.tip_shaper import TipShaper
 
 _ADDRESS: Final = "127.0.0.1:6501,6502"
 _NO_WAY: Final = (
@@ -61,6 +63,9 @@ _CONTINUOUS: Final = (
 )
 _GRAB_SHARE: Final = 10.0
 """Real time without a grab of lines, in times of the last grab: large scans must not fill the connection."""
+_UNSAVED: Final = (
+    "scans are not saved, although saving was switched on (Scan Control): their data is fetched from Nanonis' memory"
+)
 _AT_ONCE: Final = 0
 """Argument of functions that could also wait for the end of their action."""
 _NO_TIMEOUT: Final = -1
@@ -104,6 +109,9 @@ class Nanonis(Driver):
         reply_timeout_s: longest wait for a reply, real time.
         autosave: True switches on saving of every scan; False leaves the panel's setting alone.
         grabbed_rows, grabbed_backward: see `fetched.Grabbing`.
+        preamplifier_range: largest current of the preamplifier, if Nanonis' label of the gain does not state V/A.
+        sensor: "qplus" or "other". On a qPlus sensor `x-crash` is refused at a larger bias than `qplus_bias`.
+        qplus_bias: largest amount of the bias at which a qPlus sensor may touch the sample.
         common: settings of every driver.
     """
 
@@ -115,6 +123,7 @@ class Nanonis(Driver):
     counts_clockwise: ClassVar[bool] = True
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
+    coarse_commands: ClassVar[str] = r"^\s*Motor\.Start"
     never_shows: ClassVar = {
         "another one begun": "a stop and a start between two looks seem one scan, unless the stop saves a file",
     }
@@ -132,6 +141,9 @@ class Nanonis(Driver):
         autosave: bool = True,
         grabbed_rows: str = "top-first",
         grabbed_backward: str = "mirrored",
+        preamplifier_range: Current | None = None,
+        sensor: str = "",
+        qplus_bias: Voltage = 0.05,
         **common: Any,
     ) -> None:
         super().__init__(**common)
@@ -153,6 +165,8 @@ class Nanonis(Driver):
         self._side = [parameter_groups.SideGroup(group(ask)) for group in _SIDE]
         vital = (*(group(ask) for group in _BY_VALUE), self._probe, feedback, self._tip, self._kept)
         self.groups = (*vital, *self._side)
+        self._preamplifier = Preamplifier(ask, preamplifier_range)
+        self._tip_shaper = TipShaper(ask, sensor, qplus_bias, lambda: self.log)
         self._files: NanonisFiles
 
     def connect(self) -> None:
@@ -174,6 +188,8 @@ class Nanonis(Driver):
             session, self._files, self._probe, self._tip, self.memory, self.clock, self.log
         )
         z_controller.compare(session.ask, self.table[names.ZCTRL_SETPOINT].unit, self.log)
+        if self._holds_current:
+            self._preamplifier.look(self.log)
         folder = self._session_dir or Path(session.ask("Util.SessionPathGet")[0])
         if not folder.is_dir():
             self.log.warning(
@@ -243,6 +259,14 @@ class Nanonis(Driver):
 
     def reach(self) -> Mapping[str, ParameterSpec]:
         return self._probe.within(super().reach())
+
+    @property
+    def _holds_current(self) -> bool:
+        return self.table[names.ZCTRL_SETPOINT].si_unit == "A"
+
+    def refuse_unreachable(self, values: Mapping[str, Value]) -> None:
+        if names.ZCTRL_SETPOINT in values and self._holds_current:
+            self._preamplifier.refuse_beyond(float(values[names.ZCTRL_SETPOINT]))
 
     def get(self, vendor: str) -> Value:
         """Return a value by the prefix of a pair of functions: "Bias." means Bias.Get."""
@@ -363,14 +387,8 @@ class Nanonis(Driver):
     def crash(self) -> None:
         """Shape the tip: `x-crash-depth` down at `x-crash-speed` and back; the z controller is restored."""
         self._activity.refuse_safe_tip()
-        depth_m = self._kept.number(names.CRASH_DEPTH)
-        ramp_s = depth_m / self._kept.number(names.CRASH_SPEED)
-        bias_v = parameter_groups.numbers(self._ask, "Bias.Get")[0]
-        # one dip at the present bias: the tip shaper's second lift undoes the first
-        same_bias, settle_s, restore = 2, 0.1, 1
-        before = (settle_s, same_bias, bias_v)
-        self._ask("TipShaper.PropsSet", *before, -depth_m, ramp_s, bias_v, settle_s, depth_m, ramp_s, settle_s, restore)
-        lasts_s = 2 * ramp_s + 4 * settle_s
+        depth_m, speed_m_s = self._kept.number(names.CRASH_DEPTH), self._kept.number(names.CRASH_SPEED)
+        lasts_s = self._tip_shaper.prepare(depth_m, speed_m_s)
         with self._activity.occupied(ScopeState.MOVING, lasts_s + _LATE_S):
             self._ask("TipShaper.Start", _AT_ONCE, _NO_TIMEOUT, longer_s=lasts_s)
 
@@ -413,8 +431,11 @@ class Nanonis(Driver):
             autosave = save_all if save else no_change
             self._ask("Scan.PropsSet", off, off, autosave, series, comment, modules, no_change)
             # another program or the panel may switch it on again, and a reply of PropsSet is no proof
-            if self._ask("Scan.PropsGet")[0]:
+            continuous, _, autosave, *_ = self._ask("Scan.PropsGet")
+            if continuous:
                 raise Refused(ControlResponse.ACTION_ERROR, _CONTINUOUS)
+            if save and autosave != 0:
+                self.log.warning(_UNSAVED)
 
 
 def _argument(code: str, word: str) -> object:

@@ -80,11 +80,16 @@ def numbers(ask: Ask, name: str, *arguments: object) -> tuple[Any, ...]:
     return found
 
 
-def keep_speed(ask: Ask) -> None:
-    """Let Nanonis keep both scan speeds when the frame changes, instead of the time per line."""
+def keep_speed(ask: Ask) -> float:
+    """Let Nanonis keep both scan speeds when the frame changes, instead of the time per line.
+
+    Returns:
+        the forward speed, in m/s.
+    """
     *speeds, keeps_time, ratio = ask("Scan.SpeedGet")
     if keeps_time:
         ask("Scan.SpeedSet", *speeds, _KEEP_SPEED, ratio)
+    return float(speeds[0])
 
 
 class ScanSpeed(Group):

@@ -110,6 +110,7 @@ class NanonisEmulator(Emulator):
         "stale-name": "the file of the previous scan is announced for a scan",
         "autosave-off": "scans and spectra are not saved for the duration, despite the settings",
         "late-start": "a scan begins, and is reported as running, only after the duration",
+        "takes-all": "for the duration, values are taken as sent that are otherwise refused, rounded or clipped",
         "no-start": "a scan does not begin, without an error",
         "blocks": "for the duration, a pulse or a shaping of the tip is answered at its end, although no one waits",
         "ends-at-once": "for the duration, waiting for the end of a scan returns at once if none runs",
