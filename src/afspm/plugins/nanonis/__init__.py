@@ -67,6 +67,7 @@ _BY_VALUE: Final = (
     parameter_groups.MoveSpeed,
     parameter_groups.Slope,
     parameter_groups.DriftRate,
+    parameter_groups.SafeTip,
 )
 _GROUPS: Final = (*_BY_VALUE, geometry.Probe, parameter_groups.FeedbackOn, parameter_groups.TipState)
 _TRANSLATED: Final = tuple(name for group in _GROUPS for name in group.names)
