@@ -78,7 +78,7 @@ _BY_VALUE: Final = (
     parameter_groups.Gains,
     parameter_groups.MoveSpeed,
 )
-_SIDE: Final = (parameter_groups.Slope, parameter_groups.DriftRate)
+_SIDE: Final = (parameter_groups.Slope, parameter_groups.DriftRate, parameter_groups.SafeTip)
 _GROUPS: Final = (*_BY_VALUE, *_SIDE, geometry.Probe, parameter_groups.FeedbackOn, parameter_groups.TipState)
 _TRANSLATED: Final = tuple(name for group in _GROUPS for name in group.names)
 _CHANNELS: Final = both_ways(

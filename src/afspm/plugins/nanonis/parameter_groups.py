@@ -10,8 +10,9 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Final
 
+from afspm.basics import Refused
 from afspm.driver import FEEDBACK_ON, SettingsGroup, Value, refuse_value
-from afspm.model import names
+from afspm.model import ControlResponse, names
 from afspm.plugins.nanonis.protocol import BadReply, NanonisError
 
 Ask = Callable[..., tuple[Any, ...]]
@@ -203,6 +204,24 @@ class TipState(Group):
         except NanonisError:
             return False  # the place of a withdrawn tip is not known
         return bool(self._numbers("ZCtrl.ZPosGet")[0] >= high_m - _END_OF_RANGE * (high_m - low_m))
+
+
+class SafeTip(Group):
+    """The controller's own guard: whether it is on, and the signal at which it withdraws the tip."""
+
+    names = (names.SAFE_TIP_ON, names.SAFE_TIP_THRESHOLD)
+
+    def read(self) -> dict[str, Value]:
+        try:
+            (is_on,), (*_, threshold_a) = self._ask("SafeTip.OnOffGet"), self._numbers("SafeTip.PropsGet")
+        except NanonisError as error:
+            raise Refused(
+                ControlResponse.PARAM_NOT_SUPPORTED, f"Nanonis does not report its safe tip: {error}"
+            ) from error
+        return dict(zip(self.names, (is_on == 1, threshold_a), strict=True))  # (! safe-tip)
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        raise refuse_value(next(iter(values)), "it is read-only")
 
 
 class MoveSpeed(Group):
