@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from afspm.basics.frozen import replace
     from afspm.basics.interpreter import python_command, python_environment
     from afspm.basics.launch import Launch, Sockets
-    from afspm.basics.plain_data import Plain, PlainList, PlainMapping, from_json
+    from afspm.basics.plain_data import Count, Plain, PlainList, PlainMapping, from_json
     from afspm.basics.progress_line import ProgressLine
     from afspm.basics.requirements import require
     from afspm.basics.shared_time import Publication
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
         Duration,
         Length,
         PollPeriod,
+        PositiveLength,
         Speed,
         convert,
         parse_quantity,
@@ -87,6 +88,7 @@ __all__ = [
     "Clock",
     "ConfigError",
     "ControlLost",
+    "Count",
     "Duration",
     "ExitCode",
     "ExperimentClock",
@@ -104,6 +106,7 @@ __all__ = [
     "PlainList",
     "PlainMapping",
     "PollPeriod",
+    "PositiveLength",
     "ProgressLine",
     "Publication",
     "Refused",
