@@ -95,7 +95,7 @@ class Emulator(ABC):
             `kind`, `at_s`, `count`, `duration_s`.
         surface: a kind of sample, or a table of `kind` and its settings.
         tip, tip_changes, drift, feedback, scanner, noise, signals, iv, force, property_map: settings of the simulated
-            world, as in `World.from_settings`.
+            world, as in `World.from_settings`. The scanner may be a name: "stm-4k".
 
     Attributes:
         clock, log: of the experiment; set before `open`, like all following attributes.
@@ -147,7 +147,7 @@ class Emulator(ABC):
         tip_changes: PlainMapping | None = None,
         drift: PlainMapping | None = None,
         feedback: PlainMapping | None = None,
-        scanner: PlainMapping | None = None,
+        scanner: str | PlainMapping | None = None,
         noise: PlainMapping | None = None,
         signals: PlainMapping | None = None,
         iv: PlainMapping | None = None,
