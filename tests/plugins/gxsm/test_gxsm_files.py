@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import re
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from afspm import read
-from afspm.basics import convert
+from afspm.basics import FileError, convert
 from afspm.emulation import ControllerClock, Faults
+from afspm.plugins.gxsm import result_files
 from afspm.plugins.gxsm.emulator import files
 from afspm.plugins.gxsm.emulator.file_writer import FAULT_KINDS, GxsmFileWriter
 from afspm.plugins.gxsm.emulator.files import CHANNELS
@@ -202,3 +206,32 @@ def test_a_spectrum_written_by_the_emulator_is_read_as_it_was_measured(tmp_path:
     assert (curve.kind, curve.names, curve.units) == ("VP", ("Bias", "Z-mon"), ("V", "m"))
     np.testing.assert_allclose(curve.values, [[-1.0, 1e-9], [0.0, 2e-9], [1.0, 3e-9]])
     assert content.end_ns == int(START_S * 1e9)
+
+
+def test_files_of_earlier_nights_are_not_read_in_a_folder_that_gxsm_names_late(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # 330 of them took 27 s, in which the translator answered nothing
+    for number in range(5):
+        old = tmp_path / f"night{number:03}-M-Xp-Topo.nc"
+        old.write_bytes(b"CDF")
+        os.utime(old, (1e9, 1e9))
+    own = tmp_path / "run001-M-Xp-Topo.nc"
+    own.write_bytes(b"CDF")
+    asked: list[Path] = []
+
+    def read(file: Path) -> None:
+        asked.append(file)
+        raise FileError("half")
+
+    monkeypatch.setattr(result_files, "read_result", read)
+    saved, now_ns = (
+        result_files.GxsmFiles({}, logging.getLogger(), patience_s=10.0, soon_s=1.0, late_s=20.0),
+        time.time_ns(),
+    )
+    taken = {"frame": [0.0, 0.0, 1e-6, 1e-6, 0.0], "shape": [8, 8], "place": [0.0, 0.0, 0.0]}
+    saved.begin("scan", None, now_ns - 5 * 10**9, taken)
+    saved.end(now_ns, now_ns, [str(own)], tmp_path)
+    for _ in range(2):  # a file is read once it has not grown between two looks
+        saved.results(now_ns / 1e9)
+    assert asked == [own]

@@ -220,6 +220,7 @@ class GxsmFiles(ResultFiles):
         ended = self._kept["ended"]
         if folder is not None and str(folder) != ended["folder"]:  # old scans there are recognised by their start
             ended["folder"] = str(folder)
+            ended["lasted_ns"] = end_ns - ended["begun_ns"] if ended["begun_ns"] else 0
             ended["begun_ns"] = ended["begun_ns"] or end_ns
         self._sizes, self._whole, self._before, self._half = {}, {}, {}, set()
         if is_whole is False:
@@ -315,11 +316,12 @@ class GxsmFiles(ResultFiles):
     def _new(self, ended: Entry) -> dict[Path, FileContent]:
         # Complete files only: a file is read once its size has been the same in two looks.
         found = {}
+        not_before_ns = max(ended["newest_ns"], self._named_ns(ended))
         names = ended.get("names")
         there = _files(_folder(ended), ended["what"]) if names is None else [Path(name) for name in names]
         for file in sorted(file for file in there if file.exists()):
             stat = file.stat()
-            if stat.st_mtime_ns <= ended["newest_ns"]:
+            if stat.st_mtime_ns <= not_before_ns:
                 continue
             size = (stat.st_size, stat.st_mtime_ns)
             if self._sizes.get(file) != size:
@@ -347,6 +349,14 @@ class GxsmFiles(ResultFiles):
             ours = {**endings(found), **endings(named)}
             return {file: found[file] for file in ours.values()}
         return {file: found[file] for file in sorted(found, key=lambda file: file.stat().st_mtime_ns)[-1:]}
+
+    def _named_ns(self, ended: Entry) -> int:
+        # Of a folder that GXSM had not named at the start, only files that are hardly older than the named ones are
+        # read: a folder of an earlier night may have hundreds.
+        if not ended.get("lasted_ns"):
+            return 0
+        named = [modified_ns(Path(ended["folder"], name)) for name in ended["named"]]
+        return min(named, default=0) - int(ended["lasted_ns"]) - self._late_ns
 
     def _is_of_before(self, content: FileContent, begun_ns: int) -> bool:
         # Files have the time of GXSM's computer, whose clock may differ from this one and be set at any time. A start
