@@ -185,7 +185,8 @@ dev: $(DEV)
 messages: $(TEST)
 	@echo "The message classes are up to date: src/afspm/wire/generated"
 
-## style, spelling, types, which package imports which, the workflows, and the answers of drivers to the quality scale
+## style, spelling, types, which package imports which, the workflows, the answers of drivers to the
+## quality scale, and the claims behind their marks (! ID)
 check: $(DEV)
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
@@ -194,6 +195,7 @@ check: $(DEV)
 	@$(BIN)/lint-imports
 	@$(BIN)/zizmor --quiet --no-progress --offline --strict-collection --persona pedantic .github
 	@$(BIN)/python tools/quality.py
+	@$(BIN)/python tools/claims.py
 	@$(BIN)/python tools/doors.py
 
 ## speed, beside bare pyzmq and beside the last landed run: a table, and build/bench.json. LAND=1 lands this run's ratios

@@ -17,6 +17,7 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
+import claims
 import doors
 import python_api
 import quality
@@ -368,6 +369,8 @@ PARTS: dict[str, Callable[[], str]] = {
     "witnesses": witnesses,
     "matrix": matrix,
     "quality": quality.scale_tables,
+    "claim-counts": claims.counts,
+    "claims": claims.table,
     "quality-rules": quality.rules_table,
     "components": component_pages,
     "simulator": simulator_page,

@@ -80,6 +80,9 @@ OFF_WORDS: Final = frozenset({"false", "0", "off", "no"})
 """Texts that a peer may send for a switch, in lower case."""
 ENGAGED: Final = "x-engaged"
 """Whether the tip is at the sample, if the microscope reports it; read-only."""
+SAFE_TIP_ON: Final = "x-safe-tip-on"
+SAFE_TIP_THRESHOLD: Final = "x-safe-tip-threshold"
+"""The controller's own guard, which withdraws the tip at too large a signal, where it is reported; read-only."""
 CONTROLLER: Final = "x-controller"
 """The controller's name and version as a text; read-only."""
 

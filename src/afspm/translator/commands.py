@@ -173,8 +173,10 @@ class Commands:
         self._about_to_act(request)
         try:
             action.do()
-        except LOST:
-            raise  # it may have been carried out
+        except LOST as error:
+            if action.name != names.RETRACT or not self._driver.withdraw_elsewhere():
+                raise  # it may have been carried out
+            self._log.warning("the tip was withdrawn over the connection kept for it, since %s", error)
         except Exception:  # a driver may raise anything; it is raised again
             treatment.forget()
             raise

@@ -155,6 +155,7 @@ class CommonSettings:
     result_timeout_s: float
     live_lines_s: float | None
     trace: bool
+    settle_before_scan_s: float
 
 
 class DriverBase(ABC):
@@ -190,6 +191,8 @@ class DriverBase(ABC):
             at least twice `program_s` of real time.
         live_lines_s: time between two publications of a running scan's lines, in experiment seconds; 0: never; None: by
             `live_real_s`.
+        settle_before_scan_s: wait after a request that moves the frame, in experiment seconds: the microscope counts as
+            moving until the scanner has settled, so that no scan begins.
         trace: record all exchanges with the controller in `controller.trace.jsonl` of the run's folder.
 
     Attributes:
@@ -282,6 +285,7 @@ class DriverBase(ABC):
         result_timeout_s: Duration = 10.0,
         live_lines_s: Duration | None = None,
         trace: bool = False,
+        settle_before_scan_s: Duration = 0.0,
     ) -> None:
         if live_lines_s is not None and type(self).lines is DriverBase.lines:
             raise ConfigError(f"{type(self).__name__} does not publish lines of a running scan", where="live_lines_s")
@@ -289,7 +293,9 @@ class DriverBase(ABC):
         # a microscope that can't move its tip alone has no rows for it later on, and the same scanner
         self._reach = reach_in(self.table)
         self.channels = self.channels_of({"channels": channels})
-        self.common = CommonSettings(dict(actions or {}), poll_period_s, result_timeout_s, live_lines_s, trace)
+        self.common = CommonSettings(
+            dict(actions or {}), poll_period_s, result_timeout_s, live_lines_s, trace, settle_before_scan_s
+        )
         self.adjustable: frozenset[str] = frozenset()
         self.prove: Callable[[], None] = _prove_nothing
         self._last_written: dict[str, Value] = {}
@@ -453,6 +459,26 @@ class DriverBase(ABC):
         Override where it does: a pulse or crash then ends once the feedback holds the current at its setpoint.
         """
         return None
+
+    @property
+    def withdraws_aside(self) -> bool:
+        """Whether the controller can be asked to withdraw the tip while the working connection is silent."""
+        return False
+
+    def withdraw_elsewhere(self) -> bool:
+        """Withdraw the tip over a connection kept for this alone; return False if there is none.
+
+        Called if `x-retract` is asked for and the controller is lost.
+
+        Raises:
+            ControllerLost: this connection, too, is silent or lost.
+        """
+        return False
+
+    @classmethod
+    def lost_without(cls, settings: PlainMapping) -> Sequence[str]:
+        """Return what a real controller with these settings can't do, each with its remedy, as sentences."""
+        return ()
 
     def is_last_written(self, name: str, value: Value) -> bool:
         """Return whether the run has set this parameter last, and to this value."""

@@ -85,11 +85,17 @@ class Person:
 
 
 def commissioned(
-    folder: Path, vendor: str, person: Person, driver: str = "", *, patience: float = REHEARSAL_PATIENCE
+    folder: Path,
+    vendor: str,
+    person: Person,
+    driver: str = "",
+    *,
+    patience: float = REHEARSAL_PATIENCE,
+    settings: str = "",
 ) -> CommissioningResult:
     shutil.copy(HERE / "spoiled.py", folder)
     file = folder / "experiment.toml"
-    file.write_text(EXPERIMENT.format(vendor=vendor, driver=driver or vendor), encoding="utf-8")
+    file.write_text(EXPERIMENT.format(vendor=vendor, driver=driver or vendor) + settings, encoding="utf-8")
     report = folder / "report.toml"
     before = InstrumentReport.read(report) if report.exists() else None
     options = CheckOptions([file], runs=folder / "runs", patience=patience)
@@ -277,14 +283,16 @@ def ask(folder: Path, driver: str, *answers: str) -> subprocess.CompletedProcess
 
 
 def test_the_command_asks_and_reports(tmp_path: Path) -> None:
-    # controller, withdrawn, frame, angle, scan and stop; the tip stays away
-    done = ask(tmp_path, "Nanonis", *["y"] * 6, "n")
+    # controller, withdrawn, frame, angle, scan, lines and stop; the tip stays away
+    done = ask(tmp_path, "Nanonis", *["y"] * 7, "n")
     assert done.returncode == 1, done.stdout + done.stderr  # the tip was not approached
     assert "✓ Stopping a scan" in done.stdout
     assert "– declined: The tip is at the sample" in done.stdout
     report = InstrumentReport.read(tmp_path / "experiment-commissioning.toml")
     assert report.operations["scan"] == "passed"
     assert report.operations["axes"] == "blocked"
+    assert report.claims["grabbed-rows"] == "holds"
+    assert report.claims["angle-clockwise"] == "not shown", "an emulator has no panel that shows it"
     for step in ("panel", "stop-at-panel", "connection"):
         assert report.steps[step] == {"outcome": "skipped", "line": f"{NO_PANEL} or cable"}
     assert f"Where to, in the panel's picture? – skipped: {NO_PANEL}" in done.stdout
@@ -369,3 +377,50 @@ def test_a_scan_that_the_person_stops_at_the_panel_ends_no_control(vendor: str, 
     lines = {name: f"{one.outcome.value}: {one.line}" for name, one in result.progress.results.items()}
     assert lines["stop-at-panel"] == "passed: noticed", lines
     assert result.passed, (result.lost, lines)
+
+
+def at_nanonis(folder: Path, function: str, *arguments: object) -> tuple[Any, ...]:
+    """Call a function of the emulated controller, as its panel does."""
+    link = nanonis.Link(("127.0.0.1", int(address(folder).rpartition(":")[2])), DEADLINE_S, time.monotonic)
+    try:
+        return link.ask(function, *arguments)
+    finally:
+        link.close()
+
+
+def test_claims_about_nanonis_are_settled_with_the_tip_withdrawn(tmp_path: Path) -> None:
+    def continuous() -> str:
+        _, _, _, series, comment, modules, _, _, paste = at_nanonis(tmp_path, "Scan.PropsGet")
+        on, all_saved = 1, 1
+        at_nanonis(tmp_path, "Scan.PropsSet", on, 0, all_saved, series, comment, modules, paste)
+        return "y"
+
+    person = Person({"Switch *continuous* on": continuous, "Is the tip at the sample": False})
+    result = commissioned(tmp_path, "Nanonis", person)
+    assert {name for name, verdict in result.claims.items() if verdict == "holds"} == {
+        "angle-clockwise", "y-up", "continuous-off", "grabbed-rows", "grabbed-backward", "buffer-numbers", "safe-tip",
+    }  # fmt: skip
+    assert InstrumentReport.read(tmp_path / "report.toml").claims == result.claims
+    assert any("WARNING: the safe tip is off" in line for line in person.shown)
+    assert result.progress.results["safe-tip"].line == "OFF (its threshold: 1 nA)"
+
+
+# nanonis 5
+def test_wrong_order_of_rows_in_memory_is_found_while_a_scan_fills(tmp_path: Path) -> None:
+    person = Person({"Is the tip at the sample": False})
+    result = commissioned(tmp_path, "Nanonis", person, settings='grabbed_rows = "recorded"\n')
+    assert result.progress.results["lines"].outcome is CheckOutcome.FAILED
+    assert "in other rows" in result.progress.results["lines"].line
+    assert (result.claims["grabbed-rows"], result.claims["buffer-numbers"]) == ("does not hold", "not shown")
+
+
+def test_safe_tip_that_is_on_is_reported_with_its_threshold(tmp_path: Path) -> None:
+    def switch_on() -> str:
+        at_nanonis(tmp_path, "SafeTip.OnOffSet", 1)
+        return "y"
+
+    person = Person({"Is this the controller": switch_on, "scanner can't reach it": False})
+    result = commissioned(tmp_path, "Nanonis", person)
+    assert result.progress.results["safe-tip"].line == "on, at 1 nA"
+    assert not any("WARNING" in line for line in person.shown)
+    assert result.claims["grabbed-rows"] == "not shown"

@@ -41,9 +41,14 @@ from afspm.plugins.nanonis import fetched, geometry, parameter_groups, protocol,
 from afspm.plugins.nanonis.activity import SAFE_TIP, WITHDRAWING, NanonisActivity
 from afspm.plugins.nanonis.preamplifier import Preamplifier
 from afspm.plugins.nanonis.result_files import NanonisFiles
-from afspm.plugins.nanonis.session import MODULES, Session
+from afspm.plugins.nanonis.session import MODULES, Link, Ports, Session, WithdrawalPort
 from afspm.plugins.nanonis.tip_shaper import TipShaper
 
+_ADDRESS: Final = "127.0.0.1:6501,6502"
+_NO_WAY: Final = (
+    "no port is kept for withdrawing the tip: while the first port of Nanonis stays silent, the tip stays where it is; "
+    'name a third one, as in address = "127.0.0.1:6501,6502,6503"'
+)
 _AT_FIRST: Final[dict[str, Value]] = {
     names.SCAN_DIRECTION: names.UP,
     names.SPEC_KIND: "IV",
@@ -56,6 +61,8 @@ _CONTINUOUS: Final = (
     "the continuous scan stays on at Nanonis' panel (Scan Control), although it was switched off: one scan would "
     "follow the other without end. Switch it off there"
 )
+_GRAB_SHARE: Final = 10.0
+"""Real time without a grab of lines, in times of the last grab: large scans must not fill the connection."""
 _UNSAVED: Final = (
     "scans are not saved, although saving was switched on (Scan Control): their data is fetched from Nanonis' memory"
 )
@@ -70,10 +77,9 @@ _BY_VALUE: Final = (
     parameter_groups.ScanSpeed,
     parameter_groups.Gains,
     parameter_groups.MoveSpeed,
-    parameter_groups.Slope,
-    parameter_groups.DriftRate,
 )
-_GROUPS: Final = (*_BY_VALUE, geometry.Probe, parameter_groups.FeedbackOn, parameter_groups.TipState)
+_SIDE: Final = (parameter_groups.Slope, parameter_groups.DriftRate, parameter_groups.SafeTip)
+_GROUPS: Final = (*_BY_VALUE, *_SIDE, geometry.Probe, parameter_groups.FeedbackOn, parameter_groups.TipState)
 _TRANSLATED: Final = tuple(name for group in _GROUPS for name in group.names)
 _CHANNELS: Final = both_ways(
     {
@@ -94,8 +100,9 @@ class Nanonis(Driver):
     """The driver of a microscope with a Nanonis controller.
 
     Args:
-        address: "host:port,port": two of the ports at File > Settings Options > TCP Programming Interface; each port
-            serves one client. An emulator needs a single port.
+        address: "host:port,port,port": ports at File > Settings Options > TCP Programming Interface; each serves one
+            client: for quick requests, for calls that last, and for withdrawing the tip alone; a fourth one
+            is taken if one of the first two stays silent. An emulator needs a single port.
         session_dir: local path of Nanonis' session folder. Default: the path that Nanonis reports. Data in unreachable
             files is fetched over TCP.
         release: release of Nanonis' software (Help > Info), if the software reports none or a wrong release.
@@ -127,7 +134,7 @@ class Nanonis(Driver):
     def __init__(
         self,
         *,
-        address: str = "127.0.0.1:6501,6502",
+        address: str = _ADDRESS,
         session_dir: str | None = None,
         release: int | None = None,
         reply_timeout_s: Duration = 5.0,
@@ -141,27 +148,37 @@ class Nanonis(Driver):
     ) -> None:
         super().__init__(**common)
         self.controller_at = address
-        _addresses(address)
+        self._ports = Ports(_addresses(address))
+        self._withdrawal: WithdrawalPort | None = None
         self._session_dir = None if session_dir is None else Path(session_dir)
         self._release = release
         self._reply_timeout_s = reply_timeout_s
         self._autosave = autosave
         self._grabbing = fetched.Grabbing(grabbed_rows, grabbed_backward)
         self._session: Session | None = None
+        self._grabs_at_s = 0.0
         self._kept = KeptSettings(_AT_FIRST)
         ask = self._ask
         self._probe = geometry.Probe(ask, lambda: self.clock.now_s())
         feedback = parameter_groups.FeedbackOn(ask, lambda holds: self.wait_for(holds, reply_timeout_s))
         self._tip = parameter_groups.TipState(ask)
+        self._side = [parameter_groups.SideGroup(group(ask)) for group in _SIDE]
+        vital = (*(group(ask) for group in _BY_VALUE), self._probe, feedback, self._tip, self._kept)
+        self.groups = (*vital, *self._side)
         self._preamplifier = Preamplifier(ask, preamplifier_range)
         self._tip_shaper = TipShaper(ask, sensor, qplus_bias, lambda: self.log)
-        self.groups = (*(group(ask) for group in _BY_VALUE), self._probe, feedback, self._tip, self._kept)
         self._files: NanonisFiles
 
     def connect(self) -> None:
-        self.close()
-        addresses = _addresses(self.controller_at)
-        session = self._session = self.session_class(self, addresses, self._reply_timeout_s, self._release)
+        self._close_session()
+        if self._ports.named != (named := _addresses(self.controller_at)):
+            self._ports = Ports(named)
+        if self._withdrawal is None and self.withdraws_aside:
+            self._withdrawal = WithdrawalPort(self._link_to_withdraw, self.clock.monotonic_s, self.log)
+        if self._withdrawal is not None:
+            self._withdrawal.hold()
+        self._leave_out_unreadable()
+        session = self._session = self.session_class(self, self._ports, self._reply_timeout_s, self._release)
         if not hasattr(self, "_files"):
             self._kept.kept_in(self.memory)
             own_folder = (self.run_dir / "scans").resolve()
@@ -182,10 +199,43 @@ class Nanonis(Driver):
             )
         self._files.look(folder)
 
+    def _leave_out_unreadable(self) -> None:
+        for group in self._side:
+            if group.unreadable and not self.table.keys().isdisjoint(group.names):
+                self.log.warning("%s: not supported from now on: %s", ", ".join(group.names), group.unreadable)
+                self.table = self.table.without(group.names)
+
     def close(self) -> None:
+        self._close_session()
+        if self._withdrawal is not None:
+            self._withdrawal.close()
+
+    def _close_session(self) -> None:
         if self._session is not None:
             self._session.close()
             self._session = None
+
+    @property
+    def withdraws_aside(self) -> bool:
+        return not self.only_reads and Ports(_addresses(self.controller_at)).for_withdrawing is not None
+
+    def withdraw_elsewhere(self) -> bool:
+        if self._withdrawal is None:
+            return False
+        self._withdrawal.withdraw()
+        return True
+
+    def _link_to_withdraw(self, timeout_s: float) -> Link:
+        address = self._ports.for_withdrawing
+        assert address is not None
+        link = self.session_class.link(address, timeout_s, self.clock.monotonic_s)
+        self.prove()
+        return link
+
+    @classmethod
+    def lost_without(cls, settings: Mapping[str, object]) -> Sequence[str]:
+        address = str(settings.get("address", _ADDRESS))
+        return () if Ports(_addresses(address)).for_withdrawing else (_NO_WAY,)
 
     @property
     def _there(self) -> Session:
@@ -195,6 +245,8 @@ class Nanonis(Driver):
         return self._there.ask(name, *arguments, longer_s=longer_s)
 
     def status(self) -> ScopeStatus:
+        if self._withdrawal is not None:
+            self._withdrawal.hold()
         return self._activity.status()
 
     def next_change_s(self) -> float | None:
@@ -259,7 +311,7 @@ class Nanonis(Driver):
 
     def _fetch(self, ended: Entry) -> Sequence[Scan | Spectrum]:
         if ended["what"] == SCAN:
-            found = fetched.images(self._ask, self._grabbing)
+            found = self._images()
             return [Scan(as_region(ended["frame"]), image.name, image.unit, image.values) for image in found]
         curve, self._activity.curve = self._activity.curve, None
         if curve is None:
@@ -272,7 +324,19 @@ class Nanonis(Driver):
         kept = self._files.frame
         if kept is None or not self._files.was_seen:
             return ()  # the memory may still hold the previous scan, all of whose lines would be new
-        return fetched.new_lines(fetched.images(self._ask, self._grabbing), as_region(kept), start)
+        began_s = self.clock.monotonic_s()
+        if began_s < self._grabs_at_s:
+            return ()
+        new = fetched.new_lines(self._images(), as_region(kept), start)
+        ended_s = self.clock.monotonic_s()
+        self._grabs_at_s = ended_s + _GRAB_SHARE * (ended_s - began_s)
+        return new
+
+    def _images(self) -> list[fetched.Image]:
+        try:
+            return fetched.images(self._there.ask_for_data, self._grabbing)
+        except protocol.UnreadableReply as error:
+            raise FileError(f"the scan in Nanonis' memory can't be read: {error}") from error
 
     # --- actions ---
 
@@ -300,6 +364,9 @@ class Nanonis(Driver):
         """Take a spectrum of the kind `x-spec-kind` at the tip's position."""
         self._activity.refuse_safe_tip()
         kind = str(self._kept[names.SPEC_KIND])
+        if not self._there.listener.is_there:
+            reason = "no port of Nanonis is left for a second connection, which a spectrum needs"
+            raise Refused(ControlResponse.ACTION_ERROR, reason)
         if MODULES[kind] not in self._there.opened:
             raise Refused(ControlResponse.ACTION_ERROR, f"Nanonis can't open the module {MODULES[kind]}")
         self._activity.start_curve(kind)
@@ -389,5 +456,5 @@ def _addresses(text: str) -> list[tuple[str, int]]:
     except ValueError:
         found = []
     if not found:
-        raise ConfigError(f"{text!r} is not an address", where="address", hint='"host:port,port"')
+        raise ConfigError(f"{text!r} is not an address", where="address", hint='"host:port,port,port"')
     return found

@@ -44,7 +44,7 @@ class Grabbing:
 
     def image(self, raw: np.ndarray, *, upwards: bool, backward: bool) -> np.ndarray:
         """Return the image [y, x] with both axes ascending."""
-        # Unconfirmed: a public note on one instrument says that the top row comes first in both directions.
+        # (! grabbed-rows, grabbed-backward)
         rows = raw if self.rows == "recorded" and upwards else raw[::-1]
         pixels = rows[:, ::-1] if backward and self.backward == "mirrored" else rows
         return np.ascontiguousarray(pixels, dtype=np.float64)

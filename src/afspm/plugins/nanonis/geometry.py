@@ -15,7 +15,7 @@ from afspm.basics import lengths_text
 from afspm.driver import FRAME, POSITION, ParameterSpec, Value, check_speed, frame, frame_values, refuse_value
 from afspm.model import Region, names
 from afspm.plugins.nanonis.parameter_groups import Ask, Group, MoveSpeed, keep_speed
-from afspm.plugins.nanonis.protocol import BadReply, NanonisError
+from afspm.plugins.nanonis.protocol import BadReply, NanonisError, UnreadableReply
 
 _OUTPUT_V: Final = 10.0
 """Amount of the largest voltage of Nanonis' outputs, to which the piezo calibration belongs."""
@@ -139,7 +139,7 @@ class Probe(Group):
         """Warn if Nanonis does not report the voltages of the scanner."""
         try:
             self._voltages()
-        except NanonisError as error:
+        except (NanonisError, UnreadableReply) as error:
             log.warning("the scanner's calibration and voltage limits are unknown, so only its range counts: %s", error)
 
     def _voltages(self) -> tuple[Sequence[float], bool, Sequence[float]]:
@@ -147,10 +147,10 @@ class Probe(Group):
         return self._numbers("Piezo.CalibrGet")[:2], bool(on), limits_v
 
     def _ends_of_voltages_m(self) -> list[tuple[float, float]]:
-        # the range that Nanonis reports says nothing of voltage limits that a person sets in the same module
+        # (! piezo-voltages) the range says nothing of voltage limits, which a person sets in the same module
         try:
             metres_per_volt, on, limits_v = self._voltages()
-        except NanonisError:
+        except (NanonisError, UnreadableReply):
             return [(-math.inf, math.inf)] * 2  # `look` has named it
         ends_m = []
         for axis, factor in enumerate(metres_per_volt):

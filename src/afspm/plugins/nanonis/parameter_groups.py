@@ -10,8 +10,9 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Final
 
+from afspm.basics import Refused
 from afspm.driver import FEEDBACK_ON, SettingsGroup, Value, refuse_value
-from afspm.model import names
+from afspm.model import ControlResponse, names
 from afspm.plugins.nanonis.protocol import BadReply, NanonisError
 
 Ask = Callable[..., tuple[Any, ...]]
@@ -40,6 +41,31 @@ class Group(SettingsGroup):
 
     def _numbers(self, name: str, *arguments: object) -> tuple[Any, ...]:
         return numbers(self._ask, name, *arguments)
+
+
+class SideGroup(SettingsGroup):
+    """A group whose values the tip's safety does not need: answers that can't be read end its use, not the contact.
+
+    Attributes:
+        unreadable: why the group is left out, after two bad answers in a row; otherwise empty.
+    """
+
+    def __init__(self, group: Group) -> None:
+        self.names = group.names
+        self._group, self._failed, self.unreadable = group, False, ""
+
+    def read(self) -> dict[str, Value]:
+        try:
+            found = self._group.read()
+        except BadReply as error:
+            self.unreadable = str(error) if self._failed else ""
+            self._failed = True
+            raise
+        self._failed = False
+        return found
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        self._group.write(values)
 
 
 def numbers(ask: Ask, name: str, *arguments: object) -> tuple[Any, ...]:
@@ -178,6 +204,24 @@ class TipState(Group):
         except NanonisError:
             return False  # the place of a withdrawn tip is not known
         return bool(self._numbers("ZCtrl.ZPosGet")[0] >= high_m - _END_OF_RANGE * (high_m - low_m))
+
+
+class SafeTip(Group):
+    """The controller's own guard: whether it is on, and the signal at which it withdraws the tip."""
+
+    names = (names.SAFE_TIP_ON, names.SAFE_TIP_THRESHOLD)
+
+    def read(self) -> dict[str, Value]:
+        try:
+            (is_on,), (*_, threshold_a) = self._ask("SafeTip.OnOffGet"), self._numbers("SafeTip.PropsGet")
+        except NanonisError as error:
+            raise Refused(
+                ControlResponse.PARAM_NOT_SUPPORTED, f"Nanonis does not report its safe tip: {error}"
+            ) from error
+        return dict(zip(self.names, (is_on == 1, threshold_a), strict=True))  # (! safe-tip)
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        raise refuse_value(next(iter(values)), "it is read-only")
 
 
 class MoveSpeed(Group):

@@ -36,6 +36,10 @@ class BadReply(ControllerLost):
     code = "nanonis-reply"
 
 
+class UnreadableReply(BadReply):
+    """The error that a whole reply to the right function has other results than expected: later replies count."""
+
+
 class NanonisError(AfspmError):
     """An error reported by Nanonis, with its own text."""
 
@@ -49,13 +53,11 @@ class Function:
     Attributes:
         arguments: fields in order, each as (type code, first release that has the field).
         layouts: the possible results, each as fields in order; more than one where sources differ.
-        is_aside: whether an answer that can't be read leaves the connection as it is.
     """
 
     name: str
     arguments: tuple[tuple[str, int], ...]
     layouts: tuple[tuple[tuple[str, int], ...], ...]
-    is_aside: bool = False
 
     def argument_codes(self, release: int) -> tuple[str, ...]:
         """Return the type codes of the fields in a request to a release."""
@@ -77,9 +79,8 @@ def functions() -> Mapping[str, Function]:
     rows = {}
     for line in Path(__file__).with_name("functions.txt").read_text(encoding="ascii").splitlines():
         if line and not line.startswith("#"):
-            marked, arguments, results = re.split(" {2,}", line)
-            name, layouts = marked.removesuffix("?"), tuple(map(_fields, results.split(" | ")))
-            rows[name] = Function(name, _fields(arguments), layouts, is_aside=marked.endswith("?"))
+            name, arguments, results = re.split(" {2,}", line)
+            rows[name] = Function(name, _fields(arguments), tuple(map(_fields, results.split(" | "))))
     return rows
 
 
@@ -131,8 +132,8 @@ def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[
     The specification does not define whether an error follows results or replaces them: both forms are accepted.
 
     Raises:
-        NanonisError: Nanonis reports an error, or the body of an answer aside does not fit the function.
-        BadReply: the body does not fit the function.
+        NanonisError: Nanonis reports an error.
+        UnreadableReply: the body does not fit the function.
     """
     whole = None
     # The fields depend on the release: a wrong release leaves bytes over, or needs more bytes than received.
@@ -147,8 +148,7 @@ def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[
         if whole is None or codes:
             return found
     hint = f"it was read as release {release} sends it" if _depends_on_release(name) else ""
-    kind = NanonisError if function(name).is_aside else BadReply  # all its bytes were received
-    raise kind(f"the reply to {name} is malformed: {whole.what if whole else ''}", hint=hint)
+    raise UnreadableReply(f"the reply to {name} is malformed: {whole.what if whole else ''}", hint=hint)
 
 
 def _depends_on_release(name: str) -> bool:

@@ -244,7 +244,7 @@ def _as_set(content: FileContent, entry: Entry) -> Content:
 
 
 def _points_missing(content: Content) -> str:
-    # (!) It is unknown how Nanonis returns a stopped spectrum: with NaN where it did not measure, as in its scans.
+    # NaN where a stopped spectrum did not measure, as in scans (! stopped-spectrum)
     for one in content:
         if isinstance(one, Spectrum) and (points := int(np.isnan(one.values[:, 1:]).all(axis=1).sum())):
             return f"{points} of its {len(one.values)} points were not measured"

@@ -169,6 +169,10 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
         self.session().do(commands.STOP_CURVE)
         self.activity.stopped()
 
+    @property
+    def withdraws_aside(self) -> bool:
+        return True  # each withdrawal has a connection of its own
+
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
         """Stop scan, curve and approach, and withdraw the tip."""

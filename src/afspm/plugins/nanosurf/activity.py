@@ -34,11 +34,14 @@ from afspm.plugins.nanosurf.settings import TipPlace
 
 FORCE: Final = "force"
 _LEAST: Final = 0.45
-"""Duration of a complete scan, as the least share of its lines' time: a line may be one pass instead of two (!)."""
+"""Duration of a complete scan, as the least share of its lines' time: a line may be one pass, not two
+(! line-both-ways)."""
 _LEARNT: Final = 0.95
 """The same, as a share of the duration of a complete scan of these lines: its way to the first line varies."""
 _PARTIAL: Final = "Studio saved the scan without its last lines, and no request had stopped it"
-_MOVED: Final = "its frame was changed at Studio's panel, and whether that moves a running scan is unknown (!)"
+_MOVED: Final = (  # (! frame-in-scan)
+    "its frame was changed at Studio's panel, and whether that moves a running scan is unknown"
+)
 
 
 @dataclass(frozen=True)

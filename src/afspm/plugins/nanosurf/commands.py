@@ -1,7 +1,7 @@
 """Commands of Nanosurf Studio that the driver uses, and the releases that have them.
 
 The names come from the command tree in nanosurf-core 2.0.7 (MIT), those before release 17 from nanosurf 1.9.4 (MIT),
-which users' scripts have for Studio 13. The mark (!) stands for an unconfirmed fact.
+which users' scripts have for Studio 13. A mark (! ID) names a row of claims.toml.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ _BEFORE: Final = {
     WITHDRAW: "approach.start_withdraw",
     "approach.stop_approach": "approach.abort",
 }  # fmt: skip
-"""Paths before release 17, by the paths of this module. (!) *Image offset* is taken for the centre of the frame."""
+"""Paths before release 17, by the paths of this module (! image-offset, move-signals)."""
 _MOVE_SIGNALS: Final = tuple(
     f"approach.signal.{name}.connect"
     for name in ("approach_started", "withdraw_started", "approach_or_withdraw_finished")
@@ -193,7 +193,7 @@ def used(release: int) -> tuple[str, ...]:
 
 
 def level(release: int) -> int:
-    """Return the lowest session level with the used commands: the old commands need the highest level (!).
+    """Return the lowest session level with the used commands: the old commands need the highest (! licence-level).
 
     Before release 17 the number is no level: 1 is the microscope's own tree.
     """

@@ -1,8 +1,8 @@
 """Nanosurf Studio's files (.nhf): HDF5 of formats 1 (since 2023) and 2, with images and curves.
 
 A file of the maker's examples and the maker's reader (nanosurf-utils, MIT) show: rows and columns ascend, backward
-segments are not mirrored, integers are scaled to a range. A rotation is taken as counter-clockwise in degrees, which is
-unconfirmed (!).
+segments are not mirrored, integers are scaled to a range. A rotation is taken as counter-clockwise in degrees
+(! angle-counter-clockwise).
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def _scans(group: h5py.Group) -> Iterator[Scan]:
 
 def _curves(group: h5py.Group) -> Iterator[Spectrum]:
     # The segments of a curve are joined, for channels that all of them have. Positions of curves are not in the file
-    # (!).
+    # (! curve-positions).
     parts = [_blocks(segment) for segment in _segments(group)]
     shared = [name for name in parts[0] if all(name in part for part in parts)] if parts else []
     count = min((len(part[name][1]) for part in parts for name in shared), default=0)

@@ -1,7 +1,7 @@
 """Files of Nanosurf's older programs (.nid): a header with sections like an .ini, "#!", and the values of each channel.
 
 Ten files of the maker's examples (NSFopen, MIT), compared with Gwyddion, show: rows ascend, backward lines are not
-mirrored, integers are scaled to a range. A rotation is taken as counter-clockwise, which is unconfirmed (!). Curves
+mirrored, integers are scaled to a range. A rotation is taken as counter-clockwise (! angle-counter-clockwise). Curves
 have no position, since a map of curves does not contain the positions. Thermal tuning writes a spectrum over the
 frequency and its fit, without images: each is a spectrum of its own, whose kind is the maker's name for it.
 """

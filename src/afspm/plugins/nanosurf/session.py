@@ -19,7 +19,7 @@ from afspm.plugins.nanosurf.lua_values import written
 
 ENUMS: Final = frozenset({"imaging.scan_mode", "imaging.slow_axis_scan_direction", "data.storage.nhf_auto_store_mode"})
 """Paths of choices, whose value is a number."""
-# (!) before release 17 there may be no full version
+# before release 17 there may be none (! full-version)
 _FULL: Final = "root.version.full and root.version.full() or root.version.major()"
 VERSIONS: Final = f"return root.version.major(), {_FULL}, root.session.list()"
 """Returns the release, the full version and the names of the sessions."""
@@ -253,7 +253,7 @@ def new_lines(
     Returns:
         one item for each channel, all with the same lines, rows ascending in y; empty without new lines.
     """
-    # (!) the number of the image's buffer, and the order of the lines in the buffer (as scanned), are unconfirmed
+    # the lines are in the order of scanning (! image-buffer)
     found = session.run(commands.BUFFER_LINES % buffer)[0]
     channels = [_buffered_channel(one, shape[1]) for one in found.values()]
     done = min((len(values) for _, _, values in channels), default=0)

@@ -1,7 +1,7 @@
 """Frame, speed and tip position: conversion between Studio's values and generic parameters.
 
-Studio has the centre of a frame, its angle, and lines per second; a line is forward and backward (!). The mark (!)
-stands for an unconfirmed fact.
+Studio has the centre of a frame, its angle, and lines per second; a line is forward and backward
+(! line-both-ways, frame-centre, angle-counter-clockwise, target-offset).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ UNITS: Final[dict[str, tuple[str, ...]]] = {
 }
 """Accepted units of Studio's values: the conversions here are right for these units only."""
 SPEED_PATH: Final = 2.0
-"""Path of the tip in a line, in widths of the frame: forward and backward (!)."""
+"""Path of the tip in a line, in widths of the frame: forward and backward (! line-both-ways)."""
 
 
 class FrameSettings(SettingsGroup):
@@ -70,7 +70,7 @@ class FrameSettings(SettingsGroup):
 
 
 class Slopes(SettingsGroup):
-    """The compensation of the sample's tilt, as slopes; Studio has angles, whose sign is unconfirmed (!)."""
+    """The compensation of the sample's tilt, as slopes; Studio has angles (! slope-sign)."""
 
     names = (names.SAMPLE_SLOPE_X, names.SAMPLE_SLOPE_Y)
 

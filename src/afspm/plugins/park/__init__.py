@@ -69,8 +69,8 @@ class Park(ScriptedDriver[Session, SmartScanActivity]):
     never_shows: ClassVar = {
         "which measurement it is": "SmartScan names no file: all new ones are taken",
         "another one begun": "a stop and a start between two looks seem one scan",
-        "end in the file": "a file has one time, which is read as the start (!)",
-        "missing rows": "no mark of a row that was not scanned is known (!)",
+        "end in the file": "a file has one time, which is read as the start (! one-time)",
+        "missing rows": "no mark of a row that was not scanned is known (! no-missing-rows)",
         "stop of a scan": "SmartScan shows only that no scan runs: an end that comes too soon counts as a stop",
         "stop of a spectrum": "SmartScan shows nothing of it, nor how long a curve takes",
     }
@@ -164,6 +164,10 @@ class Park(ScriptedDriver[Session, SmartScanActivity]):
     def stop_spec(self) -> None:
         self.session().do(STOP_CURVE)
         self.activity.stopped()
+
+    @property
+    def withdraws_aside(self) -> bool:
+        return True  # each withdrawal has a connection of its own
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:

@@ -34,7 +34,7 @@ class ScanDuration:
     Attributes:
         began_s: experiment time right before the start.
         at_least_s: duration by the slowest lines seen so far; 0 if unknown. Whether a change moves a running scan is
-            unknown (!); if it made the scan faster, and it left no file, a person is at work.
+            unknown (! frame-in-scan); if it made the scan faster, and it left no file, a person is at work.
         is_under_way: whether SmartScan has reported the scan as running.
         ended_early: how much too early it ended, in words; empty: not, or not yet.
     """
@@ -91,7 +91,7 @@ class SmartScanActivity(Activity):
     def status(self) -> ScopeStatus:
         """Return the present state. Register measurements that began or ended, and take a curve that awaits the tip."""
         call = self._running_call()
-        curve = call is not None and call.what in CURVES  # scan_query may report a curve as a scan (!)
+        curve = call is not None and call.what in CURVES  # (! curve-as-scan)
         scanning = not curve and self._session.scanning()
         if self._stopping and curve:
             with suppress(Refused):

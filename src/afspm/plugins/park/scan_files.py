@@ -1,10 +1,11 @@
 """Park's TIFF files: each has one channel of a scan in one direction, or curves.
 
 Images: rows ascend, lengths are in µm, and a value is gain · (number · scale + offset) in the channel's unit. Offsets
-are taken as the centre of the frame, a rotation as counter-clockwise, and backward lines as not mirrored (!).
+are taken as the centre of the frame, a rotation as counter-clockwise, and backward lines as not mirrored
+(! offset-is-centre, angle-counter-clockwise, tiff-rows, tiff-backward, tiff-values).
 
 Curves: the numbers of a channel follow each other, forward and then backward; a value is gain · number, as in pspylib
-and AtomicJ. Positions are taken as positions of the scanner, in µm (!). The mark (!) stands for an unconfirmed fact.
+and AtomicJ. Positions are taken as positions of the scanner, in µm (! curve-offsets, curve-positions).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Frame, speed, gains and tip position: conversion between SmartScan's values and generic parameters.
 
 SmartScan has the centre of a frame in µm, its angle in degrees, and lines per second; a line is forward and backward
-(!). The mark (!) stands for an unconfirmed fact.
+(! offset-is-centre, line-both-ways). A mark (! ID) names a row of claims.toml.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _RATE: Final = "scan.rate"
 _GAIN: Final = "zservo.gain"
 _GAINS: Final = {names.ZCTRL_PGAIN: f"{_GAIN}.p", names.ZCTRL_IGAIN: f"{_GAIN}.i"}
 _SPEED_PATH: Final = 2.0
-"""Path of the tip in a line, in widths of the frame: forward and backward (!)."""
+"""Path of the tip in a line, in widths of the frame: forward and backward (! line-both-ways)."""
 
 
 class FrameSettings(SettingsGroup):
@@ -81,7 +81,7 @@ class FrameSettings(SettingsGroup):
 
 
 class Gains(SettingsGroup):
-    """The gains of the feedback: two of the four members of an object, which may be write-only (!)."""
+    """The gains of the feedback: two of the four members of an object, which may be write-only (! gains-readable)."""
 
     names = tuple(_GAINS)
 
@@ -103,7 +103,7 @@ class Gains(SettingsGroup):
 
 
 class TipPlace(KeptSettings):
-    """The target position of the tip, (0, 0) before the first move; SmartScan reports only the stage's position (!)."""
+    """The target position of the tip, (0, 0) before the first move (! tip-place)."""
 
     def __init__(self, session: Callable[[], Session], begun: Callable[[LongCall], None]) -> None:
         super().__init__(dict.fromkeys(POSITION, 0.0))

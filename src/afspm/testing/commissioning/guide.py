@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 from afspm.basics.clock import Clock
 from afspm.basics.errors import UnitError
 from afspm.basics.units import convert, parse_quantity
+from afspm.testing.commissioning.maker_claims import MakerClaim
 from afspm.testing.commissioning.progress import CommissioningStep
 from afspm.testing.conformance import Declined, Failed, Lost, Skipped, Unsupported, near
 from afspm.testing.translators.measuring import CheckMeasurements
@@ -45,6 +46,9 @@ class Guide:
         program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
         counts_clockwise: True if the controller's panel shows angles clockwise.
         in_contact: True if the person has approached the tip, which is withdrawn after the steps at the sample.
+        claims: the driver's claims about the maker's program, by id.
+        seen: the observations that settle claims, by the names in `MakerClaim.commission`: True if the claim holds.
+        unprepared: the claims whose preparation the person has not confirmed: no step settles them.
     """
 
     kit: CheckMeasurements
@@ -55,6 +59,10 @@ class Guide:
     program_s: float = 0.0
     counts_clockwise: bool = False
     in_contact: bool = False
+    claims: Mapping[str, MakerClaim] = field(default_factory=dict)
+    seen: dict[str, bool] = field(default_factory=dict)
+    unprepared: set[str] = field(default_factory=set)
+    _is_unseen: bool = False
 
     @property
     def clock(self) -> Clock:
@@ -73,9 +81,22 @@ class Guide:
         self.prompts.show(f"\n{step.title}\n{step.explained}")
         if step.needs_panel and not self.has_panel:
             raise Skipped(f"{NO_PANEL} or cable")
+        self._is_unseen = False
+        self._prepare(step)
         if step.moves and not self.prompts.confirm("Shall afspm do this now?"):
             raise Declined("not confirmed")
-        return step.do(self) or ""
+        line = step.do(self) or ""
+        # a step passes without a panel, too, and then shows less of the maker's program
+        if not self._is_unseen:
+            self.seen[step.name] = True
+        return line
+
+    def _prepare(self, step: CommissioningStep) -> None:
+        for name, claim in self.claims.items():
+            if claim.ask and claim.step == step.name:
+                question = f"{claim.ask} Is it done?"
+                if not (self._can_be_seen(question) and self.prompts.confirm(question)):
+                    self.unprepared.add(name)
 
     def explain(self, step: CommissioningStep, failure: Failed) -> tuple[str, ...]:
         """Stop the microscope's activity, and return the remedy.
@@ -122,8 +143,11 @@ class Guide:
         """Ask for a line of text about the panel; return None without a panel."""
         return self.prompts.text(question) if self._can_be_seen(question) else None
 
-    def require_choice(self, question: str, right: str, wrong: Sequence[str], what: str) -> bool:
+    def require_choice(self, question: str, right: str, wrong: Sequence[str], what: str, shows: str = "") -> bool:
         """Ask which option the panel shows; return False if the person can't see any option.
+
+        Args:
+            shows: the name of the observation in `seen`, if it settles a claim.
 
         Raises:
             Failed: a wrong option.
@@ -131,15 +155,20 @@ class Guide:
         if not self._can_be_seen(question):
             return False
         seen = self.prompts.choose(question, [right, *wrong, UNSEEN], UNSEEN)
+        if seen != UNSEEN:
+            self.seen[shows] = seen == right
         if seen not in (right, UNSEEN):
             raise Failed(f"{what}: {right}", f"{seen} at the panel")
         return seen == right
 
-    def compare(self, what: str, value: float, unit: str, absolute: float = 0.0) -> bool:
+    def compare(self, what: str, value: float, unit: str, absolute: float = 0.0, shows: str = "") -> bool:
         """Ask for a value shown at the panel; return False if the panel does not show the value.
 
         The person types the value before afspm shows its own: a person who knows the expected value may misread a wrong
         value.
+
+        Args:
+            shows: the name of the observation in `seen`, if it settles a claim.
 
         Raises:
             Failed: the values differ by more than 1 % and `absolute`, and the person confirms the typed value.
@@ -159,8 +188,10 @@ class Guide:
                 continue
             if near(at_panel, value, relative=0.01, absolute=absolute):
                 self.prompts.show(f"  afspm reads {shown}: the same")
+                self.seen[shows] = True
                 return True
             if self.prompts.confirm(f"  afspm reads {shown}, which is not {typed}. Is {typed} what the panel shows?"):
+                self.seen[shows] = False
                 raise Failed(f"{what} as at the panel, {typed}", shown)
 
     def compare_angle(self, turned_deg: float) -> bool:
@@ -170,6 +201,7 @@ class Guide:
     def _can_be_seen(self, question: str) -> bool:
         if not self.has_panel:
             self.prompts.show(f"  {question} – skipped: {NO_PANEL}")
+            self._is_unseen = True
         return self.has_panel
 
 

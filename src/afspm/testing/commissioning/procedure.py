@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
+from afspm.basics.errors import ConfigError
+from afspm.driver import Driver
+from afspm.experiment import Role
 from afspm.experiment.tracing import trace_overlay
 from afspm.model import ControlRequest, Parameter, Response, names
+from afspm.testing.commissioning import maker_claims
 from afspm.testing.commissioning.guide import Guide, Prompts
+from afspm.testing.commissioning.maker_claims import MakerClaim
 from afspm.testing.commissioning.progress import CommissioningProgress
 from afspm.testing.commissioning.report import InstrumentReport, steps_of
 from afspm.testing.commissioning.steps import all_steps
@@ -24,6 +29,8 @@ from afspm.testing.translators.session import CheckOptions, CheckSession, opened
 REHEARSAL_PATIENCE: Final = 10.0
 """Factor of the limits in real time with a simulated microscope: its program shares the computer with afspm, and a busy
 computer must not look like a late controller."""
+LINES_S: Final = 1.0
+"""Experiment seconds between two readings of the lines of a running scan, unless the experiment file says otherwise."""
 _NOT_WITHDRAWN = "THE TIP WAS NOT WITHDRAWN ({why}): withdraw it by hand, now."
 _NEVER_SHOWN = "The tip was withdrawn. This controller does not show that: look."
 
@@ -34,6 +41,7 @@ class CommissioningResult:
 
     Attributes:
         progress: the steps.
+        claims: the verdicts on the driver's claims, by id.
         file: the file of the report.
         lost: the reason of an early end; empty after all steps.
         folder: the run folder, with the log and the trace.
@@ -43,6 +51,7 @@ class CommissioningResult:
     file: Path
     lost: str = ""
     folder: Path = Path()
+    claims: dict[str, str] = field(default_factory=dict)
 
     @property
     def passed(self) -> bool:
@@ -77,20 +86,29 @@ def commission(
             result.folder = session.folder
             if has_panel is None:
                 has_panel = not session.simulated
-            _in_session(session, prompts, result, tried_on, has_panel=has_panel)
+            claims = maker_claims.read(session.driver_folder) if session.driver_folder else {}
+            kept = before.claims if before else {}
+            result.claims = {name: kept.get(name, maker_claims.NOT_SHOWN) for name, one in claims.items() if one.step}
+            _in_session(session, prompts, result, tried_on, claims, has_panel=has_panel)
     except Lost as lost:
         result.lost = str(lost)
     return result
 
 
 def _in_session(
-    session: CheckSession, prompts: Prompts, result: CommissioningResult, tried_on: str, *, has_panel: bool
+    session: CheckSession,
+    prompts: Prompts,
+    result: CommissioningResult,
+    tried_on: str,
+    claims: Mapping[str, MakerClaim],
+    *,
+    has_panel: bool,
 ) -> None:
     checks = CheckReport()
     checks.describe(session)
 
     def write() -> None:
-        _report(session, checks, result.progress, tried_on).write(result.file)
+        _report(session, checks, result, tried_on).write(result.file)
 
     try:
         with restored(session, checks) as kit:
@@ -102,8 +120,9 @@ def _in_session(
                 has_tip=session.has_tip,
                 program_s=session.program_s,
                 counts_clockwise=session.counts_clockwise,
+                claims=claims,
             )
-            walk = _Walk(guide, result.progress, write)
+            walk = _Walk(guide, result, write)
             try:
                 walk.through()
             finally:
@@ -117,9 +136,10 @@ def _in_session(
 class _Walk:
     """The run of all steps in order."""
 
-    def __init__(self, guide: Guide, progress: CommissioningProgress, write: Callable[[], None]) -> None:
+    def __init__(self, guide: Guide, result: CommissioningResult, write: Callable[[], None]) -> None:
         self._guide = guide
-        self._progress = progress
+        self._progress = result.progress
+        self._claims = result.claims
         self._write = write
 
     def through(self) -> None:
@@ -131,6 +151,10 @@ class _Walk:
             self._guide.prompts.show(f"{symbol}{named} {step.title}: {result.line}")
             for line in result.complaints:
                 self._guide.prompts.show(f"  {line}")
+            settled = maker_claims.verdicts(self._guide.claims, step.name, self._guide.seen, self._guide.unprepared)
+            self._claims.update(settled)
+            for name, verdict in settled.items():
+                self._guide.prompts.show(f"  {verdict}: {self._guide.claims[name].claim} ({name})")
             self._write()
             if step.contact or result.outcome is not CheckOutcome.PASSED:
                 self.withdraw()
@@ -165,13 +189,29 @@ def _require_away(shown: Response) -> None:
 
 
 def _traced(options: CheckOptions, stack: ExitStack) -> CheckOptions:
-    overlay = trace_overlay(prepare(options).resolved, Path(stack.enter_context(tempfile.TemporaryDirectory())))
-    return options if overlay is None else replace(options, files=[*options.files, overlay])
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+    overlay = trace_overlay(prepare(options).resolved, folder)
+    traced = options if overlay is None else replace(options, files=[*options.files, overlay])
+    return _with_lines(traced, folder)
 
 
-def _report(
-    session: CheckSession, checks: CheckReport, progress: CommissioningProgress, tried_on: str
-) -> InstrumentReport:
+def _with_lines(options: CheckOptions, folder: Path) -> CheckOptions:
+    (translator,) = prepare(options).resolved.with_role(Role.TRANSLATOR)
+    driver = translator.component
+    gives = driver is not None and issubclass(driver, Driver) and driver.lines is not Driver.lines
+    if not gives or "live_lines_s" in translator.settings:
+        return options
+    overlay = folder / "lines.toml"
+    overlay.write_text(f'[{translator.name}]\nlive_lines_s = "{LINES_S:g} s"\n', encoding="utf-8")
+    watched = replace(options, files=[*options.files, overlay])
+    try:
+        prepare(watched)
+    except ConfigError:  # a driver may need another setting for them
+        return options
+    return watched
+
+
+def _report(session: CheckSession, checks: CheckReport, result: CommissioningResult, tried_on: str) -> InstrumentReport:
     support = session.support
     lacking = [name for name, value in support.parameters.items() if value is None]
     lacking += [name for name, has in support.actions.items() if has is False]
@@ -183,8 +223,9 @@ def _report(
         evidence="afspm commission",
         began=checks.began,
         afspm=checks.afspm,
-        operations=progress.operations(),
-        steps=steps_of(progress),
+        operations=result.progress.operations(),
+        steps=steps_of(result.progress),
+        claims=result.claims,
         unsupported=lacking,
         unrestored=checks.unrestored,
     )

@@ -34,6 +34,7 @@ class InstrumentReport:
         evidence: a command, or tests of the repository.
         operations: the outcome of each operation.
         steps: outcome and line of each step of `afspm commission`.
+        claims: the verdicts on claims about the maker's program that steps settle, by id; see `MakerClaim`.
         unsupported: actions and parameters that the controller does not have.
         unrestored: settings that could not be restored.
     """
@@ -47,6 +48,7 @@ class InstrumentReport:
     afspm: str
     operations: Mapping[str, str]
     steps: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    claims: Mapping[str, str] = field(default_factory=dict)
     unsupported: Sequence[str] = ()
     unrestored: Sequence[str] = ()
     note: str = ""

@@ -12,17 +12,25 @@ from typing import Final
 
 import numpy as np
 
-from afspm.model import ControlRequest, Feedback, RegionChange, Scan, ScanParameters, ScopeState, names
+from afspm.basics.formatting import quantity
+from afspm.model import ChannelRoles, ControlRequest, Feedback, RegionChange, Scan, ScanParameters, ScopeState, names
 from afspm.record.drawing import raster
+from afspm.testing.commissioning import lines_in_scan
 from afspm.testing.commissioning.guide import Guide
 from afspm.testing.commissioning.progress import CommissioningStep
 from afspm.testing.conformance import Declined, Lost, Skipped, expect
 from afspm.testing.translators.checks import frames, picture, scans
+from afspm.testing.translators.client import describe_all
+from afspm.testing.translators.client import scans as published
 from afspm.testing.translators.measuring import SCAN_S, FrameSetting, Taken, number
 
 READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES = (
     "read", "frame", "angle", "scan", "end of a scan", "files", "stop", "lost connection", "axes",
 )  # fmt: skip
+UP, LINE_TIME, ROWS, COLUMNS = "frame/y-up", "scan/line-time", "lines/rows", "lines/columns"
+SETPOINT: Final = f"panel/{names.ZCTRL_SETPOINT}"
+OBSERVATIONS: Final = (UP, LINE_TIME, ROWS, COLUMNS, SETPOINT)
+"""Observations within steps that settle claims, beside the passed steps themselves."""
 OPERATIONS: Final = (READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES)
 _NOTICED_S: Final = 5.0
 """Seconds between the end of a scan at the panel and its publication: reaction, saving, polling."""
@@ -111,8 +119,31 @@ def _compare_values(guide: Guide) -> int:
     for name in (names.ZCTRL_SETPOINT, names.TIP_BIAS_VOLTAGE):
         if guide.kit.support.has(name):
             found = guide.kit.client.get(name)
-            compared += guide.compare(name, number(found, found.unit or ""), found.unit or "")
+            compared += guide.compare(name, number(found, found.unit or ""), found.unit or "", shows=f"panel/{name}")
     return compared
+
+
+@_step(
+    "The hardware's own guard",
+    "afspm asks whether the controller itself withdraws the tip at too large a signal (a safe tip).",
+    "Compare the guard at the panel; afspm does not switch it.",
+    after=("controller",),
+    moves=False,
+    remembered=False,
+    needs=(names.SAFE_TIP_ON,),
+)
+def _safe_tip(guide: Guide) -> str:
+    client = guide.kit.client
+    is_on = str(client.get(names.SAFE_TIP_ON).value).lower() in names.ON_WORDS
+    threshold = client.get(names.SAFE_TIP_THRESHOLD)
+    at = quantity(number(threshold, threshold.unit or ""), threshold.unit or "")
+    line = f"on, at {at}" if is_on else f"OFF (its threshold: {at})"
+    if not is_on:
+        guide.prompts.show(
+            "  WARNING: the safe tip is off, and afspm alone withdraws the tip. Switch it on at the panel."
+        )
+    guide.require_at_panel(f"The safe tip is {line}. Does the panel show the same?", "the panel's safe tip")
+    return line
 
 
 # --- with the tip withdrawn ---
@@ -151,7 +182,7 @@ def _frame(guide: Guide) -> str:
     client.asked(ControlRequest.SET_SCAN_PARAMS, ScanParameters(_moved(guide, moved)), "moving the frame")
     client.settled(client.observations.mark())
     above = "The frame moved, by its y. Where to, in the panel's picture?"
-    seen = guide.require_choice(above, "up", ["down", "left", "right"], "a frame of a larger y")
+    seen = guide.require_choice(above, "up", ["down", "left", "right"], "a frame of a larger y", UP)
     if not (count or seen):
         return guide.unseen()
     return f"{count} values are those of the panel{', and y points up there' if seen else ''}"
@@ -174,7 +205,7 @@ def _angle(guide: Guide) -> str:
     frames.ask_for(guide.kit, guide.kit.frames.turned.request(guide.kit.support))
     frames.require_in_force(guide.kit, guide.kit.frames.turned)
     question = "In the panel's picture, which way is it turned against the frame before?"
-    seen = guide.require_choice(question, "counter-clockwise", ["clockwise", "not turned"], "a turned frame")
+    seen = guide.require_choice(question, "counter-clockwise", ["clockwise", "not turned"], "a turned frame", "angle")
     return "turned counter-clockwise" if seen else guide.unseen()
 
 
@@ -206,8 +237,19 @@ def _scan(guide: Guide) -> str:
         own_s = max(2.0 * _NOTICED_S, guide.program_s / client.clock.real_s(1.0)) * client.patience
         most_s = 1.5 * taken.expected_s + own_s
         expect(free_s - begin_s <= most_s, wanted, f"{_lasted(guide, free_s - begin_s)} until its end was noticed")
+    end_s = free_s if panel_s is None else panel_s
+    if taken.expected_s is not None and (holds := line_time(guide, end_s - begin_s, taken.expected_s)) is not None:
+        guide.seen[LINE_TIME] = holds
     channels = ", ".join(one.channel for one in taken.scans)
     return f"{_lasted(guide, free_s - begin_s)}, {len(taken.scans)} channels: {channels}"
+
+
+def line_time(guide: Guide, lasted_s: float, expected_s: float) -> bool | None:
+    """Return whether a scan took the time that its speed gives; None if that does not show."""
+    if guide.kit.client.clock.real_s(1.0) < 1.0:
+        return None  # the program's own time is a large part of a scan on a fast clock
+    part = lasted_s / expected_s
+    return True if 0.8 <= part <= 1.6 else False if part <= 0.6 or part >= 1.9 else None
 
 
 def _lasted(guide: Guide, lasted_s: float) -> str:
@@ -254,6 +296,36 @@ def _files(guide: Guide) -> str:
 
 
 @_step(
+    "A scan, watched while it fills",
+    "afspm takes a scan upwards, reads its lines while it runs, and finds them in the scan that is saved at its end.",
+    "Don't rely on lines of a running scan, nor on scans without a file: see the README of the driver for their order.",
+    after=("scan",),
+    needs=(names.START_SCAN,),
+)
+def _lines(guide: Guide) -> str:
+    kit, client = guide.kit, guide.kit.client
+    if not client.observations.lines:
+        raise Skipped("no line of a running scan is published")
+    if kit.support.has(names.SCAN_DIRECTION):
+        client.set(names.SCAN_DIRECTION, names.UP)
+    client.observations.lines.clear()
+    taken = kit.take_scan(kit.frames.plain)
+    roles = client.observations.newest(ChannelRoles) or ChannelRoles()
+    found = [roles.shown(one) for one in taken.scans]
+    places = [place for one in found for place in lines_in_scan.places(one, client.observations.lines)]
+    if not places:
+        raise Skipped("all lines are alike, or none is in the saved scan")
+    guide.seen[ROWS] = right = all(place.is_row for place in places)
+    back = [place for place in places if place.is_retrace]
+    if back:
+        guide.seen[COLUMNS] = not any(place.is_mirrored for place in back)
+    wrong = [place for place in places if not place.is_row or place.is_mirrored]
+    came = f"{len(wrong)} of {len(places)} elsewhere, {'mirrored' if right else 'in other rows'}"
+    expect(not wrong, "each line where it is in the saved scan", came)
+    return f"{len(places)} lines are where they are in the saved scan"
+
+
+@_step(
     "Stopping a scan",
     "afspm begins a scan and stops it. Watch that the panel stops, too.",
     "Stop the scan at the panel. Do not leave this controller alone until this is solved.",
@@ -284,11 +356,12 @@ def _stop_at_panel(guide: Guide) -> str:
         client.come_to_rest()
         raise Skipped("not stopped at the panel")
     client.wait_state(ScopeState.FREE, mark, client.real_s(60.0))
-    client.settled(mark)
+    observed = client.settled(mark)
     while to_do := client.continue_run(_LOST_S):
         if guide.prompts.text(f"{to_do}. Then press Enter (u: leave it)").strip():
             raise Lost(to_do)
-    return "noticed"
+    expect(not published(observed), "no scan that was stopped at the panel", describe_all(observed))
+    return "noticed, and no scan was published"
 
 
 @_step(

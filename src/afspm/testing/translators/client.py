@@ -21,6 +21,7 @@ from afspm.model import (
     Response,
     Role,
     Scan,
+    ScanLines,
     ScopeState,
     ScopeStatus,
     Spectrum,
@@ -62,10 +63,15 @@ class Observation:
 
 
 class Observations:
-    """All packets about the microscope, oldest first."""
+    """All packets about the microscope, oldest first.
+
+    Attributes:
+        lines: the lines of running scans, which are not in `all`.
+    """
 
     def __init__(self) -> None:
         self.all: list[Observation] = []
+        self.lines: list[ScanLines] = []
 
     def take(self, packet: Packet, ours: bool) -> None:
         """Record a packet of the translator, or an unreadable packet; a listener of an `ExperimentLink`."""
@@ -76,7 +82,9 @@ class Observations:
         except WireError as error:
             thing = error
         # other packets come from the scheduler, or only on request of a client
-        if isinstance(thing, WireError) or _is_always_published(wire.declaration(message)):
+        if isinstance(thing, ScanLines):
+            self.lines.append(thing)
+        elif isinstance(thing, WireError) or _is_always_published(wire.declaration(message)):
             self.all.append(Observation(message, thing, packet.time_ns))
 
     def mark(self) -> int:

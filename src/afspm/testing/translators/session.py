@@ -92,6 +92,7 @@ class CheckSession:
         program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
         counts_clockwise: True if the controller's panel shows angles clockwise.
         has_tip: False for a microscope without a tip.
+        driver_folder: the folder of the driver's own files; None for a translator that is no driver.
     """
 
     client: CheckClient
@@ -106,6 +107,7 @@ class CheckSession:
     program_s: float = 0.0
     counts_clockwise: bool = False
     has_tip: bool = True
+    driver_folder: Path | None = None
 
 
 def prepare(options: CheckOptions) -> Experiment:
@@ -151,11 +153,11 @@ def opened(options: CheckOptions) -> Iterator[CheckSession]:
         support = find_out(client, sorted(actions), sorted(parameters))
         named = translator.class_path or " ".join(translator.part.command)
         excused: Mapping[str, str] = {}
-        maker, program_s, clockwise = "", 0.0, False
+        maker, program_s, clockwise, folder_of_driver = "", 0.0, False, None
         if translator.component is not None and issubclass(translator.component, Driver):
             driver = translator.component
             excused, maker, program_s = driver.excused(support.controller), driver.maker, driver.program_s
-            clockwise = driver.counts_clockwise
+            clockwise, folder_of_driver = driver.counts_clockwise, driver.parameters_file.parent
         yield CheckSession(
             client,
             support,
@@ -169,6 +171,7 @@ def opened(options: CheckOptions) -> Iterator[CheckSession]:
             program_s,
             clockwise,
             has_tip(experiment),
+            folder_of_driver,
         )
 
 

@@ -118,7 +118,7 @@ def chosen(number: int, *choices: T) -> T:
 
 
 def _refuse_nan(name: str, arguments: Iterable[object], *, keeps_nan: bool) -> None:
-    # NaN means no change in the maker's own examples of some functions; (!) its meaning for others is unknown.
+    # NaN means no change in the maker's own examples of some functions (! nan-no-change)
     for argument in arguments:
         if not isinstance(argument, str) and np.asarray(argument).dtype.kind == "f":
             values = np.asarray(argument)

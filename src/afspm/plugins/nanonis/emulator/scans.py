@@ -284,8 +284,8 @@ class ScanModule:
     def set_frame(self, x: float, y: float, width: float, height: float, angle_deg: float) -> Answer:
         """Set the frame, also beyond the scanner's range unless `clips_frames`: the output of a scan is clipped.
 
-        A real one clips the voltages while it scans; the emulator scans the frame as it was set. (!) The real
-        controller's answer to a frame smaller than an atom is unknown; the emulator refuses it.
+        A real one clips the voltages while it scans; the emulator scans the frame as it was set
+        (! frame-beyond-range, frame-bounds).
         """
         smallest_m = 0.0 if self._core.takes_all else _SMALLEST_M
         if not (min(width, height) >= smallest_m and all(map(math.isfinite, (x, y, width, height, angle_deg)))):
@@ -315,7 +315,7 @@ class ScanModule:
         if not self._core.takes_all:
             pixels = max(_PIXELS_AT_ONCE, round(pixels / _PIXELS_AT_ONCE) * _PIXELS_AT_ONCE)
         lines = lines or max(1, round(pixels * self.lines / self.pixels))
-        # (!) The real controller's limit is unknown; without one, FrameDataGrab would need more memory than there is.
+        # without a limit FrameDataGrab would need more memory than there is (! frame-bounds)
         if pixels * lines > MOST_PIXELS:
             raise FunctionRefused(f"{lines} lines of {pixels} pixels are more than {MOST_PIXELS} pixels")
         self.channels, self.pixels, self.lines = channels or self.channels, pixels, lines

@@ -152,7 +152,7 @@ class Utilities:
 
     @answers("File.datLoad")
     def _load(self, path: str, header_only: int) -> Answer:
-        # (!) The order of the data is unknown: each row is taken to be a channel.
+        # (! dat-rows)
         try:
             found = read_dat(self._core.session.read(path))
         except (OSError, ValueError) as error:

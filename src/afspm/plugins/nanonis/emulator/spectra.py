@@ -160,7 +160,7 @@ class SpectroscopyModules:
         def ready(now_s: float) -> Results | None:
             if self.ended == ended:
                 return None
-            # (!) It is unknown how the real software returns a stopped sweep: here with NaN where it did not measure.
+            # (! stopped-spectrum)
             values = curve.values.copy()
             values[self._measured(curve) :] = np.nan
             return spectrum_columns(curve), values.T, [*curve.position_m, float(curve.values[0, 0])]

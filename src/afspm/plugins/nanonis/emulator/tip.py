@@ -68,7 +68,7 @@ class ZController:
             return 3
         if self.state == "off" and now_s < self._follows_s:
             return 4
-        # (!) The status of a real controller in a spectrum is unknown: here it follows `feedback.hold_reads`.
+        # in a spectrum it follows `feedback.hold_reads` (! hold-in-spectrum)
         if self.state == "on" and not self._core.rig.feedback_reads(now_s):
             return 3
         return {"off": 1, "on": 2, "safe": 5}[self.state]
@@ -100,7 +100,7 @@ class ZController:
 
     @answers("ZCtrl.Home")
     def _home(self) -> Answer:
-        # (!) It is unknown if the real software refuses this while the z controller is on; here that is switched off.
+        # (! home-with-feedback)
         relative, home_m = (*self._core.registers.get("ZCtrl.HomeProps"), 0, 0.0)[:2]
         z_m = self._signals.z_m(self._core.now_s)
         self.switch(self._core.now_s, on=False)
@@ -306,7 +306,7 @@ class TipModules:
 
     @answers("Motor.StartMove")
     def _start_motor(self, direction: int, steps: int, group: int, wait: int) -> Answer:
-        # (!) It is unknown if the real software refuses this during a scan or a withdrawal; the emulator does.
+        # refused during a scan or a withdrawal (! motor-in-scan)
         if direction > 5:
             raise FunctionRefused(f"{direction} is not a direction")
         now_s = self._core.now_s

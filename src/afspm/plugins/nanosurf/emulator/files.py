@@ -53,7 +53,7 @@ def image(scan: ScanActivity, now_s: float, mode: str) -> bytes:
 def curves(spectra: Sequence[SpectrumActivity], shape: tuple[int, int], now_s: float, mode: str) -> bytes:
     """Encode the file of force curves: one segment for the approach, one for the retract.
 
-    (!) The axes of a segment are taken as a line for each curve.
+    The axes of a segment are a line for each curve (! segment-axes).
 
     Args:
         spectra: the curves.

@@ -133,7 +133,8 @@ MODES: Final = {
     "static_mode": ("load",),
     **dict.fromkeys(("dynamic_mode", "wavemode", "wavemode_nma"), ("load", "update")),
 }
-"""The modes of measurement with the commands of each; (!) every mode measures like the emulator's feedback mode."""
+"""The modes of measurement with the commands of each; every mode measures like the emulator's own
+(! modes-measure-alike)."""
 
 CYCLES: Final = ("force_distance_z_z",)
 """The ids of spectroscopy cycles."""

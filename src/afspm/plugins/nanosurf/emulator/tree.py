@@ -280,7 +280,7 @@ class CommandTree:
         return self._blocking(partial(program.begin_procedure, path), lambda: program.rig.doing(self._now_s) == path)
 
     def _workspace_commands(self) -> Nested:
-        # (!) The field names in the results of `get_item_…` are unknown.
+        # the field names in the results of `get_item_…` are made up (! dates-in-names)
         items = self._workspace
 
         def getter(**names: str) -> Callable[[str], object]:
