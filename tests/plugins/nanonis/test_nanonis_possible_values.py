@@ -150,6 +150,22 @@ def test_frame_beyond_the_voltage_limits_is_refused(bench: Make) -> None:
     assert peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((240e-9, 0.0))).ok
 
 
+@pytest.mark.parametrize("is_missing", [True, False], ids=["missing", "unreadable"])
+def test_unknown_voltages_of_the_scanner_are_named_and_its_range_counts(bench: Make, is_missing: bool) -> None:
+    asked = ["Piezo.CalibrGet", "Current.GainsGet", "TipShaper.PropsGet"]
+    made = bench(range_m=1e-6, other_layout=[] if is_missing else asked)
+    if is_missing:
+        made.at_panel(lambda emulator: emulator.software.functions.remove(*asked))
+    peer = made.start()
+    ready(peer)
+    made.until_logged("the scanner's calibration and voltage limits are unknown, so only its range counts")
+    made.until_logged("the preamplifier's range is unknown")
+    wide = ScanParameters(Region((0.0, 0.0), (1.2e-6, 300e-9)), SHAPE, "")
+    assert "-500 to 500 nm" in peer.ask(ControlRequest.SET_SCAN_PARAMS, wide).reason
+    assert peer.set(names.ZCTRL_SETPOINT, "200", "nA").ok
+    assert "open it at Nanonis" in peer.act(names.CRASH).reason
+
+
 def test_frame_that_is_scanned_at_another_speed_is_refused(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     made, peer = lenient(bench)
     scans = made.emulator.software.scans

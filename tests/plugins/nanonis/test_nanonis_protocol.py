@@ -95,6 +95,16 @@ def test_reply_of_another_release_is_reported(name: str, written: int, read: int
         protocol.results(name, wire.body(name, sent, written), read)
 
 
+@pytest.mark.parametrize("index", [b"\0\0\0\2", b"\0\2"], ids=["int32", "uint16"])
+@pytest.mark.parametrize("filters", [b"", bytes(12)], ids=["without-filters", "with-filters"])
+def test_gains_are_read_in_each_layout(index: bytes, filters: bytes) -> None:
+    # the maker's text and its client differ in the index
+    labels = [b"LN 10^7", b"LN 10^8", b"LN 10^9"]
+    texts = b"".join(len(label).to_bytes(4) + label for label in labels)
+    body = len(texts).to_bytes(4) + len(labels).to_bytes(4) + texts + index + filters + bytes(8)
+    assert protocol.results("Current.GainsGet", body)[:2] == (["LN 10^7", "LN 10^8", "LN 10^9"], 2)
+
+
 def test_text_in_windows_encoding_is_read() -> None:
     body = wire.body("Util.SessionPathGet", ["C:\\Müller"], 0, "latin-1")
     assert protocol.results("Util.SessionPathGet", body) == ("C:\\Müller",)

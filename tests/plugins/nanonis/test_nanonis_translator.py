@@ -377,7 +377,7 @@ def test_setting_is_read_before_and_after_it_once(bench: Make) -> None:
     frame_set, bias_set = asked.index("Scan.FrameSet"), asked.index("Bias.Set")
     before = asked[frame_set - 9 : frame_set]
     assert before[:3] == ["Scan.BufferGet", "Scan.FrameGet", "Scan.SpeedGet"]
-    assert before[3:6] == ["Piezo.RangeGet", "Piezo.CalibrGet", "Piezo.XYZLimitsGet"]
+    assert before[3:6] == ["Piezo.RangeGet", "Piezo.XYZLimitsGet", "Piezo.CalibrGet"]
     assert before[6:] == ["Scan.BufferGet", "Scan.BufferSet", "Scan.SpeedGet"], asked
     assert asked[frame_set + 1 : frame_set + 4] == ["Scan.SpeedGet", "Scan.BufferGet", "Scan.FrameGet"]
     assert asked[bias_set - 1 :] == ["Bias.Get", "Bias.Set", "Bias.Get"]

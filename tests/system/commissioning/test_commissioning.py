@@ -29,6 +29,7 @@ from afspm.plugins.nanonis import Nanonis
 from afspm.plugins.nanonis import session as nanonis
 from afspm.plugins.nanosurf import Nanosurf
 from afspm.plugins.park import Park
+from afspm.testing.commissioning import maker_claims
 from afspm.testing.commissioning.guide import NO_PANEL, Guide
 from afspm.testing.commissioning.procedure import REHEARSAL_PATIENCE, CommissioningResult, commission
 from afspm.testing.commissioning.report import InstrumentReport
@@ -234,7 +235,9 @@ def test_z_that_counts_the_other_way_is_found_by_the_withdrawal(
     assert not result.passed
     assert "z counts the other way at this rig" in result.progress.results["x-retract"].line
     assert any("THE TIP WAS NOT WITHDRAWN" in line for line in person.shown)
-    assert InstrumentReport.read(tmp_path / "report.toml").steps["x-retract"]["outcome"] == "mismatch"
+    report = InstrumentReport.read(tmp_path / "report.toml")
+    assert report.steps["x-retract"]["outcome"] == "mismatch"
+    assert report.claims["withdrawn-limit"] == maker_claims.FALSE
 
 
 @not_on_wine("a process can't be stopped and continued there")

@@ -195,6 +195,7 @@ class Nanonis(Driver):
             session, self._files, self._probe, self._tip, self.memory, self.clock, self.log
         )
         z_controller.compare(session.ask, self.table[names.ZCTRL_SETPOINT].unit, self.log)
+        self._probe.look(self.log)
         if self._holds_current:
             self._preamplifier.look(self.log)
         folder = self._session_dir or Path(session.ask("Util.SessionPathGet")[0])

@@ -6,15 +6,16 @@ afspm by corner or centre, a counter-clockwise angle in rad, and a size from cen
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, Final
 
 from afspm.basics import lengths_text
 from afspm.driver import FRAME, POSITION, ParameterSpec, Value, check_speed, frame, frame_values, refuse_value
 from afspm.model import Region, names
 from afspm.plugins.nanonis.parameter_groups import Ask, Group, MoveSpeed, keep_speed
-from afspm.plugins.nanonis.protocol import BadReply, NanonisError
+from afspm.plugins.nanonis.protocol import BadReply, NanonisError, UnreadableReply
 
 _OUTPUT_V: Final = 10.0
 """Amount of the largest voltage of Nanonis' outputs, to which the piezo calibration belongs."""
@@ -134,13 +135,23 @@ class Probe(Group):
             name: found[name].within(ends, "Nanonis, Piezo: calibration and voltage limits") for name, ends in ends_m
         }
 
-    def _ends_of_voltages_m(self) -> list[tuple[float, float]]:
-        # the range that Nanonis reports says nothing of voltage limits that a person sets in the same module
+    def look(self, log: logging.Logger) -> None:
+        """Warn if Nanonis does not report the voltages of the scanner."""
         try:
-            metres_per_volt = self._numbers("Piezo.CalibrGet")[:2]
-            on, *limits_v = self._numbers("Piezo.XYZLimitsGet")
-        except NanonisError:
-            return [(-math.inf, math.inf)] * 2  # a release without these functions has the range alone
+            self._voltages()
+        except (NanonisError, UnreadableReply) as error:
+            log.warning("the scanner's calibration and voltage limits are unknown, so only its range counts: %s", error)
+
+    def _voltages(self) -> tuple[Sequence[float], bool, Sequence[float]]:
+        on, *limits_v = self._numbers("Piezo.XYZLimitsGet")
+        return self._numbers("Piezo.CalibrGet")[:2], bool(on), limits_v
+
+    def _ends_of_voltages_m(self) -> list[tuple[float, float]]:
+        # (! piezo-voltages) the range says nothing of voltage limits, which a person sets in the same module
+        try:
+            metres_per_volt, on, limits_v = self._voltages()
+        except (NanonisError, UnreadableReply):
+            return [(-math.inf, math.inf)] * 2  # `look` has named it
         ends_m = []
         for axis, factor in enumerate(metres_per_volt):
             low_v, high_v = limits_v[2 * axis : 2 * axis + 2] if on else (-_OUTPUT_V, _OUTPUT_V)

@@ -1,8 +1,8 @@
 """The range of the preamplifier, which bounds the setpoint of a current.
 
 A current beyond this range is never measured: the feedback drives the tip into the sample to reach it. Nanonis reports
-the gains as labels ("LN 10^9"), which follow the preamplifier. (! gain-label) A label's power of ten is its gain in
-V/A, and its output ends at 10 V: others report that the current of a 10^9 V/A stops at 10.004 nA.
+the gains as labels ("LN 10^9"), which follow the preamplifier. (! preamplifier-label) A label's power of ten is its
+gain in V/A, and its output ends at 10 V: others report that the current of a 10^9 V/A stops at 10.004 nA.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Final, cast
 from afspm.basics import quantity
 from afspm.driver import refuse_value
 from afspm.model import names
-from afspm.plugins.nanonis.protocol import NanonisError
+from afspm.plugins.nanonis.protocol import NanonisError, UnreadableReply
 
 _LABEL: Final = re.compile(r"(?:[a-z]+ )?(?:10\^|1(?:\.0*)?e\+?)(\d{1,2})(?: ?V/A)?", re.IGNORECASE)
 _OUTPUT_V: Final = 10.0
@@ -63,7 +63,7 @@ class Preamplifier:
             return self._given_a, "preamplifier_range"
         try:
             labels, index, *_ = cast(tuple[Sequence[str], int], self._ask("Current.GainsGet"))
-        except NanonisError as error:
+        except (NanonisError, UnreadableReply) as error:
             return None, str(error)
         if not 0 <= index < len(labels):
             return None, f"Nanonis reports gain {index} of {len(labels)}"

@@ -10,7 +10,7 @@ from typing import Any, Final
 from afspm.basics import ConfigError, Refused, quantity
 from afspm.model import ControlResponse
 from afspm.plugins.nanonis.parameter_groups import numbers
-from afspm.plugins.nanonis.protocol import NanonisError
+from afspm.plugins.nanonis.protocol import NanonisError, UnreadableReply
 
 QPLUS: Final = "qplus"
 SENSORS: Final = ("", QPLUS, "other")
@@ -23,8 +23,8 @@ class TipShaper:
 
     Args:
         sensor: "qplus", "other", or "" if not known.
-        qplus_bias_v: largest amount of the bias at which a qPlus sensor may be dipped. Others report that the fork
-            rings above 50 mV, and may be ruined.
+        qplus_bias_v: largest amount of the bias at which a qPlus sensor may be dipped. (! qplus-dip) Others report
+            that the fork rings above 50 mV, and may be ruined.
 
     Raises:
         ConfigError: no such sensor.
@@ -61,7 +61,7 @@ class TipShaper:
     def _properties(self) -> tuple[Any, ...]:
         try:
             return self._ask("TipShaper.PropsGet")
-        except NanonisError as error:
+        except (NanonisError, UnreadableReply) as error:
             reason = f"the Tip Shaper does not answer, so nothing was sent: open it at Nanonis ({error})"
             raise Refused(ControlResponse.ACTION_ERROR, reason) from error
 

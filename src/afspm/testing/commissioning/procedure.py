@@ -19,7 +19,7 @@ from afspm.testing.commissioning.guide import Guide, Prompts
 from afspm.testing.commissioning.maker_claims import MakerClaim
 from afspm.testing.commissioning.progress import CommissioningProgress
 from afspm.testing.commissioning.report import InstrumentReport, steps_of
-from afspm.testing.commissioning.steps import all_steps
+from afspm.testing.commissioning.steps import WITHDRAWN, all_steps
 from afspm.testing.conformance import CheckOutcome, CheckResult, Failed, Lost, Skipped, attempt, mark
 from afspm.testing.translators.client import value_in
 from afspm.testing.translators.report import CheckReport
@@ -151,13 +151,13 @@ class _Walk:
             self._guide.prompts.show(f"{symbol}{named} {step.title}: {result.line}")
             for line in result.complaints:
                 self._guide.prompts.show(f"  {line}")
+            if step.contact or result.outcome is not CheckOutcome.PASSED:
+                self.withdraw()
             settled = maker_claims.verdicts(self._guide.claims, step.name, self._guide.seen, self._guide.unprepared)
             self._claims.update(settled)
             for name, verdict in settled.items():
                 self._guide.prompts.show(f"  {verdict}: {self._guide.claims[name].claim} ({name})")
             self._write()
-            if step.contact or result.outcome is not CheckOutcome.PASSED:
-                self.withdraw()
 
     def withdraw(self) -> None:
         """Withdraw a tip that was approached for these steps."""
@@ -171,7 +171,9 @@ class _Walk:
             kit.client.settled(kit.client.observations.mark())
             shown = kit.client.ask(ControlRequest.PARAM, Parameter(names.ENGAGED))
             if shown.ok:
+                self._guide.seen[WITHDRAWN] = False
                 _require_away(shown)
+                self._guide.seen[WITHDRAWN] = True
             self._guide.prompts.show("The tip was withdrawn." if shown.ok else _NEVER_SHOWN)
         except (Failed, Skipped, Lost) as error:
             self._guide.prompts.show(_NOT_WITHDRAWN.format(why=error))

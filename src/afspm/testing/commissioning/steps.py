@@ -28,8 +28,9 @@ READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES = (
     "read", "frame", "angle", "scan", "end of a scan", "files", "stop", "lost connection", "axes",
 )  # fmt: skip
 UP, LINE_TIME, ROWS, COLUMNS = "frame/y-up", "scan/line-time", "lines/rows", "lines/columns"
+WITHDRAWN: Final = "axes/withdrawn"
 SETPOINT: Final = f"panel/{names.ZCTRL_SETPOINT}"
-OBSERVATIONS: Final = (UP, LINE_TIME, ROWS, COLUMNS, SETPOINT)
+OBSERVATIONS: Final = (UP, LINE_TIME, ROWS, COLUMNS, SETPOINT, WITHDRAWN)
 """Observations within steps that settle claims, beside the passed steps themselves."""
 OPERATIONS: Final = (READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES)
 _NOTICED_S: Final = 5.0
