@@ -362,7 +362,7 @@ def test_a_scan_that_the_person_stops_at_the_panel_ends_no_control(vendor: str, 
     person = Person({"Stop the scan at the panel, then": stop, "approach at the panel": do("SimpleEngageMe", "Engage")})
     result = commissioned(tmp_path, vendor, person)
     lines = {name: f"{one.outcome.value}: {one.line}" for name, one in result.progress.results.items()}
-    assert lines["stop-at-panel"] == "passed: noticed", lines
+    assert lines["stop-at-panel"] == "passed: noticed, and no scan was published", lines
     assert result.passed, (result.lost, lines)
 
 
@@ -411,3 +411,4 @@ def test_safe_tip_that_is_on_is_reported_with_its_threshold(tmp_path: Path) -> N
     assert result.progress.results["safe-tip"].line == "on, at 1 nA"
     assert not any("WARNING" in line for line in person.shown)
     assert result.claims["grabbed-rows"] == "not shown"
+    assert not InstrumentReport.read(tmp_path / "report.toml").unrestored
