@@ -94,6 +94,8 @@ class Answers:
     def poll(self, timeout_s: float | None) -> list[Served]:
         return []
 
+    def waiting_request(self) -> None: ...
+
     def reply(self, frames: Sequence[bytes] | None) -> None:
         self.at_s, self.waited_s, self.last = perf_counter(), self._waiting.s, frames or ()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 import time
@@ -213,3 +214,27 @@ def test_scan_that_does_not_start_is_refused(maker: Maker, bench: Make) -> None:
         assert response.code == code
         assert "did not begin the scan that it was asked for" in response.reason
     assert scanned(peer), "the next one is taken"
+
+
+@each
+def test_each_number_has_bounds_that_hold_though_the_maker_takes_all(maker: Maker, bench: Make) -> None:
+    made = bench()
+    peer = small(made)
+    if "takes-all" in made.emulator.all_faults():  # Asylum's PV checks nothing, as of a real one
+        made.strike("takes-all", duration_s=1e9)
+    driver = load_plugin("afspm.drivers", maker.name.capitalize())
+    for name, row in driver.parameter_table({}).items():
+        if not row.is_number or row.read_only:
+            continue
+        low, high = row.range
+        assert math.isfinite(low), name
+        assert math.isfinite(high), name
+        before = peer.get_response(name)
+        if before.code == ControlResponse.PARAM_NOT_SUPPORTED:
+            continue
+        step = row.multiple if row.type == "int" else 0.01 * (high - low)
+        for beyond in (low - step, high + step):
+            response = peer.set(name, beyond, row.si_unit or None)
+            assert response.code == ControlResponse.PARAM_ERROR, name
+            assert "is outside" in response.reason
+        assert peer.get_response(name).payload == before.payload, name

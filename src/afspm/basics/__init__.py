@@ -52,10 +52,12 @@ if TYPE_CHECKING:
     from afspm.basics.shared_time import Publication
     from afspm.basics.units import (
         Angle,
+        Current,
         Duration,
         Length,
         PollPeriod,
         Speed,
+        Voltage,
         convert,
         parse_quantity,
         same_kind,
@@ -87,6 +89,7 @@ __all__ = [
     "Clock",
     "ConfigError",
     "ControlLost",
+    "Current",
     "Duration",
     "ExitCode",
     "ExperimentClock",
@@ -112,6 +115,7 @@ __all__ = [
     "Speed",
     "TransportError",
     "UnitError",
+    "Voltage",
     "WireError",
     "area_text",
     "convert",

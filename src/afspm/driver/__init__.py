@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 if TYPE_CHECKING:  # one maker's controller has it today, and another's may
     from afspm.storage.formats import igor, netcdf
     from afspm.storage.formats.content import clock_ns
-    from afspm.translator.driver_base import LOST, Introduction
+    from afspm.translator.driver_base import LOST, ControllerSilent, Introduction
     from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
     from afspm.translator.parameters import ParameterSpec, ParameterTable, refuse_value
     from afspm.translator.result_files import missing_text, newest
@@ -71,6 +71,7 @@ __all__ = [
     "Activity",
     "Content",
     "ControllerLost",
+    "ControllerSilent",
     "Driver",
     "Entry",
     "FileContent",

@@ -24,6 +24,7 @@ class MicroscopeCapabilities:
         table: the microscope's parameter table.
         max_pixels: the largest number of pixels of a scan.
         channels: the channels that the microscope may have, by their roles.
+        never_withdrawn: actions that need a withdrawn tip, if the microscope never shows the tip.
     """
 
     actions: frozenset[str]
@@ -32,6 +33,7 @@ class MicroscopeCapabilities:
     table: ParameterTable
     channels: ChannelRoles
     max_pixels: int
+    never_withdrawn: tuple[str, ...] = ()
 
     def refuses(self, parameter: Parameter) -> str:
         """Return the reason of the microscope to refuse a value; empty for a valid value or an unknown parameter."""
@@ -72,10 +74,11 @@ def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None
         channels = microscope.channels_of(settings)
         table = microscope.parameter_table(microscope.rows(settings))
         sets = {name: _set_by(what, table) for name, what in added.items()}
+        never = microscope.never_withdrawn(settings)
     except (AfspmError, AttributeError):
         return None  # the check of its settings reports the error in the table
     units = {name: table[name].si_unit for name in table}
-    return MicroscopeCapabilities(frozenset(actions), units, sets, table, channels, acting.max_pixels)
+    return MicroscopeCapabilities(frozenset(actions), units, sets, table, channels, acting.max_pixels, never)
 
 
 def _set_by(action: object, table: ParameterTable) -> tuple[Parameter, ...]:
@@ -92,5 +95,7 @@ def base() -> dict[str, str | None]:
         names.CRASH_SPEED: "m/s",
         names.CRASH_DEPTH: "m",
         names.SPEC_KIND: None,
+        # without a unit at most makers; a limit with another one is an error, rather than never compared
+        **dict.fromkeys((names.ZCTRL_PGAIN, names.ZCTRL_IGAIN), ""),
     }
     return {**names.BASE_PARAMETERS, **ours}

@@ -151,6 +151,11 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
         for action, reason in planned_measurements.refused_actions(resolved.limits):
             what = f"[{translator.name}] actions: the limits would always refuse {reason}"
             resolved.document.error(what, translator.name, "actions", action)
+        there = translator.capabilities()
+        for action in () if there is None else there.never_withdrawn:
+            what = f"[{translator.name}] actions.{action}: it needs a withdrawn tip, which this microscope never shows"
+            hint = "leave it out, and do it by hand after `afspm pause`"
+            resolved.document.error(what, translator.name, "actions", action, hint=hint)
     for process in resolved.processes.values():
         if process.component is None:
             continue

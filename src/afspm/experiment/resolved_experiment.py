@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from afspm.client.component import Component
 from afspm.experiment import capabilities
@@ -21,6 +22,9 @@ from afspm.model import Frame, ProblemNames, Role
 from afspm.scheduler.instruments.conditions import InstrumentSettings
 from afspm.scheduler.publishing.envelopes import CacheSettings
 from afspm.scheduler.safety.limits import ExperimentLimits
+
+if TYPE_CHECKING:
+    from afspm.translator.driver import Driver
 
 
 @dataclass
@@ -118,13 +122,23 @@ class ResolvedExperiment:
 
     def never_shown(self) -> dict[str, str]:
         """Return what the controller never shows of a measurement, with the reasons; empty if it is simulated."""
+        kind, settings = self._driver()
+        return kind.without_witness(settings) if kind is not None else {}
+
+    def lost_without(self) -> Sequence[str]:
+        """Return what a real controller with these settings can't do, each with its remedy, as sentences."""
+        kind, settings = self._driver()
+        return kind.lost_without(settings) if kind is not None and not self.emulators else ()
+
+    def _driver(self) -> tuple[type[Driver] | None, Mapping[str, object]]:
+        # the class of the microscope with its settings; None for a simulated one, and one in another language
         from afspm.translator.driver import Driver
 
         for translator in self.with_role(Role.TRANSLATOR)[:1]:
             kind = translator.component
             if kind is not None and issubclass(kind, Driver) and not kind.simulated:
-                return kind.without_witness(translator.settings)
-        return {}
+                return kind, translator.settings
+        return None, {}
 
     def error(self, what: str, *path: str | int, hint: str = "") -> None:
         self.document.error(what, *path, hint=hint)

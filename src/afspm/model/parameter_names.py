@@ -46,7 +46,7 @@ TIP_BIAS_VOLTAGE: Final = "tip-bias-voltage"
 SAMPLE_BIAS: Final = "x-sample-bias"
 """The second electrode, of a microscope that has both: between tip and sample lies the difference."""
 
-# The SI unit of each base parameter; None where it depends on the operating mode of the microscope.
+# The SI unit of each base parameter; None where it depends on the microscope, or on its operating mode.
 BASE_PARAMETERS: Final[dict[str, str | None]] = {
     SCAN_TOP_LEFT_X: "m",
     SCAN_TOP_LEFT_Y: "m",
@@ -56,8 +56,8 @@ BASE_PARAMETERS: Final[dict[str, str | None]] = {
     SCAN_RESOLUTION_X: "px",
     SCAN_RESOLUTION_Y: "px",
     ZCTRL_SETPOINT: None,
-    ZCTRL_PGAIN: "",
-    ZCTRL_IGAIN: "",
+    ZCTRL_PGAIN: None,
+    ZCTRL_IGAIN: None,
     SAMPLE_SLOPE_X: "",
     SAMPLE_SLOPE_Y: "",
     SCAN_SPEED: "m/s",

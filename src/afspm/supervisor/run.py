@@ -24,6 +24,7 @@ from afspm.record.run_json import (
     COMPUTER,
     ENDED,
     FEEDBACK_OFF,
+    LOST_WITHOUT,
     METADATA,
     NEVER_SHOWN,
     PLANNED,
@@ -150,6 +151,7 @@ def go(
         facts |= own_runs.signed(folder, [*map(str, experiment.folders)])
         facts[METADATA] = before.get(METADATA) or experiment.resolved.metadata() | dict(options.metadata)
         facts[NEVER_SHOWN] = experiment.resolved.never_shown()
+        facts[LOST_WITHOUT] = lost = list(experiment.resolved.lost_without())
         works = experiment.planned_work().items()
         facts[PLANNED] = before.get(PLANNED) or {name: work and work.as_dict() for name, work in works}
         if before.get(ENDED) and REAL_S in before:
@@ -162,6 +164,8 @@ def go(
                 if {start.launch.name for start in starts} & set(experiment.recorders):
                     expect_recorder(log_folder(folder / STATE_DIR))
             log.write(LOGGED_AS, logging.INFO, f"{name}: {counted(len(starts), 'process', 'processes')}, into {folder}")
+            for one in lost:
+                log.write(LOGGED_AS, logging.WARNING, one)
             if not common.simulated and (warning := _ahead_of_wall(clock)):
                 log.write(LOGGED_AS, logging.WARNING, warning)
             reporter = reporter_of(experiment, starts, clock, common.run, handed.supervisor)

@@ -25,6 +25,7 @@ from afspm.translator.setting_groups import MOVES, of_message
 from afspm.translator.temporary_settings import TemporarySettings, state_for
 from afspm.wire import declared, encode
 
+NEVER_SHOWN = "it needs a withdrawn tip, and this microscope never shows the tip: do it by hand, after `afspm pause`"
 _ANNOUNCED = {one.set_by: one.name for one in declared() if one.set_by is not None}
 _SETTERS = (*_ANNOUNCED, ControlRequest.PARAM)
 _MOST_CONTENDED = 2
@@ -164,14 +165,18 @@ class Commands:
         if action.name in STARTS:
             self._refuse_without_tip()
             treatment.refuse_start()
+        if action.needs_withdrawn:
+            self._refuse_at_sample()
         treatment.forget()  # of a treatment that this action ends
         if action.name in names.TREATMENTS:
             treatment.expect(action.name, action.state)
         self._about_to_act(request)
         try:
             action.do()
-        except LOST:
-            raise  # it may have been carried out
+        except LOST as error:
+            if action.name != names.RETRACT or not self._driver.withdraw_elsewhere():
+                raise  # it may have been carried out
+            self._log.warning("the tip was withdrawn over the connection kept for it, since %s", error)
         except Exception:  # a driver may raise anything; it is raised again
             treatment.forget()
             raise
@@ -199,6 +204,12 @@ class Commands:
             code = ControlResponse.NOT_FREE if is_unknown else ControlResponse.ACTION_ERROR
             raise Refused(code, reason or "the tip is withdrawn: bring it to the sample first")
 
+    def _refuse_at_sample(self) -> None:
+        if names.ENGAGED not in self._driver.table:
+            raise Refused(ControlResponse.ACTION_ERROR, NEVER_SHOWN)
+        if self._driver.in_force([names.ENGAGED])[names.ENGAGED]:
+            raise Refused(ControlResponse.ACTION_ERROR, "the tip is at the sample: withdraw it first (x-retract)")
+
     def _find_action(self, name: str) -> Action:
         if name not in self.actions:
             # the name comes from a peer, and may be of any length
@@ -219,11 +230,11 @@ class Commands:
         for name, what in given.items():
             where = f"actions.{name}"
             does = isinstance(what, Mapping) and not {"set", "command"}.isdisjoint(what)
-            known = {"set", "command", "for", "switches_feedback"}
+            known = {"set", "command", "for", "switches_feedback", "withdrawn"}
             if not does or not set(what) <= known or not isinstance(what.get("set", {}), Mapping):
                 hint = (
                     '{ set = { "<parameter>" = <value> }, command = "<text>", for = "<time>",'
-                    " switches_feedback = true }, or parts of it"
+                    " switches_feedback = true, withdrawn = true }, or parts of it"
                 )
                 raise ConfigError(f"{what!r} is not an action", where=where, hint=hint)
             values = self._driver.table.written(what.get("set", {}), where=where)
@@ -233,7 +244,8 @@ class Commands:
             state = moves if for_s is None else state_for(values)
             switches = bool(what.get("switches_feedback")) or (for_s is None and names.FEEDBACK_ON in values)
             do = partial(self._run_added_action, values, command, for_s)
-            added[name] = Action(name, do, state, switches_feedback=switches)
+            needs_withdrawn = self._driver.needs_withdrawn(what)
+            added[name] = Action(name, do, state, switches_feedback=switches, needs_withdrawn=needs_withdrawn)
         return added
 
     def _run_added_action(self, values: Mapping[str, Value], command: str | None, for_s: float | None) -> None:

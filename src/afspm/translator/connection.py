@@ -90,8 +90,10 @@ class Connection:
         """
         try:
             self.reach()
-        except LOST:
-            raise
+        except LOST as error:
+            if not self._driver.withdraws_aside:
+                raise
+            self.why_lost = _reason(error)
         except Exception as error:  # broad: a driver may raise anything, and the tip may be reachable all the same
             self._log.warning("connecting failed, and retracting the tip is tried all the same: %s", error)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -63,6 +64,7 @@ class Action:
         while_busy: True if the action is accepted even while the microscope is not free.
         interrupts: the states that the action interrupts.
         switches_feedback: True if the action may switch the z feedback on or off by itself, and leave it so.
+        needs_withdrawn: True if the action is refused unless `x-engaged` shows a withdrawn tip.
     """
 
     name: str
@@ -71,6 +73,7 @@ class Action:
     while_busy: bool = False
     interrupts: frozenset[ScopeState] = frozenset()
     switches_feedback: bool = False
+    needs_withdrawn: bool = False
 
     @property
     def only_stops(self) -> bool:
@@ -179,7 +182,8 @@ class DriverBase(ABC):
         actions: generic actions added by the experiment file: `{name = {set = {<parameter> = <value>}}}` sets
             parameters, `{name = {command = "<text>"}}` sends a text to the controller (`command`); an action may have
             both keys. With `for = "50 ms"` the microscope is busy for this time, and then the former values are
-            restored. An action that may leave the z feedback switched says `switches_feedback = true`.
+            restored. An action that may leave the z feedback switched says `switches_feedback = true`; one that would
+            break a tip at the sample says `withdrawn = true`.
         poll_period_s: time between two polls of the controller while nothing is due, in real seconds; the state is read
             more often when a measurement is about to end, as learned from earlier measurements.
         result_timeout_s: longest time from the end of a scan or spectrum to its complete file, in experiment seconds;
@@ -239,6 +243,10 @@ class DriverBase(ABC):
     never_shows: ClassVar[Mapping[str, str] | None] = None
     """The witnesses of a measurement (`WITNESSES`) that the controller never shows, with the reasons, except those
     that are parameters, which the table has or lacks. None: the driver does not say."""
+
+    coarse_commands: ClassVar[str] = ""
+    """A regular expression, found in each command as text that moves the coarse motor or stage: such an action of the
+    experiment file needs a withdrawn tip, whether or not the file says so. Empty: no such command is known."""
 
     start_engages: ClassVar[bool] = False
     """True if the start of a scan brings a withdrawn tip to the sample."""
@@ -316,6 +324,20 @@ class DriverBase(ABC):
         missing = {name: [one for one in shown_by if one not in table] for name, shown_by in WITNESSES.items()}
         unread = {name: f"{', '.join(some)} can't be read" for name, some in missing.items() if some}
         return unread | dict(cls.never_shows or {})
+
+    @classmethod
+    def needs_withdrawn(cls, action: Mapping[str, object]) -> bool:
+        """Return whether an action of the experiment file needs a withdrawn tip."""
+        command = str(action.get("command", ""))
+        return bool(action.get("withdrawn")) or bool(cls.coarse_commands and re.search(cls.coarse_commands, command))
+
+    @classmethod
+    def never_withdrawn(cls, settings: PlainMapping) -> tuple[str, ...]:
+        """Return the actions of these settings that need a withdrawn tip, if the microscope never shows the tip."""
+        if names.ENGAGED in cls.parameter_table(cls.rows(settings)):
+            return ()
+        given = (settings.get("actions") or {}).items()
+        return tuple(name for name, what in given if isinstance(what, Mapping) and cls.needs_withdrawn(what))
 
     @classmethod
     def declared_channels(cls, settings: PlainMapping) -> ChannelRoles:
@@ -432,6 +454,26 @@ class DriverBase(ABC):
         """
         return None
 
+    @property
+    def withdraws_aside(self) -> bool:
+        """Whether the controller can be asked to withdraw the tip while the working connection is silent."""
+        return False
+
+    def withdraw_elsewhere(self) -> bool:
+        """Withdraw the tip over a connection kept for this alone; return False if there is none.
+
+        Called if `x-retract` is asked for and the controller is lost.
+
+        Raises:
+            ControllerLost: this connection, too, is silent or lost.
+        """
+        return False
+
+    @classmethod
+    def lost_without(cls, settings: PlainMapping) -> Sequence[str]:
+        """Return what a real controller with these settings can't do, each with its remedy, as sentences."""
+        return ()
+
     def is_last_written(self, name: str, value: Value) -> bool:
         """Return whether the run has set this parameter last, and to this value."""
         return name in self._last_written and self.table[name].same(self._last_written[name], value)
@@ -519,6 +561,13 @@ class DriverBase(ABC):
         Each frame is compared with it, with all corners. Override where the controller reports its range.
         """
         return self._reach
+
+    def refuse_unreachable(self, values: Mapping[str, Value]) -> None:  # noqa: B027 (most have nothing to ask)
+        """Raise Refused for values that the controller would take as set, and could not bring about.
+
+        Called after the table's ranges have been checked, before anything is set. Override where the controller
+        reports present bounds.
+        """
 
     def in_force(self, wanted: Collection[str]) -> dict[str, Value]:
         """Return the values of `read`, each replaced by the last set value if equal within the precision.

@@ -71,7 +71,7 @@ class ParameterSpec:
 
     @property
     def si_unit(self) -> str:
-        """The SI unit of the value; for the setpoint and a maker's own parameters, by the `unit` of the row."""
+        """The SI unit of the value; for setpoint, gains and a maker's own parameters, by the `unit` of the row."""
         si = names.BASE_PARAMETERS.get(self.name)
         return units.si_unit(self.unit) if si is None else si
 
@@ -359,6 +359,8 @@ def _row(known: ParameterSpec, given: PlainMapping, where: str, *, translated: b
     if "choices" in values:
         values["choices"] = tuple(str(choice) for choice in values["choices"])
     row = replace(known, **{k: v for k, v in values.items() if k not in ("range", "resolution")})
+    if not units.same_kind(row.unit, known.unit):
+        row = replace(row, range=ParameterSpec.range, where="")  # a bound in A is none in Hz
     try:
         return _with_numbers(row, values, where)
     except (UnitError, TypeError, ValueError) as error:

@@ -47,6 +47,9 @@ class RequestHandler:
         fence: decides which scheduler is obeyed.
         is_connected: returns whether an earlier connection still exists.
         reply: sends a response, and logs a refusal at a level.
+
+    Attributes:
+        withdraws: True while the tip is being withdrawn on request.
     """
 
     def __init__(
@@ -73,6 +76,7 @@ class RequestHandler:
         is_set = observer.claims.is_set
         self.commands = Commands(driver, state.sequence, temporary, observer.panel, self._record_begin, is_set, log)
         self._acting: Request | None = None
+        self.withdraws = False
         self._commander = b""
         self._last_refusal = ""
 
@@ -101,6 +105,7 @@ class RequestHandler:
         if known is not None:
             self._reply(known, logging.DEBUG)  # logged with the first answer; a client may repeat it each second
             return
+        self.withdraws = is_withdrawal(request)
         try:
             self._carry_out(request)
         except LOST as error:
@@ -110,6 +115,8 @@ class RequestHandler:
             if self._acting is not request:
                 reason, detail = f"not sent: {reason}", ResponseDetail.NOT_SENT
             self._finish(request, Response(ControlResponse.NO_RESPONSE, b"", reason, request.id, detail))
+        finally:
+            self.withdraws = False
 
     def act(self, action: str) -> Response:
         """Execute an action of the translator itself, and publish its steps."""
@@ -126,7 +133,7 @@ class RequestHandler:
             connection.guarded(look)
         if request.subject != names.RETRACT:
             connection.require()
-        elif request.kind == ControlRequest.ACTION:  # the question whether there is such an action needs no controller
+        elif self.withdraws:  # the question whether there is such an action needs no controller
             # a retract is always possible: a reachable controller suffices, even if its state can't be read
             connection.reach_for_retract()
         try:
@@ -192,6 +199,11 @@ def _run_of(frames: Sequence[bytes]) -> str:
     # before decoding, so that a stranger costs little: the id of a component's request names its run
     request_id = frames[2].decode("utf-8", "replace") if len(frames) > 2 else ""
     return run_of(request_id.partition("/")[0], request_id)
+
+
+def is_withdrawal(request: Request) -> bool:
+    """Return whether a request is to withdraw the tip."""
+    return request.kind == ControlRequest.ACTION and request.subject == names.RETRACT
 
 
 def _is_read_only(request: Request) -> bool:

@@ -11,6 +11,7 @@ from typing import Final, TypeVar
 
 from afspm.basics.errors import ConfigError
 from afspm.translator.driver_base import ControllerLost, ControllerSilent
+from afspm.translator.hurry import EVERY_S, end_if_hurried
 from afspm.translator.trace import TCP, TRACE, TracedAnswer
 
 _AT_ONCE: Final = 1 << 20  # bounds the buffer of one `recv`: a reply may announce any size
@@ -44,11 +45,16 @@ class Receiver:
         Raises:
             TimeoutError: no byte came in time. ControllerLost: the connection was closed. OSError.
         """
-        left_s = self._until_s - self._monotonic_s()
-        if left_s <= 0.0:
-            raise TimeoutError
-        self._socket.settimeout(left_s)
-        part = self._socket.recv(min(most, _AT_ONCE))
+        asked_s = self._monotonic_s()
+        while True:
+            left_s = self._until_s - self._monotonic_s()
+            if left_s <= 0.0:
+                raise TimeoutError
+            self._socket.settimeout(min(left_s, EVERY_S))
+            with suppress(TimeoutError):
+                part = self._socket.recv(min(most, _AT_ONCE))
+                break
+            end_if_hurried(self._monotonic_s() - asked_s, self._what)
         if not part:
             raise ControllerLost(f"the connection was closed after {after} bytes of the reply to {self._what}")
         self._traced.add(part)

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from afspm import wire
+from afspm.basics.errors import WireError
 from afspm.basics.exit_codes import ExitCode
 from afspm.model import ControlResponse, Response, ScopeState, ScopeStatus
 from afspm.model.fencing import SchedulerFence
@@ -28,8 +29,9 @@ from afspm.translator.connection import Connection
 from afspm.translator.controller_lock import ControllerTaken, commanding
 from afspm.translator.driver_base import DriverBase
 from afspm.translator.emulated_controller import EmulatedController, wired_to
+from afspm.translator.hurry import hurried_by
 from afspm.translator.observer import Observer
-from afspm.translator.requests import RequestHandler
+from afspm.translator.requests import RequestHandler, is_withdrawal
 from afspm.translator.safe_exit import SafeExit
 from afspm.translator.state import TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
@@ -116,7 +118,7 @@ class Translator:
         self._safe_exit = SafeExit(
             connection, state, temporary, clock, log, retracts=run.retracts, act=act, observe=observe
         )
-        self._ended = False
+        self._ended = self._leaves = False
 
     def run(self) -> ExitCode:
         """Run until the experiment ends, the parent process ends, or the parent stops this process.
@@ -124,6 +126,14 @@ class Translator:
         Returns:
             ENDED after the scheduler's CLOSE; otherwise ORPHAN, after the safe exit.
         """
+        try:
+            with hurried_by(self._withdraws):
+                return self._run()
+        finally:
+            self.driver.close()
+            self._port.close()
+
+    def _run(self) -> ExitCode:
         due, is_due = contextlib.ExitStack(), True
         try:
             while not self._ended:
@@ -142,6 +152,7 @@ class Translator:
                             self.handle(one)
                 # after CLOSE there is nothing to do: the scheduler has made the tip safe
                 if not self._ended and any(isinstance(one, ParentGone) for one in arrived):
+                    self._leaves = True
                     with self._step():
                         self._safe_exit.leave(self._wait_and_look)
                     return ExitCode.ORPHAN
@@ -150,8 +161,18 @@ class Translator:
             return ExitCode.ENDED
         finally:
             due.close()
-            self.driver.close()
-            self._port.close()
+
+    def _withdraws(self) -> bool:
+        # called while an answer of the controller is awaited
+        if not self.driver.withdraws_aside:
+            return False
+        if self.requests.withdraws or (self._leaves and self._safe_exit.is_owed()):
+            return True
+        waiting = self._port.waiting_request()
+        try:
+            return waiting is not None and is_withdrawal(wire.decode_request(waiting.frames))
+        except WireError:
+            return False
 
     def _wake(self) -> None:
         self._woken.set()  # first: the poll that it ends may bring a request, too

@@ -10,7 +10,8 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from afspm.basics.errors import ConfigError
-from afspm.translator.driver_base import ControllerLost
+from afspm.translator.driver_base import ControllerLost, ControllerSilent
+from afspm.translator.hurry import EVERY_S, end_if_hurried
 from afspm.translator.trace import TRACE, ZEROMQ, TracedAnswer
 
 T = TypeVar("T")
@@ -60,7 +61,7 @@ class ZmqConnection:
         """Send a request and return its reply, decoded by `parse`, which returns None for another request's reply.
 
         Raises:
-            ControllerLost: no reply, or a reply that `parse` rejects.
+            ControllerSilent: no reply. ControllerLost: a reply that `parse` rejects.
         """
         try:
             with self._trace.asking(what, message) as traced:
@@ -139,9 +140,14 @@ class ZmqConnection:
             raise self._lost(f"the connection was lost before {what}") from error
 
     def _await_reply(self, what: str, until_s: float) -> None:
-        left_s = until_s - self._monotonic_s()
-        if left_s <= 0.0 or not self._socket.poll(math.ceil(left_s * 1000.0)):
-            raise self._lost(f"no reply to {what} within {self._timeout_s:g} s", self._hints[2])
+        asked_s = self._monotonic_s()
+        while not self._socket.poll(math.ceil(min(max(0.0, until_s - self._monotonic_s()), EVERY_S) * 1000.0)):
+            now_s = self._monotonic_s()
+            if now_s >= until_s:
+                self.close()
+                why = f"no reply to {what} within {self._timeout_s:g} s"
+                raise ControllerSilent(why, where=self._address, hint=self._hints[2])
+            end_if_hurried(now_s - asked_s, what)
 
     def _taken(self, traced: TracedAnswer) -> bytes:
         frames = self._socket.recv_multipart()

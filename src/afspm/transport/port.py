@@ -151,6 +151,9 @@ class ServerPort(Protocol):
         Waits up to `timeout_s` real seconds (None: without limit); returns early after `wake_up`.
         """
 
+    def waiting_request(self) -> RequestReceived | None:
+        """Return the request that the next `poll` returns, if it has arrived, without taking it."""
+
     def reply(self, frames: Sequence[bytes] | None) -> None:
         """Answer the request, with frames of `wire.encode_response`. Never blocks.
 

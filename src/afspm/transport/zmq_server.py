@@ -39,6 +39,7 @@ class ZmqServerPort(BasePort[Served]):
         self._allowed = allowed
         self._has_keys = network.keys is not None and network.keys.binds_encrypted(serve, requests=True)
         self._asker: list[bytes] | None = None
+        self._waiting: RequestReceived | None = None
         self._socket = network.socket(zmq.ROUTER)
         # The newest connection gets an identity. Without it, a scheduler that reconnects before its old connection
         # times out is ignored, and libzmq never frees the queue of its requests.
@@ -49,13 +50,20 @@ class ZmqServerPort(BasePort[Served]):
 
     def poll(self, timeout_s: float | None) -> list[Served]:
         # until `reply`, further requests wait in the socket: a readable socket would end every wait at once
+        waiting, self._waiting = self._waiting, None
         if is_busy := self._asker is not None:
             self._poller.pause(self._socket)
         try:
-            return super().poll(timeout_s)
+            found = super().poll(timeout_s if waiting is None else 0.0)
+            return found if waiting is None else [*found, waiting]
         finally:
             if is_busy:
                 self._poller.register(self._socket, self._request)
+
+    def waiting_request(self) -> RequestReceived | None:
+        if self._waiting is None:
+            self._waiting = next((one for one in self._request() if isinstance(one, RequestReceived)), None)
+        return self._waiting
 
     def _serve(self) -> list[Served]:
         return [SubscriberJoined()] if self._publisher is not None and self._publisher.serve() else []

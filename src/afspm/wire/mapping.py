@@ -143,7 +143,8 @@ def _each(name: str, mapping: MessageMapping[Any]) -> FieldMapping:
     return FieldMapping(
         name,
         lambda things: [mapping.to_wire(thing) for thing in things],
-        lambda messages: tuple(map(mapping.from_wire, messages)),
+        # a list first: of an iterator of unknown length, Python 3.11.7 once failed to resize the tuple (SystemError)
+        lambda messages: (*map(mapping.from_wire, messages),),
     )
 
 

@@ -54,6 +54,49 @@ def test_start_is_refused_while_last_scan_stays_0(bench: Make, monkeypatch: pyte
     assert "LastScan stays 0" in response.reason
 
 
+def test_start_is_refused_while_saving_stays_off(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    values = made.emulator.controller.values
+    values.put("SaveImage", 0)
+    put = values.put
+    monkeypatch.setattr(values, "put", lambda name, value: put(name, 0 if name == "SaveImage" else value))
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert "SaveImage stays off" in response.reason
+
+
+def test_scan_whose_start_leaves_last_scan_at_0_is_named(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    made.strike("keeps-scanning")
+    values = made.emulator.controller.values
+    put, is_kept = values.put, []
+
+    def keeps(name: str, value: float) -> None:
+        is_kept.extend([True] if (name, value) == ("LastScan", 0) else [])
+        put(name, 0 if name == "LastScan" and is_kept else value)
+
+    monkeypatch.setattr(values, "put", keeps)
+    assert peer.act(names.START_SCAN).ok
+    made.until_logged("the scan runs, but LastScan is 0")
+
+
+@pytest.mark.parametrize("volts", [0.0, -0.5])
+def test_amplitude_that_presses_the_tip_into_the_sample_is_refused(bench: Make, volts: float) -> None:
+    peer = bench().start()
+    ready(peer)
+    assert "an amplitude is above 0 V" in peer.set(names.ZCTRL_SETPOINT, volts).reason
+
+
+def test_deflection_may_be_negative(bench: Make) -> None:
+    peer = bench().start(parameters={names.ZCTRL_SETPOINT: {"vendor": "DeflectionSetpointVolts"}})
+    ready(peer)
+    assert peer.set(names.ZCTRL_SETPOINT, -0.5).ok
+
+
 def test_scan_has_exactly_the_frame_that_was_set(bench: Make) -> None:
     made = bench()
     peer = made.start()

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from threading import Event
 from typing import Any
 
 from tests.plugins.vendor_bench import PATIENT, AtPanel, VendorBench
 
-from afspm.plugins.nanonis.emulator import NanonisEmulator, PendingReply
+from afspm.emulation import ClientConnection
+from afspm.plugins.nanonis.emulator import NanonisEmulator, NanonisRequest, PendingReply
 
 
 class Emulated(AtPanel, NanonisEmulator):
     """An emulated controller with a person at its panel, who can see the end of a scan.
 
     Attributes:
+        asked: functions asked for, by port.
         ends_as_awaited: True ends a scan once a client waits for the end, never between two waits.
     """
 
@@ -22,6 +25,7 @@ class Emulated(AtPanel, NanonisEmulator):
         super().__init__(**settings)
         self.scan_ended = Event()
         self.ends_as_awaited = False
+        self.asked: dict[int, list[str]] = defaultdict(list)
 
     def tick(self, now_s: float) -> float | None:
         scanning = self.software.scans.running
@@ -31,6 +35,10 @@ class Emulated(AtPanel, NanonisEmulator):
         if self.software.scans.ends:
             self.scan_ended.set()
         return next_s
+
+    def _answer(self, connection: ClientConnection, asked: NanonisRequest, *rest: Any) -> None:
+        self.asked[connection.socket.getsockname()[1]].append(asked.name)
+        super()._answer(connection, asked, *rest)
 
     def _waits_for(self, function: str) -> bool:
         waiting = [connection.waits_for for connection in self._server.connections]

@@ -228,7 +228,7 @@ def test_frame_changed_in_a_scan_leaves_it_without_a_result(bench: Make) -> None
     [
         ("ZCtrl.SetpntSet", (2e-10,), names.ZCTRL_SETPOINT, 2e-10),
         ("Bias.Set", (0.25,), names.TIP_BIAS_VOLTAGE, 0.25),
-        ("ZCtrl.GainSet", (0.25, 1.0, 0.25), names.ZCTRL_PGAIN, 0.25),
+        ("ZCtrl.GainSet", (2.5e-11, 1e-3, 2.5e-8), names.ZCTRL_PGAIN, 2.5e-11),
         ("Scan.SpeedSet", (4e-6, 4e-6, 1.0, 1.0, 1, 1.0), names.SCAN_SPEED, 4e-6),
         ("Scan.FrameSet", (0.0, 0.0, 1e-6, 1e-6, -20.0), names.SCAN_ANGLE, 20.0),
     ],
@@ -277,7 +277,7 @@ def test_own_requests_are_no_acts_by_hand(bench: Make) -> None:
     values = {
         names.TIP_BIAS_VOLTAGE: 0.2,
         names.SCAN_SPEED: 3e-6,
-        names.ZCTRL_PGAIN: 0.3,
+        names.ZCTRL_PGAIN: 3e-11,
         names.ZCTRL_SETPOINT: 5e-11,
         names.SCAN_ANGLE: 12.3456789,
         names.SCAN_SIZE_X: 7.654321e-7,

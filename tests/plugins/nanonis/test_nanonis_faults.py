@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from deadlines import DEADLINE_S
 from tests.plugins.nanonis.nanonis_bench import Bench
-from tests.plugins.vendor_bench import SOON, scans, small, states
+from tests.plugins.vendor_bench import SOON, scanned, scans, small, states
 
 from afspm.model import (
     ControlRequest,
@@ -446,3 +446,42 @@ def test_translator_survives_nonsense_replies(bench: Make, seed: int) -> None:
         assert response.code in (ControlResponse.NOT_FREE, ControlResponse.NO_RESPONSE), response.reason
     found = peer.until(lambda one: isinstance(one, Scan) and bool(np.isfinite(one.values).all()))
     assert scans(found)
+
+
+@pytest.mark.parametrize(
+    ("function", "logged"),
+    [
+        ("AutoApproach.OnOffGet", "the module AutoApproach of Nanonis is not used from now on"),
+        ("BiasSpectr.StatusGet", "the module BiasSpectr of Nanonis is not used from now on"),
+    ],
+)
+def test_unreadable_side_answer_ends_the_use_of_its_module_alone(bench: Make, function: str, logged: str) -> None:
+    # nanonis.md, fact 15
+    made = bench(other_layout=[function])
+    peer = small(made)
+    made.until_logged(logged)
+    assert scanned(peer)
+    assert made.log_text().count("from now on") == 1
+    no_response = ControlResponse.NO_RESPONSE
+    assert peer.act(names.RETRACT).code != no_response
+
+
+def test_values_that_twice_can_not_be_read_are_left_out(bench: Make) -> None:
+    made = bench(other_layout=["Piezo.DriftCompGet"])
+    peer = small(made)
+    for _ in range(2):
+        assert peer.get_response("x-drift-rate-x").code == ControlResponse.NO_RESPONSE
+        peer.until(UNDEFINED)
+        peer.until(FREE)
+    made.until_logged("x-drift-rate-x, x-drift-rate-y: not supported from now on")
+    assert peer.get_response("x-drift-rate-x").code == ControlResponse.PARAM_NOT_SUPPORTED
+    assert scanned(peer)
+
+
+def test_unreadable_lines_end_the_lines_of_the_scan_alone(bench: Make) -> None:
+    # nanonis.md, fact 15: a channel that is not recorded
+    made = bench(speed=SEEN, other_layout=["Scan.FrameDataGrab"])
+    peer = small(made, live_lines_s=1.0)
+    assert scanned(peer)
+    made.until_logged("no more lines of this scan are published")
+    assert "lost contact" not in made.log_text()

@@ -230,9 +230,9 @@ def test_settings_are_reported_to_the_last_digit_despite_float32(bench: Make) ->
         names.TIP_BIAS_VOLTAGE: 0.123456789,
         names.SCAN_SPEED: 1.23456789e-6,
         names.MOVE_SPEED: 2.3456789e-6,
-        names.ZCTRL_PGAIN: 0.123456789,
-        names.ZCTRL_IGAIN: 123.456789,
-        names.ZCTRL_SETPOINT: 0.66666666666,
+        names.ZCTRL_PGAIN: 1.23456789e-12,
+        names.ZCTRL_IGAIN: 1.23456789e-8,
+        names.ZCTRL_SETPOINT: 0.66666666666e-9,
         names.SCAN_TOP_LEFT_X: 1.23456789012e-8,
         names.SCAN_SIZE_Y: 3.33333333333e-7,
         names.SCAN_ANGLE: -12.3456789012,
@@ -263,9 +263,9 @@ def test_feedback_is_set_switched_off_and_on(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
-    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False, proportional_gain=0.25, setpoint=0.5)).ok
+    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False, proportional_gain=2.5e-11, setpoint=5e-10)).ok
     received = peer.until(lambda one: isinstance(one, Feedback))
-    assert (received[-1].on, received[-1].proportional_gain, received[-1].setpoint) == (False, 0.25, 0.5)
+    assert (received[-1].on, received[-1].proportional_gain, received[-1].setpoint) == (False, 2.5e-11, 5e-10)
     assert made.emulator.rig.setup.feedback.on is False
     assert made.emulator.rig.setup.feedback.integral_gain == pytest.approx(1500.0), "P alone changes T, and I stays"
     assert peer.set("x-feedback-on", True).ok
@@ -286,11 +286,11 @@ def test_feedback_is_switched_on_after_its_other_settings(bench: Make, monkeypat
         switched_with.append((on, software.core.rig.setup.feedback.setpoint))
         plain(now_s, on=on, **settings)
 
-    assert peer.set(names.ZCTRL_SETPOINT, 0.25).ok
+    assert peer.set(names.ZCTRL_SETPOINT, 2.5e-10).ok
     monkeypatch.setattr(software.z_controller, "switch", switch)
-    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False, setpoint=0.5)).ok
-    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True, setpoint=0.75)).ok
-    assert switched_with == [(False, 0.25), (True, 0.75)]
+    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False, setpoint=5e-10)).ok
+    assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True, setpoint=7.5e-10)).ok
+    assert switched_with == [(False, pytest.approx(2.5e-10)), (True, pytest.approx(7.5e-10))]
 
 
 def test_wider_frame_is_not_scanned_faster(bench: Make) -> None:
@@ -375,10 +375,11 @@ def test_setting_is_read_before_and_after_it_once(bench: Make) -> None:
     assert peer.set(names.TIP_BIAS_VOLTAGE, "0.1").ok
     asked = [one.what for one in read_trace(made.folder / FILE) if isinstance(one, TracedExchange)]
     frame_set, bias_set = asked.index("Scan.FrameSet"), asked.index("Bias.Set")
-    before = asked[frame_set - 7 : frame_set]
-    assert before[:4] == ["Scan.BufferGet", "Scan.FrameGet", "Scan.SpeedGet", "Piezo.RangeGet"]
-    assert before[4:] == ["Scan.BufferGet", "Scan.BufferSet", "Scan.SpeedGet"], asked
-    assert asked[frame_set + 1 : frame_set + 3] == ["Scan.BufferGet", "Scan.FrameGet"]
+    before = asked[frame_set - 9 : frame_set]
+    assert before[:3] == ["Scan.BufferGet", "Scan.FrameGet", "Scan.SpeedGet"]
+    assert before[3:6] == ["Piezo.RangeGet", "Piezo.CalibrGet", "Piezo.XYZLimitsGet"]
+    assert before[6:] == ["Scan.BufferGet", "Scan.BufferSet", "Scan.SpeedGet"], asked
+    assert asked[frame_set + 1 : frame_set + 4] == ["Scan.SpeedGet", "Scan.BufferGet", "Scan.FrameGet"]
     assert asked[bias_set - 1 :] == ["Bias.Get", "Bias.Set", "Bias.Get"]
 
 

@@ -52,6 +52,26 @@ def test_scan_shows_the_sample_in_place(bench: Make, release: int, direction: st
     assert made.emulator.rig.scan.upwards is (direction == "up")
 
 
+@pytest.mark.parametrize(
+    ("path", "kept"), [("imaging.scan_mode", 0), ("data.storage.nhf_auto_store_mode", 0)], ids=["repeats", "unsaved"]
+)
+def test_start_is_refused_while_studio_keeps_another_switch(
+    bench: Make, monkeypatch: pytest.MonkeyPatch, path: str, kept: int
+) -> None:
+    # results T5: switches were set, and never read back
+    made = bench()
+    peer = small(made)
+    program = made.emulator.program
+    assert isinstance(program, StudioProgram)
+    program.values[path] = kept
+    put = program.put
+    monkeypatch.setattr(program, "put", lambda name, value: put(name, kept if name == path else value))
+    response = peer.act(names.START_SCAN)
+    assert response.code == ControlResponse.ACTION_ERROR
+    assert f"Studio keeps {path} = {kept}" in response.reason
+    assert not program.scanning
+
+
 def test_studio_before_the_present_tree_scans_and_moves_the_tip_along_z(bench: Make) -> None:
     made = bench(release=13)
     peer = made.start(release=13)

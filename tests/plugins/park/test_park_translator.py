@@ -348,6 +348,13 @@ def test_long_command_keeps_the_microscope_busy_and_connected(bench: Make, repli
     assert not made.emulator.rig.busy(made.clock.now_s())
 
 
+def test_move_of_the_stage_is_refused_since_no_value_shows_the_tip(bench: Make) -> None:
+    made = bench()
+    peer = small(made, actions={"x-up": {"command": "spm.zstage.move(10, 1)"}})
+    assert "it needs a withdrawn tip, and this microscope never shows the tip" in peer.act("x-up").reason
+    assert not made.emulator.rig.busy(made.clock.now_s())
+
+
 def test_unknown_command_is_refused_with_smartscans_own_text(bench: Make) -> None:
     peer = small(bench(), actions={"x-mode": {"command": "spm.head.setMode('ncm')"}})
     response = peer.act("x-mode")

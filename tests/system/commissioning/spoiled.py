@@ -9,6 +9,7 @@ from typing import Any
 from afspm.basics import entry_points
 from afspm.driver import Driver
 from afspm.model import Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.plugins.nanonis import Nanonis
 from afspm.plugins.nanonis.emulator import NanonisEmulator
 
 LATE_S = 120.0
@@ -38,6 +39,14 @@ class OtherWay(Driver):
             replace(one, region=replace(one.region, angle_rad=-one.region.angle_rad)) if isinstance(one, Scan) else one
             for one in found
         ]
+
+
+class OtherZNanonis(Nanonis):
+    """Z counts towards the sample, as on a rig whose piezo is wired so."""
+
+    def _ask(self, name: str, *arguments: object, longer_s: float = 0.0) -> tuple[Any, ...]:
+        found = super()._ask(name, *arguments, longer_s=longer_s)
+        return (-found[0],) if name == "ZCtrl.ZPosGet" else found  # type: ignore[operator]
 
 
 class LateEnd(Driver):

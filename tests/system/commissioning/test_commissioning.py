@@ -224,6 +224,19 @@ def test_ctrl_c_in_contact_withdraws_the_tip(tmp_path: Path) -> None:
     assert not InstrumentReport.read(tmp_path / "report.toml").unrestored
 
 
+def test_z_that_counts_the_other_way_is_found_by_the_withdrawal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    person = Person()
+    result = commissioned(tmp_path, "Nanonis", person, "spoiled.OtherZNanonis")
+    assert not result.passed
+    assert "z counts the other way at this rig" in result.progress.results["x-retract"].line
+    assert any("THE TIP WAS NOT WITHDRAWN" in line for line in person.shown)
+    assert InstrumentReport.read(tmp_path / "report.toml").steps["x-retract"]["outcome"] == "mismatch"
+
+
 @not_on_wine("a process can't be stopped and continued there")
 def test_a_lost_connection_is_noticed_and_found_again(tmp_path: Path) -> None:
     def pid() -> int:

@@ -51,7 +51,7 @@ CELLS = [(job, instrument) for job in PROOFS for instrument in SECOND_FILES]
 _GAINS = {
     "asylum": (0.01, 1000.0),
     "gxsm": (0.1, 200.0),
-    "nanonis": (1.0, 100_000.0),
+    "nanonis": (1e-10, 1e-5),
     "nanosurf": (1.0, 100_000.0),
     "park": (0.001, 100.0),
     "simulator": (1.0, 100_000.0),

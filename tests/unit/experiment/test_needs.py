@@ -34,6 +34,27 @@ def test_parameters_and_actions_added_by_the_file_count_as_capabilities(write: W
     assert errors(write(SWAPPER, frame=SIMULATED + ADDED)) == []
 
 
+@pytest.mark.parametrize(
+    ("kind", "action", "is_wrong"),
+    [
+        ("Park", '{ command = "spm.zstage.move(100, 1)" }', True),
+        ("Gxsm", '{ command = "DSP_CMD_MOV-XP_XY" }', True),
+        ("Nanosurf", '{ command = "root.workflow.mine()", withdrawn = true }', True),
+        ("Nanosurf", '{ command = "root.workflow.mine()" }', False),
+        ("Nanonis", '{ command = "Motor.StartMove 4 10 0 1" }', False),
+        ("Simulator", "{ set = { scan-angle = 0 }, withdrawn = true }", False),
+    ],
+)
+def test_action_for_a_withdrawn_tip_is_refused_where_no_tip_is_shown(
+    write: Write, kind: str, action: str, is_wrong: bool
+) -> None:
+    # results m5: a stage that moves beside a tip at the sample
+    frame = SIMULATED.replace("Simulator", kind) + f"actions = {{ x-step = {action} }}\n"
+    found = [finding.what for finding in errors(write("", frame=frame))]
+    what = "[microscope] actions.x-step: it needs a withdrawn tip, which this microscope never shows"
+    assert found == ([what] if is_wrong else [])
+
+
 def test_a_command_that_is_the_translator_may_have_everything(write: Write) -> None:
     assert errors(write(SWAPPER)) == []
 

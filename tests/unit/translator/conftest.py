@@ -70,6 +70,8 @@ class FakePort:
     def poll(self, timeout_s: float | None) -> list[Served]:
         return []
 
+    def waiting_request(self) -> None: ...
+
     def reply(self, frames: Sequence[bytes] | None) -> None:
         self.replies.append(list(frames or []))
 

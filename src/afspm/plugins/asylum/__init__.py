@@ -21,7 +21,18 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.basics import ConfigError, Duration, PollPeriod, Refused
-from afspm.driver import FEEDBACK_ON, FRAME, POSITION, SCAN, KeptSettings, ScriptedDriver, Value, action, frame
+from afspm.driver import (
+    FEEDBACK_ON,
+    FRAME,
+    POSITION,
+    SCAN,
+    KeptSettings,
+    ScriptedDriver,
+    Value,
+    action,
+    frame,
+    refuse_value,
+)
 from afspm.model import ControlResponse, Region, ScopeState, both_ways, names
 from afspm.plugins.asylum.activity import FORCE, AsylumActivity
 from afspm.plugins.asylum.link import Link
@@ -31,6 +42,7 @@ from afspm.plugins.asylum.settings import NAMES, FeedbackSwitch, FrameSettings, 
 from afspm.plugins.asylum.xop import XopError
 
 _LAST_SCAN: Final = "LastScan"
+_AMPLITUDE: Final = "AmplitudeSetpointVolts"
 _AT_FIRST: Final[dict[str, Value]] = {
     names.SCAN_DIRECTION: names.UP,
     names.SPEC_KIND: FORCE,
@@ -185,6 +197,13 @@ class Asylum(ScriptedDriver[Session, AsylumActivity]):
             return self.session().text("GS", vendor)
         return self.session().values([vendor])[vendor]
 
+    def refuse_unreachable(self, values: Mapping[str, Value]) -> None:
+        setpoint = values.get(names.ZCTRL_SETPOINT)
+        is_amplitude = self.table[names.ZCTRL_SETPOINT].vendor == _AMPLITUDE
+        if is_amplitude and setpoint is not None and float(setpoint) <= 0.0:
+            # PV takes it: the feedback would press the cantilever until it oscillates no more, and further
+            raise refuse_value(names.ZCTRL_SETPOINT, f"an amplitude is above 0 V, not {float(setpoint):g} V")
+
     def is_read_alone(self, name: str) -> bool:
         return self.table[name].type == "text" or name == names.ENGAGED
 
@@ -210,6 +229,10 @@ class Asylum(ScriptedDriver[Session, AsylumActivity]):
         up = self._kept[names.SCAN_DIRECTION] == names.UP
         self._begin(SCAN, "DoScanFunc", "UpScan" if up else "DownScan")
         self.session().put({_LAST_SCAN: 1})  # again, in case the start has reset it
+        if not self.session().values([_LAST_SCAN])[_LAST_SCAN]:
+            self.log.error(
+                "the scan runs, but LastScan is 0: Asylum scans the frame again and again. Set it to 1 there"
+            )
         self.activity.await_begin(SCAN)
         # spots count from the corner of the new image now: the same position is another spot
         if probe_m is not None:

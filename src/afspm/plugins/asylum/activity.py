@@ -169,6 +169,9 @@ class AsylumActivity(Activity):
         if self._session.values([name])[name] != _SAVE:
             self._log.warning("Asylum did not save its measurements (%s); saving is on from now on", name)
             self._session.put({name: _SAVE})
+            if self._session.values([name])[name] != _SAVE:
+                reason = f"{name} stays off, although it was set: nothing would be saved. Switch saving on at Asylum"
+                raise Refused(ControlResponse.ACTION_ERROR, reason)
         folder = self.folder(what)
         if not folder.is_dir():
             reason = f"Asylum's folder {folder} does not exist on this computer: set folders"

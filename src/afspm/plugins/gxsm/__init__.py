@@ -112,6 +112,7 @@ class Gxsm(Driver):
     counts_clockwise: ClassVar[bool] = True
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
+    coarse_commands: ClassVar[str] = "^DSP_CMD_MOV"
     never_shows: ClassVar = {"stop of a spectrum": "GXSM shows nothing of it"}
     shadow: ClassVar[str] = "afspm.plugins.gxsm.shadow.GxsmShadow"
 

@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from afspm.basics import ConfigError, Duration, FileError, Refused
+from afspm.basics import ConfigError, Current, Duration, FileError, Refused, Voltage
 from afspm.driver import (
     FRAME,
     SCAN,
@@ -39,9 +39,16 @@ from afspm.driver import (
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.nanonis import fetched, geometry, parameter_groups, protocol, z_controller
 from afspm.plugins.nanonis.activity import SAFE_TIP, WITHDRAWING, NanonisActivity
+from afspm.plugins.nanonis.preamplifier import Preamplifier
 from afspm.plugins.nanonis.result_files import NanonisFiles
-from afspm.plugins.nanonis.session import MODULES, Session
+from afspm.plugins.nanonis.session import MODULES, Link, Ports, Session, WithdrawalPort
+from afspm.plugins.nanonis.tip_shaper import TipShaper
 
+_ADDRESS: Final = "127.0.0.1:6501,6502"
+_NO_WAY: Final = (
+    "no port is kept for withdrawing the tip: while the first port of Nanonis stays silent, the tip stays where it is; "
+    'name a third one, as in address = "127.0.0.1:6501,6502,6503"'
+)
 _AT_FIRST: Final[dict[str, Value]] = {
     names.SCAN_DIRECTION: names.UP,
     names.SPEC_KIND: "IV",
@@ -54,6 +61,11 @@ _CONTINUOUS: Final = (
     "the continuous scan stays on at Nanonis' panel (Scan Control), although it was switched off: one scan would "
     "follow the other without end. Switch it off there"
 )
+_GRAB_SHARE: Final = 10.0
+"""Real time without a grab of lines, in times of the last grab: large scans must not fill the connection."""
+_UNSAVED: Final = (
+    "scans are not saved, although saving was switched on (Scan Control): their data is fetched from Nanonis' memory"
+)
 _AT_ONCE: Final = 0
 """Argument of functions that could also wait for the end of their action."""
 _NO_TIMEOUT: Final = -1
@@ -65,11 +77,9 @@ _BY_VALUE: Final = (
     parameter_groups.ScanSpeed,
     parameter_groups.Gains,
     parameter_groups.MoveSpeed,
-    parameter_groups.Slope,
-    parameter_groups.DriftRate,
-    parameter_groups.SafeTip,
 )
-_GROUPS: Final = (*_BY_VALUE, geometry.Probe, parameter_groups.FeedbackOn, parameter_groups.TipState)
+_SIDE: Final = (parameter_groups.Slope, parameter_groups.DriftRate, parameter_groups.SafeTip)
+_GROUPS: Final = (*_BY_VALUE, *_SIDE, geometry.Probe, parameter_groups.FeedbackOn, parameter_groups.TipState)
 _TRANSLATED: Final = tuple(name for group in _GROUPS for name in group.names)
 _CHANNELS: Final = both_ways(
     {
@@ -90,14 +100,18 @@ class Nanonis(Driver):
     """The driver of a microscope with a Nanonis controller.
 
     Args:
-        address: "host:port,port": two of the ports at File > Settings Options > TCP Programming Interface; each port
-            serves one client. An emulator needs a single port.
+        address: "host:port,port,port": ports at File > Settings Options > TCP Programming Interface; each serves one
+            client: for quick requests, for calls that last, and for withdrawing the tip alone; a fourth one
+            is taken if one of the first two stays silent. An emulator needs a single port.
         session_dir: local path of Nanonis' session folder. Default: the path that Nanonis reports. Data in unreachable
             files is fetched over TCP.
         release: release of Nanonis' software (Help > Info), if the software reports none or a wrong release.
         reply_timeout_s: longest wait for a reply, real time.
         autosave: True switches on saving of every scan; False leaves the panel's setting alone.
         grabbed_rows, grabbed_backward: see `fetched.Grabbing`.
+        preamplifier_range: largest current of the preamplifier, if Nanonis' label of the gain does not state V/A.
+        sensor: "qplus" or "other". On a qPlus sensor `x-crash` is refused at a larger bias than `qplus_bias`.
+        qplus_bias: largest amount of the bias at which a qPlus sensor may touch the sample.
         common: settings of every driver.
     """
 
@@ -109,6 +123,7 @@ class Nanonis(Driver):
     counts_clockwise: ClassVar[bool] = True
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
+    coarse_commands: ClassVar[str] = r"^\s*Motor\.Start"
     never_shows: ClassVar = {
         "another one begun": "a stop and a start between two looks seem one scan, unless the stop saves a file",
     }
@@ -119,36 +134,51 @@ class Nanonis(Driver):
     def __init__(
         self,
         *,
-        address: str = "127.0.0.1:6501,6502",
+        address: str = _ADDRESS,
         session_dir: str | None = None,
         release: int | None = None,
         reply_timeout_s: Duration = 5.0,
         autosave: bool = True,
         grabbed_rows: str = "top-first",
         grabbed_backward: str = "mirrored",
+        preamplifier_range: Current | None = None,
+        sensor: str = "",
+        qplus_bias: Voltage = 0.05,
         **common: Any,
     ) -> None:
         super().__init__(**common)
         self.controller_at = address
-        _addresses(address)
+        self._ports = Ports(_addresses(address))
+        self._withdrawal: WithdrawalPort | None = None
         self._session_dir = None if session_dir is None else Path(session_dir)
         self._release = release
         self._reply_timeout_s = reply_timeout_s
         self._autosave = autosave
         self._grabbing = fetched.Grabbing(grabbed_rows, grabbed_backward)
         self._session: Session | None = None
+        self._grabs_at_s = 0.0
         self._kept = KeptSettings(_AT_FIRST)
         ask = self._ask
         self._probe = geometry.Probe(ask, lambda: self.clock.now_s())
         feedback = parameter_groups.FeedbackOn(ask, lambda holds: self.wait_for(holds, reply_timeout_s))
         self._tip = parameter_groups.TipState(ask)
-        self.groups = (*(group(ask) for group in _BY_VALUE), self._probe, feedback, self._tip, self._kept)
+        self._side = [parameter_groups.SideGroup(group(ask)) for group in _SIDE]
+        vital = (*(group(ask) for group in _BY_VALUE), self._probe, feedback, self._tip, self._kept)
+        self.groups = (*vital, *self._side)
+        self._preamplifier = Preamplifier(ask, preamplifier_range)
+        self._tip_shaper = TipShaper(ask, sensor, qplus_bias, lambda: self.log)
         self._files: NanonisFiles
 
     def connect(self) -> None:
-        self.close()
-        addresses = _addresses(self.controller_at)
-        session = self._session = self.session_class(self, addresses, self._reply_timeout_s, self._release)
+        self._close_session()
+        if self._ports.named != (named := _addresses(self.controller_at)):
+            self._ports = Ports(named)
+        if self._withdrawal is None and self.withdraws_aside:
+            self._withdrawal = WithdrawalPort(self._link_to_withdraw, self.clock.monotonic_s, self.log)
+        if self._withdrawal is not None:
+            self._withdrawal.hold()
+        self._leave_out_unreadable()
+        session = self._session = self.session_class(self, self._ports, self._reply_timeout_s, self._release)
         if not hasattr(self, "_files"):
             self._kept.kept_in(self.memory)
             own_folder = (self.run_dir / "scans").resolve()
@@ -158,6 +188,8 @@ class Nanonis(Driver):
             session, self._files, self._probe, self._tip, self.memory, self.clock, self.log
         )
         z_controller.compare(session.ask, self.table[names.ZCTRL_SETPOINT].unit, self.log)
+        if self._holds_current:
+            self._preamplifier.look(self.log)
         folder = self._session_dir or Path(session.ask("Util.SessionPathGet")[0])
         if not folder.is_dir():
             self.log.warning(
@@ -166,10 +198,43 @@ class Nanonis(Driver):
             )
         self._files.look(folder)
 
+    def _leave_out_unreadable(self) -> None:
+        for group in self._side:
+            if group.unreadable and not self.table.keys().isdisjoint(group.names):
+                self.log.warning("%s: not supported from now on: %s", ", ".join(group.names), group.unreadable)
+                self.table = self.table.without(group.names)
+
     def close(self) -> None:
+        self._close_session()
+        if self._withdrawal is not None:
+            self._withdrawal.close()
+
+    def _close_session(self) -> None:
         if self._session is not None:
             self._session.close()
             self._session = None
+
+    @property
+    def withdraws_aside(self) -> bool:
+        return not self.only_reads and Ports(_addresses(self.controller_at)).for_withdrawing is not None
+
+    def withdraw_elsewhere(self) -> bool:
+        if self._withdrawal is None:
+            return False
+        self._withdrawal.withdraw()
+        return True
+
+    def _link_to_withdraw(self, timeout_s: float) -> Link:
+        address = self._ports.for_withdrawing
+        assert address is not None
+        link = self.session_class.link(address, timeout_s, self.clock.monotonic_s)
+        self.prove()
+        return link
+
+    @classmethod
+    def lost_without(cls, settings: Mapping[str, object]) -> Sequence[str]:
+        address = str(settings.get("address", _ADDRESS))
+        return () if Ports(_addresses(address)).for_withdrawing else (_NO_WAY,)
 
     @property
     def _there(self) -> Session:
@@ -179,6 +244,8 @@ class Nanonis(Driver):
         return self._there.ask(name, *arguments, longer_s=longer_s)
 
     def status(self) -> ScopeStatus:
+        if self._withdrawal is not None:
+            self._withdrawal.hold()
         return self._activity.status()
 
     def next_change_s(self) -> float | None:
@@ -192,6 +259,14 @@ class Nanonis(Driver):
 
     def reach(self) -> Mapping[str, ParameterSpec]:
         return self._probe.within(super().reach())
+
+    @property
+    def _holds_current(self) -> bool:
+        return self.table[names.ZCTRL_SETPOINT].si_unit == "A"
+
+    def refuse_unreachable(self, values: Mapping[str, Value]) -> None:
+        if names.ZCTRL_SETPOINT in values and self._holds_current:
+            self._preamplifier.refuse_beyond(float(values[names.ZCTRL_SETPOINT]))
 
     def get(self, vendor: str) -> Value:
         """Return a value by the prefix of a pair of functions: "Bias." means Bias.Get."""
@@ -235,7 +310,7 @@ class Nanonis(Driver):
 
     def _fetch(self, ended: Entry) -> Sequence[Scan | Spectrum]:
         if ended["what"] == SCAN:
-            found = fetched.images(self._ask, self._grabbing)
+            found = self._images()
             return [Scan(as_region(ended["frame"]), image.name, image.unit, image.values) for image in found]
         curve, self._activity.curve = self._activity.curve, None
         if curve is None:
@@ -248,7 +323,19 @@ class Nanonis(Driver):
         kept = self._files.frame
         if kept is None or not self._files.was_seen:
             return ()  # the memory may still hold the previous scan, all of whose lines would be new
-        return fetched.new_lines(fetched.images(self._ask, self._grabbing), as_region(kept), start)
+        began_s = self.clock.monotonic_s()
+        if began_s < self._grabs_at_s:
+            return ()
+        new = fetched.new_lines(self._images(), as_region(kept), start)
+        ended_s = self.clock.monotonic_s()
+        self._grabs_at_s = ended_s + _GRAB_SHARE * (ended_s - began_s)
+        return new
+
+    def _images(self) -> list[fetched.Image]:
+        try:
+            return fetched.images(self._there.ask_for_data, self._grabbing)
+        except protocol.UnreadableReply as error:
+            raise FileError(f"the scan in Nanonis' memory can't be read: {error}") from error
 
     # --- actions ---
 
@@ -276,6 +363,9 @@ class Nanonis(Driver):
         """Take a spectrum of the kind `x-spec-kind` at the tip's position."""
         self._activity.refuse_safe_tip()
         kind = str(self._kept[names.SPEC_KIND])
+        if not self._there.listener.is_there:
+            reason = "no port of Nanonis is left for a second connection, which a spectrum needs"
+            raise Refused(ControlResponse.ACTION_ERROR, reason)
         if MODULES[kind] not in self._there.opened:
             raise Refused(ControlResponse.ACTION_ERROR, f"Nanonis can't open the module {MODULES[kind]}")
         self._activity.start_curve(kind)
@@ -297,14 +387,8 @@ class Nanonis(Driver):
     def crash(self) -> None:
         """Shape the tip: `x-crash-depth` down at `x-crash-speed` and back; the z controller is restored."""
         self._activity.refuse_safe_tip()
-        depth_m = self._kept.number(names.CRASH_DEPTH)
-        ramp_s = depth_m / self._kept.number(names.CRASH_SPEED)
-        bias_v = parameter_groups.numbers(self._ask, "Bias.Get")[0]
-        # one dip at the present bias: the tip shaper's second lift undoes the first
-        same_bias, settle_s, restore = 2, 0.1, 1
-        before = (settle_s, same_bias, bias_v)
-        self._ask("TipShaper.PropsSet", *before, -depth_m, ramp_s, bias_v, settle_s, depth_m, ramp_s, settle_s, restore)
-        lasts_s = 2 * ramp_s + 4 * settle_s
+        depth_m, speed_m_s = self._kept.number(names.CRASH_DEPTH), self._kept.number(names.CRASH_SPEED)
+        lasts_s = self._tip_shaper.prepare(depth_m, speed_m_s)
         with self._activity.occupied(ScopeState.MOVING, lasts_s + _LATE_S):
             self._ask("TipShaper.Start", _AT_ONCE, _NO_TIMEOUT, longer_s=lasts_s)
 
@@ -347,8 +431,11 @@ class Nanonis(Driver):
             autosave = save_all if save else no_change
             self._ask("Scan.PropsSet", off, off, autosave, series, comment, modules, no_change)
             # another program or the panel may switch it on again, and a reply of PropsSet is no proof
-            if self._ask("Scan.PropsGet")[0]:
+            continuous, _, autosave, *_ = self._ask("Scan.PropsGet")
+            if continuous:
                 raise Refused(ControlResponse.ACTION_ERROR, _CONTINUOUS)
+            if save and autosave != 0:
+                self.log.warning(_UNSAVED)
 
 
 def _argument(code: str, word: str) -> object:
@@ -368,5 +455,5 @@ def _addresses(text: str) -> list[tuple[str, int]]:
     except ValueError:
         found = []
     if not found:
-        raise ConfigError(f"{text!r} is not an address", where="address", hint='"host:port,port"')
+        raise ConfigError(f"{text!r} is not an address", where="address", hint='"host:port,port,port"')
     return found

@@ -12,7 +12,7 @@ from afspm.driver import SCAN, Activity, ControllerLost, Kept, as_list, frame
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.plugins.nanonis.geometry import Probe, ScanFrame
 from afspm.plugins.nanonis.parameter_groups import TipState
-from afspm.plugins.nanonis.protocol import NanonisError
+from afspm.plugins.nanonis.protocol import NanonisError, UnreadableReply
 from afspm.plugins.nanonis.result_files import NanonisFiles
 from afspm.plugins.nanonis.session import APPROACH, MODULES, CurveEnded, ListenerEvent, ScanEnded, Session
 
@@ -127,7 +127,7 @@ class NanonisActivity(Activity):
     def stop_curve(self) -> None:
         """Stop the running spectrum."""
         for module in self._opened.intersection(MODULES.values()):
-            if self._ask(f"{module}.StatusGet")[0]:
+            if self._says(module, "StatusGet"):
                 self._ask(f"{module}.Stop")
         self.stopped()
 
@@ -248,14 +248,25 @@ class NanonisActivity(Activity):
             self._ask("AutoApproach.OnOffSet", off)
 
     def _approaches(self) -> bool:
-        return APPROACH in self._opened and bool(self._ask("AutoApproach.OnOffGet")[0])
+        return self._says(APPROACH, "OnOffGet")
+
+    def _says(self, module: str, question: str) -> bool:
+        # a module that is not vital: an answer that can't be read ends its use, and not the contact with Nanonis
+        if module not in self._opened:
+            return False
+        try:
+            return bool(self._ask(f"{module}.{question}")[0])
+        except UnreadableReply as error:
+            self._opened.discard(module)
+            self._log.warning("the module %s of Nanonis is not used from now on: %s", module, error)
+            return False
 
     def _kind_running(self) -> str:
         # the blocking call on the second connection reports the end of the translator's own spectra
         if self._kind_asked:
             return self._kind_asked
         for kind, module in MODULES.items():
-            if module in self._opened and self._ask(f"{module}.StatusGet")[0]:
+            if self._says(module, "StatusGet"):
                 return kind
         return ""
 

@@ -11,11 +11,13 @@ from collections.abc import Callable, Mapping
 from typing import ClassVar, Final
 
 from afspm.basics import lengths_text
-from afspm.driver import FRAME, POSITION, ParameterSpec, Value, frame, frame_values, refuse_value
+from afspm.driver import FRAME, POSITION, ParameterSpec, Value, check_speed, frame, frame_values, refuse_value
 from afspm.model import Region, names
 from afspm.plugins.nanonis.parameter_groups import Ask, Group, MoveSpeed, keep_speed
 from afspm.plugins.nanonis.protocol import BadReply, NanonisError
 
+_OUTPUT_V: Final = 10.0
+"""Amount of the largest voltage of Nanonis' outputs, to which the piezo calibration belongs."""
 _DIGITS: Final = 1e-6  # relative precision of float32, with a margin
 _ADDED_UP: Final = frozenset(FRAME) - {names.SCAN_ANGLE, names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y}
 """Parameters calculated from centre and size: the rounding error of the largest value applies to each."""
@@ -41,7 +43,7 @@ class ScanFrame(Group):
         if names.SCAN_RESOLUTION_X in values or names.SCAN_RESOLUTION_Y in values:
             self._ask("Scan.BufferSet", self._ask("Scan.BufferGet")[0], columns, rows)
         # a frame set wider with the time per line kept would be scanned faster, beyond any limit of the speed
-        keep_speed(self._ask)
+        speed_m_s = keep_speed(self._ask)
         width, height = region.size_m
         self._ask(
             "Scan.FrameSet",
@@ -50,6 +52,7 @@ class ScanFrame(Group):
             height / _share(rows),
             0.0 - math.degrees(region.angle_rad),
         )
+        check_speed(speed_m_s, self._numbers("Scan.SpeedGet")[0])
 
 
 def _share(pixels: int) -> float:
@@ -125,7 +128,25 @@ class Probe(Group):
             self._unknown_range = str(error)
             return reach
         rows = zip(self.names, self._range_m, strict=True)
-        return {name: reach[name].within((-whole / 2, whole / 2), "Nanonis, module Piezo") for name, whole in rows}
+        found = {name: reach[name].within((-whole / 2, whole / 2), "Nanonis, module Piezo") for name, whole in rows}
+        ends_m = zip(self.names, self._ends_of_voltages_m(), strict=True)
+        return {
+            name: found[name].within(ends, "Nanonis, Piezo: calibration and voltage limits") for name, ends in ends_m
+        }
+
+    def _ends_of_voltages_m(self) -> list[tuple[float, float]]:
+        # the range that Nanonis reports says nothing of voltage limits that a person sets in the same module
+        try:
+            metres_per_volt = self._numbers("Piezo.CalibrGet")[:2]
+            on, *limits_v = self._numbers("Piezo.XYZLimitsGet")
+        except NanonisError:
+            return [(-math.inf, math.inf)] * 2  # a release without these functions has the range alone
+        ends_m = []
+        for axis, factor in enumerate(metres_per_volt):
+            low_v, high_v = limits_v[2 * axis : 2 * axis + 2] if on else (-_OUTPUT_V, _OUTPUT_V)
+            low_m, high_m = sorted((factor * max(low_v, -_OUTPUT_V), factor * min(high_v, _OUTPUT_V)))
+            ends_m.append((low_m, high_m))
+        return ends_m
 
     def arrived(self) -> bool:
         """Return True if no move is pending, or if the tip has reached the target."""

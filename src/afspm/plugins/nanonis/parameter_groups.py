@@ -43,6 +43,31 @@ class Group(SettingsGroup):
         return numbers(self._ask, name, *arguments)
 
 
+class SideGroup(SettingsGroup):
+    """A group whose values the tip's safety does not need: answers that can't be read end its use, not the contact.
+
+    Attributes:
+        unreadable: why the group is left out, after two bad answers in a row; otherwise empty.
+    """
+
+    def __init__(self, group: Group) -> None:
+        self.names = group.names
+        self._group, self._failed, self.unreadable = group, False, ""
+
+    def read(self) -> dict[str, Value]:
+        try:
+            found = self._group.read()
+        except BadReply as error:
+            self.unreadable = str(error) if self._failed else ""
+            self._failed = True
+            raise
+        self._failed = False
+        return found
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        self._group.write(values)
+
+
 def numbers(ask: Ask, name: str, *arguments: object) -> tuple[Any, ...]:
     """Return the results of a function whose numbers must be finite.
 
@@ -56,11 +81,16 @@ def numbers(ask: Ask, name: str, *arguments: object) -> tuple[Any, ...]:
     return found
 
 
-def keep_speed(ask: Ask) -> None:
-    """Let Nanonis keep both scan speeds when the frame changes, instead of the time per line."""
+def keep_speed(ask: Ask) -> float:
+    """Let Nanonis keep both scan speeds when the frame changes, instead of the time per line.
+
+    Returns:
+        the forward speed, in m/s.
+    """
     *speeds, keeps_time, ratio = ask("Scan.SpeedGet")
     if keeps_time:
         ask("Scan.SpeedSet", *speeds, _KEEP_SPEED, ratio)
+    return float(speeds[0])
 
 
 class ScanSpeed(Group):

@@ -36,6 +36,10 @@ class BadReply(ControllerLost):
     code = "nanonis-reply"
 
 
+class UnreadableReply(BadReply):
+    """The error that a whole reply to the right function has other results than expected: later replies count."""
+
+
 class NanonisError(AfspmError):
     """An error reported by Nanonis, with its own text."""
 
@@ -47,20 +51,21 @@ class Function:
     """One function of the protocol.
 
     Attributes:
-        arguments, results: fields in order, each as (type code, first release that has the field).
+        arguments: fields in order, each as (type code, first release that has the field).
+        layouts: the possible results, each as fields in order; more than one where sources differ.
     """
 
     name: str
     arguments: tuple[tuple[str, int], ...]
-    results: tuple[tuple[str, int], ...]
+    layouts: tuple[tuple[tuple[str, int], ...], ...]
 
     def argument_codes(self, release: int) -> tuple[str, ...]:
         """Return the type codes of the fields in a request to a release."""
         return tuple(code for code, since in self.arguments if since <= release)
 
-    def result_codes(self, release: int) -> tuple[str, ...]:
-        """Return the type codes of the fields in a reply of a release."""
-        return tuple(code for code, since in self.results if since <= release)
+    def result_codes(self, release: int) -> list[tuple[str, ...]]:
+        """Return the type codes of the fields in a reply of a release, for each layout."""
+        return [tuple(code for code, since in fields if since <= release) for fields in self.layouts]
 
 
 def _fields(text: str) -> tuple[tuple[str, int], ...]:
@@ -75,7 +80,7 @@ def functions() -> Mapping[str, Function]:
     for line in Path(__file__).with_name("functions.txt").read_text(encoding="ascii").splitlines():
         if line and not line.startswith("#"):
             name, arguments, results = re.split(" {2,}", line)
-            rows[name] = Function(name, _fields(arguments), _fields(results))
+            rows[name] = Function(name, _fields(arguments), tuple(map(_fields, results.split(" | "))))
     return rows
 
 
@@ -128,26 +133,26 @@ def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[
 
     Raises:
         NanonisError: Nanonis reports an error.
-        BadReply: the body does not fit the function.
+        UnreadableReply: the body does not fit the function.
     """
-    try:
-        # The fields depend on the release: a wrong release leaves bytes over, or needs more bytes than received.
-        found, status, text = _parsed(body, function(name).result_codes(release))
-    except BadReply as whole:
+    whole = None
+    # The fields depend on the release: a wrong release leaves bytes over, or needs more bytes than received.
+    for codes in (*function(name).result_codes(release), ()):
         try:
-            _, status, text = _parsed(body, ())
-        except BadReply:
-            status = 0
-        if status == 0:
-            hint = f"it was read as release {release} sends it" if _depends_on_release(name) else ""
-            raise BadReply(f"the reply to {name} is malformed: {whole.what}", hint=hint) from None
-    if status:
-        raise NanonisError(f"Nanonis: {text or 'no reason given'} (error {status})", where=name)
-    return found
+            found, status, text = _parsed(body, codes)
+        except BadReply as error:
+            whole = whole or error
+            continue
+        if status:
+            raise NanonisError(f"Nanonis: {text or 'no reason given'} (error {status})", where=name)
+        if whole is None or codes:
+            return found
+    hint = f"it was read as release {release} sends it" if _depends_on_release(name) else ""
+    raise UnreadableReply(f"the reply to {name} is malformed: {whole.what if whole else ''}", hint=hint)
 
 
 def _depends_on_release(name: str) -> bool:
-    return any(since for _, since in function(name).results)
+    return any(since for fields in function(name).layouts for _, since in fields)
 
 
 def _parsed(body: bytes | bytearray, codes: Sequence[str]) -> tuple[tuple[object, ...], int, str]:

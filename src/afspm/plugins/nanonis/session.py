@@ -1,9 +1,11 @@
-"""Both connections to Nanonis: one for quick requests, one for blocking calls."""
+"""The connections to Nanonis: one for quick requests, one for blocking calls, and one for withdrawing the tip."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import logging
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from queue import SimpleQueue
 from threading import Thread
 from typing import Any, ClassVar, Final
@@ -11,7 +13,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from afspm.basics import AfspmError
-from afspm.driver import ControllerLost, Driver, Receiver, TcpConnection
+from afspm.driver import ControllerLost, ControllerSilent, Driver, Receiver, TcpConnection
 from afspm.plugins.nanonis import protocol
 from afspm.plugins.nanonis.protocol import BadReply, NanonisError
 
@@ -21,9 +23,22 @@ _WITHOUT_VERSION: Final = 10862
 """The release to assume if the software refuses Util.VersionGet, and can't report its release."""
 _WAIT_MS: Final = 1000
 _LONGEST_CURVE_S: Final = 24 * 3600.0
+_HELD_EVERY_S: Final = 60.0
+_WITHDRAWS_WITHIN_S: Final = 2.0
+"""Longest wait for an answer of the port that is kept for withdrawing, real time."""
 _HINTS: Final = (
     "is Nanonis running, with this port open (File > Settings Options > TCP Programming Interface)?",
     "Nanonis is silent while a dialog waits for an answer on its screen",
+)
+
+
+_WEDGED: Final = (
+    "%s: this port may be wedged until Nanonis is restarted, as others report after a client was killed in mid-answer; "
+    "the next port is used in place of %d"
+)
+_ALONE: Final = (
+    "no port of Nanonis is left for a second connection: no spectrum can be taken, and the end of a scan is noticed by "
+    "polling; restart Nanonis, or name a fourth port in address"
 )
 
 
@@ -53,15 +68,50 @@ class Link:
 
         Raises:
             NanonisError: Nanonis reports an error. InvalidValue: the arguments can't be sent.
-            ControllerLost, BadReply: no answer, or a malformed answer; the connection is closed.
+            UnreadableReply: other results than expected. ControllerLost, BadReply: no answer, or one to something else;
+                the connection is closed.
         """
 
-        def read(receiver: Receiver) -> tuple[object, ...]:
+        def read(receiver: Receiver) -> bytearray:
             # A reply may exceed one segment of TCP, e.g. 128 names of signals, or a scan.
             size = protocol.body_bytes(bytes(receiver.exactly(protocol.HEADER_BYTES)), name)
-            return protocol.results(name, receiver.exactly(size), self.release)
+            return receiver.exactly(size)
 
-        return self._tcp.ask(name, protocol.request(name, arguments, self.release), read, longer_s=longer_s)
+        body = self._tcp.ask(name, protocol.request(name, arguments, self.release), read, longer_s=longer_s)
+        return protocol.results(name, body, self.release)
+
+
+Address = tuple[str, int]
+
+
+@dataclass
+class Ports:
+    """Nanonis' ports; each serves one client.
+
+    Attributes:
+        named: the ports as named: for quick requests, for blocking calls, for withdrawing, and for the data of scans or
+            in place of a silent one. A single port is an emulator's, and serves all.
+        silent: ports that have accepted a connection and answered nothing. Others report of a real Nanonis that a port
+            stays so until Nanonis is restarted, after a client was killed in mid-answer.
+    """
+
+    named: Sequence[Address]
+    silent: set[Address] = field(default_factory=set)
+
+    @property
+    def for_withdrawing(self) -> Address | None:
+        return self.named[2] if len(self.named) > 2 else None
+
+    def working(self) -> list[Address]:
+        """Return the ports for quick requests and blocking calls, silent ones last."""
+        some = [one for one in self.named if one != self.for_withdrawing]
+        return sorted(some, key=lambda one: one in self.silent)
+
+    def besides(self, *taken: Address | None) -> Address | None:
+        """Return the next port beside those taken; None: there is none. A single port is never taken."""
+        if len(self.named) == 1:
+            return self.named[0]
+        return next((one for one in self.working() if one not in taken and one not in self.silent), None)
 
 
 class Session:
@@ -69,7 +119,7 @@ class Session:
 
     Args:
         driver: driver that uses the connections.
-        addresses: addresses of the first and the second connection; a single address serves both.
+        ports: the ports to connect to; silent ones are remembered in it.
         timeout_s: longest wait for an answer, real time.
         release: release of the software; None: query Nanonis.
 
@@ -84,31 +134,83 @@ class Session:
 
     link: ClassVar[type[Link]] = Link
 
-    def __init__(self, driver: Driver, addresses: list[tuple[str, int]], timeout_s: float, release: int | None) -> None:
+    def __init__(self, driver: Driver, ports: Ports, timeout_s: float, release: int | None) -> None:
         self._log = driver.log
-        self._link = self.link(addresses[0], timeout_s, driver.clock.monotonic_s)
-        self.ask = self._link.ask
+        self._driver, self._timeout_s = driver, timeout_s
         self._listener: Listener | None = None
+        self._data: Link | None = None
+        working = self._reach_first(ports, release)
         # each port of Nanonis serves one client, one call at a time: a blocking call needs a port of its own
         try:
+            at = ports.besides(working)
+            self._data_at = ports.besides(working, at) if len(ports.named) > 1 else None
+            second = None if at is None else self._connected(at, self._link.release)
+            if second is None:
+                self._log.warning(_ALONE)
+            silent = ports.silent.add
+            self._listener = self.listener = Listener(second, driver.wake, lambda: silent(at) if at else None)
             driver.prove()
+        except AfspmError:
+            self.close()
+            raise
+
+    def _reach_first(self, ports: Ports, release: int | None) -> Address:
+        """Return the port that answers quick requests: the first one named, unless it stays silent."""
+        candidates = ports.working()
+        for address in candidates:
+            try:
+                self._open_first(address, ports, release)
+            except ControllerSilent as error:
+                ports.silent.add(address)
+                if address == candidates[-1]:
+                    raise
+                self._log.error(_WEDGED, error, address[1])
+            else:
+                ports.silent.discard(address)
+                return address
+        raise AssertionError("there is a port")
+
+    def _open_first(self, address: Address, ports: Ports, release: int | None) -> None:
+        try:
+            self._link = self._connected(address)
+        except ControllerLost:
+            ports.silent.clear()  # Nanonis does not run: it answers at all ports once it is started again
+            raise
+        self.ask = self._link.ask
+        try:
+            self._driver.prove()
             self.controller = f"Nanonis, release {release}"
             # The fields of requests and replies depend on the release.
             self._link.release = release or self._found_release()
             # The spectroscopy modules of the real software answer only after their Open.
             self.opened = {module for module in (*MODULES.values(), APPROACH) if self._open(module)}
             self._find_range()
-            second = self.link(addresses[-1], timeout_s, driver.clock.monotonic_s, self._link.release)
-            self._listener = self.listener = Listener(second, driver.wake)
-            driver.prove()
         except AfspmError:
-            self.close()
+            self._link.close()
             raise
+
+    def _connected(self, address: Address, release: int = protocol.NEWEST) -> Link:
+        return self.link(address, self._timeout_s, self._driver.clock.monotonic_s, release)
 
     def close(self) -> None:
         if self._listener is not None:
             self._listener.close()
+        if self._data is not None:
+            self._data.close()
         self._link.close()
+
+    def ask_for_data(self, name: str, *arguments: object) -> tuple[Any, ...]:
+        """Call a function with a large answer, over a port of its own if one is left, otherwise as `ask`."""
+        if self._data_at is None:
+            return self.ask(name, *arguments)
+        try:
+            if self._data is None:
+                self._data = self._connected(self._data_at, self._link.release)
+            return self._data.ask(name, *arguments)
+        except ControllerLost as error:
+            self._log.warning("the data of scans comes over the first port from now on: %s", error)
+            self._data_at = None
+            return self.ask(name, *arguments)
 
     def _found_release(self) -> int:
         try:
@@ -172,16 +274,19 @@ class Listener:
     """A thread that makes blocking calls on the second connection, one at a time.
 
     Args:
+        link: the second connection; None: Nanonis has no port left for it, and `scan` does nothing.
         wake: called from that thread when `events` has new entries.
+        on_silent: called from that thread if the port accepts a connection, and answers nothing.
 
     Attributes:
         for_scan: whether the thread waits for the end of a scan, or is about to.
         for_curve: whether it waits for the end of a spectrum, or is about to.
     """
 
-    def __init__(self, link: Link, wake: Callable[[], None]) -> None:
+    def __init__(self, link: Link | None, wake: Callable[[], None], on_silent: Callable[[], None]) -> None:
         self._link = link
         self._wake = wake
+        self._on_silent = on_silent
         self._jobs: SimpleQueue[Callable[[], ListenerEvent | None] | None] = SimpleQueue()
         self._events: SimpleQueue[ListenerEvent] = SimpleQueue()
         self.for_scan = self.for_curve = self._closed = False
@@ -189,9 +294,13 @@ class Listener:
 
     def scan(self) -> None:
         """Let the thread wait for the end of a scan, unless it already waits."""
-        if not self.for_scan:
+        if self._link is not None and not self.for_scan:
             self.for_scan = True
             self._jobs.put(self._next_end_of_scan)
+
+    @property
+    def is_there(self) -> bool:
+        return self._link is not None
 
     def curve(self, module: str, base_name: str) -> None:
         """Let the thread start a spectrum with a module, and wait for its data instead of the end of a scan."""
@@ -208,7 +317,8 @@ class Listener:
     def close(self) -> None:
         """Close the connection, which ends the thread and its blocking call."""
         self._closed = True
-        self._link.close()
+        if self._link is not None:
+            self._link.close()
         self._jobs.put(None)
 
     def _work(self) -> None:
@@ -216,6 +326,8 @@ class Listener:
             result = self._done(job)
             if self._closed:
                 return
+            if isinstance(result, ControllerSilent):
+                self._on_silent()
             if result is not None:
                 self._events.put(result)
                 self._wake()
@@ -232,10 +344,14 @@ class Listener:
             self.for_scan = False
             return BadReply(f"Nanonis sent an unreadable message on a measurement: {error!r}")
 
+    def _ask(self, name: str, *arguments: object, longer_s: float) -> tuple[Any, ...]:
+        assert self._link is not None
+        return self._link.ask(name, *arguments, longer_s=longer_s)
+
     def _next_end_of_scan(self) -> ListenerEvent | None:
         # Short waits in a loop: a dead connection is noticed, and a spectrum gets its turn.
         while self.for_scan and not self._closed:
-            timed_out, path = self._link.ask("Scan.WaitEndOfScan", _WAIT_MS, longer_s=_WAIT_MS / 1000)
+            timed_out, path = self._ask("Scan.WaitEndOfScan", _WAIT_MS, longer_s=_WAIT_MS / 1000)
             if not timed_out:
                 self.for_scan = False
                 return ScanEnded(path)
@@ -245,7 +361,72 @@ class Listener:
         with_data = 1
         # With data requested, Start replies at the end of the spectrum, and blocks this connection until then.
         try:
-            names, values, _ = self._link.ask(f"{module}.Start", with_data, base_name, longer_s=_LONGEST_CURVE_S)
+            names, values, _ = self._ask(f"{module}.Start", with_data, base_name, longer_s=_LONGEST_CURVE_S)
         finally:
             self.for_curve = False
         return CurveEnded(tuple(names), values)
+
+
+class WithdrawalPort:
+    """A port of Nanonis that is held open, asked once a minute, and used for withdrawing the tip alone.
+
+    Args:
+        connected: opens the connection, with a wait for an answer in real seconds.
+    """
+
+    def __init__(
+        self, connected: Callable[[float], Link], monotonic_s: Callable[[], float], log: logging.Logger
+    ) -> None:
+        self._connected, self._monotonic_s, self._log = connected, monotonic_s, log
+        self._link: Link | None = None
+        self._next_s = -math.inf
+        self._is_missed = False
+
+    def hold(self) -> None:
+        """Ask a question if the last one was a minute ago, over a new connection if the old one is lost."""
+        if self._monotonic_s() < self._next_s:
+            return
+        self._next_s = self._monotonic_s() + _HELD_EVERY_S
+        try:
+            self._asked("ZCtrl.OnOffGet")
+        except AfspmError as error:
+            if not self._is_missed:
+                self._log.error("no way is left to withdraw the tip if the first port falls silent: %s", error)
+            self._is_missed = True
+            return
+        if self._is_missed:
+            self._log.info("the port kept for withdrawing the tip answers again")
+        self._is_missed = False
+
+    def withdraw(self) -> None:
+        """Stop approach and measurement, and withdraw the tip by its piezo.
+
+        Raises:
+            ControllerLost: the port is silent or lost. NanonisError: Nanonis refuses to withdraw.
+        """
+        off, stop, no_direction, at_once, no_timeout = 0, 1, 0, 0, -1
+        stops: tuple[tuple[object, ...], ...] = (
+            (f"{APPROACH}.OnOffSet", off),
+            ("Scan.Action", stop, no_direction),
+            *((f"{module}.Stop",) for module in MODULES.values()),
+        )
+        for name, *arguments in stops:
+            try:
+                self._asked(str(name), *arguments)
+            except NanonisError as error:  # most often what does not run, or was not purchased
+                self._log.info("%s before the tip is withdrawn: %s", name, error)
+        self._asked("ZCtrl.Withdraw", at_once, no_timeout)
+
+    def _asked(self, name: str, *arguments: object) -> None:
+        if self._link is None:
+            self._link = self._connected(_WITHDRAWS_WITHIN_S)
+        try:
+            self._link.ask(name, *arguments)
+        except ControllerLost:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        if self._link is not None:
+            self._link.close()
+            self._link = None

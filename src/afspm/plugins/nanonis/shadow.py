@@ -15,7 +15,8 @@ QUESTIONS: Final = frozenset({
     *("Scan.StatusGet", "Scan.WaitEndOfScan", "Scan.FrameGet", "Scan.BufferGet", "Scan.SpeedGet", "Scan.PropsGet"),
     *("Scan.FrameDataGrab", "FolMe.XYPosGet", "FolMe.SpeedGet"),
     *("ZCtrl.OnOffGet", "ZCtrl.SetpntGet", "ZCtrl.GainGet", "ZCtrl.StatusGet", "ZCtrl.LimitsGet", "ZCtrl.ZPosGet"),
-    *("ZCtrl.CtrlListGet", "Piezo.RangeGet", "Piezo.TiltGet", "Piezo.DriftCompGet"),
+    *("ZCtrl.CtrlListGet", "Current.GainsGet", "Piezo.TiltGet", "Piezo.DriftCompGet"),
+    *("Piezo.RangeGet", "Piezo.CalibrGet", "Piezo.XYZLimitsGet"),
     *("BiasSpectr.StatusGet", "ZSpectr.StatusGet", "AutoApproach.OnOffGet"),
 })  # fmt: skip
 """Functions of Nanonis that return a value and change nothing; `Scan.WaitEndOfScan` waits at most a second."""

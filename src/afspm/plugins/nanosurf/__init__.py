@@ -150,7 +150,7 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
         """Scan the frame once, in the direction `x-scan-direction`."""
         self._save_files(self.session())  # a person may have switched it off
         wanted = direction(str(self._kept[names.SCAN_DIRECTION]))
-        self.session().put({DIRECTION: wanted, "imaging.scan_mode": _ONE_FRAME})
+        self.session().switch({DIRECTION: wanted, "imaging.scan_mode": _ONE_FRAME})
         self.activity.start_scan()
 
     @action(names.STOP_SCAN)
@@ -168,6 +168,10 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
     def stop_spec(self) -> None:
         self.session().do(commands.STOP_CURVE)
         self.activity.stopped()
+
+    @property
+    def withdraws_aside(self) -> bool:
+        return True  # each withdrawal has a connection of its own
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
@@ -211,7 +215,7 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
             self.log.warning("Studio did not save each measurement to a new .nhf file; it does from now on")
         else:
             self.log.info("Studio saves stopped scans, too, from now on: so a stop differs from an end")
-        session.put({**SAVES, **self._parts})
+        session.switch({**SAVES, **self._parts})
 
     def _look_at_folder(self) -> None:
         folder = self._folder()

@@ -115,6 +115,18 @@ class Session:
         except StudioError as error:
             raise Refused(ControlResponse.PARAM_ERROR, f"Studio refused {', '.join(values)}: {error}") from error
 
+    def switch(self, values: Mapping[str, Value]) -> None:
+        """Set switches of panels that a measurement depends on, and read them back.
+
+        Raises:
+            Refused: PARAM_ERROR: see `put`. ACTION_ERROR: Studio keeps another value.
+        """
+        self.put(values)
+        found = self.values(list(values))
+        if kept := [f"{path} = {found[path]}" for path, value in values.items() if found[path] != value]:
+            reason = f"Studio keeps {', '.join(kept)}, although another value was set; set it at Studio"
+            raise Refused(ControlResponse.ACTION_ERROR, reason)
+
     def units(self, paths: Iterable[str]) -> dict[str, str]:
         """Return Studio's units of values by path; empty: none."""
         paths = list(paths)

@@ -65,6 +65,7 @@ class Park(ScriptedDriver[Session, SmartScanActivity]):
     program: ClassVar[str] = SmartScanActivity.program
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0 + SETTLE_S
+    coarse_commands: ClassVar[str] = r"\b(zstage|xystage)\b"
     never_shows: ClassVar = {
         "which measurement it is": "SmartScan names no file: all new ones are taken",
         "another one begun": "a stop and a start between two looks seem one scan",
@@ -163,6 +164,10 @@ class Park(ScriptedDriver[Session, SmartScanActivity]):
     def stop_spec(self) -> None:
         self.session().do(STOP_CURVE)
         self.activity.stopped()
+
+    @property
+    def withdraws_aside(self) -> bool:
+        return True  # each withdrawal has a connection of its own
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:

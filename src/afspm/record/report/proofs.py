@@ -9,7 +9,7 @@ from afspm.model import MeasurementConditions, Parameter
 from afspm.record.report import markup
 from afspm.record.report.markup import PageTimes
 from afspm.record.run import Run
-from afspm.record.run_json import NEVER_SHOWN
+from afspm.record.run_json import LOST_WITHOUT, NEVER_SHOWN
 from afspm.record.tables import ScanRow, SpectrumRow
 
 MOST_ROWS = 200
@@ -19,11 +19,12 @@ class ResultProofs:
     """The published conditions of all results; none for results of other translators and of earlier versions.
 
     Attributes:
-        never_shown: what the controller never shows of a measurement, with its name and the reasons, as a sentence.
+        notes: what the controller never shows of a measurement, with its name and the reasons, and what it can't do
+            with the settings of this run, as sentences.
     """
 
-    def __init__(self, conditions: Sequence[MeasurementConditions] = (), never_shown: str = "") -> None:
-        self.never_shown = never_shown
+    def __init__(self, conditions: Sequence[MeasurementConditions] = (), notes: Sequence[str] = ()) -> None:
+        self.notes = notes
         self._by_time = {one.time_ns: one for one in conditions}
         self._by_file = {one.filename: one for one in conditions if one.filename}
 
@@ -42,12 +43,14 @@ class ResultProofs:
 
 def read(run: Run) -> ResultProofs:
     never = "; ".join(f"{witness} ({why})" for witness, why in run.facts.get(NEVER_SHOWN, {}).items())
-    sentence = f"{run.metadata.get('software', 'The controller')} never shows: {never}." if never else ""
-    return ResultProofs([one for _, _, one in run.messages(("MeasurementConditions",))], sentence)
+    software = run.metadata.get("software", "The controller")
+    notes = [f"{software} never shows: {never}."] if never else []
+    notes += [f"{software}: {lost}." for lost in run.facts.get(LOST_WITHOUT, ())]
+    return ResultProofs([one for _, _, one in run.messages(("MeasurementConditions",))], notes)
 
 
 def html(proofs: ResultProofs, rows: Sequence[ScanRow | SpectrumRow], clock: PageTimes) -> str:
-    """Return what the controller never shows, and the table of the results with unproved facts; empty without any."""
+    """Return the notes on the controller, and the table of the results with unproved facts; empty without any."""
     found = [(row, one.unproved) for row in rows if (one := proofs.of(row)) is not None and one.unproved]
     cells = [
         [
@@ -59,8 +62,8 @@ def html(proofs: ResultProofs, rows: Sequence[ScanRow | SpectrumRow], clock: Pag
     ]
     left_out = len(found) - len(cells)
     more = f'<p class="note">{left_out} more are in the record.</p>' if left_out else ""
-    never = f'<p class="note">{escape(proofs.never_shown)}</p>' if proofs.never_shown else ""
-    return never + markup.table(["result", "finished", "the controller could have shown, and did not"], cells) + more
+    notes = "".join(f'<p class="note">{escape(one)}</p>' for one in proofs.notes)
+    return notes + markup.table(["result", "finished", "the controller could have shown, and did not"], cells) + more
 
 
 def _settings(one: MeasurementConditions) -> str:

@@ -28,6 +28,7 @@ SCRIPT_FAULTS: Final = {
     "dialog": "a dialog waits on the screen: nothing is answered for the duration",
     "restart": "the program closes its socket, and opens it again after the duration",
     "crash": "the program vanishes",
+    "takes-all": "for the duration, values beyond the program's own bounds are taken as sent",
     **MakerProgram.fault_kinds,
 }
 

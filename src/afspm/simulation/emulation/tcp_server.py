@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from _typeshed import HasFileno
 
 READ_AT_ONCE = 1 << 16
+_LAST_ANSWER_S = 1.0
 
 
 @dataclass(eq=False)
@@ -26,6 +27,7 @@ class ClientConnection:
         sending: bytes not yet sent.
         waits_for: the condition of the reply to the current request; no other request is answered meanwhile.
         closing: True if there are no more answers: the connection ends once all bytes are sent.
+        half_closed: True if the client sends nothing more, and may still read the answer that it waits for.
         memory: the controller's state for this client.
     """
 
@@ -34,6 +36,7 @@ class ClientConnection:
     sending: bytearray = field(default_factory=bytearray)
     waits_for: object = None
     closing: bool = False
+    half_closed: bool = False
     memory: Plain = field(default_factory=dict)
 
 
@@ -44,6 +47,7 @@ class TcpServer:
         ports: listening ports; 0 selects a free port.
         stream_port: port for clients that only read; 0: any free port; None: no such port.
         one_each: True if each of `ports` serves one client at a time; other clients wait until the connection ends.
+        wedges: True if a port stays silent for ever once its client has reset the connection in mid-answer.
         wakes: an object with a `fileno`; `poll` returns once it is readable.
         on_bytes: called with a connection after new bytes in `received`.
     """
@@ -55,10 +59,12 @@ class TcpServer:
         *,
         stream_port: int | None = None,
         one_each: bool,
+        wedges: bool = False,
         wakes: HasFileno,
         on_bytes: Callable[[ClientConnection], None],
     ) -> None:
-        self._one_each = one_each
+        self._one_each, self._wedges = one_each, wedges
+        self._silent: set[socket.socket] = set()
         self._stream: socket.socket | None = None
         self._on_bytes = on_bytes
         self._selector = selectors.DefaultSelector()
@@ -107,6 +113,9 @@ class TcpServer:
     def send(self, connection: ClientConnection, content: bytes = b"") -> None:
         """Send the bytes that the client accepts now, and the rest in later polls."""
         connection.sending += content
+        if connection.half_closed:
+            self._send_last(connection)
+            return
         try:
             while connection.sending:
                 sent = connection.socket.send(connection.sending)
@@ -114,7 +123,7 @@ class TcpServer:
         except BlockingIOError:
             pass
         except OSError:
-            self.cut(connection)
+            self._reset(connection)
             return
         if connection.closing and not connection.sending:
             self.cut(connection)
@@ -122,12 +131,26 @@ class TcpServer:
         events = selectors.EVENT_READ | (selectors.EVENT_WRITE if connection.sending else 0)
         self._selector.modify(connection.socket, events, connection)
 
+    def _send_last(self, connection: ClientConnection) -> None:
+        try:
+            connection.socket.sendall(connection.sending)
+            # of a client that is gone, the answer to the answer is a reset
+            is_gone = bool(connection.socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR))
+        except OSError:
+            is_gone = True
+        (self._reset if is_gone else self.cut)(connection)
+
+    def wedge(self, connection: ClientConnection) -> None:
+        """Let the connection's port accept connections, and answer nothing any more."""
+        self._silent.add(self._of[connection])
+
     def cut(self, connection: ClientConnection) -> None:
         listener = self._of.pop(connection, None)
         if listener is None:
             return
         connection.closing = True
-        self._selector.unregister(connection.socket)
+        if not connection.half_closed:
+            self._selector.unregister(connection.socket)
         connection.socket.close()
         if self._one_each and listener is not self._stream:
             self._selector.register(listener, selectors.EVENT_READ, listener)
@@ -158,16 +181,28 @@ class TcpServer:
             if self._one_each and listener is not self._stream:
                 self._selector.unregister(listener)
 
+    def _reset(self, connection: ClientConnection) -> None:
+        if self._wedges:
+            self.wedge(connection)
+        self.cut(connection)
+
     def _read(self, connection: ClientConnection) -> None:
         try:
             received = connection.socket.recv(READ_AT_ONCE)
         except BlockingIOError:
             return
         except OSError:
-            received = b""
+            self._reset(connection)
+            return
         if not received:
+            if self._wedges and (connection.waits_for is not None or connection.sending):
+                # whether the client is gone, or waits for the answer, shows when it is sent
+                connection.half_closed = True
+                self._selector.unregister(connection.socket)
+                connection.socket.settimeout(_LAST_ANSWER_S)
+                return
             self.cut(connection)
             return
-        if self._of[connection] is not self._stream:
+        if self._of[connection] not in (self._stream, *self._silent):
             connection.received += received
             self._on_bytes(connection)

@@ -13,14 +13,15 @@ from afspm.basics.errors import ConfigError
 from afspm.driver import Driver
 from afspm.experiment import Role
 from afspm.experiment.tracing import trace_overlay
-from afspm.model import names
+from afspm.model import ControlRequest, Parameter, Response, names
 from afspm.testing.commissioning import maker_claims
 from afspm.testing.commissioning.guide import Guide, Prompts
 from afspm.testing.commissioning.maker_claims import MakerClaim
 from afspm.testing.commissioning.progress import CommissioningProgress
 from afspm.testing.commissioning.report import InstrumentReport, steps_of
 from afspm.testing.commissioning.steps import all_steps
-from afspm.testing.conformance import CheckOutcome, Failed, Lost, Skipped, attempt, mark
+from afspm.testing.conformance import CheckOutcome, CheckResult, Failed, Lost, Skipped, attempt, mark
+from afspm.testing.translators.client import value_in
 from afspm.testing.translators.report import CheckReport
 from afspm.testing.translators.runner import restored
 from afspm.testing.translators.session import CheckOptions, CheckSession, opened, prepare
@@ -31,6 +32,7 @@ computer must not look like a late controller."""
 LINES_S: Final = 1.0
 """Experiment seconds between two readings of the lines of a running scan, unless the experiment file says otherwise."""
 _NOT_WITHDRAWN = "THE TIP WAS NOT WITHDRAWN ({why}): withdraw it by hand, now."
+_NEVER_SHOWN = "The tip was withdrawn. This controller does not show that: look."
 
 
 @dataclass
@@ -167,9 +169,23 @@ class _Walk:
             kit.client.come_to_rest()
             kit.act(names.RETRACT)
             kit.client.settled(kit.client.observations.mark())
-            self._guide.prompts.show("The tip was withdrawn.")
+            shown = kit.client.ask(ControlRequest.PARAM, Parameter(names.ENGAGED))
+            if shown.ok:
+                _require_away(shown)
+            self._guide.prompts.show("The tip was withdrawn." if shown.ok else _NEVER_SHOWN)
         except (Failed, Skipped, Lost) as error:
             self._guide.prompts.show(_NOT_WITHDRAWN.format(why=error))
+            failed = CheckResult(names.RETRACT, "Withdrawing the tip", CheckOutcome.FAILED, str(error))
+            self._progress.results[names.RETRACT] = failed
+            self._write()
+
+
+def _require_away(shown: Response) -> None:
+    # the sign of z against the tip depends on the rig
+    if value_in(shown, names.ENGAGED).value != "false":
+        expected = f"{names.ENGAGED} false after {names.RETRACT}"
+        came = "true: the tip is at the sample, or z counts the other way at this rig, and it never reads withdrawn"
+        raise Failed(expected, came)
 
 
 def _traced(options: CheckOptions, stack: ExitStack) -> CheckOptions:

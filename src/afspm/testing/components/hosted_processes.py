@@ -435,6 +435,9 @@ class MemoryServerPort:
     def poll(self, timeout_s: float | None) -> list[Served]:
         return self._host.poll(timeout_s)
 
+    def waiting_request(self) -> None:
+        """Return None: no question to a simulated controller takes time."""
+
     def reply(self, frames: Sequence[bytes] | None) -> None:
         self._host.reply(frames)
 

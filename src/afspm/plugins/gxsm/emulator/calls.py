@@ -142,7 +142,8 @@ class GxsmFunctions:
         if self._faults.strikes("refused", self._program.clock.now_s()):
             self._program.dialogs.append(f"Valid Range of {ref}")
             return 0
-        return self._program.entries.set(ref, value)
+        takes_all = self._faults.lasts("takes-all", self._program.clock.now_s())
+        return self._program.entries.set(ref, value, takes_all=takes_all)
 
     @_function
     def _get(self, ref: str) -> float | str:

@@ -78,16 +78,21 @@ class GxsmEntries:
         """Set an entry without checks or side effects; lengths are in ångström."""
         self._entries[ref].value = value
 
-    def set(self, ref: str, text: str) -> int:
-        """Set an entry from text. Return 0 even after a failure, as GXSM does."""
+    def set(self, ref: str, text: str, *, takes_all: bool = False) -> int:
+        """Set an entry from text. Return 0 even after a failure, as GXSM does.
+
+        Args:
+            takes_all: True takes the value as it is, also beyond the limits.
+        """
         entry = self._entries.get(ref)
         if entry is None:
             return 0
         value = self._atof(text) * self._factor(entry)
-        value = float(np.trunc(value)) if entry.whole else value
-        value = entry.step if 0.0 <= value < entry.step else value
+        if not takes_all:
+            value = float(np.trunc(value)) if entry.whole else value
+            value = entry.step if 0.0 <= value < entry.step else value
         # GXSM keeps the old value, returns 0, and shows a dialog on the screen
-        if not entry.low <= value <= entry.high:
+        if not (takes_all or entry.low <= value <= entry.high):
             self._dialogs(f"Valid Range of {ref}: {entry.low} to {entry.high}")
             return 0
         if ref in ("StepsX", "StepsY"):

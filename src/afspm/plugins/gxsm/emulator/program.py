@@ -24,6 +24,7 @@ from afspm.plugins.gxsm.scan_memory import stored
 CARDS: Final = {"SRanger": "SRangerMK2:SPM", "RPSPMC": "RPSPMC:SPM", "simulator": "SPM-SIM:SPM"}
 FAULT_KINDS: Final[Mapping[str, str]] = {
     "refused": "a value is refused as out of range: a dialog opens on the screen",
+    "takes-all": "for the duration, values beyond GXSM's own limits are taken as sent",
     "no-start": "a scan does not begin, without an error",
     "panel-stop": "the scan is stopped at the panel",
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
@@ -72,6 +72,9 @@ class NanonisEmulator(Emulator):
         ports: number of ports, consecutive unless `port` is 0.
         logger_port: port of the TCP Logger's stream; 0: any free port.
         one_each: True if a port serves one client at a time, like a real controller's port.
+        wedges: True if a port stays silent for ever once its client has reset the connection in mid-answer, as others
+            report of real ones.
+        other_layout: functions whose replies have four bytes more than documented, such as "Scan.FrameDataGrab".
         session_path: path of the session folder on the controller's computer, e.g. "D:\\Data". Default: the local path.
         range_m: range of the scanner in x and y.
         clips_frames: True if a frame beyond the range is clipped when it is set. False: it is kept as set, and the tip
@@ -89,6 +92,7 @@ class NanonisEmulator(Emulator):
         "slow": "a reply comes later, by the duration",
         "dialog": "a dialog waits on the screen: nothing is answered for the duration",
         "cut": "the connection is cut instead of a reply",
+        "wedged": "the port stays silent for ever, also for later clients",
         "truncated": "half a reply, then the connection is cut",
         "error": "a reply with an error",
         "refused": "an error in reply to what sets or starts something",
@@ -106,6 +110,7 @@ class NanonisEmulator(Emulator):
         "stale-name": "the file of the previous scan is announced for a scan",
         "autosave-off": "scans and spectra are not saved for the duration, despite the settings",
         "late-start": "a scan begins, and is reported as running, only after the duration",
+        "takes-all": "for the duration, values are taken as sent that are otherwise refused, rounded or clipped",
         "no-start": "a scan does not begin, without an error",
         "blocks": "for the duration, a pulse or a shaping of the tip is answered at its end, although no one waits",
         "ends-at-once": "for the duration, waiting for the end of a scan returns at once if none runs",
@@ -121,6 +126,8 @@ class NanonisEmulator(Emulator):
         ports: int = 1,
         logger_port: int = 0,
         one_each: bool = False,
+        wedges: bool = False,
+        other_layout: Sequence[str] = (),
         session_path: str = "",
         range_m: Length = 100e-6,
         bare_errors: bool = False,
@@ -134,8 +141,12 @@ class NanonisEmulator(Emulator):
         self._ports = ports
         self.logger_port = logger_port
         self._chance = random.Random(self.seed)
-        self._one_each = one_each
+        self._one_each, self._wedges = one_each, wedges
         self._session_path = session_path
+        self._other_layout = other_layout
+        if unknown := set(other_layout) - wire.functions().keys():
+            what = f"Nanonis has no function {min(unknown)!r}"
+            raise ConfigError(what, where="other_layout", hint='a list of functions, such as ["Piezo.TiltGet"]')
         self._range_m = range_m
         self._bare_errors = bare_errors
         for name, value, known in (
@@ -155,6 +166,7 @@ class NanonisEmulator(Emulator):
             ports,
             stream_port=self.logger_port,
             one_each=self._one_each,
+            wedges=self._wedges,
             wakes=self.woken,
             on_bytes=self._answer_all,
         )
@@ -307,12 +319,17 @@ class NanonisEmulator(Emulator):
         padded = (*results, *(wire.ZEROS[field.code] for field in fields[len(results) :]))
         if self.faults.lasts("nonsense", now_s):
             padded = tuple(wire.senseless_value(field.code, self._chance) for field in fields)
-        self._send(connection, asked.sent, wire.body(asked.name, padded, self._wire_release(now_s), encoding))
+        body = wire.body(asked.name, padded, self._wire_release(now_s), encoding)
+        more = b"\0" * 4 if asked.name in self._other_layout else b""
+        self._send(connection, asked.sent, body + more)
 
     def _send(self, connection: ClientConnection, name: str, body: bytes) -> None:
         now_s = self.clock.now_s()
         content = wire.reply(name, body)
         if self.faults.strikes("no-reply", now_s):
+            return
+        if self.faults.strikes("wedged", now_s):
+            self._server.wedge(connection)
             return
         if self.faults.strikes("cut", now_s):
             self._server.cut(connection)

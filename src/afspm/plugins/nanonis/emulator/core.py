@@ -21,6 +21,12 @@ _Z_CONTROLLERS: Final = {
 """Name and unit of the z controller, by the mode of the simulated feedback."""
 
 
+GAIN_M: Final = 1e-10
+"""Gain in m, or in m/s, for a simulated gain of 1: a decade of a tunnelling current is about 0.1 nm."""
+OUTPUT_V: Final = 10.0
+"""Amount of the largest voltage of an output."""
+
+
 @dataclass
 class NanonisCore:
     """The state shared by all modules.
@@ -50,6 +56,19 @@ class NanonisCore:
     def now_s(self) -> float:
         """Experiment time."""
         return self.clock.now_s()
+
+    @property
+    def reach_m(self) -> tuple[float, float]:
+        """Largest distance of the tip from the middle of the scanner in x and y, with the voltage limits in force."""
+        on, *limits_v = self.registers.get("Piezo.XYZLimits")
+        most_v = [min(map(abs, limits_v[2 * axis : 2 * axis + 2])) if on else OUTPUT_V for axis in (0, 1)]
+        x, y = (range_m / (2 * OUTPUT_V) * volts for range_m, volts in zip(self.range_m[:2], most_v, strict=True))
+        return x, y
+
+    @property
+    def takes_all(self) -> bool:
+        """True while the software takes values as sent, which it would otherwise refuse, round or clip."""
+        return self.faults.lasts("takes-all", self.now_s)
 
     @property
     def measures_frequency_shift(self) -> bool:

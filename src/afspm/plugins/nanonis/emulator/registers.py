@@ -20,6 +20,7 @@ AT_FIRST: Final[dict[str, Values]] = {
     "ZSpectr.Range": (0.0, 120e-9),
     "Bias.Calibr": (1.0, 0.0),
     "Piezo.Sens": (3.8e-9, 3.8e-9, 0.9e-9),
+    "Piezo.XYZLimits": (0, -10.0, 10.0, -10.0, 10.0, -10.0, 10.0),
     "TipShaper.Props": (0.1, 0, 0.0, -1e-9, 0.1, 0.0, 0.1, 1e-9, 0.1, 0.1, 1),
     "Util.RTFreq": (20e3,),
     "Util.AcqPeriod": (0.02,),

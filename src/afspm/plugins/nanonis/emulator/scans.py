@@ -13,7 +13,7 @@ from afspm.basics import InvalidValue
 from afspm.emulation import MOST_PIXELS, RETRACE, InstrumentBusy, ScanActivity
 from afspm.model import Region
 from afspm.plugins.nanonis.emulator import files
-from afspm.plugins.nanonis.emulator.core import NanonisCore
+from afspm.plugins.nanonis.emulator.core import GAIN_M, NanonisCore
 from afspm.plugins.nanonis.emulator.dispatch import Answer, DeferredResult, FunctionRefused, Results, answers, chosen
 from afspm.plugins.nanonis.emulator.session import checked_name
 from afspm.plugins.nanonis.emulator.signals import CHANNELS, NAMES, Signals, name_and_unit
@@ -82,7 +82,7 @@ class ScanFiles:
         path = session.path_of(name)
         images = self.images(ended, scan.stopped_s)
         controller, unit = self._core.z_controller_name
-        gains = (feedback.proportional_gain or 0.0, feedback.integral_gain or 0.0)
+        gains = (GAIN_M * (feedback.proportional_gain or 0.0), GAIN_M * (feedback.integral_gain or 0.0))
         content = files.SxmContent(
             path=path,
             start_s=self._core.file_clock.shown_s(scan.start_s),
@@ -171,7 +171,7 @@ class ScanModule:
         size_m = (width * (self.pixels - 1) / self.pixels, height * max(self.lines - 1, 1) / self.lines)
         rig.setup.region = Region((x, y), size_m, -math.radians(clockwise_deg))
         rig.setup.shape = (self.lines, self.pixels)
-        rig.setup.reach_m = (self._core.range_m[0] / 2, self._core.range_m[1] / 2)
+        rig.setup.reach_m = self._core.reach_m
         forward_s, backward_s = self.speed[2:4]
         rig.setup.line_s, rig.setup.upwards = forward_s + backward_s, upwards
         scan = rig.start_scan(self._core.now_s)
@@ -287,7 +287,8 @@ class ScanModule:
         A real one clips the voltages while it scans; the emulator scans the frame as it was set
         (! frame-beyond-range, frame-bounds).
         """
-        if not (min(width, height) >= _SMALLEST_M and all(map(math.isfinite, (x, y, width, height, angle_deg)))):
+        smallest_m = 0.0 if self._core.takes_all else _SMALLEST_M
+        if not (min(width, height) >= smallest_m and all(map(math.isfinite, (x, y, width, height, angle_deg)))):
             raise FunctionRefused(
                 f"a frame of {width:g} m x {height:g} m can't be scanned: its sides must be at least {_SMALLEST_M:g} m"
             )
@@ -311,7 +312,8 @@ class ScanModule:
         # The real controller rounds the pixels of a line to multiples of 16.
         if not all(0 <= channel < 128 for channel in channels) or not 1 <= pixels <= MOST_PIXELS or lines < 0:
             raise FunctionRefused("no such channel or number of pixels")
-        pixels = max(_PIXELS_AT_ONCE, round(pixels / _PIXELS_AT_ONCE) * _PIXELS_AT_ONCE)
+        if not self._core.takes_all:
+            pixels = max(_PIXELS_AT_ONCE, round(pixels / _PIXELS_AT_ONCE) * _PIXELS_AT_ONCE)
         lines = lines or max(1, round(pixels * self.lines / self.pixels))
         # without a limit FrameDataGrab would need more memory than there is (! frame-bounds)
         if pixels * lines > MOST_PIXELS:

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from afspm.plugins.nanonis.emulator.core import NanonisCore
+from afspm.plugins.nanonis.emulator.core import GAIN_M, OUTPUT_V, NanonisCore
 from afspm.plugins.nanonis.emulator.dispatch import Answer, FunctionRefused, answers, chosen
 from afspm.plugins.nanonis.emulator.scans import ScanModule
 from afspm.plugins.nanonis.emulator.signals import Signals
@@ -121,13 +121,16 @@ class ZController:
         # I = P / T; an I in the request counts only without T.
         integral = proportional / time_s if time_s > 0.0 else integral
         rig = self._core.rig
-        rig.setup.feedback = replace(rig.setup.feedback, proportional_gain=proportional, integral_gain=integral)
+        p, i = proportional / GAIN_M, integral / GAIN_M
+        rig.setup.feedback = replace(rig.setup.feedback, proportional_gain=p, integral_gain=i)
         return ()
 
     @answers("ZCtrl.GainGet")
     def _get_gain(self) -> Answer:
         feedback = self._core.rig.setup.feedback
-        proportional, integral = feedback.proportional_gain or 0.0, feedback.integral_gain or 0.0
+        proportional, integral = (
+            GAIN_M * (gain or 0.0) for gain in (feedback.proportional_gain, feedback.integral_gain)
+        )
         return proportional, proportional / integral if integral else math.inf, integral
 
     @answers("ZCtrl.CtrlListGet")
@@ -181,8 +184,10 @@ class TipModules:
             raise FunctionRefused("the tip can't be moved while it scans")
         rig = self._core.rig
         rig.setup.move_speed_m_s = self._own_speed_m_s if self._has_own_speed else self._scans.speed[0]
-        reach_x, reach_y = self._core.range_m[0] / 2, self._core.range_m[1] / 2
-        rig.move_probe((float(np.clip(x, -reach_x, reach_x)), float(np.clip(y, -reach_y, reach_y))), self._core.now_s)
+        if not self._core.takes_all:
+            reach_x, reach_y = self._core.reach_m
+            x, y = float(np.clip(x, -reach_x, reach_x)), float(np.clip(y, -reach_y, reach_y))
+        rig.move_probe((x, y), self._core.now_s)
         return self._core.until_free(wait)
 
     @answers("FolMe.XYPosGet")
@@ -209,7 +214,7 @@ class TipModules:
 
     @answers("Bias.Set")
     def _set_bias(self, bias_v: float) -> Answer:
-        if not abs(bias_v) <= 10.0:
+        if not abs(bias_v) <= 10.0 and not self._core.takes_all:
             raise FunctionRefused("the bias is limited to 10 V")
         self._core.rig.setup.bias_v = bias_v
         return ()
@@ -247,7 +252,7 @@ class TipModules:
 
     @answers("Piezo.TiltSet")
     def _set_tilt(self, x_deg: float, y_deg: float) -> Answer:
-        if not max(abs(x_deg), abs(y_deg)) < _STEEPEST_DEG:
+        if not max(abs(x_deg), abs(y_deg)) < _STEEPEST_DEG and not self._core.takes_all:
             raise FunctionRefused("that is not a tilt")
         self._core.registers.put("Piezo.Tilt", x_deg, y_deg)
         self._core.rig.setup.slope = (math.tan(math.radians(x_deg)), math.tan(math.radians(y_deg)))
@@ -256,6 +261,10 @@ class TipModules:
     @answers("Piezo.RangeGet")
     def _get_range(self) -> Answer:
         return self._core.range_m
+
+    @answers("Piezo.CalibrGet")
+    def _get_calibration(self) -> Answer:
+        return tuple(range_m / (2 * OUTPUT_V) for range_m in self._core.range_m)
 
     @answers("Piezo.RangeSet")
     def _set_range(self, *range_m: float) -> Answer:

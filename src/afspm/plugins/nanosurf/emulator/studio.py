@@ -236,7 +236,9 @@ class StudioProgram(MakerProgram):
                 raise InvalidValue(f"{path}: {value!r} is no {type(row.at_first).__name__}")
         else:
             low, high = (0, max(number for _, number in row.enum)) if row.enum else self.bounds(path)
-            if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+            takes_all = self.faults.lasts("takes-all", self.now_s)
+            fits = takes_all or (isinstance(value, int | float) and low <= value <= high)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not fits:
                 raise InvalidValue(f"{path}: {value!r} is not within {low:g} to {high:g}")
             value = type(row.at_first)(value / self.scale(path))
         self.values[path] = value

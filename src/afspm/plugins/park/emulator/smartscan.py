@@ -184,25 +184,28 @@ class SmartScanProgram(MakerProgram):
             raise InvalidValue(f"{path} can't be set")
         present = self._values[path]
         if path in _BOUNDS:
-            low, high = _BOUNDS[path]
-            _number(path, value, low, high)
+            self._number(path, value, *_BOUNDS[path])
         elif isinstance(present, dict):
             if not isinstance(value, dict):
                 raise InvalidValue(f"{path}: {value!r} is no object")
             value = {**present, **value}
             for member, number in value.items() if path == _GAIN else ():
-                _number(f"{path}.{member}", number, 0.0, 100.0)
+                self._number(f"{path}.{member}", number, 0.0, 100.0)
         elif isinstance(value, bool) is not isinstance(present, bool):
             raise InvalidValue(f"{path}: {value!r}")
         self.rig.account(self.now_s)  # with the feedback as it was
         self._values[path] = value
         self._apply()
 
+    def _number(self, name: str, value: object, low: float, high: float, *, whole: bool = False) -> None:
+        if not self.faults.lasts("takes-all", self.now_s):
+            _number(name, value, low, high, whole=whole)
+
     def _set_geometry(self, wanted: object) -> None:
         if not isinstance(wanted, dict):
             raise InvalidValue(f"the geometry: {wanted!r} is no object")
         for name, (kind, low, high) in GEOMETRY.items():
-            _number(name, wanted.get(name, self.geometry[name]), low, high, whole=kind is int)
+            self._number(name, wanted.get(name, self.geometry[name]), low, high, whole=kind is int)
         self.geometry |= {name: wanted[name] for name in GEOMETRY if name in wanted}
 
     def _start_and_wait(self) -> Wait:
@@ -284,7 +287,7 @@ class SmartScanProgram(MakerProgram):
 
     def _move(self, x_um: float, y_um: float) -> Wait:
         for name, value in (("x", x_um), ("y", y_um)):
-            _number(name, value, -50.0, 50.0)
+            self._number(name, value, -50.0, 50.0)
         self.rig.move_probe((x_um * MICROMETRE, y_um * MICROMETRE), self.now_s)
         return Wait(lambda: self.rig.doing(self.now_s) == "move")
 

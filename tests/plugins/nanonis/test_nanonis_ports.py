@@ -1,0 +1,136 @@
+"""Ports of Nanonis that fall silent: another one is taken, and the tip can still be withdrawn (results Z2)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from deadlines import DEADLINE_S
+from tests.plugins.nanonis.nanonis_bench import Bench, Emulated
+from tests.plugins.vendor_bench import PATIENT, SOON, Peer, scanned, small
+
+from afspm.model import ControlResponse, Scan, ScopeState, names
+from afspm.plugins.nanonis.emulator import DelayedReply
+
+Make = Callable[..., Bench]
+FREE, UNDEFINED = ScopeState.FREE, ScopeState.UNDEFINED
+REAL: dict[str, Any] = {"speed": 1.0, "ports": 4, "one_each": True, "wedges": True, "port": 0}
+
+
+def named(made: Bench, count: int) -> dict[str, Any]:
+    """Return settings that name the first ports of the emulated controller."""
+    host, _, ports = made.address.rpartition(":")
+    return {"address": f"{host}:{','.join(ports.split(',')[:count])}", **SOON}
+
+
+def holds(made: Bench, condition: Callable[[Emulated], object]) -> bool:
+    """Wait until a condition holds in the emulator; return whether it did in time."""
+    until_s, found = time.monotonic() + DEADLINE_S, list[bool]()
+    while not (found and found[-1]) and time.monotonic() < until_s:
+        made.at_panel(lambda emulator: found.append(bool(condition(emulator))))
+    return found[-1]
+
+
+def holds_now(made: Bench, condition: Callable[[Emulated], object]) -> bool:
+    found = list[bool]()
+    made.at_panel(lambda emulator: found.append(bool(condition(emulator))))
+    return found[0]
+
+
+def answers_late(emulated: Emulated) -> bool:
+    return any(isinstance(one.waits_for, DelayedReply) for one in emulated._server.connections)
+
+
+def wedged(emulated: Emulated) -> int:
+    return len(emulated._server._silent)
+
+
+def is_withdrawn(emulated: Emulated) -> bool:
+    return not emulated.rig.engaged
+
+
+def withdraws_within(made: Bench, peer: Peer) -> float:
+    """Ask for a withdrawal; return the real seconds until the tip leaves the sample."""
+    asked_s = time.monotonic()
+    response = peer.act(names.RETRACT)
+    assert response.ok, response.reason
+    assert holds(made, is_withdrawn)
+    return time.monotonic() - asked_s
+
+
+def test_kill_in_mid_answer_wedges_a_port_and_the_next_translator_takes_another(bench: Make) -> None:
+    made = bench(**REAL)
+    small(made, **named(made, 4))
+    made.strike("slow", duration_s=2.0)
+    assert holds(made, answers_late)
+    made.kill()
+    assert holds(made, wedged)
+    peer = made.start(**named(made, 4))
+    peer.until(FREE)
+    made.until_logged("may be wedged until Nanonis is restarted")
+    assert peer.act(names.START_SCAN).ok
+    peer.until(lambda one: isinstance(one, Scan))
+    assert withdraws_within(made, peer) < DEADLINE_S
+
+
+def test_tip_is_withdrawn_by_the_third_port_while_the_others_stay_silent(bench: Make) -> None:
+    made = bench(**REAL)
+    peer = small(made, **named(made, 3))
+    made.strike("wedged", count=2)
+    peer.until(UNDEFINED)
+    assert holds(made, lambda emulated: wedged(emulated) == 2)
+    assert withdraws_within(made, peer) < DEADLINE_S
+    made.until_logged("the tip was withdrawn over the connection kept for it")
+
+
+def test_tip_is_withdrawn_while_a_question_to_the_silent_port_lasts(bench: Make) -> None:
+    # the wait for that answer would be longer than this test
+    made = bench(**REAL)
+    peer = small(made, **{**named(made, 3), **PATIENT})
+    made.strike("wedged")
+    assert holds(made, wedged)
+    assert withdraws_within(made, peer) < DEADLINE_S
+
+
+def test_without_a_third_port_the_tip_stays(bench: Make) -> None:
+    made = bench(**REAL)
+    peer = small(made, **named(made, 2))
+    made.strike("wedged", count=2)
+    peer.until(UNDEFINED)
+    assert holds(made, lambda emulated: wedged(emulated) == 2)
+    assert peer.act(names.RETRACT).code == ControlResponse.NO_RESPONSE
+    assert not holds_now(made, is_withdrawn)
+
+
+def test_without_a_spare_port_scans_go_on_and_spectra_are_refused(bench: Make) -> None:
+    made = bench(**REAL)
+    peer = small(made, **named(made, 3))
+    made.strike("wedged")
+    peer.until(UNDEFINED)
+    peer.until(FREE)
+    made.until_logged("no port of Nanonis is left for a second connection")
+    assert peer.act(names.START_SCAN).ok
+    peer.until(lambda one: isinstance(one, Scan))
+    assert "which a spectrum needs" in peer.act(names.START_SPEC).reason
+    assert withdraws_within(made, peer) < DEADLINE_S
+
+
+def test_end_of_the_process_waits_for_the_answer_in_flight(bench: Make) -> None:
+    made = bench(**REAL)
+    small(made, **named(made, 2))
+    made.strike("slow", duration_s=1.0)
+    assert holds(made, answers_late)
+    made.let_go()
+    assert holds(made, lambda emulated: not answers_late(emulated))
+    assert not holds_now(made, wedged)
+
+
+def test_port_for_withdrawing_is_held_open_and_asked_for_nothing_else(bench: Make) -> None:
+    made = bench(**REAL)
+    peer = small(made, **named(made, 3))
+    assert scanned(peer)
+    third = int(made.address.split(",")[2])
+    asked = list[str]()
+    made.at_panel(lambda emulated: asked.extend(emulated.asked[third]))
+    assert asked == ["ZCtrl.OnOffGet"]
