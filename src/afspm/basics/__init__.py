@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from afspm.basics.frozen import replace
     from afspm.basics.interpreter import python_command, python_environment
     from afspm.basics.launch import Launch, Sockets
-    from afspm.basics.plain_data import Plain, PlainList, PlainMapping, from_json
+    from afspm.basics.plain_data import Count, Plain, PlainList, PlainMapping, from_json
     from afspm.basics.progress_line import ProgressLine
     from afspm.basics.requirements import require
     from afspm.basics.shared_time import Publication
@@ -56,6 +56,7 @@ if TYPE_CHECKING:
         Duration,
         Length,
         PollPeriod,
+        PositiveLength,
         Speed,
         Voltage,
         convert,
@@ -89,6 +90,7 @@ __all__ = [
     "Clock",
     "ConfigError",
     "ControlLost",
+    "Count",
     "Current",
     "Duration",
     "ExitCode",
@@ -107,6 +109,7 @@ __all__ = [
     "PlainList",
     "PlainMapping",
     "PollPeriod",
+    "PositiveLength",
     "ProgressLine",
     "Publication",
     "Refused",

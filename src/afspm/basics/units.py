@@ -134,6 +134,7 @@ class Unit:
 
 
 Length = Annotated[float, Unit("m")]
+PositiveLength = Annotated[float, Unit("m", above=0.0)]
 Duration = Annotated[float, Unit("s", least=0.0)]
 PositiveDuration = Annotated[float, Unit("s", above=0.0)]
 Period = Annotated[float, Unit("s", is_written=True, least=0.0)]

@@ -188,6 +188,7 @@ def emulate(
     to the vendor's usual port may expect a real controller there. A replay ends with 1 if a request differs from the
     recorded one.
     """
+    from afspm.basics.errors import ConfigError
     from afspm.simulation.emulation.emulator import emulator_names, find_emulator
 
     if replay is not None:
@@ -198,8 +199,11 @@ def emulate(
             typer.echo(_described(known, find_emulator(known)))
         return
     class_ = find_emulator(name)
-    given = {**(class_.usual if usual else {}), **({"port": port} if port else {}), **_settings(settings or [])}
-    made = class_(seed=seed, faults=fault or [], **_in_si(class_, given))
+    options = {**({"port": port} if port else {}), **({"seed": seed} if seed != 1 else {}), "faults": fault or []}
+    given = _settings(settings or [])
+    for twice in sorted(given.keys() & {key for key, value in options.items() if value}):
+        raise ConfigError(f"{twice} is given as an option and as a setting", hint="leave one of them out")
+    made = class_(**_checked(class_, {**(class_.usual if usual else {}), **options, **given}, name))
     made.check()
     _emulate(made, speed, folder or Path(f"emulated-{class_.vendor.lower()}"))
 
@@ -265,23 +269,19 @@ def _settings(given: list[str]) -> dict[str, object]:
         raise ConfigError(f"{' '.join(given)}: {error}", hint="SETTING=VALUE, names separated by dots") from error
 
 
-def _in_si(class_: type[Emulator], given: Plain) -> Plain:
-    # quantities are read as in an experiment file: range_m="2.6 um"
-    from typing import get_type_hints
+def _checked(class_: type[Emulator], given: Plain, name: str) -> Plain:
+    # settings are checked and converted to SI as those of [controller] in an experiment file
+    from afspm.basics.errors import ConfigError, ErrorCollector
+    from afspm.experiment.component_settings import resolve
+    from afspm.experiment.document import Document
 
-    from afspm.basics.errors import ConfigError, UnitError
-    from afspm.basics.units import Unit
-
-    found = dict(given)
-    for maker in class_.__mro__:
-        hints = get_type_hints(vars(maker).get("__init__", None) or (lambda: None), include_extras=True)
-        for name in given.keys() & hints.keys():
-            for unit in getattr(hints[name], "__metadata__", ()):
-                if isinstance(unit, Unit):
-                    try:
-                        found[name] = unit.read(given[name])
-                    except UnitError as error:
-                        raise ConfigError(error.what, where=name, hint=error.hint) from error
+    document = Document((Path("emulate"),), {name: given})
+    found = resolve(class_, given, (name,), document)
+    errors = ErrorCollector()
+    for finding in document.findings.found:
+        with errors:
+            raise ConfigError(finding.what, hint=finding.hint)
+    errors.raise_all()
     return found
 
 

@@ -43,6 +43,7 @@ class DriftSettings:
 
     Attributes:
         velocity_m_per_s: constant drift, at most 1e-6 m/s along each axis.
+        speed_m_per_s: constant drift in x and y, added to it; its direction follows from the seed.
         relaxing: exponential relaxations since the start.
         walk_m_per_sqrt_hour: standard deviation in x and y of a random walk after one hour.
         walk_z_m_per_sqrt_hour: the same for z.
@@ -53,6 +54,7 @@ class DriftSettings:
     """
 
     velocity_m_per_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    speed_m_per_s: float = 0.0
     relaxing: tuple[Relaxation, ...] = field(default_factory=tuple)
     walk_m_per_sqrt_hour: float = 0.0
     walk_z_m_per_sqrt_hour: float = 0.0
@@ -62,10 +64,12 @@ class DriftSettings:
     about_m: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        check(self, from_zero="walk_m_per_sqrt_hour walk_z_m_per_sqrt_hour")
-        if not max(map(abs, self.velocity_m_per_s)) <= _FASTEST_M_PER_S:
-            what = f"{list(self.velocity_m_per_s)} is faster than {_FASTEST_M_PER_S:g} m/s"
-            raise ConfigError(what, where="velocity_m_per_s", hint="1 nm/s is 1e-9, 1 nm/min is 17e-12")
+        check(self, from_zero="walk_m_per_sqrt_hour walk_z_m_per_sqrt_hour speed_m_per_s")
+        for name in ("velocity_m_per_s", "speed_m_per_s"):
+            along = np.ravel(getattr(self, name))
+            if not max(map(abs, along)) <= _FASTEST_M_PER_S:
+                what = f"{[float(one) for one in along]} is faster than {_FASTEST_M_PER_S:g} m/s"
+                raise ConfigError(what, where=name, hint="1 nm/s is 1e-9, 1 nm/min is 17e-12")
         if not abs(self.expansion_per_s) <= _FASTEST_EXPANSION_PER_S:
             wanted = f"between {-_FASTEST_EXPANSION_PER_S:g} and {_FASTEST_EXPANSION_PER_S:g} 1/s"
             raise ConfigError(f"{self.expansion_per_s!r} is not {wanted}", where="expansion_per_s")
@@ -78,6 +82,8 @@ class Drift:
         self._settings = settings
         self._seed = chance.subseed(seed, "drift")
         self._start_s = start_s
+        angle = 2.0 * math.pi * float(chance.uniform(self._seed, 7))
+        self._steady_m_per_s = settings.speed_m_per_s * np.array([math.cos(angle), math.sin(angle), 0.0])
 
     def at(self, t_s: ArrayLike) -> NDArray[np.float64]:
         """Return (x, y, z) in m at experiment times, shape t.shape + (3,); zero at the start.
@@ -87,7 +93,7 @@ class Drift:
         """
         since = self._since_s(t_s)[..., None]
         s = self._settings
-        total = since * np.asarray(s.velocity_m_per_s)
+        total = since * (np.asarray(s.velocity_m_per_s) + self._steady_m_per_s)
         for relaxation in s.relaxing:
             total = total - np.expm1(-since / relaxation.time_s) * np.asarray(relaxation.total_m)
         total = total + np.sin(since * (2.0 * math.pi / 86400.0)) * np.asarray(s.daily_m)

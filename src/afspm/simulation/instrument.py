@@ -218,6 +218,10 @@ class SimulatedInstrument:
                 )
             except InvalidValue:  # with an invalid feedback the tip meets no surface
                 self._signals = self._noise_alone()
+        spike_a = self.world.settings.scanner.coarse_spike_a
+        if any(spike_a) and self.doing(now_s) in ("approach", "stage"):
+            # of the motor's steps: how long each lasts is not known, so every reading has one
+            self._signals = {**self._signals, "Current": self._signals["Current"] + self._noise.uniform(*spike_a)}
         return self._signals
 
     def _noise_alone(self) -> dict[str, float]:
@@ -355,11 +359,19 @@ class SimulatedInstrument:
 
     # -- moves
 
-    def move_probe(self, xy_m: tuple[float, float], now_s: float, *, way_m: float = 0.0) -> None:
+    def move_probe(
+        self,
+        xy_m: tuple[float, float],
+        now_s: float,
+        *,
+        way_m: float = 0.0,
+        frame_m: tuple[float, float] | None = None,
+    ) -> None:
         """Move the tip at the move speed. A call during a move changes its target.
 
         Args:
             way_m: path length of a frame that moves at the same time.
+            frame_m: centre of that frame, where the scanner goes.
 
         Raises:
             InstrumentBusy: during another activity. InvalidValue: the position is farther than any scanner reaches.
@@ -371,6 +383,7 @@ class SimulatedInstrument:
         from_m, self._probe_m = self.probe_at(now_s), (float(xy_m[0]), float(xy_m[1]))
         end_s = now_s + max(math.dist(from_m, self._probe_m), way_m) / self.setup.move_speed_m_s
         self._doing = Move("move", now_s, end_s, from_m, self._probe_m)
+        self.world.move_to(self._probe_m if frame_m is None else frame_m, end_s)
 
     def stop_move(self, now_s: float) -> None:
         """Stop the tip at its present position."""

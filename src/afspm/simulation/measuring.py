@@ -110,6 +110,8 @@ class Setup:
         slope: (x, y) compensation of tilt set on the instrument, m/m.
         sharp_m: radius of the sharp tip.
         offset_m: returns the remaining distance (x, y) of the scanner to its target (creep), at times.
+        settling_m: returns z that the last move has left, at times.
+        scales: the errors of calibration, see `ScannerSettings.scales`.
     """
 
     sample: Callable[[Array, Array, float], Relief]
@@ -117,6 +119,8 @@ class Setup:
     turn: Callable[[float], NDArray[np.complex128]]
     unturned: Callable[[Array, Array, Array], tuple[Array, Array]]
     offset_m: Callable[[Array], Array]
+    settling_m: Callable[[Array], Array]
+    scales: tuple[float, float, float]
     scanner: ScannerSettings
     noise: NoiseSettings
     signals: SignalSettings
@@ -180,7 +184,7 @@ def measure(course: Course, tips: TipTimes, setup: Setup, random: np.random.Gene
     z = _z(lines, course, setup, random)
     gap = z - lines
     noise = height_noise(setup.noise, course.shape[0], nx, course.line_s, course.start_s, random)
-    both = z + noise
+    both = setup.scales[2] * z + noise
     trace, retrace = np.empty(course.shape), np.empty(course.shape)
     trace[order], retrace[order] = both[:, :nx], both[:, nx:][:, ::-1]
     compensated = _tilt(course, setup.slope)
@@ -208,7 +212,7 @@ def at_rest(course: Course, felt_m: Felt, tip: TipShape, setup: Setup, random: n
     if not loop.on and setup.held_z_m is not None:
         z = np.full(height.shape, setup.held_z_m)
     noise = setup.noise.white_m * random.standard_normal(height.shape)
-    channels = {"Height": ("m", z + noise - _tilt(course, setup.slope))}
+    channels = {"Height": ("m", setup.scales[2] * z + noise - _tilt(course, setup.slope))}
     gap = z - height
     if tip.debris_m and loop.settings.mode == "current":
         gap = gap + _FLICKER_M * random.standard_normal(height.shape)
@@ -238,7 +242,8 @@ def feel(course: Course, tips: TipTimes, setup: Setup) -> Felt:
         now = taken_s[:, rows] >= since_s
         height[:, rows] = np.where(now, here, height[:, rows])
         material[:, rows] = np.where(now, stuff, material[:, rows])
-    z_drift = np.stack([setup.drift_m(course.row_times_s(part))[:, 2:] for part in (0.25, 0.75)])
+    times = [course.row_times_s(part) for part in (0.25, 0.75)]
+    z_drift = np.stack([setup.drift_m(row_s)[:, 2:] + setup.settling_m(row_s)[:, None] for row_s in times])
     height += z_drift
     return Felt((height[0], height[1]), (material[0], material[1]))
 
@@ -248,9 +253,11 @@ def _sample_positions(course: Course, setup: Setup, part: float) -> tuple[Array,
     x, y = course.pixels_m()
     times = course.row_times_s(part)
     away = setup.drift_m(times)[:, :2] + setup.offset_m(times)
-    lag = setup.scanner.backlash_m if part > 0.5 else 0.0
     angle = course.region.angle_rad
-    x, y = x - away[:, :1] + lag * math.cos(angle), y - away[:, 1:2] + lag * math.sin(angle)
+    if part > 0.5:
+        lag = setup.scanner.retrace_lag_m(course.shape[1], course.region.size_m[0])
+        x, y = x + lag * math.cos(angle), y + lag * math.sin(angle)
+    x, y = setup.scales[0] * x - away[:, :1], setup.scales[1] * y - away[:, 1:2]
     return setup.unturned(x, y, times[:, None])
 
 

@@ -13,12 +13,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm.basics.errors import InvalidValue
+from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.model import Frame, Region
 from afspm.model.arrays import Array
+from afspm.simulation import chance
 from afspm.simulation.settings import check, one_of
 
 MOST_PIXELS = 1 << 24
+_EXACT = ((0.0, 0.0),) * 3
+_SAME_M = 1e-13
 DIRECTIONS = ("up", "down")
 FLATTENINGS = ("none", "offset", "line")
 
@@ -34,7 +37,14 @@ class ScannerSettings:
         tilt_x, tilt_y: slope of the sample in its holder, m/m.
         creep: remaining fraction of a move right after the move; falls by a quarter per decade of 1 + t in s, to zero
             after almost three hours; 0: none.
+        creep_share, creep_time_s: creep beyond the target of each move by creep_share * ln(1 + t / creep_time_s) of the
+            move; it never ends, and the creep of all moves adds up.
+        settling_share, settling_s: z after a move, as a share of the move's length; decays exponentially.
         backlash_m: lag of the retrace in x.
+        retrace_offset: lag of the retrace in x in the left, middle and right third of a line, relative to the line.
+        miscalibration: smallest and largest error of x, y and z; size and sign follow from the seed. A scanner with
+            the error 0.08 moves 1.08 times as far as it should; heights with the error 0.12 read 1.12 times as high.
+        coarse_spike_a: smallest and largest spike in the current while a coarse motor moves.
     """
 
     flatten: str = "none"
@@ -43,11 +53,36 @@ class ScannerSettings:
     tilt_x: float = 0.0
     tilt_y: float = 0.0
     creep: float = 0.0
+    creep_share: float = 0.0
+    creep_time_s: float = 500.0
+    settling_share: float = 0.0
+    settling_s: float = 10.0
     backlash_m: float = 0.0
+    retrace_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    miscalibration: tuple[tuple[float, float], ...] = ()
+    coarse_spike_a: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         one_of(self.flatten, FLATTENINGS, "flatten")
-        check(self, from_zero="band_limit_px oversampling backlash_m", fraction="creep")
+        check(self, from_zero="band_limit_px oversampling backlash_m", fraction="creep creep_share settling_share")
+        check(self, above_zero="creep_time_s settling_s")
+        for name in ("miscalibration", "retrace_offset"):
+            if not all(-0.5 <= one <= 0.5 for one in np.ravel(getattr(self, name))):
+                raise ConfigError(f"{getattr(self, name)} is beyond a half", where=name, hint="0.08 is 8 %")
+        if len(self.miscalibration) not in (0, 3):
+            raise ConfigError(f"{len(self.miscalibration)} ranges", where="miscalibration", hint="three: x, y and z")
+
+    def scales(self, seed: int) -> tuple[float, float, float]:
+        """Return the errors of calibration as factors: true x by set x, true y by set y, read z by true z."""
+        random = chance.generator(chance.subseed(seed, "calibration"))
+        ranges = self.miscalibration or _EXACT
+        x, y, z = (1.0 + float(random.choice((-1.0, 1.0)) * random.uniform(*one)) for one in ranges)
+        return x, y, z
+
+    def retrace_lag_m(self, shape_x: int, width_m: float) -> Array:
+        """Return the lag of the retrace at each pixel of a line, (shape_x,)."""
+        along = (np.arange(shape_x) + 0.5) / shape_x
+        return np.asarray(self.backlash_m + width_m * np.interp(along, (1 / 6, 1 / 2, 5 / 6), self.retrace_offset))
 
 
 def clipped(along_m: Array, reach_m: Array | float) -> Array:
@@ -133,23 +168,37 @@ class ScannerPlace:
     Attributes:
         at_m: (x, y) of the last target.
         came_from_m, came_s: the previous target, and the time of the last move.
+        moves: time and way (t_s, x, y) of all moves, for a creep that never ends; empty for other scanners.
     """
 
-    def __init__(self, creep: float, start_s: float) -> None:
-        self._creep = creep
+    def __init__(self, settings: ScannerSettings, start_s: float) -> None:
+        self._settings = settings
         self.at_m, self.came_from_m, self.came_s = (0.0, 0.0), (0.0, 0.0), start_s
+        self.moves: list[tuple[float, float, float]] = []
 
     def move_to(self, position_m: tuple[float, float], t_s: float) -> None:
         """Set the target; a repeated target has no effect on the creep."""
-        if position_m != self.at_m:
+        if math.dist(position_m, self.at_m) > _SAME_M:
             self.came_from_m, self.came_s, self.at_m = self.at_m, t_s, position_m
+            if self._settings.creep_share:
+                self.moves.append((t_s, *np.subtract(self.at_m, self.came_from_m).tolist()))
 
     def creep_m(self, t_s: Array) -> Array:
-        """Return the remaining part (x, y) of the last move at times, shape (n, 2)."""
+        """Return the remaining part (x, y) of the last move minus the way crept beyond all targets, shape (n, 2)."""
+        s, times = self._settings, np.asarray(t_s)
         move = np.subtract(self.at_m, self.came_from_m)
-        since = np.maximum(np.asarray(t_s) - self.came_s, 0.0) + 1.0
-        left = self._creep * np.maximum(1.0 - np.log10(since) / 4.0, 0.0)
-        return np.asarray(left[:, None] * move)
+        since = np.maximum(times - self.came_s, 0.0) + 1.0
+        left = (s.creep * np.maximum(1.0 - np.log10(since) / 4.0, 0.0))[:, None] * move
+        if self.moves:
+            began_s, ways = np.split(np.array(self.moves), [1], axis=1)
+            grown = np.log1p(np.maximum(times[:, None] - began_s.T, 0.0) / s.creep_time_s)
+            left = left - s.creep_share * grown @ ways
+        return np.asarray(left)
+
+    def settling_m(self, t_s: Array) -> Array:
+        """Return z that the last move has left at times, shape (n,)."""
+        s, since = self._settings, np.maximum(np.asarray(t_s) - self.came_s, 0.0)
+        return np.asarray(s.settling_share * math.dist(self.at_m, self.came_from_m) * np.exp(-since / s.settling_s))
 
 
 @dataclass(frozen=True)

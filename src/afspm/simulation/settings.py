@@ -1,6 +1,7 @@
 """Settings of the simulated physics: frozen dataclasses created from plain tables; invalid values are refused.
 
-Every setting carries its unit in its name. A table may contain a table (another dataclass) or a list (a tuple).
+Every setting carries its unit in its name: a number is in that unit, and a text has a unit of its own ("8 nm"). A
+table may contain a table (another dataclass) or a list (a tuple).
 """
 
 from __future__ import annotations
@@ -8,16 +9,20 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import re
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
-from afspm.basics.errors import ConfigError, ErrorCollector, individual_errors
+from afspm.basics.errors import ConfigError, ErrorCollector, UnitError, individual_errors
 from afspm.basics.type_aliases import unaliased
+from afspm.basics.units import si_or_text
 
 T = TypeVar("T")
 _LONGEST_M = 1e-3
+_UNIT = re.compile(r"(?<!_per)(?<!conductance)_(m_per_s|m|s|v|a|hz|n|deg|rad)(?:\[\d+\])?$")
+_UNITS = {"m_per_s": "m/s", "v": "V", "a": "A", "hz": "Hz", "n": "N"}
 
 
 def build(cls: type[T], settings: object, where: str) -> T:
@@ -118,13 +123,19 @@ def _convert(hint: Any, value: object, where: str) -> object:
     if dataclasses.is_dataclass(hint):
         made: type[object] = hint  # type: ignore[assignment]
         return value if isinstance(value, made) else build(made, value, where)
+    if hint is float and isinstance(value, str) and (named := _UNIT.search(where)):
+        try:
+            value = si_or_text(value, _UNITS.get(named[1], named[1]))
+        except UnitError as error:
+            raise ConfigError(error.what, where=where, hint=error.hint) from error
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
         if not math.isfinite(value):
             raise ConfigError(f"{value!r} is not a finite number", where=where)
         return float(value)
     if hint is not float and isinstance(value, hint) and isinstance(value, bool) == (hint is bool):
         return value
-    raise ConfigError(f"expected {getattr(hint, '__name__', hint)}, got {value!r}", where=where)
+    wanted, remedy = getattr(hint, "__name__", hint), "a number, without a unit" if hint is float else ""
+    raise ConfigError(f"expected {wanted}, got {value!r}", where=where, hint=remedy)
 
 
 def _sequence(arguments: tuple[object, ...], value: object, where: str) -> tuple[object, ...]:

@@ -155,6 +155,7 @@ class CommonSettings:
     result_timeout_s: float
     live_lines_s: float | None
     trace: bool
+    settle_before_scan_s: float
 
 
 class DriverBase(ABC):
@@ -190,6 +191,8 @@ class DriverBase(ABC):
             at least twice `program_s` of real time.
         live_lines_s: time between two publications of a running scan's lines, in experiment seconds; 0: never; None: by
             `live_real_s`.
+        settle_before_scan_s: wait after a request that moves the frame, in experiment seconds: the microscope counts as
+            moving until the scanner has settled, so that no scan begins.
         trace: record all exchanges with the controller in `controller.trace.jsonl` of the run's folder.
 
     Attributes:
@@ -282,6 +285,7 @@ class DriverBase(ABC):
         result_timeout_s: Duration = 10.0,
         live_lines_s: Duration | None = None,
         trace: bool = False,
+        settle_before_scan_s: Duration = 0.0,
     ) -> None:
         if live_lines_s is not None and type(self).lines is DriverBase.lines:
             raise ConfigError(f"{type(self).__name__} does not publish lines of a running scan", where="live_lines_s")
@@ -289,7 +293,9 @@ class DriverBase(ABC):
         # a microscope that can't move its tip alone has no rows for it later on, and the same scanner
         self._reach = reach_in(self.table)
         self.channels = self.channels_of({"channels": channels})
-        self.common = CommonSettings(dict(actions or {}), poll_period_s, result_timeout_s, live_lines_s, trace)
+        self.common = CommonSettings(
+            dict(actions or {}), poll_period_s, result_timeout_s, live_lines_s, trace, settle_before_scan_s
+        )
         self.adjustable: frozenset[str] = frozenset()
         self.prove: Callable[[], None] = _prove_nothing
         self._last_written: dict[str, Value] = {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
@@ -94,6 +94,8 @@ class Observer:
         self._result_since_s: float | None = None
         self._replayed = False
         self._overdue = OverdueScan()
+        self._is_unsettled = False
+        self._settled_s: float | None = None
 
     def begin(self) -> None:
         """Publish the last results again (once, after a restart), then all settings and the state.
@@ -149,7 +151,8 @@ class Observer:
         if self.panel.feedback.is_in_question:
             wait_s = min(wait_s, _AGAIN_S)
         sequence_s = self._state.sequence.deadline_s()
-        for at_s in (self._driver.next_change_s(), sequence_s, self._live.due_s, self._temporary.until_s):
+        of_driver = (self._driver.next_change_s(), self._settled_s)
+        for at_s in (*of_driver, sequence_s, self._live.due_s, self._temporary.until_s):
             if at_s is not None:
                 # an overdue change is polled for eagerly, but with a pause: the controller has other work
                 until_s = self._clock.real_s(at_s - now_s)
@@ -159,7 +162,7 @@ class Observer:
     def late_at_change(self) -> AbstractContextManager[None]:
         """Return a context that holds simulated time at the driver's next change, or when awaited lines are due."""
         now_s = self._clock.now_s()
-        due = (self._driver.next_change_s(), self._live.awaited_s)
+        due = (self._driver.next_change_s(), self._live.awaited_s, self._settled_s)
         at_s = min((one for one in due if one is not None and one > now_s), default=None)
         return nullcontext() if at_s is None else self._clock.late(at_s)
 
@@ -173,8 +176,8 @@ class Observer:
 
         The time may be some microseconds early; it has passed if a look may do something now.
         """
-        waits_for = (self._state.sequence.deadline_s(), self._temporary.until_s, self._result_since_s)
-        if waits_for != (None, None, None) or self.panel.feedback.is_in_question:
+        waits_for = (self._state.sequence.deadline_s(), self._temporary.until_s, self._result_since_s, self._settled_s)
+        if any(one is not None for one in waits_for) or self._is_unsettled or self.panel.feedback.is_in_question:
             return -math.inf
         due_s = self._live.due_s
         lines_s = math.inf if due_s is None else self.real_time_s(due_s)
@@ -281,6 +284,12 @@ class Observer:
             acts = self.panel.read(before, self.values, self._state.sequence.published.state, self._clock.now_ns())
             self._tell(acts)
         self.claims.asks(request, self.values)
+
+    def is_set(self, values: Mapping[str, Value]) -> None:
+        """Note the values that a request of the run has set, as read back."""
+        self.claims.is_set(values)
+        if self._driver.common.settle_before_scan_s and setting_groups.moves_scanner(self.values, values):
+            self._is_unsettled, self._settled_s = True, None
 
     def _judge_feedback(self) -> None:
         # of a measurement of the run: what a person measures by hand is his own
@@ -452,7 +461,16 @@ class Observer:
 
     def _status(self) -> ScopeStatus:
         # while temporary settings are in force the microscope counts as busy, even if the controller reports FREE
-        return self._temporary.status or self._driver.status()
+        status = self._temporary.status or self._driver.status()
+        if not self._is_unsettled or status.state is not ScopeState.FREE:
+            return status
+        now_s = self._clock.now_s()
+        if self._settled_s is None:  # the controller has just finished the move
+            self._settled_s = now_s + self._driver.common.settle_before_scan_s
+        if now_s < self._settled_s:
+            return ScopeStatus(ScopeState.MOVING)
+        self._is_unsettled, self._settled_s = False, None
+        return status
 
     def _observe_values(self, announce: Sequence[str]) -> None:
         self._take_in(self._read())

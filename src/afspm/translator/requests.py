@@ -73,7 +73,7 @@ class RequestHandler:
         self._is_connected = is_connected
         self._reply = reply
         self._outcomes = RequestOutcomes(state.kept, all_or_nothing=driver.memory_is_all)
-        is_set = observer.claims.is_set
+        is_set = observer.is_set
         self.commands = Commands(driver, state.sequence, temporary, observer.panel, self._record_begin, is_set, log)
         self._acting: Request | None = None
         self.withdraws = False

@@ -37,8 +37,22 @@ _FRAME_MESSAGE, _FEEDBACK_MESSAGE, _POSITION_MESSAGE = SCAN_PARAMETERS.name, FEE
 MOVES: Final = frozenset(FRAME + POSITION)
 
 
+_PLACE: Final = FRAME[:4]
+_STAYS: Final = 0.01
+"""Largest move of a frame, relative to its size, after which the scanner need not settle, such as one for drift."""
 _SAME_SPEED: Final = 0.01
 """Largest difference from the speed that a frame is set with, relative; a line rate may be rounded."""
+
+
+def moves_scanner(before: Mapping[str, Value], values: Mapping[str, Value]) -> bool:
+    """Return whether values that were set, in SI, have moved the frame by more than a hundredth of its size."""
+    after = {**before, **values}
+    if names.SCAN_SIZE_X not in values.keys() | before.keys() or not MOVES & values.keys():
+        return False
+    size_m = max(float(after[name]) for name in (names.SCAN_SIZE_X, names.SCAN_SIZE_Y))
+    off_m = [float(after[name]) - float(before.get(name, math.inf)) for name in _PLACE if name in values]
+    turned = float(after.get(names.SCAN_ANGLE, 0.0)) - float(before.get(names.SCAN_ANGLE, 0.0))
+    return max(map(abs, (*off_m, turned * size_m))) > _STAYS * size_m
 
 
 class SettingsGroup(ABC):

@@ -87,21 +87,46 @@ def test_taken_port_is_reported_in_one_sentence(vendor: str, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("vendor", "setting", "reason"),
     [
-        ("nanonis", "range_m=2.6 V", "range_m: V can't be converted to m"),
-        ("nanonis", "range_m=-1 um", "range_m"),
-        ("gxsm", "reach_m=400", "reach_m: without a unit this means 400 m"),
-        ("park", "start_s=soon", "start_s: 'soon' is not a number with a unit"),
-        ("asylum", "clock_off_s=2 um", "clock_off_s"),
+        ("nanonis", "range_m=2.6 V", "[nanonis] range_m = '2.6 V': V can't be converted to m (a length, for example"),
+        ("nanonis", "range_m=-1 um", "'-1 um' is not above 0 m"),
+        ("nanonis", "rage_m=1 um", "[nanonis] has no setting 'rage_m' (did you mean 'range_m'?)"),
+        ("nanonis", "ports=two", "[nanonis] ports is a whole number, not 'two'"),
+        ("nanonis", "logger_port=70000", "logger_port = 70000: this is not a port (0 to 65535)"),
+        ("gxsm", "reach_m=400", "reach_m = 400: without a unit this means 400 m"),
+        ("gxsm", "reach_m=-2 um", "'-2 um' is not above 0 m"),
+        ("park", "start_s=soon", "start_s = 'soon': 'soon' is not a number with a unit"),
+        ("park", "noise.current_a=1 pV", "noise.current_a: pV can't be converted to A"),
+        ("asylum", "clock_off_s=2 um", "um can't be converted to s"),
+        ("asylum", "idle_s=-5 ms", "'-5 ms' is below 0 s"),
+        ("nanosurf", "release=new", "[nanosurf] release is a whole number, not 'new'"),
+        ("nanosurf", "tip.radius_m=-8 nm", "is not above zero"),
     ],
 )
-def test_impossible_quantity_is_refused_before_listening(
-    vendor: str, setting: str, reason: str, tmp_path: Path
-) -> None:
+def test_impossible_setting_is_refused_before_listening(vendor: str, setting: str, reason: str, tmp_path: Path) -> None:
     # results T7
     with started("afspm", "emulate", vendor, setting, cwd=tmp_path) as process:
         out, err = process.communicate(timeout=DEADLINE_S)
     assert (process.returncode, out) == (1, "")
     assert reason in err
+
+
+@pytest.mark.parametrize("vendor", sorted(MAKERS))
+def test_seed_and_quantities_are_settings_of_every_emulator(vendor: str, tmp_path: Path) -> None:
+    # results T7
+    given = ("seed=7", "tip.radius_m=8 nm", "clock_off_s=1 min", "drift.velocity_m_per_s=['15 pm/s', 0, 0]")
+    with started("afspm", "emulate", vendor, *given, "-o", "files", cwd=tmp_path) as process:
+        assert process.stdout is not None
+        assert "listening" in process.stdout.readline()
+    begun = json.loads((tmp_path / "files" / "truth.jsonl").read_text(encoding="utf-8").splitlines()[0])
+    assert begun["seed"] == 7
+    assert begun["settings"]["tip"]["radius_m"] == "8 nm"
+
+
+def test_option_given_as_a_setting_too_is_refused(tmp_path: Path) -> None:
+    with started("afspm", "emulate", "echo.Echo", "--seed", "3", "seed=7", cwd=tmp_path) as process:
+        out, err = process.communicate(timeout=DEADLINE_S)
+    assert (process.returncode, out) == (1, "")
+    assert "seed is given as an option and as a setting" in err
 
 
 def test_quantity_on_the_command_line_has_a_unit(tmp_path: Path) -> None:

@@ -122,8 +122,8 @@ def test_vendors_usual_port_is_taken_on_request_alone() -> None:
 
 
 def test_invalid_settings_are_refused_before_the_start() -> None:
-    with pytest.raises(ConfigError, match="drifft"):
-        Tiny(drifft={}).check()
+    with pytest.raises(ConfigError, match="velocitty"):
+        Tiny(drift={"velocitty": 1.0}).check()
     with pytest.raises(ConfigError, match="no fault 'crush'"):
         Tiny(faults=["crush"]).check()
     with pytest.raises(ConfigError, match="unknown: 'frequency-shift'"):

@@ -235,6 +235,7 @@ def test_tip_at_rest_shows_the_value_of_a_scan_without_changing_the_world(rig: S
         near = scanned[name][1][3:6, 3:6]
         assert abs(values.mean() - near.mean()) < 5 * near.std() + 3 * values.std()
     unseen = World.from_settings({}, 3, 1000.0)
+    unseen.move_to((30e-9, -20e-9), 1000.0 + math.hypot(30e-9, 20e-9) / rig.setup.move_speed_m_s)
     unseen.scan(rig.setup.region, (9, 9), 0.5, clock.t_s, rig.setup.feedback, 0.1)
     assert rig.world.state() == unseen.state()
 

@@ -266,7 +266,11 @@ def test_settings_are_refused_with_place_and_nearest_name() -> None:
         ({"drif": {}}, "did you mean 'drift'"),
         ({"noise": {"whit_m": 1.0}}, "did you mean 'white_m'"),
         ({"noise": {"white_m": -1.0}}, "zero or more"),
-        ({"noise": {"white_m": "much"}}, "expected float"),
+        ({"noise": {"white_m": "much"}}, "'much' is not a number with a unit"),
+        ({"noise": {"white_m": "3 pA"}}, "A can't be converted to m"),
+        ({"noise": {"white_m": "3"}}, "'3' has no unit"),
+        ({"signals": {"conductance_s": "3 s"}}, "expected float"),
+        ({"feedback": {"setpoint": "3 pA"}}, "without a unit"),
         ({"noise": {"white_m": float("nan")}}, "finite"),
         ({"noise": 3}, "expected a table"),
         ({"tip": {"radius_m": 8.0}}, "lengths are in m"),  # faults 18: it was accepted, and took all memory

@@ -390,6 +390,45 @@ def test_long_move_ends_when_the_controller_reports_it(bench: Any) -> None:
     assert bench.heard() == ["FREE", "MOVING", "ProbePosition", "FREE"]
 
 
+def test_scanner_settles_after_a_move_of_the_frame_before_a_scan(make_bench: Any) -> None:
+    # results C38
+    bench = make_bench({"settle_before_scan_s": 5.0})
+    bench.heard()
+    elsewhere = ScanParameters(Region.from_top_left((3e-7, 0.0), (1e-6, 0.5e-6)), (4, 8))
+    assert bench.ask(FRAME, elsewhere).code == OK
+    assert bench.heard() == ["MOVING", "ScanParameters2d"]
+    polls = 0
+    while bench.translator.wait_s() > 0.0 and bench.clock.t_s < 1004.9:
+        bench.look(after_s=min(1.0, bench.translator.wait_s()))
+        polls += 1
+    assert polls > 5, "the controller is polled meanwhile"
+    assert bench.ask(ACTION, names.START_SCAN).code == NOT_FREE
+    assert bench.ask(ACTION, names.STOP_SCAN).code == OK
+    assert bench.microscope.done == []
+    bench.look(after_s=1005.0 - bench.clock.t_s)
+    assert bench.heard() == ["FREE"]
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+
+
+def test_tip_can_be_retracted_while_the_scanner_settles(make_bench: Any) -> None:
+    bench = make_bench({"settle_before_scan_s": 5.0})
+    assert bench.ask(FRAME, ScanParameters(Region.from_top_left((3e-7, 0.0), (1e-6, 0.5e-6)), (4, 8))).code == OK
+    assert bench.ask(ACTION, names.RETRACT).code == OK
+    assert bench.microscope.done == ["retract"]
+
+
+@pytest.mark.parametrize(
+    ("x_m", "pixels"), [(0.0, (4, 8)), (0.0, (16, 32)), (5e-9, (4, 8))], ids=["same", "pixels", "drift"]
+)
+def test_scan_begins_at_once_where_the_scanner_has_hardly_moved(
+    make_bench: Any, x_m: float, pixels: tuple[int, int]
+) -> None:
+    bench = make_bench({"settle_before_scan_s": 5.0})
+    assert bench.ask(FRAME, ScanParameters(Region.from_top_left((x_m, 0.0), (1e-6, 0.5e-6)), pixels)).code == OK
+    assert bench.ask(PARAM, Parameter("scan-speed", "2", "um/s")).code == OK
+    assert bench.ask(ACTION, names.START_SCAN).code == OK
+
+
 def test_only_fields_in_the_message_are_set(bench: Any) -> None:
     message = scan_pb2.ScanParameters2d()
     message.spatial.roi.size.y = 250.0

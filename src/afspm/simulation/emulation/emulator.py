@@ -93,7 +93,9 @@ class Emulator(ABC):
         dates_files: True if that clock also gives the files their modification times, as on a disk of that computer.
         faults: each a text as on the command line (`KIND[@SECONDS][,count=N][,duration=SECONDS]`) or a table of
             `kind`, `at_s`, `count`, `duration_s`.
-        world: `surface`, `tip`, `drift` … of the simulated world, as in `World.from_settings`.
+        surface: a kind of sample, or a table of `kind` and its settings.
+        tip, tip_changes, drift, feedback, scanner, noise, signals, iv, force, property_map: settings of the simulated
+            world, as in `World.from_settings`. The scanner may be a name: "stm-4k".
 
     Attributes:
         clock, log: of the experiment; set before `open`, like all following attributes.
@@ -140,12 +142,35 @@ class Emulator(ABC):
         clock_off_s: Annotated[float, Unit("s")] = 0.0,
         dates_files: bool = False,
         faults: Sequence[str | PlainMapping | Fault] = (),
-        **world: object,
+        surface: str | PlainMapping = "steps",
+        tip: PlainMapping | None = None,
+        tip_changes: PlainMapping | None = None,
+        drift: PlainMapping | None = None,
+        feedback: PlainMapping | None = None,
+        scanner: str | PlainMapping | None = None,
+        noise: PlainMapping | None = None,
+        signals: PlainMapping | None = None,
+        iv: PlainMapping | None = None,
+        force: PlainMapping | None = None,
+        property_map: PlainMapping | None = None,
     ) -> None:
         self.port = port
         self.seed = seed
         self._clock_off_s, self._dates_files = clock_off_s, dates_files
-        self._world_settings = world
+        world = {
+            "surface": surface,
+            "tip": tip,
+            "tip_changes": tip_changes,
+            "drift": drift,
+            "feedback": feedback,
+            "scanner": scanner,
+            "noise": noise,
+            "signals": signals,
+            "iv": iv,
+            "force": force,
+            "property_map": property_map,
+        }
+        self._world_settings = {name: settings for name, settings in world.items() if settings is not None}
         self._faults = [Fault.of(fault) for fault in faults]
         self._stop = threading.Event()
         self._leave_at_s = math.inf

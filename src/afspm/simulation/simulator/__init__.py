@@ -100,7 +100,8 @@ class Simulator(Driver):
     Args:
         seed: seed of all random numbers.
         surface: a kind, or a table of `kind` and its settings.
-        tip, tip_changes, drift, feedback, scanner, noise, signals, iv, force, property_map: a table of settings.
+        scanner: a table of settings, or the name of a scanner with the statistics of a real one: "stm-4k".
+        tip, tip_changes, drift, feedback, noise, signals, iv, force, property_map: a table of settings.
         initial: values of parameters at the start, by their generic names.
         approach_s: duration of engaging and retracting.
         faults: faults and their times, each a table of `kind` (`FAULT_KINDS`), `at_s`, `count`, `duration_s`.
@@ -112,6 +113,7 @@ class Simulator(Driver):
         poll_period_s: interval between reads of the state, in real seconds, while nothing is due.
         result_timeout_s: longest delay of the file after the end of a scan or spectrum.
         live_lines_s: interval between publications of lines of a running scan; 0: never; by default 0.5 real seconds.
+        settle_before_scan_s: wait after a move of the frame, before a scan can begin.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
@@ -138,7 +140,7 @@ class Simulator(Driver):
         tip_changes: Table | None = None,
         drift: Table | None = None,
         feedback: Table | None = None,
-        scanner: Table | None = None,
+        scanner: str | Table | None = None,
         noise: Table | None = None,
         signals: Table | None = None,
         iv: Table | None = None,
@@ -155,6 +157,7 @@ class Simulator(Driver):
         poll_period_s: PollPeriod = 0.25,
         result_timeout_s: Duration = 10.0,
         live_lines_s: Duration | None = None,
+        settle_before_scan_s: Duration = 0.0,
     ) -> None:
         world: Table = {
             "surface": surface,
@@ -192,6 +195,7 @@ class Simulator(Driver):
                 poll_period_s=poll_period_s,
                 result_timeout_s=result_timeout_s,
                 live_lines_s=live_lines_s,
+                settle_before_scan_s=settle_before_scan_s,
             )
             self.channels = self.channels_of({**self._world_settings, "channels": channels})
             if not fault_action:

@@ -184,7 +184,8 @@ class SimulatedController:
             self.stop(now_s)  # a change allowed at this moment ends the measurement
             place_m = (float(after[names.PROBE_POS_X]), float(after[names.PROBE_POS_Y]))
             with _refusing():
-                self.instrument.move_probe(place_m, now_s, way_m=way_m)
+                frame_m = self.instrument.setup.region.center_m if way_m > 0.0 else None
+                self.instrument.move_probe(place_m, now_s, way_m=way_m, frame_m=frame_m)
         self._keep()
 
     def _put_in_force(self) -> None:

@@ -73,7 +73,7 @@ class AsylumEmulator(Emulator):
     def __init__(
         self,
         *,
-        idle_s: float = 0.0,
+        idle_s: Duration = 0.0,
         start_s: Duration = 0.2,
         file_s: Duration = 0.1,
         save_path: str = "",

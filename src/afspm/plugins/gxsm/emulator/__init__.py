@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
-from afspm.basics import ConfigError, Length, PlainMapping
+from afspm.basics import ConfigError, PlainMapping, PositiveLength
 from afspm.emulation import Crashed, Emulator
 from afspm.plugins.gxsm.emulator import block, calls, file_writer, files, program
 from afspm.plugins.gxsm.emulator.block import SharedMemoryBlock
@@ -77,7 +77,7 @@ class GxsmEmulator(Emulator):
         feedback_actions: Sequence[str] = (),
         display_units: Mapping[str, str] = MappingProxyType({}),
         channels_set: bool = True,
-        reach_m: Length = 2e-6,
+        reach_m: PositiveLength = 2e-6,
         **settings: Any,
     ) -> None:
         super().__init__(**settings)

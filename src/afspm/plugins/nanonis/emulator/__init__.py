@@ -7,9 +7,9 @@ import random
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final
 
-from afspm.basics import ConfigError, InvalidValue, Length, PlainMapping
+from afspm.basics import ConfigError, Count, InvalidValue, Listens, PlainMapping, PositiveLength
 from afspm.emulation import LOOPBACK, ClientConnection, Crashed, Emulator, InstrumentBusy, TcpServer
 from afspm.plugins.nanonis.emulator import logger, wire
 from afspm.plugins.nanonis.emulator.dispatch import DeferredResult, FunctionRefused, Results
@@ -123,13 +123,13 @@ class NanonisEmulator(Emulator):
         self,
         *,
         release: str | int = "2025",
-        ports: int = 1,
-        logger_port: int = 0,
+        ports: Count = 1,
+        logger_port: Annotated[int, Listens()] = 0,
         one_each: bool = False,
         wedges: bool = False,
         other_layout: Sequence[str] = (),
         session_path: str = "",
-        range_m: Length = 100e-6,
+        range_m: PositiveLength = 100e-6,
         bare_errors: bool = False,
         grabbed_rows: str = "top-first",
         unscanned: str = "nan",
@@ -155,8 +155,6 @@ class NanonisEmulator(Emulator):
         ):
             if value not in known:
                 raise ConfigError(f"unknown value {value!r}", where=name, hint=f"one of {', '.join(known)}")
-        if not range_m > 0.0:
-            raise ConfigError(f"a scanner of {range_m:g} m", where="range_m", hint="its range is above 0")
         self._grabbed_rows, self._unscanned, self._clips_frames = grabbed_rows, unscanned, clips_frames
 
     def open(self) -> str:
