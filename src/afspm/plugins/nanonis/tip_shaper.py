@@ -24,7 +24,7 @@ class TipShaper:
     Args:
         sensor: "qplus", "other", or "" if not known.
         qplus_bias_v: largest amount of the bias at which a qPlus sensor may be dipped. Others report that the fork
-            rings above 50 mV, and may be ruined.
+            rings above 50 mV, and may be ruined (! qplus-dip).
 
     Raises:
         ConfigError: no such sensor.
