@@ -175,6 +175,10 @@ def emulate(
         list[str] | None,
         opt("A fault, and its time.", metavar="KIND[@SECONDS][,count=N][,duration=SECONDS]"),
     ] = None,
+    as_reported: Annotated[
+        bool,
+        typer.Option("--as-reported", help="Behave in all that others report of real ones."),
+    ] = False,
     folder: Annotated[
         Path | None, opt("For its files. Default: emulated-NAME", "--folder", "-o", metavar="DIR")
     ] = None,
@@ -199,7 +203,14 @@ def emulate(
             typer.echo(_described(known, find_emulator(known)))
         return
     class_ = find_emulator(name)
-    options = {**({"port": port} if port else {}), **({"seed": seed} if seed != 1 else {}), "faults": fault or []}
+    if as_reported and not class_.reported:
+        raise ConfigError(f"no reports of real controllers are known for {class_.vendor}", where="--as-reported")
+    options = {
+        **({"port": port} if port else {}),
+        **({"as_reported": True} if as_reported else {}),
+        **({"seed": seed} if seed != 1 else {}),
+        "faults": fault or [],
+    }
     given = _settings(settings or [])
     for twice in sorted(given.keys() & {key for key, value in options.items() if value}):
         raise ConfigError(f"{twice} is given as an option and as a setting", hint="leave one of them out")
@@ -243,7 +254,9 @@ def _emulate(emulator: Emulator, speed: float, folder: Path) -> None:
 
 def _described(name: str, class_: type[Emulator]) -> str:
     faults = "".join(f"\n    {kind:20} {does}" for kind, does in class_.all_faults().items())
-    return f"{name}: {class_.vendor}{faults}"
+    known = {**class_.reported, **class_.reported_of_others}
+    reports = "".join(f"\n    {report:20} {does}" for report, does in known.items())
+    return f"{name}: {class_.vendor}{faults}" + (f"\n  as others report of real ones:{reports}" if reports else "")
 
 
 def _settings(given: list[str]) -> dict[str, object]:

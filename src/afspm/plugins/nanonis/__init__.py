@@ -16,6 +16,7 @@ sends nothing unrequested.
 
 from __future__ import annotations
 
+import codecs
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -85,8 +86,8 @@ _CHANNELS: Final = both_ways(
     {
         "height": ["Z"],
         "current": ["Current"],
-        "amplitude": ["Amplitude", "OC_M1_Amplitude"],
-        "phase": ["Phase", "OC_M1_Phase"],
+        "amplitude": ["Amplitude", "OC_D1_Amplitude", "OC_M1_Amplitude"],
+        "phase": ["Phase", "OC_D1_Phase", "OC_M1_Phase"],
         "frequency shift": ["OC_M1_Freq._Shift", "Frequency_Shift"],
         "excitation": ["Excitation", "OC_M1_Excitation"],
         "other": ["Bias", "LI_Demod_1_X", "LI_Demod_1_Y", "LI_Demod_2_X", "LI_Demod_2_Y"],
@@ -109,6 +110,8 @@ class Nanonis(Driver):
         reply_timeout_s: longest wait for a reply, real time.
         autosave: True switches on saving of every scan; False leaves the panel's setting alone.
         grabbed_rows, grabbed_backward: see `fetched.Grabbing`.
+        code_page: code page of Nanonis' computer, such as "gbk", for its texts that are not UTF-8. Without it they may
+            be shown with other letters, and are sent back unchanged all the same.
         preamplifier_range: largest current of the preamplifier, if Nanonis' label of the gain does not state V/A.
         sensor: "qplus" or "other". On a qPlus sensor `x-crash` is refused at a larger bias than `qplus_bias`.
         qplus_bias: largest amount of the bias at which a qPlus sensor may touch the sample.
@@ -141,6 +144,7 @@ class Nanonis(Driver):
         autosave: bool = True,
         grabbed_rows: str = "top-first",
         grabbed_backward: str = "mirrored",
+        code_page: str = "",
         preamplifier_range: Current | None = None,
         sensor: str = "",
         qplus_bias: Voltage = 0.05,
@@ -155,13 +159,14 @@ class Nanonis(Driver):
         self._reply_timeout_s = reply_timeout_s
         self._autosave = autosave
         self._grabbing = fetched.Grabbing(grabbed_rows, grabbed_backward)
+        self._code_page = _code_page(code_page)
         self._session: Session | None = None
         self._grabs_at_s = 0.0
         self._kept = KeptSettings(_AT_FIRST)
         ask = self._ask
         self._probe = geometry.Probe(ask, lambda: self.clock.now_s())
         feedback = parameter_groups.FeedbackOn(ask, lambda holds: self.wait_for(holds, reply_timeout_s))
-        self._tip = parameter_groups.TipState(ask)
+        self._tip = parameter_groups.TipState(ask, lambda: self.log)
         self._side = [parameter_groups.SideGroup(group(ask)) for group in _SIDE]
         vital = (*(group(ask) for group in _BY_VALUE), self._probe, feedback, self._tip, self._kept)
         self.groups = (*vital, *self._side)
@@ -178,7 +183,9 @@ class Nanonis(Driver):
         if self._withdrawal is not None:
             self._withdrawal.hold()
         self._leave_out_unreadable()
-        session = self._session = self.session_class(self, self._ports, self._reply_timeout_s, self._release)
+        session = self._session = self.session_class(
+            self, self._ports, self._reply_timeout_s, self._release, self._code_page
+        )
         if not hasattr(self, "_files"):
             self._kept.kept_in(self.memory)
             own_folder = (self.run_dir / "scans").resolve()
@@ -446,6 +453,14 @@ def _argument(code: str, word: str) -> object:
     if code == "S":
         return word
     raise ValueError(code)
+
+
+def _code_page(name: str) -> str:
+    try:
+        codecs.lookup(name or "utf-8")
+    except LookupError:
+        raise ConfigError(f"{name!r} is no code page", where="code_page", hint='such as "gbk" or "cp1252"') from None
+    return name
 
 
 def _addresses(text: str) -> list[tuple[str, int]]:

@@ -6,6 +6,7 @@ differently, values are converted ("Traps" in the README).
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Final
@@ -26,6 +27,7 @@ _DRIFT_WITHOUT_LIMIT: Final = 7
 """Number of results of Piezo.DriftCompGet in release 2021."""
 _CONTROLLER_OFF, _SAFE_TIP, _WITHDRAWING = 1, 5, 6
 """Values of ZCtrl.StatusGet; the others are on, on hold and switching off."""
+_KNOWN: Final = range(_CONTROLLER_OFF, _WITHDRAWING + 1)
 _END_OF_RANGE: Final = 1e-3
 """Distance from the upper limit of z, as a part of the range, within which the tip counts as withdrawn: more than its
 noise."""
@@ -174,8 +176,9 @@ class TipState(Group):
 
     names = (names.ENGAGED,)
 
-    def __init__(self, ask: Ask) -> None:
+    def __init__(self, ask: Ask, log: Callable[[], logging.Logger]) -> None:
         super().__init__(ask)
+        self._log, self._told = log, set[int]()
         self.is_safe = self.is_withdrawing = self._was_withdrawing = False
 
     @property
@@ -186,6 +189,9 @@ class TipState(Group):
     def look(self) -> int:
         """Read the status of the z controller, which sets the attributes, and return it."""
         status = int(self._ask("ZCtrl.StatusGet")[0])
+        if status not in _KNOWN and status not in self._told:
+            self._told.add(status)
+            self._log().warning("Nanonis' z controller has the status %d, which no document names (1 to 6)", status)
         self.is_safe, self.is_withdrawing = status == _SAFE_TIP, status == _WITHDRAWING
         return status
 

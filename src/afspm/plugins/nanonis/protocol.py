@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -126,8 +127,41 @@ def body_bytes(header: bytes, asked: str) -> int:
     return int(size)
 
 
-def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[object, ...]:
+class ReceivedText(str):
+    """A text with the bytes that Nanonis sent: sent back, it is the same text in any code page.
+
+    Attributes:
+        raw: these bytes.
+    """
+
+    __slots__ = ("raw",)
+    raw: bytes
+
+    @classmethod
+    def of(cls, raw: bytes, code_page: str) -> ReceivedText:
+        """Decode as UTF-8, otherwise by the code page of Nanonis' computer, otherwise as `text_of`."""
+        text = text_of(raw)
+        if code_page:
+            with suppress(UnicodeDecodeError):
+                text = raw.decode("utf-8" if _is_utf8(raw) else code_page)
+        found = cls(text)
+        found.raw = raw
+        return found
+
+
+def _is_utf8(raw: bytes) -> bool:
+    try:
+        raw.decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+def results(name: str, body: bytes | bytearray, release: int = NEWEST, code_page: str = "") -> tuple[object, ...]:
     """Decode the results in a reply's body.
+
+    Args:
+        code_page: see `ReceivedText.of`.
 
     The specification does not define whether an error follows results or replaces them: both forms are accepted.
 
@@ -139,7 +173,7 @@ def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[
     # The fields depend on the release: a wrong release leaves bytes over, or needs more bytes than received.
     for codes in (*function(name).result_codes(release), ()):
         try:
-            found, status, text = _parsed(body, codes)
+            found, status, text = _parsed(body, codes, code_page)
         except BadReply as error:
             whole = whole or error
             continue
@@ -155,8 +189,8 @@ def _depends_on_release(name: str) -> bool:
     return any(since for fields in function(name).layouts for _, since in fields)
 
 
-def _parsed(body: bytes | bytearray, codes: Sequence[str]) -> tuple[tuple[object, ...], int, str]:
-    reader = _Reader(memoryview(body))
+def _parsed(body: bytes | bytearray, codes: Sequence[str], code_page: str) -> tuple[tuple[object, ...], int, str]:
+    reader = _Reader(memoryview(body), code_page)
     found = tuple(_READERS[code](reader) for code in codes)
     # The error block at the end of every reply: a status, and a text.
     status, text = reader.number("I"), reader.text()
@@ -168,8 +202,9 @@ def _parsed(body: bytes | bytearray, codes: Sequence[str]) -> tuple[tuple[object
 class _Reader:
     """A reader of consecutive fields of a body, never beyond its end."""
 
-    def __init__(self, body: memoryview) -> None:
+    def __init__(self, body: memoryview, code_page: str) -> None:
         self._body = body
+        self._code_page = code_page
         self._at = 0
 
     @property
@@ -189,7 +224,7 @@ class _Reader:
         return shortest_single(found) if code == "f" else found
 
     def text(self) -> str:
-        return text_of(self.take(self.number("i")))
+        return ReceivedText.of(bytes(self.take(self.number("i"))), self._code_page)
 
     def texts(self) -> list[str]:
         self.number("i")  # the size in bytes, which peers calculate differently
@@ -244,7 +279,7 @@ def _counted(code: str, values: Sequence[object]) -> bytes:
 
 
 def _text(value: str) -> bytes:
-    raw = value.encode()
+    raw = value.raw if isinstance(value, ReceivedText) else value.encode()
     return struct.pack(">i", len(raw)) + raw
 
 

@@ -47,6 +47,7 @@ class Link:
 
     Attributes:
         release: release of the controller's software, set once known.
+        code_page: of the controller's computer, for texts that are not UTF-8; empty: as `text_of` decodes them.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class Link:
         release: int = protocol.NEWEST,
     ) -> None:
         self.release = release
+        self.code_page = ""
         self._tcp = TcpConnection(address, timeout_s, monotonic_s, _HINTS)
         self.close = self._tcp.close
 
@@ -78,7 +80,7 @@ class Link:
             return receiver.exactly(size)
 
         body = self._tcp.ask(name, protocol.request(name, arguments, self.release), read, longer_s=longer_s)
-        return protocol.results(name, body, self.release)
+        return protocol.results(name, body, self.release, self.code_page)
 
 
 Address = tuple[str, int]
@@ -122,6 +124,7 @@ class Session:
         ports: the ports to connect to; silent ones are remembered in it.
         timeout_s: longest wait for an answer, real time.
         release: release of the software; None: query Nanonis.
+        code_page: see `Link`.
 
     Attributes:
         controller: name and release of the software, for people.
@@ -134,7 +137,10 @@ class Session:
 
     link: ClassVar[type[Link]] = Link
 
-    def __init__(self, driver: Driver, ports: Ports, timeout_s: float, release: int | None) -> None:
+    def __init__(
+        self, driver: Driver, ports: Ports, timeout_s: float, release: int | None, code_page: str = ""
+    ) -> None:
+        self._code_page = code_page
         self._log = driver.log
         self._driver, self._timeout_s = driver, timeout_s
         self._listener: Listener | None = None
@@ -190,7 +196,9 @@ class Session:
             raise
 
     def _connected(self, address: Address, release: int = protocol.NEWEST) -> Link:
-        return self.link(address, self._timeout_s, self._driver.clock.monotonic_s, release)
+        link = self.link(address, self._timeout_s, self._driver.clock.monotonic_s, release)
+        link.code_page = self._code_page
+        return link
 
     def close(self) -> None:
         if self._listener is not None:

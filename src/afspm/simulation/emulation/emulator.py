@@ -91,6 +91,7 @@ class Emulator(ABC):
         clock_off_s: lead of the clock of the controller's computer, whose times stand in its files; negative: it is
             behind.
         dates_files: True if that clock also gives the files their modification times, as on a disk of that computer.
+        as_reported: what others report of real controllers (`reported`): True for all of it, or a list of names.
         faults: each a text as on the command line (`KIND[@SECONDS][,count=N][,duration=SECONDS]`) or a table of
             `kind`, `at_s`, `count`, `duration_s`.
         surface: a kind of sample, or a table of `kind` and its settings.
@@ -117,6 +118,11 @@ class Emulator(ABC):
     `all_faults` adds the faults of every emulator.
     """
 
+    reported: ClassVar[Mapping[str, str]] = {}
+    """What others report of real controllers, by name, and the emulator does on request (`as_reported`)."""
+    reported_of_others: ClassVar[Mapping[str, str]] = {}
+    """What others report of another maker's controllers, only by name."""
+
     modes: ClassVar[Sequence[str]] = ("amplitude", "current", "frequency-shift")
     """The modes of the simulated feedback that the controller supports."""
 
@@ -141,6 +147,7 @@ class Emulator(ABC):
         seed: int = 1,
         clock_off_s: Annotated[float, Unit("s")] = 0.0,
         dates_files: bool = False,
+        as_reported: bool | Sequence[str] = False,
         faults: Sequence[str | PlainMapping | Fault] = (),
         surface: str | PlainMapping = "steps",
         tip: PlainMapping | None = None,
@@ -157,6 +164,7 @@ class Emulator(ABC):
         self.port = port
         self.seed = seed
         self._clock_off_s, self._dates_files = clock_off_s, dates_files
+        self.as_reported = self._chosen(as_reported)
         world = {
             "surface": surface,
             "tip": tip,
@@ -175,6 +183,15 @@ class Emulator(ABC):
         self._stop = threading.Event()
         self._leave_at_s = math.inf
         self._button: ScreenButton | None = None
+
+    def _chosen(self, as_reported: bool | Sequence[str]) -> frozenset[str]:
+        if isinstance(as_reported, bool):
+            return frozenset(self.reported) if as_reported else frozenset()
+        known = {**self.reported, **self.reported_of_others}
+        if unknown := set(as_reported) - known.keys():
+            hint = f"true, or some of {', '.join(known)}" if known else "it knows none"
+            raise ConfigError(f"no report is called {min(unknown)!r}", where="as_reported", hint=hint)
+        return frozenset(as_reported)
 
     def check(self) -> None:
         """Check the settings.

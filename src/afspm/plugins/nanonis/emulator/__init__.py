@@ -11,8 +11,8 @@ from typing import Annotated, Any, ClassVar, Final
 
 from afspm.basics import ConfigError, Count, InvalidValue, Listens, PlainMapping, PositiveLength
 from afspm.emulation import LOOPBACK, ClientConnection, Crashed, Emulator, InstrumentBusy, TcpServer
-from afspm.plugins.nanonis.emulator import logger, wire
-from afspm.plugins.nanonis.emulator.dispatch import DeferredResult, FunctionRefused, Results
+from afspm.plugins.nanonis.emulator import as_reported, logger, wire
+from afspm.plugins.nanonis.emulator.dispatch import DeferredResult, FunctionRefused, OtherLayout, Results
 from afspm.plugins.nanonis.emulator.software import NanonisSoftware
 
 RELEASES: Final = {"2021": 10862, "2022": 11798, "2023": 13742, "2024": 14429, "2025": 14573}
@@ -87,6 +87,8 @@ class NanonisEmulator(Emulator):
 
     vendor = "Nanonis"
     usual: ClassVar[Mapping[str, object]] = {"port": 6501, "ports": 4, "logger_port": logger.USUAL_PORT}
+    reported: ClassVar[Mapping[str, str]] = as_reported.OF_NANONIS
+    reported_of_others: ClassVar[Mapping[str, str]] = as_reported.OF_OTHERS
     fault_kinds: ClassVar[Mapping[str, str]] = {
         "no-reply": "a request is not answered",
         "slow": "a reply comes later, by the duration",
@@ -138,10 +140,12 @@ class NanonisEmulator(Emulator):
     ) -> None:
         super().__init__(**{**settings, "feedback": _of_stm(settings.get("feedback", {}))})
         self.release = _release(release)
-        self._ports = ports
+        self._ports = max(ports, 4) if as_reported.WEDGED_PORT in self.as_reported else ports
         self.logger_port = logger_port
         self._chance = random.Random(self.seed)
-        self._one_each, self._wedges = one_each, wedges
+        is_wedged = as_reported.WEDGED_PORT in self.as_reported
+        self._one_each, self._wedges = one_each or is_wedged, wedges or is_wedged
+        self._encoding = "gbk" if as_reported.CODE_PAGE in self.as_reported else "utf-8"
         self._session_path = session_path
         self._other_layout = other_layout
         if unknown := set(other_layout) - wire.functions().keys():
@@ -178,8 +182,9 @@ class NanonisEmulator(Emulator):
             range_m=self._range_m,
             release=self.release,
             rows_as_recorded=self._grabbed_rows == "recorded",
-            unscanned=_UNSCANNED[self._unscanned],
-            clips_frames=self._clips_frames,
+            unscanned=_UNSCANNED["zeros" if as_reported.ZEROS in self.as_reported else self._unscanned],
+            clips_frames=self._clips_frames and as_reported.OVER_RANGE not in self.as_reported,
+            reported=self.as_reported,
             file_clock=self.file_clock,
             log=self.log,
         )
@@ -291,7 +296,9 @@ class NanonisEmulator(Emulator):
         if name.endswith(_ACTS) and self.faults.strikes("refused", now_s):
             raise FunctionRefused("it is not possible now")
         self.software.core.client = connection.memory
-        found = self.software.functions.call(name, wire.arguments(name, body, self._wire_release(now_s)))
+        found = self.software.functions.call(
+            name, wire.arguments(name, body, self._wire_release(now_s), self._encoding)
+        )
         if isinstance(found, DeferredResult):
             connection.waits_for = PendingReply(asked, found)
         else:
@@ -307,7 +314,7 @@ class NanonisEmulator(Emulator):
         if not asked.wants_answer:
             return
         now_s = self.clock.now_s()
-        encoding = "utf-8"
+        encoding = self._encoding
         if self.faults.strikes("not-utf8", now_s):
             encoding = "latin-1"
             results = tuple(f"{value}\u00b5" if isinstance(value, str) else value for value in results)
@@ -318,7 +325,7 @@ class NanonisEmulator(Emulator):
         if self.faults.lasts("nonsense", now_s):
             padded = tuple(wire.senseless_value(field.code, self._chance) for field in fields)
         body = wire.body(asked.name, padded, self._wire_release(now_s), encoding)
-        more = b"\0" * 4 if asked.name in self._other_layout else b""
+        more = b"\0" * 4 if asked.name in self._other_layout or isinstance(results, OtherLayout) else b""
         self._send(connection, asked.sent, body + more)
 
     def _send(self, connection: ClientConnection, name: str, body: bytes) -> None:

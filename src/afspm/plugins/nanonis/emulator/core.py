@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -38,6 +39,7 @@ class NanonisCore:
         log: of the experiment.
         client: values stored for the client whose request is being answered.
         opened: names of the modules that clients have opened.
+        reported: what others report of real instruments, and the software does (`as_reported`).
     """
 
     rig: SimulatedInstrument
@@ -51,6 +53,7 @@ class NanonisCore:
     registers: Registers = field(default_factory=Registers)
     client: Plain = field(default_factory=dict)
     opened: set[str] = field(default_factory=set)
+    reported: Collection[str] = ()
 
     @property
     def now_s(self) -> float:

@@ -11,6 +11,7 @@ from typing import Final, TypeVar
 
 import numpy as np
 
+from afspm.plugins.nanonis.emulator.as_reported import NO_MODULE
 from afspm.plugins.nanonis.emulator.registers import Registers
 
 T = TypeVar("T")
@@ -27,6 +28,10 @@ _MAY_BE_INFINITE: Final = ("BiasSpectr.TimingSet", "ZSpectr.TimingSet")
 
 class FunctionRefused(Exception):
     """The refusal of a function by the controller, with a reason."""
+
+
+class OtherLayout(tuple[object, ...]):
+    """Results that are sent in another layout than documented."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,7 @@ class Dispatcher:
         self._registers = registers
         self._handlers: dict[str, Handler] = {}
         self._removed: tuple[str, ...] = ()
+        self._closed: tuple[str, ...] = ()
         for module in modules:
             for attribute, marked in vars(type(module)).items():
                 for name in getattr(marked, "answered_functions", ()):
@@ -76,6 +82,10 @@ class Dispatcher:
     def remove(self, *modules: str) -> None:
         """Refuse all functions of some modules ("Piezo."), as software without a licence for them does."""
         self._removed = modules
+
+    def close(self, *modules: str) -> None:
+        """Refuse all functions of some modules, as if their windows were closed."""
+        self._closed = modules
 
     def call(self, name: str, arguments: list[object]) -> Answer:
         """Execute a function; return its results.
@@ -86,6 +96,8 @@ class Dispatcher:
         """
         if name.startswith(self._removed):
             raise FunctionRefused("Module not available")
+        if (module := name.partition(".")[0]) in self._closed:
+            raise FunctionRefused(NO_MODULE.format(module=module))
         handler = self._handlers.get(name)
         _refuse_nan(name, arguments, keeps_nan=handler is None or name in _KEEPS_NAN)
         if handler is not None:

@@ -12,16 +12,26 @@ import numpy as np
 from afspm.basics import InvalidValue
 from afspm.emulation import MOST_PIXELS, RETRACE, InstrumentBusy, ScanActivity
 from afspm.model import Region
-from afspm.plugins.nanonis.emulator import files
+from afspm.plugins.nanonis.emulator import as_reported, files
 from afspm.plugins.nanonis.emulator.core import GAIN_M, NanonisCore
-from afspm.plugins.nanonis.emulator.dispatch import Answer, DeferredResult, FunctionRefused, Results, answers, chosen
+from afspm.plugins.nanonis.emulator.dispatch import (
+    Answer,
+    DeferredResult,
+    FunctionRefused,
+    OtherLayout,
+    Results,
+    answers,
+    chosen,
+)
 from afspm.plugins.nanonis.emulator.session import checked_name
-from afspm.plugins.nanonis.emulator.signals import CHANNELS, NAMES, Signals, name_and_unit
+from afspm.plugins.nanonis.emulator.signals import CHANNELS, Signals, name_and_unit
 
 Image = tuple[str, str, np.ndarray, np.ndarray]
 """Name, unit, values forward and backward [y, x]."""
 _PIXELS_AT_ONCE: Final = 16
 _WAITED: Final = "waited"
+_UNRECORDED: Final = 24
+"""A channel that a person has chosen while a scan runs."""
 """Key in a client's memory: (number of ended scans, time) at its last start of a scan, or at its last timeout."""
 _PASTES: Final = (0, 1, 2)
 _SMALLEST_M: Final = 2e-12
@@ -68,7 +78,7 @@ class ScanFiles:
         for channel, (unit, values) in drawn.items():
             if channel in CHANNELS:
                 back = drawn.get(f"{channel}{RETRACE}", (unit, values))[1]
-                found[CHANNELS[channel]] = (NAMES.get(channel, channel), unit, values, back)
+                found[CHANNELS[channel]] = (self._signals.called.get(channel, channel), unit, values, back)
         nothing = np.zeros(started.scan.shape)
         for index in started.channels:
             if index not in found:
@@ -146,6 +156,9 @@ class ScanModule:
         self.frame = (0.0, 0.0, 1e-6, 1e-6, 0.0)
         self.speed = (2e-6, 2e-6, 0.5, 0.5, 0, 1.0)
         self.properties = ScanProperties()
+        self.properties.continuous = as_reported.CONTINUOUS in core.reported
+        if as_reported.CODE_PAGE in core.reported:
+            self.properties.comment = as_reported.COMMENT
         self.running: StartedScan | None = None
         self.last: StartedScan | None = None
         self.ends, self._last_end = 0, (-math.inf, "")
@@ -169,6 +182,8 @@ class ScanModule:
         x, y, width, height, clockwise_deg = self.frame
         rig = self._core.rig
         size_m = (width * (self.pixels - 1) / self.pixels, height * max(self.lines - 1, 1) / self.lines)
+        if as_reported.OFFSET_IN_VOLTS in self._core.reported:
+            x, y = as_reported.IN_VOLTS * x, as_reported.IN_VOLTS * y
         rig.setup.region = Region((x, y), size_m, -math.radians(clockwise_deg))
         rig.setup.shape = (self.lines, self.pixels)
         rig.setup.reach_m = self._core.reach_m
@@ -186,7 +201,7 @@ class ScanModule:
                 self.advance(now_s)
             self._start_on_request(bool(direction), now_s)
             self._core.client[_WAITED] = self.ends, now_s
-        elif action == 1:
+        elif action == 1 and as_reported.DEAF_STOP not in self._core.reported:
             rig.stop_scan(now_s)
         elif action == 2 and rig.scan is not None:
             rig.scan.pause(now_s)
@@ -194,7 +209,7 @@ class ScanModule:
             rig.scan.resume(now_s)
         elif action == 6:
             rig.move_probe(self.frame[:2], now_s)
-        elif action not in (2, 3, 4, 5):
+        elif action not in (1, 2, 3, 4, 5):
             raise FunctionRefused(f"{action} is not an action")
         return ()
 
@@ -231,7 +246,11 @@ class ScanModule:
 
     @answers("Scan.StatusGet")
     def _status(self) -> Answer:
-        return (int(self.running is not None and self.running.scan.running(self._core.now_s)),)
+        core = self._core
+        hides_s = core.rig.scan.start_s + as_reported.LATE_S if core.rig.scan is not None else -math.inf
+        if as_reported.LATE_STATUS in core.reported and core.now_s < hides_s:
+            return (0,)
+        return (int(self.running is not None and self.running.scan.running(core.now_s)),)
 
     @answers("Scan.XYPosGet")
     def _position(self, wait: int) -> Answer:
@@ -305,7 +324,11 @@ class ScanModule:
 
     @answers("Scan.FrameGet")
     def _frame(self) -> Answer:
-        return self.frame
+        if as_reported.ROUNDED_READING not in self._core.reported:
+            return self.frame
+        step_m = as_reported.ROUNDED_M
+        x, y = (round(as_reported.SCALE * value / step_m) * step_m for value in self.frame[:2])
+        return x, y, *self.frame[2:]
 
     @answers("Scan.BufferSet")
     def _set_buffer(self, channels: list[int], pixels: int, lines: int) -> Answer:
@@ -318,12 +341,15 @@ class ScanModule:
         # without a limit FrameDataGrab would need more memory than there is (! frame-bounds)
         if pixels * lines > MOST_PIXELS:
             raise FunctionRefused(f"{lines} lines of {pixels} pixels are more than {MOST_PIXELS} pixels")
+        if as_reported.FEW_PIXELS in self._core.reported:
+            pixels = _PIXELS_AT_ONCE
         self.channels, self.pixels, self.lines = channels or self.channels, pixels, lines
         return ()
 
     @answers("Scan.BufferGet")
     def _buffer(self) -> Answer:
-        return self.channels, self.pixels, self.lines
+        chosen_too = [_UNRECORDED] if as_reported.OTHER_LAYOUT in self._core.reported else []
+        return [*self.channels, *chosen_too], self.pixels, self.lines
 
     @answers("Scan.SpeedSet")
     def _set_speed(self, *speed: Any) -> Answer:
@@ -377,6 +403,8 @@ class ScanModule:
     @answers("Scan.FrameDataGrab")
     def _grab(self, channel: int, forward: int) -> Answer:
         last = self.last
+        if channel == _UNRECORDED and as_reported.OTHER_LAYOUT in self._core.reported:
+            return OtherLayout((self._signals.names[channel], np.zeros((0, 0)), 1))
         if channel not in (last.channels if last else self.channels):
             raise FunctionRefused("the channel is not among the acquired ones")
         if last is None or last.scan.drawing:

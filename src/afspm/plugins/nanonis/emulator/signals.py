@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from afspm.emulation import RETRACE, SpectrumActivity
+from afspm.plugins.nanonis.emulator.as_reported import QPLUS_NAMES
 from afspm.plugins.nanonis.emulator.core import NanonisCore
 from afspm.plugins.nanonis.emulator.dispatch import Answer, FunctionRefused, answers
 from afspm.plugins.nanonis.emulator.logger import LARGEST_OVERSAMPLING, TcpLogger
@@ -14,6 +15,7 @@ CHANNELS: Final = {"Current": 0, "Height": 14, "Phase": 16, "Amplitude": 17, "Fr
 """Index of the signal by simulated channel."""
 NAMES: Final = {"Height": "Z", "Frequency Shift": "OC M1 Freq. Shift"}
 _CURRENT, _BIAS = CHANNELS["Current"], 24
+_OF_QPLUS: Final = {"Amplitude": "OC D1 Amplitude", "Phase": "OC D1 Phase"}
 _UNITS: Final = {"Current": "A", "Height": "m", "Phase": "deg", "Amplitude": "V", "Frequency Shift": "Hz"}
 _OF_SPECTRA: Final = {"Deflection": (20, "m"), "Force": (21, "N"), "dI/dV": (22, "S")}
 """Signals of spectra only: index and unit."""
@@ -29,12 +31,14 @@ class Signals:
 
     Attributes:
         names: names with units of the 128 signals.
+        called: names in the software of the simulated channels, where they differ.
         slots: indexes of the signals in the 24 slots of the Signals Manager.
     """
 
     def __init__(self, core: NanonisCore) -> None:
         self._core, self._registers = core, core.registers
-        self.names = _signal_names()
+        self.called = {**NAMES, **(_OF_QPLUS if QPLUS_NAMES in core.reported else {})}
+        self.names = _signal_names(self.called)
         used = [*CHANNELS.values(), _BIAS]
         self.slots = [*used, *(index for index in range(len(self.names)) if index not in used)][:_SLOTS]
         self.logger = TcpLogger()
@@ -220,10 +224,10 @@ def spectrum_signal(column: str) -> int | None:
     return CHANNELS.get(name) if name in CHANNELS else _OF_SPECTRA.get(name, (None,))[0]
 
 
-def _signal_names() -> list[str]:
+def _signal_names(called: Mapping[str, str]) -> list[str]:
     signals = [f"Input {number + 1} (V)" for number in range(128)]
     for name, index in CHANNELS.items():
-        signals[index] = f"{NAMES.get(name, name)} ({_UNITS[name]})"
+        signals[index] = f"{called.get(name, name)} ({_UNITS[name]})"
     for name, (index, unit) in _OF_SPECTRA.items():
         signals[index] = f"{name} ({unit})"
     signals[_BIAS] = "Bias (V)"

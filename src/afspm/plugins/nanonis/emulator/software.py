@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Collection
 from pathlib import Path
 from typing import Final
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from afspm.basics import Clock
 from afspm.emulation import ControllerClock, Faults, SimulatedInstrument
+from afspm.plugins.nanonis.emulator import as_reported
 from afspm.plugins.nanonis.emulator.core import NanonisCore
 from afspm.plugins.nanonis.emulator.dispatch import Answer, Dispatcher, FunctionRefused, answers, chosen
 from afspm.plugins.nanonis.emulator.files import read_dat
@@ -32,6 +34,7 @@ class NanonisSoftware:
         session_path: session folder's path on the controller's computer; empty: the path of `folder`.
         range_m: range of the scanner in x and y.
         rows_as_recorded, unscanned, clips_frames: see `ScanModule`.
+        reported: see `NanonisCore`.
     """
 
     def __init__(
@@ -49,9 +52,11 @@ class NanonisSoftware:
         clips_frames: bool,
         file_clock: ControllerClock,
         log: logging.Logger,
+        reported: Collection[str] = (),
     ) -> None:
         session = SessionFolder(folder, session_path, faults, file_clock, log)
         self.core = NanonisCore(rig, faults, clock, file_clock, session, (range_m, range_m, _RANGE_Z_M), release, log)
+        self.core.reported = reported
         self.signals = Signals(self.core)
         self.scans = ScanModule(
             self.core,
@@ -62,20 +67,24 @@ class NanonisSoftware:
         )
         self.spectra = SpectroscopyModules(self.core, self.signals)
         self.z_controller = ZController(self.core, self.scans, self.signals)
+        self.tip = TipModules(self.core, self.scans, self.z_controller)
         modules = (
             self.signals,
             self.scans,
             self.spectra,
             self.z_controller,
-            TipModules(self.core, self.scans, self.z_controller),
+            self.tip,
             PatternModule(self.core),
             Utilities(self.core),
         )
         self.functions = Dispatcher(self.core.registers, modules)
+        if as_reported.CLOSED_MODULES in reported:
+            self.functions.close("TipShaper")
 
     def advance(self, now_s: float) -> float | None:
         """Advance faults, scans, spectra and files; return the time of the next delayed scan or file, None without."""
         self.z_controller.go_wrong(now_s)
+        self.tip.advance(now_s)
         starts_s = self.scans.advance(now_s)
         self.spectra.advance(now_s)
         late_s = self.core.session.write_late(now_s)

@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from afspm.plugins.nanonis.emulator import as_reported
 from afspm.plugins.nanonis.emulator.core import GAIN_M, OUTPUT_V, NanonisCore
 from afspm.plugins.nanonis.emulator.dispatch import Answer, FunctionRefused, answers, chosen
 from afspm.plugins.nanonis.emulator.scans import ScanModule
@@ -71,6 +72,8 @@ class ZController:
         # in a spectrum it follows `feedback.hold_reads` (! hold-in-spectrum)
         if self.state == "on" and not self._core.rig.feedback_reads(now_s):
             return 3
+        if as_reported.UNKNOWN_STATUS in self._core.reported and self.state == "on":
+            return as_reported.UNKNOWN_Z_STATUS
         return {"off": 1, "on": 2, "safe": 5}[self.state]
 
     @answers("ZCtrl.StatusGet")
@@ -85,7 +88,7 @@ class ZController:
     @answers("ZCtrl.OnOffGet")
     def _get_on(self) -> Answer:
         # The state of the real-time controller, which is still on while switching off.
-        return (int(self._status(self._core.now_s) in (2, 4)),)
+        return (int(self._status(self._core.now_s) in (2, 4, as_reported.UNKNOWN_Z_STATUS)),)
 
     @answers("ZCtrl.ZPosSet")
     def _set_position(self, z_m: float) -> Answer:
@@ -175,6 +178,7 @@ class TipModules:
         self._core, self._scans, self._z_controller = core, scans, z_controller
         self._has_own_speed, self._own_speed_m_s = True, core.rig.setup.move_speed_m_s
         self._motor_m, self._motor_walk = (0.0, 0.0, 0.0), (0, 0, 0.0)
+        self._shapes_at_s = math.inf
 
     # --- position ---
 
@@ -235,6 +239,21 @@ class TipModules:
 
     @answers("TipShaper.Start")
     def _shape(self, wait: int, timeout_ms: int) -> Answer:
+        if as_reported.SLOW_SHAPER in self._core.reported:
+            late_s = as_reported.SHAPER_BEGINS_LATE_S
+            self._core.rig.occupy("shaper", late_s, self._core.now_s)
+            self._shapes_at_s = self._core.now_s + late_s
+            return self._core.until_free(wait or self._blocks(), timeout_ms)
+        self._shape_now()
+        return self._core.until_free(wait or self._blocks(), timeout_ms)
+
+    def advance(self, now_s: float) -> None:
+        """Begin a shaping of the tip that is due."""
+        if now_s >= self._shapes_at_s:
+            self._shapes_at_s = math.inf
+            self._shape_now()
+
+    def _shape_now(self) -> None:
         props = self._core.registers.get("TipShaper.Props")
         lift_m, lift_s, restore = props[3], props[4], props[10]
         if lift_m < 0.0:
@@ -243,10 +262,10 @@ class TipModules:
             self._core.rig.occupy("shaper", lift_s, self._core.now_s)
         if not restore:
             self._z_controller.switch(self._core.now_s, on=False)
-        return self._core.until_free(wait or self._blocks(), timeout_ms)
 
     def _blocks(self) -> int:
-        return int(self._core.faults.lasts("blocks", self._core.now_s))
+        core = self._core
+        return int(as_reported.BLOCKING_PULSE in core.reported or core.faults.lasts("blocks", core.now_s))
 
     # --- piezos and drift compensation ---
 

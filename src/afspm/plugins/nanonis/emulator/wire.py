@@ -139,7 +139,7 @@ def split(received: bytearray) -> tuple[str, bool, bytes] | None:
     return name, bool(wants_answer), body
 
 
-def arguments(name: str, body: bytes, release: int) -> list[object]:
+def arguments(name: str, body: bytes, release: int, encoding: str = "utf-8") -> list[object]:
     """Decode the arguments in a request's body.
 
     Raises:
@@ -148,7 +148,7 @@ def arguments(name: str, body: bytes, release: int) -> list[object]:
     at, found, count = 0, [], 0
     try:
         for code in functions()[name].argument_codes(release):
-            value, at = _unpacked(code, body, at, count)
+            value, at = _unpacked(code, body, at, count, encoding)
             count = value if code == "n" else count
             found.append(value)
     except struct.error as error:
@@ -158,12 +158,12 @@ def arguments(name: str, body: bytes, release: int) -> list[object]:
     return found
 
 
-def _unpacked(code: str, body: bytes, at: int, count: int) -> tuple[Any, int]:
+def _unpacked(code: str, body: bytes, at: int, count: int, encoding: str) -> tuple[Any, int]:
     # `count` is the length of lists that share one length field.
     if code in _SIZES:
         return struct.unpack_from(f">{code}", body, at)[0], at + _SIZES[code]
     if code.startswith("*"):
-        return _items(code[1], count, body, at)
+        return _items(code[1], count, body, at, encoding)
     if code == "A":
         at += 4  # the size in bytes, which clients calculate differently: nanonis-spm and nanonisTCP disagree
     (number,) = struct.unpack_from(">i", body, at)
@@ -172,23 +172,23 @@ def _unpacked(code: str, body: bytes, at: int, count: int) -> tuple[Any, int]:
         return number, at
     if code == "S":
         end = at + max(number, 0)
-        return struct.unpack_from(f">{max(number, 0)}s", body, at)[0].decode("utf-8", "replace"), end
+        return struct.unpack_from(f">{max(number, 0)}s", body, at)[0].decode(encoding, "replace"), end
     if code == "A":
-        return _items("S", number, body, at)
+        return _items("S", number, body, at, encoding)
     if code == "2f":
         (columns,) = struct.unpack_from(">i", body, at)
-        values, at = _items("f", max(number, 0) * max(columns, 0), body, at + 4)
+        values, at = _items("f", max(number, 0) * max(columns, 0), body, at + 4, encoding)
         return np.reshape(values, (max(number, 0), max(columns, 0))), at
-    return _items(code[1], number, body, at)
+    return _items(code[1], number, body, at, encoding)
 
 
-def _items(code: str, count: int, body: bytes, at: int) -> tuple[list[Any], int]:
+def _items(code: str, count: int, body: bytes, at: int, encoding: str) -> tuple[list[Any], int]:
     count = max(count, 0)
     if code in _SIZES:
         return list(struct.unpack_from(f">{count}{code}", body, at)), at + count * _SIZES[code]
     texts = []
     for _ in range(count):
-        text, at = _unpacked("S", body, at, 0)
+        text, at = _unpacked("S", body, at, 0, encoding)
         texts.append(text)
     return texts, at
 
