@@ -14,8 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.plugins.vendor_bench import answering
 
+from afspm.basics import Refused
 from afspm.driver import ControllerLost
+from afspm.model import ControlResponse
 from afspm.plugins.nanonis.emulator import wire
+from afspm.plugins.nanonis.parameter_groups import SafeTip
 from afspm.plugins.nanonis.protocol import NanonisError
 from afspm.plugins.nanonis.session import Link
 
@@ -45,6 +48,14 @@ def test_an_error_of_the_controller_leaves_the_connection_as_it_is() -> None:
         with pytest.raises(NanonisError, match="no"):
             link.ask("Bias.Set", 1.0)
         assert link.ask("Bias.Get") == (0.5,)
+
+
+# nanonis 37
+def test_safe_tip_of_a_nanonis_without_one_is_not_supported() -> None:
+    refused = wire.reply("SafeTip.OnOffGet", wire.error_body("SafeTip.OnOffGet", "not available", 0, bare=True))
+    with talking(refused) as link, pytest.raises(Refused, match="not available") as found:
+        SafeTip(link.ask).read()
+    assert found.value.response == ControlResponse.PARAM_NOT_SUPPORTED
 
 
 def test_answer_to_another_request_is_refused() -> None:

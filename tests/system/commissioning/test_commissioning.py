@@ -107,11 +107,12 @@ def commissioned(
 def test_a_controller_that_is_right_passes_and_the_report_says_what_was_tried(vendor: str, tmp_path: Path) -> None:
     result = commissioned(tmp_path, vendor, Person())
     lines = {name: f"{one.outcome.value}: {one.line}" for name, one in result.progress.results.items()}
-    assert result.passed, (result.lost, lines)
+    assert result.passed, (result.lost, [line for line in lines.values() if not line.startswith("passed")])
     report = InstrumentReport.read(tmp_path / "report.toml")
     assert not report.unrestored
     assert report.tried_on == "emulator"
     assert report.operations["scan"] == report.operations["axes"] == report.operations["stop"] == "passed", lines
+    assert vendor != "Nanonis" or report.claims["withdrawn-limit"] == "holds"
     exchanges = [one for one in read_trace(result.folder / FILE) if isinstance(one, TracedExchange)]
     assert any("start-scan" in one.command for one in exchanges)
 
@@ -234,6 +235,7 @@ def test_z_that_counts_the_other_way_is_found_by_the_withdrawal(
     result = commissioned(tmp_path, "Nanonis", person, "spoiled.OtherZNanonis")
     assert not result.passed
     assert "z counts the other way at this rig" in result.progress.results["x-retract"].line
+    assert result.claims["withdrawn-limit"] == "does not hold"
     assert any("THE TIP WAS NOT WITHDRAWN" in line for line in person.shown)
     report = InstrumentReport.read(tmp_path / "report.toml")
     assert report.steps["x-retract"]["outcome"] == "mismatch"
@@ -378,7 +380,7 @@ def test_a_scan_that_the_person_stops_at_the_panel_ends_no_control(vendor: str, 
     person = Person({"Stop the scan at the panel, then": stop, "approach at the panel": do("SimpleEngageMe", "Engage")})
     result = commissioned(tmp_path, vendor, person)
     lines = {name: f"{one.outcome.value}: {one.line}" for name, one in result.progress.results.items()}
-    assert lines["stop-at-panel"] == "passed: noticed", lines
+    assert lines["stop-at-panel"] == "passed: noticed, and no scan was published", lines
     assert result.passed, (result.lost, lines)
 
 
@@ -427,3 +429,4 @@ def test_safe_tip_that_is_on_is_reported_with_its_threshold(tmp_path: Path) -> N
     assert result.progress.results["safe-tip"].line == "on, at 1 nA"
     assert not any("WARNING" in line for line in person.shown)
     assert result.claims["grabbed-rows"] == "not shown"
+    assert not InstrumentReport.read(tmp_path / "report.toml").unrestored

@@ -43,6 +43,7 @@ class Guide:
         folder: the run folder, for pictures.
         has_panel: True for a real controller. Without a panel, each question about it is shown and skipped.
         has_tip: False for a microscope without a tip, where the steps about it are left out.
+        has_lines: False for a controller whose lines are not published while it scans.
         program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
         counts_clockwise: True if the controller's panel shows angles clockwise.
         in_contact: True if the person has approached the tip, which is withdrawn after the steps at the sample.
@@ -56,6 +57,7 @@ class Guide:
     folder: Path
     has_panel: bool = True
     has_tip: bool = True
+    has_lines: bool = True
     program_s: float = 0.0
     counts_clockwise: bool = False
     in_contact: bool = False
@@ -78,6 +80,8 @@ class Guide:
             raise Unsupported(", ".join(missing))
         if step.about_tip and not self.has_tip:
             raise Unsupported("this microscope has no tip")
+        if step.about_lines and not self.has_lines:
+            raise Unsupported("no line of a running scan is published")
         self.prompts.show(f"\n{step.title}\n{step.explained}")
         if step.needs_panel and not self.has_panel:
             raise Skipped(f"{NO_PANEL} or cable")

@@ -50,7 +50,12 @@ class MakerClaim:
     @property
     def step(self) -> str:
         """The name of the step that settles the claim; empty: none does."""
-        return self.commission.partition("/")[0]
+        return step_of(self.commission)
+
+
+def step_of(observation: str) -> str:
+    """Return the name of the step of an observation."""
+    return observation.partition("/")[0]
 
 
 def read(folder: Path) -> dict[str, MakerClaim]:

@@ -118,6 +118,7 @@ def _in_session(
                 session.folder,
                 has_panel=has_panel,
                 has_tip=session.has_tip,
+                has_lines=_interval_of_lines(session.options) is not None,
                 program_s=session.program_s,
                 counts_clockwise=session.counts_clockwise,
                 claims=claims,
@@ -151,13 +152,16 @@ class _Walk:
             self._guide.prompts.show(f"{symbol}{named} {step.title}: {result.line}")
             for line in result.complaints:
                 self._guide.prompts.show(f"  {line}")
+            self._settle(step.name)
+            self._write()
             if step.contact or result.outcome is not CheckOutcome.PASSED:
                 self.withdraw()
-            settled = maker_claims.verdicts(self._guide.claims, step.name, self._guide.seen, self._guide.unprepared)
-            self._claims.update(settled)
-            for name, verdict in settled.items():
-                self._guide.prompts.show(f"  {verdict}: {self._guide.claims[name].claim} ({name})")
-            self._write()
+
+    def _settle(self, step: str) -> None:
+        settled = maker_claims.verdicts(self._guide.claims, step, self._guide.seen, self._guide.unprepared)
+        self._claims.update(settled)
+        for name, verdict in settled.items():
+            self._guide.prompts.show(f"  {verdict}: {self._guide.claims[name].claim} ({name})")
 
     def withdraw(self) -> None:
         """Withdraw a tip that was approached for these steps."""
@@ -171,15 +175,16 @@ class _Walk:
             kit.client.settled(kit.client.observations.mark())
             shown = kit.client.ask(ControlRequest.PARAM, Parameter(names.ENGAGED))
             if shown.ok:
-                self._guide.seen[WITHDRAWN] = False
+                self._guide.seen[WITHDRAWN] = value_in(shown, names.ENGAGED).value == "false"
+                self._settle(maker_claims.step_of(WITHDRAWN))
                 _require_away(shown)
-                self._guide.seen[WITHDRAWN] = True
             self._guide.prompts.show("The tip was withdrawn." if shown.ok else _NEVER_SHOWN)
         except (Failed, Skipped, Lost) as error:
             self._guide.prompts.show(_NOT_WITHDRAWN.format(why=error))
-            failed = CheckResult(names.RETRACT, "Withdrawing the tip", CheckOutcome.FAILED, str(error))
-            self._progress.results[names.RETRACT] = failed
-            self._write()
+            if kit.support.has(names.RETRACT):
+                failed = CheckResult(names.RETRACT, "Withdrawing the tip", CheckOutcome.FAILED, str(error))
+                self._progress.results[names.RETRACT] = failed
+        self._write()
 
 
 def _require_away(shown: Response) -> None:
@@ -211,6 +216,11 @@ def _with_lines(options: CheckOptions, folder: Path) -> CheckOptions:
     except ConfigError:  # a driver may need another setting for them
         return options
     return watched
+
+
+def _interval_of_lines(options: CheckOptions) -> object:
+    (translator,) = prepare(options).resolved.with_role(Role.TRANSLATOR)
+    return translator.settings.get("live_lines_s", getattr(translator.component, "live_real_s", None)) or None
 
 
 def _report(session: CheckSession, checks: CheckReport, result: CommissioningResult, tried_on: str) -> InstrumentReport:

@@ -28,11 +28,13 @@ READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES = (
     "read", "frame", "angle", "scan", "end of a scan", "files", "stop", "lost connection", "axes",
 )  # fmt: skip
 UP, LINE_TIME, ROWS, COLUMNS = "frame/y-up", "scan/line-time", "lines/rows", "lines/columns"
-WITHDRAWN: Final = "axes/withdrawn"
 SETPOINT: Final = f"panel/{names.ZCTRL_SETPOINT}"
+WITHDRAWN: Final = "contact/withdrawn"
 OBSERVATIONS: Final = (UP, LINE_TIME, ROWS, COLUMNS, SETPOINT, WITHDRAWN)
 """Observations within steps that settle claims, beside the passed steps themselves."""
 OPERATIONS: Final = (READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES)
+LINES_REAL_S: Final = 2.0
+"""Least real seconds of a scan that is watched while it fills."""
 _NOTICED_S: Final = 5.0
 """Seconds between the end of a scan at the panel and its publication: reaction, saving, polling."""
 _LOST_S: Final = 60.0
@@ -301,16 +303,16 @@ def _files(guide: Guide) -> str:
     "afspm takes a scan upwards, reads its lines while it runs, and finds them in the scan that is saved at its end.",
     "Don't rely on lines of a running scan, nor on scans without a file: see the README of the driver for their order.",
     after=("scan",),
+    about_lines=True,
     needs=(names.START_SCAN,),
 )
 def _lines(guide: Guide) -> str:
     kit, client = guide.kit, guide.kit.client
-    if not client.observations.lines:
-        raise Skipped("no line of a running scan is published")
     if kit.support.has(names.SCAN_DIRECTION):
         client.set(names.SCAN_DIRECTION, names.UP)
     client.observations.lines.clear()
-    taken = kit.take_scan(kit.frames.plain)
+    # long enough in real time for some readings
+    taken = kit.take_scan(kit.frames.plain, LINES_REAL_S / client.clock.real_s(1.0))
     roles = client.observations.newest(ChannelRoles) or ChannelRoles()
     found = [roles.shown(one) for one in taken.scans]
     places = [place for one in found for place in lines_in_scan.places(one, client.observations.lines)]

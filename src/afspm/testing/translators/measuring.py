@@ -238,9 +238,9 @@ class CheckMeasurements:
         """Return the scan of a named frame; take it on the first call."""
         return self._once(f"scan of the {name} frame", lambda: self.take_scan(getattr(self.frames, name)))
 
-    def take_scan(self, frame: FrameSetting) -> Taken:
-        """Take a complete scan."""
-        expected_s = self.prepare(frame, max(SCAN_S, LINE_S * frame.shape[0]))
+    def take_scan(self, frame: FrameSetting, at_least_s: float = SCAN_S) -> Taken:
+        """Take a complete scan that lasts `at_least_s` of experiment time, where its speed can be set."""
+        expected_s = self.prepare(frame, max(SCAN_S, at_least_s, LINE_S * frame.shape[0]))
         observed = self._measure(names.START_SCAN, ScopeState.SCANNING, expected_s)
         if not scans(observed):
             raise Failed("a Scan2d between SS_SCANNING and SS_FREE", describe_all(observed))

@@ -17,6 +17,8 @@ from afspm.testing.translators.translator_suite import TRANSLATOR_SUITE
 
 _LAST = (names.SCAN_SPEED, names.MOVE_SPEED)
 """Settings restored last, since a change of the frame may change them."""
+_REPORTED = (names.CONTROLLER, names.SAFE_TIP_ON, names.SAFE_TIP_THRESHOLD)
+"""Parameters that a person may change meanwhile, and that no request can set."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class SettingsBefore:
             client.observations.newest(ScanParameters),
             client.observations.newest(Feedback),
             client.observations.newest(ProbePosition),
-            {name: value for name, value in support.parameters.items() if value and name != names.CONTROLLER},
+            {name: value for name, value in support.parameters.items() if value and name not in _REPORTED},
             support,
         )
 
