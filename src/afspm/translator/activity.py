@@ -21,6 +21,7 @@ follow another one between two polls; neither waits in `settle`, since their sca
 from __future__ import annotations
 
 import logging
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import ClassVar, Final
@@ -35,6 +36,10 @@ from afspm.translator.result_files import SCAN, ResultFiles
 _MOST_REFUSALS: Final = 2
 """Refusals of a start that may be a person's doing: the program does not report what a person lets it do, such as a
 sweep, nor a scan stopped at the panel within its first poll. The client asks again after some seconds."""
+
+_ENDS_WITHIN_S: Final = 5.0
+"""Real time from a stop until a measurement that goes on is an error: a line may have to be finished first."""
+_DEAF: Final = "%s measures on %g s after the stop: stop it at the panel; until its end nothing is begun"
 
 
 class Activity(ABC):
@@ -61,6 +66,7 @@ class Activity(ABC):
         self._log = log
         self._stopping = self._failed = False
         self._refusals = 0
+        self._deaf_s = math.inf
         self._why_last_ended = ""
         self.call: LongCall | None = None
         self.curve_awaited = ""
@@ -89,6 +95,9 @@ class Activity(ABC):
         """
         if not what:
             self._stopping = False
+        elif self._stopping and self._clock.monotonic_s() >= self._deaf_s:
+            self._deaf_s = math.inf
+            self._log.error(_DEAF, self.program, _ENDS_WITHIN_S)
         if self._results.what not in ("", what):
             self.end()
         if what and not self._stopping and self._results.what != what:
@@ -135,6 +144,7 @@ class Activity(ABC):
     def stopped(self) -> None:
         """Record that a request has stopped the measurement, which has no result."""
         self._stopping, self.curve_awaited = True, ""
+        self._deaf_s = self._clock.monotonic_s() + _ENDS_WITHIN_S
         self._results.forget()
 
     def forget(self) -> None:

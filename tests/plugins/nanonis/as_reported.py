@@ -74,10 +74,11 @@ def _pulses(peer: Peer) -> list[Response]:
 
 
 def _stops(peer: Peer) -> list[Response]:
-    started = peer.act(names.START_SCAN)
+    assert peer.set(names.SCAN_SPEED, "20e-9").ok
+    started = peer.act_once_free(names.START_SCAN)
     peer.until(ScopeState.SCANNING)
     stopped = peer.act(names.STOP_SCAN)
-    peer.until(lambda one: isinstance(one, Scan))
+    peer.until(ScopeState.FREE)
     return [started, stopped]
 
 
@@ -97,7 +98,7 @@ FACTS: Final[dict[str, Fact]] = {
     as_reported.QPLUS_NAMES: Fact(),
     as_reported.FEW_PIXELS: Fact("scan-resolution-x|scan-size-x"),
     as_reported.UNKNOWN_STATUS: Fact("has the status 9, which no document names"),
-    as_reported.DEAF_STOP: Fact("stop", _stops),
+    as_reported.DEAF_STOP: Fact("measures on 5 s after the stop", _stops),
     as_reported.OFFSET_IN_VOLTS: Fact(
         why="set and returned alike: only a picture shows it, and `afspm commission` asks a person to compare one"
     ),
