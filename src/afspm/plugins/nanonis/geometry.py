@@ -147,7 +147,7 @@ class Probe(Group):
         return self._numbers("Piezo.CalibrGet")[:2], bool(on), limits_v
 
     def _ends_of_voltages_m(self) -> list[tuple[float, float]]:
-        # (! piezo-voltages) the range says nothing of voltage limits, which a person sets in the same module
+        # (! piezo-range) the range says nothing of voltage limits, which a person sets in the same module
         try:
             metres_per_volt, on, limits_v = self._voltages()
         except (NanonisError, UnreadableReply):
