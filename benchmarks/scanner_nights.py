@@ -48,8 +48,8 @@ def night(name: str, scanner: str, folder: Path) -> tuple[Path, bool]:
             ended = True
         except subprocess.TimeoutExpired:
             end = [sys.executable, "-m", "afspm", "end", "--yes", str(folder / scanner / "latest")]
-            subprocess.run(end, check=True, stdout=log, stderr=log)
-            process.wait()
+            subprocess.run(end, check=False, stdout=log, stderr=log)  # the night may just be ending by itself
+            process.wait(LONGEST_S)
             ended = False
     return folder / scanner / "latest", ended
 
