@@ -8,7 +8,7 @@ TEST := .venv/.test
 DEV := .venv/.dev
 
 .PHONY: demo demo-drift dev test test-times test-all test-slow test-power-cut test-apart test-lowest mutants test-samples test-matrix test-nion coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
-.PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift bench-guests soak chaos crowd simulate replay-nights power-cut acts docs release-check test-plug-ins changelog clean
+.PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift bench-guests soak chaos crowd scanner-nights simulate replay-nights power-cut acts docs release-check test-plug-ins changelog clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml packages/afspm-bench/pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -232,6 +232,10 @@ NIGHTS ?= 20
 CHAOS_SEED ?= $(shell date +%s)
 chaos: $(TEST)
 	@$(BIN)/python -m benchmarks.chaos --nights $(NIGHTS) --seed $(CHAOS_SEED)
+
+## the nights of demo and demo-drift with the default scanner and with a real one's statistics, side by side: half an hour
+scanner-nights: $(TEST)
+	@$(BIN)/python -m benchmarks.scanner_nights
 
 ## acts of a person at five emulated panels, between and in the requests of a run, and the same runs without one: a table
 ## by maker and kind of act. make acts CASES=3 tries 3 of each maker. Fails if a wrong result was published as complete

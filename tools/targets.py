@@ -20,6 +20,7 @@ LEFT_OUT: Final = {
     "mutants": "a part of `make test` with all cases, as the nightly runs it",
     "messages": "compiles message classes, as every set-up does",
     "real-data-record": "writes the record that `make real-data` compares with",
+    "scanner-nights": "has no targets: its figures are for reading",
     "test-nexus": "a part of test-tiled",
     "test-samples": "a part of test-slow",
     "test-times": "`make test` with a table",

@@ -236,6 +236,8 @@ class World:
         drift = self.sample.drift.at(course.row_times_s(0.25))
         truth = {
             **_truth_of_scan(self.sample, course, tips),
+            "under_start_m": self.under(region.center_m, start_s),
+            "under_end_m": self.under(region.center_m, course.end_s),
             "pressed_m": measured.pressed_m,
             "saturated": self.saturated(measured.channels["Current"][1]),
         }

@@ -7,6 +7,7 @@ from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
+import pytest
 
 from afspm.basics import ExperimentClock
 from afspm.model import (
@@ -73,6 +74,29 @@ def test_a_finished_scan_has_number_time_holder_place_and_parameters() -> None:
         "Scan": "no. 2", "Took": "10 s", "By": "series", "Size": "1 × 0.5 µm", "Centre": "(1, −0.5) µm",
         "Angle": "5.73°", "Pixels": "4 × 2", "Bias": "100 mV",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("newest_row", [None, 40])
+def test_unrest_of_z_leaves_out_slope_and_steps(newest_row: int | None) -> None:
+    # results C40
+    random = np.random.default_rng(4)
+    y, x = np.mgrid[:64, :128] * 1e-9
+    values = 0.1 * x - 0.2 * y + 3e-10 * (x > 50e-9) + 20e-12 * random.standard_normal((64, 128))
+    values += 50e-12 * random.standard_normal((64, 1))
+    if newest_row is not None:
+        values[:newest_row] = np.nan  # a scan from the top down
+    frame = ChannelFrame(1, "Height", "m", REGION, values, 50 * S if newest_row is None else None, 2, 64, newest_row)
+    text = dict(scan_facts(frame, overview_of([]), {}, 60 * S, ChannelRoles()))["Unrest of z"]
+    points_pm, lines_pm = (float(part.split()[0]) for part in text.split(", ")[:2])
+    assert points_pm == pytest.approx(20.0, rel=0.1)
+    assert lines_pm == pytest.approx(50.0, rel=0.5)  # of two dozen lines
+    assert text.endswith("(all lines, with the surface)" if newest_row is None else "(last 24 lines, with the surface)")
+
+
+@pytest.mark.parametrize(("unit", "values"), [("V", np.ones((32, 32))), ("m", np.ones((32, 32))), ("m", VALUES)])
+def test_unrest_of_z_is_left_out_where_it_means_nothing(unit: str, values: np.ndarray) -> None:
+    frame = ChannelFrame(1, "Height", unit, REGION, values, 50 * S, None, 2)
+    assert "Unrest of z" not in dict(scan_facts(frame, overview_of([]), {}, 60 * S, ChannelRoles()))
 
 
 def test_channel_is_named_and_a_retrace_is_called_one() -> None:

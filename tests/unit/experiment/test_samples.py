@@ -17,10 +17,10 @@ WITHOUT_A_MICROSCOPE = "every_microscope"  # its second file has it
 SECOND_FILES = sorted(p.name for p in (EXPERIMENTS / WITHOUT_A_MICROSCOPE).glob("*.toml") if p.stem != "experiment")
 SECOND_FILES += [str(maker.emulated) for maker in MAKERS.values()]
 NAMES = sorted(folder.name for folder in EXPERIMENTS.iterdir() if (folder / "experiment.toml").exists())
-OF_DRIFT = [f"{name}.toml" for name in ("simulator", *(name.lower() for name in MAKERS))]
+OF_DRIFT = [f"{name}.toml" for name in ("simulator", "stm-4k", *(name.lower() for name in MAKERS))]
 SAMPLES: list[tuple[str, ...]] = [(name,) for name in NAMES if name not in (WITHOUT_A_MICROSCOPE, "drift_night")]
 SAMPLES += [("drift_night", second) for second in OF_DRIFT]
-SAMPLES += [("best_points", "drift.toml")]
+SAMPLES += [("best_points", "drift.toml"), ("tip_repair", "stm-4k.toml")]
 SAMPLES += [(WITHOUT_A_MICROSCOPE, second) for second in SECOND_FILES]
 
 

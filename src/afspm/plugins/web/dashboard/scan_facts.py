@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
-from afspm.basics import NS_PER_S, duration_text, scale, time_of_day, typeset, typeset_area
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics import NS_PER_S, duration_text, quantity, scale, time_of_day, typeset, typeset_area
 from afspm.model import RETRACE, XY, ActByHand, ChannelRoles, TipStatus
 from afspm.plugins.web.frames import ChannelFrame
 from afspm.record import Overview, ScanSummary
 
+_LAST_LINES, _FEWEST = 32, 8
 Facts = list[tuple[str, str]]
 """Pairs of label and text."""
 
@@ -33,6 +37,7 @@ def scan_facts(
         ("Centre", _centre(region.center_m)),
         *angle,
         ("Pixels", f"{columns} × {rows}"),
+        *_unrest(frame),
         *(conditions or _recorded(frame, overview)).items(),
         *_tip_of_scan(frame, overview),
         *(("Note", note.text) for note in overview.notes if frame.time_ns and note.scan_ns == frame.time_ns),
@@ -65,6 +70,30 @@ def _tip_of_scan(frame: ChannelFrame, overview: Overview) -> Facts:
     until_ns = last.time_ns if last is not None and last.interrupted else overview.newest_ns
     began_ns = overview.newest_ns if frame.began_ns is None else frame.began_ns
     return tip_facts((), (act for act in overview.acts if began_ns <= act.time_ns <= until_ns))
+
+
+def _unrest(frame: ChannelFrame) -> Facts:
+    # every microscope has its z in scans, and not all have it elsewhere
+    rows = frame.values
+    if frame.newest_row is not None:  # the last lines, whichever way the scan goes
+        rows = rows[max(0, frame.newest_row - _LAST_LINES + 1) : frame.newest_row + _LAST_LINES]
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    if frame.unit != "m" or min(rows.shape) < _FEWEST:
+        return []
+    # for white noise a second difference has the variance 6, and a first one 2; slope and drift have none
+    points_m = _rms(np.diff(rows, 2, axis=1)) / math.sqrt(6.0)
+    steps_m = np.diff(np.median(rows, axis=1))
+    lines_m = _rms(steps_m - np.median(steps_m)) / math.sqrt(2.0)
+    if not min(points_m, lines_m) > 0.0:  # a height that is held, or rounded
+        return []
+    where = f"last {len(rows)} lines" if frame.newest_row is not None else "all lines"
+    shown = [typeset(quantity(one, "m", 2)) for one in (points_m, lines_m)]
+    return [("Unrest of z", f"{shown[0]} point to point, {shown[1]} line to line ({where}, with the surface)")]
+
+
+def _rms(differences: NDArray[np.float64]) -> float:
+    # robust: single steps and scars do not count
+    return float(1.4826 * np.median(np.abs(differences)))
 
 
 def _channel(name: str, roles: ChannelRoles) -> str:
