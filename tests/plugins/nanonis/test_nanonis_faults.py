@@ -478,6 +478,17 @@ def test_values_that_twice_can_not_be_read_are_left_out(bench: Make) -> None:
     assert scanned(peer)
 
 
+def test_scan_that_is_not_shown_at_once_is_no_move_of_the_tip_by_hand(bench: Make) -> None:
+    # nanonis.md, fact 13
+    made = bench(speed=1.0, as_reported=["late-status"])
+    peer = small(made)
+    before = peer.get(names.PROBE_POS_X)
+    assert peer.act(names.START_SCAN).ok
+    assert peer.get(names.PROBE_POS_X) == before
+    assert scans(peer.until(FREE))
+    assert "by hand" not in made.log_text()
+
+
 def test_unreadable_lines_end_the_lines_of_the_scan_alone(bench: Make) -> None:
     # nanonis.md, fact 15: a channel that is not recorded
     made = bench(speed=SEEN, other_layout=["Scan.FrameDataGrab"])

@@ -164,7 +164,7 @@ class Nanonis(Driver):
         self._grabs_at_s = 0.0
         self._kept = KeptSettings(_AT_FIRST)
         ask = self._ask
-        self._probe = geometry.Probe(ask, lambda: self.clock.now_s())
+        self._probe = geometry.Probe(ask, lambda: self.clock.now_s(), self._awaits_scan)
         feedback = parameter_groups.FeedbackOn(ask, lambda holds: self.wait_for(holds, reply_timeout_s))
         self._tip = parameter_groups.TipState(ask, lambda: self.log)
         self._side = [parameter_groups.SideGroup(group(ask)) for group in _SIDE]
@@ -205,6 +205,10 @@ class Nanonis(Driver):
                 folder,
             )
         self._files.look(folder)
+
+    def _awaits_scan(self) -> bool:
+        # it may move the tip before Nanonis shows it as running
+        return hasattr(self, "_files") and self._files.what == SCAN and not self._files.was_seen
 
     def _leave_out_unreadable(self) -> None:
         for group in self._side:

@@ -66,6 +66,7 @@ class Probe(Group):
 
     Args:
         now_s: returns experiment time.
+        awaits_scan: returns whether a scan was started that Nanonis does not show as running yet.
 
     Attributes:
         arrives_s: expected arrival, experiment time.
@@ -75,9 +76,9 @@ class Probe(Group):
     _finest_part: ClassVar[float] = 2e-6
     """Resolution of the converters, as a share of the scanner's range."""
 
-    def __init__(self, ask: Ask, now_s: Callable[[], float]) -> None:
+    def __init__(self, ask: Ask, now_s: Callable[[], float], awaits_scan: Callable[[], bool]) -> None:
         super().__init__(ask)
-        self._now_s = now_s
+        self._now_s, self._awaits_scan = now_s, awaits_scan
         self.arrives_s = 0.0
         self._goal_m: tuple[float, float] | None = None
         self._seen_m: tuple[float, float] | None = None
@@ -92,7 +93,7 @@ class Probe(Group):
         """
         if self._goal_m is not None:
             return self._goal_m
-        if self._seen_m is not None and not between_scans and self._ask("Scan.StatusGet")[0]:
+        if self._seen_m is not None and not between_scans and (self._ask("Scan.StatusGet")[0] or self._awaits_scan()):
             return self._seen_m
         # A difference below the converters' resolution does not count as a move.
         x, y = self._numbers("FolMe.XYPosGet", 0)
