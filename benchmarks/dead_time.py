@@ -41,7 +41,8 @@ CURVES = effort(12, 3)
 MORE_THAN_THE_SCRIPT_MS = 20.0
 COUNTED = 4
 """Measurements whose questions are counted."""
-AS_MANY = 2.0
+AS_MANY = 3.0
+"""Times the questions of a plain script: seven a scan prove that its frame, feedback and values are those claimed."""
 QUESTIONS_OF_A_CURVE = 18
 """A script asks one: its start. Seven more look at the end, seven before the start, whether a person has withdrawn the
 tip, measures or approaches."""
