@@ -8,7 +8,7 @@ TEST := .venv/.test
 DEV := .venv/.dev
 
 .PHONY: demo demo-drift dev test test-times test-all test-slow test-power-cut test-apart test-lowest mutants test-samples test-matrix test-nion coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
-.PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift bench-guests soak chaos crowd scanner-nights simulate replay-nights power-cut acts docs release-check test-plug-ins changelog clean
+.PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift bench-guests soak chaos crowd scanner-nights simulate replay-nights power-cut acts as-reported docs release-check test-plug-ins changelog clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml packages/afspm-bench/pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -247,6 +247,12 @@ acts: $(TEST)
 SCANS ?= 40
 crowd: $(TEST)
 	@$(BIN)/python -m benchmarks.crowd --scans $(SCANS)
+
+## what others report of real instruments, one report after the other, at the emulated Nanonis: which are noticed before the
+## tip is at the sample, and which in two scans. Fails if a report is neither noticed nor harmless
+REPORTS ?=
+as-reported: $(TEST)
+	@$(BIN)/python -m tests.plugins.nanonis.as_reported $(REPORTS)
 
 ## a long deterministic simulation: make simulate HOURS=100000 SEED=1
 HOURS ?= 20000

@@ -28,6 +28,7 @@ LEFT_OUT: Final = {
 }
 IN_TURN: Final = {
     "acts": "CASES=6",
+    "as-reported": "",
     "bench-drift": "EIGHTH=1",
     "chaos": "NIGHTS=4",
     "crowd": "",
