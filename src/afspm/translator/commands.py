@@ -6,7 +6,7 @@ import difflib
 import logging
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
 from typing import Any
@@ -17,6 +17,7 @@ from afspm.basics.plain_data import PlainMapping
 from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, names, request_name
 from afspm.model.microscope_status import STARTS
 from afspm.translator.driver_base import LOST, Action, DriverBase
+from afspm.translator.hurry import unhurried
 from afspm.translator.panel_watch import PanelWatch
 from afspm.translator.parameters import Value
 from afspm.translator.sequence import SequenceStep, StatusSequence
@@ -28,6 +29,8 @@ from afspm.wire import declared, encode
 NEVER_SHOWN = "it needs a withdrawn tip, and this microscope never shows the tip: do it by hand, after `afspm pause`"
 _ANNOUNCED = {one.set_by: one.name for one in declared() if one.set_by is not None}
 _SETTERS = (*_ANNOUNCED, ControlRequest.PARAM)
+ASIDE = "sent over the connection kept for it: its end is not seen while the other connections are lost"
+"""The reason in the answer to a withdrawal that no further look can confirm."""
 _MOST_CONTENDED = 2
 """Requests in a row that a client repeats because a person keeps changing the same values."""
 
@@ -174,9 +177,9 @@ class Commands:
         try:
             action.do()
         except LOST as error:
-            if action.name != names.RETRACT or not self._driver.withdraw_elsewhere():
+            if action.name != names.RETRACT or not self._withdrawn_elsewhere(error):
                 raise  # it may have been carried out
-            self._log.warning("the tip was withdrawn over the connection kept for it, since %s", error)
+            done.response = replace(done.response, reason=ASIDE)
         except Exception:  # a driver may raise anything; it is raised again
             treatment.forget()
             raise
@@ -185,6 +188,13 @@ class Commands:
         elif action.state is not None:
             done.steps = self._sequence.begin(action.state)
         return done
+
+    def _withdrawn_elsewhere(self, why: Exception) -> bool:
+        with unhurried():
+            is_done = self._driver.withdraw_elsewhere()
+        if is_done:
+            self._log.warning("the tip was withdrawn over the connection kept for it, since %s", why)
+        return is_done
 
     def _refuse_without_tip(self) -> None:
         # what the last look showed; a driver refuses by itself what else it knows, such as a safe tip

@@ -90,12 +90,15 @@ class Connection:
         """
         try:
             self.reach()
-        except LOST as error:
-            if not self._driver.withdraws_aside:
-                raise
-            self.why_lost = _reason(error)
+        except LOST:
+            raise
         except Exception as error:  # broad: a driver may raise anything, and the tip may be reachable all the same
             self._log.warning("connecting failed, and retracting the tip is tried all the same: %s", error)
+
+    def tell_lost(self) -> None:
+        """Publish again that the state is unknown, unless the controller is reached: something else was published."""
+        if not self.is_reached:
+            self._on_lost()
 
     def require(self) -> None:
         """Raise ControllerLost unless `stands`."""

@@ -335,7 +335,8 @@ class DriverBase(ABC):
     def needs_withdrawn(cls, action: Mapping[str, object]) -> bool:
         """Return whether an action of the experiment file needs a withdrawn tip."""
         command = str(action.get("command", ""))
-        return bool(action.get("withdrawn")) or bool(cls.coarse_commands and re.search(cls.coarse_commands, command))
+        is_coarse = bool(cls.coarse_commands and re.search(cls.coarse_commands, command))
+        return bool(action.get("withdrawn", is_coarse))  # `false` is a person's word for a command that is safe
 
     @classmethod
     def never_withdrawn(cls, settings: PlainMapping) -> tuple[str, ...]:
@@ -460,9 +461,13 @@ class DriverBase(ABC):
         """
         return None
 
+    serves_several: ClassVar[bool] = False
+    """True if a new connection is answered while another one is silent: a withdrawal then does not wait for the look
+    before it."""
+
     @property
     def withdraws_aside(self) -> bool:
-        """Whether the controller can be asked to withdraw the tip while the working connection is silent."""
+        """Whether `withdraw_elsewhere` can be tried while the working connection is silent or lost."""
         return False
 
     def withdraw_elsewhere(self) -> bool:

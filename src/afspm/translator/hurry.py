@@ -32,7 +32,17 @@ def hurried_by(withdraws: Callable[[], bool]) -> Iterator[None]:
     try:
         yield
     finally:
-        del _of_thread.withdraws
+        _of_thread.withdraws = None
+
+
+@contextmanager
+def unhurried() -> Iterator[None]:
+    """Let waits of this thread last as long as usual: there is no other way left."""
+    before, _of_thread.withdraws = getattr(_of_thread, "withdraws", None), None
+    try:
+        yield
+    finally:
+        _of_thread.withdraws = before
 
 
 def end_if_hurried(silent_s: float, what: str) -> None:

@@ -216,7 +216,8 @@ class Observer:
             values = True
         if values:
             withdrew = self._driver.withdrew_tip()
-            acts = self.panel.read(before, self.values, status.state, self._clock.now_ns(), withdrew)
+            state = self._of_controller(status.state)
+            acts = self.panel.read(before, self.values, state, self._clock.now_ns(), withdrew)
             if self._result_since_s is not None and any(map(self._spoils, acts)):
                 self._publish_earlier_scan()
             self._tell(acts)
@@ -269,6 +270,8 @@ class Observer:
         if isinstance(request.subject, Parameter):
             sets = (request.subject.name,)
         name = "" if action is None else action.name
+        if name == names.RETRACT:
+            self._is_unsettled, self._settled_s = False, None
         self.panel.asked(name, sets=sets)
         feedback = feedback_of(request)
         switches = action.switches_feedback if action else feedback is not None and feedback.on is not None
@@ -281,7 +284,8 @@ class Observer:
         before, is_changed = self.values, self._has_changed(*_TIP, *frame)
         self.observe(values=is_changed)
         if not is_changed:  # the same reading again is a second one
-            acts = self.panel.read(before, self.values, self._state.sequence.published.state, self._clock.now_ns())
+            state = self._of_controller(self._state.sequence.published.state)
+            acts = self.panel.read(before, self.values, state, self._clock.now_ns())
             self._tell(acts)
         self.claims.asks(request, self.values)
 
@@ -471,6 +475,10 @@ class Observer:
             return ScopeStatus(ScopeState.MOVING)
         self._is_unsettled, self._settled_s = False, None
         return status
+
+    def _of_controller(self, state: ScopeState) -> ScopeState:
+        # while the scanner settles the controller itself is free, and a person's changes are seen as between scans
+        return ScopeState.FREE if state is ScopeState.MOVING and self._settled_s is not None else state
 
     def _observe_values(self, announce: Sequence[str]) -> None:
         self._take_in(self._read())

@@ -6,6 +6,7 @@ import base64
 import hashlib
 import logging
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 
@@ -26,9 +27,10 @@ from afspm.model.fencing import Epoch, SchedulerFence
 from afspm.model.idempotency_cache import TOO_OLD, Floors
 from afspm.model.microscope_status import STARTS, feedback_of
 from afspm.model.sessions import number_of, run_of
-from afspm.translator.commands import Commands
+from afspm.translator.commands import ASIDE, CommandOutcome, Commands
 from afspm.translator.connection import Connection
 from afspm.translator.driver_base import LOST, DriverBase
+from afspm.translator.hurry import unhurried
 from afspm.translator.observer import Observer
 from afspm.translator.setting_groups import KeptSettings
 from afspm.translator.state import TranslatorState
@@ -75,6 +77,7 @@ class RequestHandler:
         self._outcomes = RequestOutcomes(state.kept, all_or_nothing=driver.memory_is_all)
         is_set = observer.is_set
         self.commands = Commands(driver, state.sequence, temporary, observer.panel, self._record_begin, is_set, log)
+        self._log = log
         self._acting: Request | None = None
         self.withdraws = False
         self._commander = b""
@@ -120,7 +123,8 @@ class RequestHandler:
 
     def act(self, action: str) -> Response:
         """Execute an action of the translator itself, and publish its steps."""
-        done = self.commands.do(Request(ControlRequest.ACTION, action))
+        request = Request(ControlRequest.ACTION, action)
+        done = self._withdrawn(request) if is_withdrawal(request) else self.commands.do(request)
         self._observer.play(done.steps)
         return done.response
 
@@ -133,11 +137,8 @@ class RequestHandler:
             connection.guarded(look)
         if request.subject != names.RETRACT:
             connection.require()
-        elif self.withdraws:  # the question whether there is such an action needs no controller
-            # a retract is always possible: a reachable controller suffices, even if its state can't be read
-            connection.reach_for_retract()
         try:
-            done = self.commands.do(request)
+            done = self._withdrawn(request) if self.withdraws else self.commands.do(request)
         finally:
             TRACE.command("")
         if done.response.ok and (feedback := feedback_of(request)) is not None:
@@ -149,6 +150,25 @@ class RequestHandler:
         observer.play(done.steps)
         if done.response.ok and (done.steps or done.announce):
             connection.guarded(partial(observer.observe, done.announce))
+            if done.response.reason == ASIDE:
+                connection.tell_lost()
+
+    def _withdrawn(self, request: Request) -> CommandOutcome:
+        # a retract is always possible: a reachable controller suffices, even if its state can't be read
+        driver, connection = self._driver, self._connection
+        if connection.stands or not driver.withdraws_aside:
+            with nullcontext() if driver.withdraws_aside else unhurried():
+                connection.reach_for_retract()
+        try:
+            with nullcontext() if driver.withdraws_aside else unhurried():
+                return self.commands.do(request)
+        except LOST as error:
+            if not driver.withdraws_aside:
+                raise
+            self._log.error("the tip can't be withdrawn over the connection kept for it: %s", error)
+        with unhurried():
+            connection.reach_for_retract()
+            return self.commands.do(request)
 
     def _is_kept(self, request: Request) -> bool:
         # it goes to the controller with the next action, before which the state is read

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 from afspm.basics.clock import Clock
 from afspm.model import Response, ScopeState, names
+from afspm.translator.commands import ASIDE
 from afspm.translator.connection import RETRY_S, Connection
 from afspm.translator.driver_base import LOST
 from afspm.translator.state import TranslatorState
@@ -49,6 +50,7 @@ class SafeExit:
         self._retracts = retracts
         self._act = act
         self._observe = observe
+        self._is_sent_aside = False
 
     def is_owed(self) -> bool:
         """Return whether the tip must be retracted before the process ends. Thread-safe."""
@@ -96,6 +98,8 @@ class SafeExit:
         while (state := self._state.sequence.published.state) is not ScopeState.FREE:
             sets_out = sets_out or state is ScopeState.COARSE_MOTOR
             if not self._connection.stands:
+                if self._is_sent_aside:
+                    return ""
                 return f"the controller is lost: {self._connection.why_lost}"
             if sets_out and state is ScopeState.INTERRUPTED:
                 return "the retract was interrupted"
@@ -113,8 +117,8 @@ class SafeExit:
         return "" if response.ok else response.reason or str(response.code)
 
     def _retract(self) -> Response:
-        self._connection.reach_for_retract()
         response = self._act(names.RETRACT)
+        self._is_sent_aside = response.ok and response.reason == ASIDE
         self._state.save()
         return response
 

@@ -164,7 +164,7 @@ class Translator:
 
     def _withdraws(self) -> bool:
         # called while an answer of the controller is awaited
-        if not self.driver.withdraws_aside:
+        if not (self.driver.withdraws_aside or self.driver.serves_several):
             return False
         if self.requests.withdraws or (self._leaves and self._safe_exit.is_owed()):
             return True

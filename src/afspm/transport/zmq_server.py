@@ -40,6 +40,7 @@ class ZmqServerPort(BasePort[Served]):
         self._has_keys = network.keys is not None and network.keys.binds_encrypted(serve, requests=True)
         self._asker: list[bytes] | None = None
         self._waiting: RequestReceived | None = None
+        self._waiting_asker: list[bytes] | None = None
         self._socket = network.socket(zmq.ROUTER)
         # The newest connection gets an identity. Without it, a scheduler that reconnects before its old connection
         # times out is ignored, and libzmq never frees the queue of its requests.
@@ -50,7 +51,9 @@ class ZmqServerPort(BasePort[Served]):
 
     def poll(self, timeout_s: float | None) -> list[Served]:
         # until `reply`, further requests wait in the socket: a readable socket would end every wait at once
-        waiting, self._waiting = self._waiting, None
+        waiting = None
+        if self._asker is None and self._waiting is not None:
+            waiting, self._waiting, self._asker = self._waiting, None, self._waiting_asker
         if is_busy := self._asker is not None:
             self._poller.pause(self._socket)
         try:
@@ -62,7 +65,10 @@ class ZmqServerPort(BasePort[Served]):
 
     def waiting_request(self) -> RequestReceived | None:
         if self._waiting is None:
+            # also while another request is being answered: its return path is kept apart
+            asker, self._asker = self._asker, None
             self._waiting = next((one for one in self._request() if isinstance(one, RequestReceived)), None)
+            self._waiting_asker, self._asker = self._asker, asker
         return self._waiting
 
     def _serve(self) -> list[Served]:

@@ -10,7 +10,7 @@ from deadlines import DEADLINE_S
 from tests.plugins.nanonis.nanonis_bench import Bench, Emulated
 from tests.plugins.vendor_bench import PATIENT, SOON, Peer, scanned, small
 
-from afspm.model import ControlResponse, Scan, ScopeState, names
+from afspm.model import ControlResponse, Scan, ScopeState, Spectrum, names
 from afspm.plugins.nanonis.emulator import DelayedReply
 
 Make = Callable[..., Bench]
@@ -134,3 +134,40 @@ def test_port_for_withdrawing_is_held_open_and_asked_for_nothing_else(bench: Mak
     asked = list[str]()
     made.at_panel(lambda emulated: asked.extend(emulated.asked[third]))
     assert asked == ["ZCtrl.OnOffGet"]
+
+
+def test_translator_that_never_reached_the_working_ports_withdraws_the_tip(bench: Make) -> None:
+    made = bench(**REAL)
+    first = small(made, **named(made, 3))
+    made.strike("wedged", count=2)
+    first.until(UNDEFINED)
+    assert holds(made, lambda emulated: wedged(emulated) == 2)
+    made.kill()
+    peer = made.start(**named(made, 3))
+    peer.until(UNDEFINED)
+    assert withdraws_within(made, peer) < DEADLINE_S
+
+
+def test_dialog_costs_no_port(bench: Make) -> None:
+    made = bench(**REAL)
+    peer = small(made, **named(made, 2))
+    made.strike("dialog", duration_s=9.0)
+    peer.until(UNDEFINED)
+    peer.until(FREE)
+    assert peer.act(names.START_SPEC).ok
+    peer.until(lambda one: isinstance(one, Spectrum))
+
+
+def test_tip_is_withdrawn_by_a_program_that_stalls_for_some_seconds(bench: Make) -> None:
+    made = bench(**REAL)
+    peer = small(made, **{**named(made, 3), **PATIENT})
+    made.strike("dialog", duration_s=4.0)
+    assert withdraws_within(made, peer) < DEADLINE_S
+
+
+def test_tip_is_withdrawn_although_a_stop_can_not_be_read(bench: Make) -> None:
+    made = bench(**REAL, other_layout=["BiasSpectr.Stop"])
+    peer = small(made, **named(made, 3))
+    made.strike("wedged", count=2)
+    peer.until(UNDEFINED)
+    assert withdraws_within(made, peer) < DEADLINE_S

@@ -42,6 +42,32 @@ def test_plain_req_socket_gets_answers_of_the_server(open_: Any, plain: Any, unt
         assert requester.recv_multipart() == response
 
 
+@pytest.mark.parametrize("is_busy", [False, True])
+def test_waiting_request_is_seen_before_its_turn_and_answered_in_it(
+    open_: Any, plain: Any, until: Any, is_busy: bool
+) -> None:
+    server = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=None))
+    first, second = plain(zmq.REQ), plain(zmq.REQ)
+    asked: list[Any] = []
+    for one in (first, second):
+        one.connect(server.serve_address)
+    if is_busy:
+        first.send_multipart(REQUESTS[0])
+        until(lambda: asked, (server, asked))
+    second.send_multipart(REQUESTS[1])
+    until(lambda: server.waiting_request() is not None)
+    assert server.waiting_request().frames == REQUESTS[1]
+    if is_busy:
+        assert server.poll(0.0) == [], "one request is being answered"
+        server.reply(RESPONSES[0])
+        assert first.recv_multipart() == RESPONSES[0]
+    (request,) = server.poll(0.0)
+    assert request.frames == REQUESTS[1]
+    assert server.waiting_request() is None
+    server.reply(RESPONSES[1])
+    assert second.recv_multipart() == RESPONSES[1]
+
+
 def test_newest_connection_of_a_name_is_served(open_: Any, plain: Any, until: Any) -> None:
     server = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=None))
     for _ in range(3):  # of which none is closed: who crashed with its computer is not found dead for seconds

@@ -26,6 +26,7 @@ from afspm.basics import ConfigError, Current, Duration, FileError, Refused, Vol
 from afspm.driver import (
     FRAME,
     SCAN,
+    ControllerLost,
     Driver,
     Entry,
     KeptSettings,
@@ -277,7 +278,10 @@ class Nanonis(Driver):
         return self.table[names.ZCTRL_SETPOINT].si_unit == "A"
 
     def refuse_unreachable(self, values: Mapping[str, Value]) -> None:
-        if names.ZCTRL_SETPOINT in values and self._holds_current:
+        if names.ZCTRL_SETPOINT not in values or not self._holds_current:
+            return
+        in_force = self.in_force([names.ZCTRL_SETPOINT])
+        if not self.same(names.ZCTRL_SETPOINT, values[names.ZCTRL_SETPOINT], in_force[names.ZCTRL_SETPOINT], in_force):
             self._preamplifier.refuse_beyond(float(values[names.ZCTRL_SETPOINT]))
 
     def get(self, vendor: str) -> Value:
@@ -407,11 +411,13 @@ class Nanonis(Driver):
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
         """Withdraw the tip by its piezo, even if the running measurement can't be stopped."""
+        if self._session is None or not hasattr(self, "_activity"):
+            raise ControllerLost("Nanonis was not reached yet", where=self.controller_at)
         # the approach first: a running approach would bring the withdrawn tip back
         for stop in (self._activity.stop_approach, self._activity.stop_measuring):
             try:
                 stop()
-            except protocol.NanonisError as error:
+            except (protocol.NanonisError, protocol.UnreadableReply) as error:
                 self.log.error("the measurement can't be stopped: %s; the tip is withdrawn all the same", error)
         self._ask("ZCtrl.Withdraw", _AT_ONCE, _NO_TIMEOUT)
 

@@ -15,7 +15,7 @@ from afspm.basics import lengths_text
 from afspm.driver import FRAME, POSITION, ParameterSpec, Value, check_speed, frame, frame_values, refuse_value
 from afspm.model import Region, names
 from afspm.plugins.nanonis.parameter_groups import Ask, Group, MoveSpeed, keep_speed
-from afspm.plugins.nanonis.protocol import BadReply, NanonisError, UnreadableReply
+from afspm.plugins.nanonis.protocol import BadReply, NanonisError
 
 _OUTPUT_V: Final = 10.0
 """Amount of the largest voltage of Nanonis' outputs, to which the piezo calibration belongs."""
@@ -140,24 +140,27 @@ class Probe(Group):
         """Warn if Nanonis does not report the voltages of the scanner."""
         try:
             self._voltages()
-        except (NanonisError, UnreadableReply) as error:
+        except (NanonisError, BadReply) as error:
             log.warning("the scanner's calibration and voltage limits are unknown, so only its range counts: %s", error)
 
     def _voltages(self) -> tuple[Sequence[float], bool, Sequence[float]]:
-        on, *limits_v = self._numbers("Piezo.XYZLimitsGet")
+        on, *limits_v = self._ask("Piezo.XYZLimitsGet")  # of limits that are off, any number
+        if on and not all(map(math.isfinite, limits_v)):
+            raise BadReply(f"Nanonis returned {limits_v} in reply to Piezo.XYZLimitsGet")
         return self._numbers("Piezo.CalibrGet")[:2], bool(on), limits_v
 
     def _ends_of_voltages_m(self) -> list[tuple[float, float]]:
         # (! piezo-range) the range says nothing of voltage limits, which a person sets in the same module
         try:
             metres_per_volt, on, limits_v = self._voltages()
-        except (NanonisError, UnreadableReply):
+        except (NanonisError, BadReply):
             return [(-math.inf, math.inf)] * 2  # `look` has named it
         ends_m = []
         for axis, factor in enumerate(metres_per_volt):
             low_v, high_v = limits_v[2 * axis : 2 * axis + 2] if on else (-_OUTPUT_V, _OUTPUT_V)
             low_m, high_m = sorted((factor * max(low_v, -_OUTPUT_V), factor * min(high_v, _OUTPUT_V)))
-            ends_m.append((low_m, high_m))
+            # limits of 0 V to 0 V, or a calibration of 0, are values that were never set
+            ends_m.append((low_m, high_m) if low_m < high_m else (-math.inf, math.inf))
         return ends_m
 
     def arrived(self) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 from afspm.basics import AfspmError
 from afspm.driver import ControllerLost, ControllerSilent, Driver, Receiver, TcpConnection
 from afspm.plugins.nanonis import protocol
-from afspm.plugins.nanonis.protocol import BadReply, NanonisError
+from afspm.plugins.nanonis.protocol import BadReply, NanonisError, UnreadableReply
 
 MODULES: Final = {"IV": "BiasSpectr", "force": "ZSpectr"}
 APPROACH: Final = "AutoApproach"
@@ -109,11 +109,9 @@ class Ports:
         some = [one for one in self.named if one != self.for_withdrawing]
         return sorted(some, key=lambda one: one in self.silent)
 
-    def besides(self, *taken: Address | None) -> Address | None:
-        """Return the next port beside those taken; None: there is none. A single port is never taken."""
-        if len(self.named) == 1:
-            return self.named[0]
-        return next((one for one in self.working() if one not in taken and one not in self.silent), None)
+    def besides(self, *taken: Address | None) -> list[Address]:
+        """Return the ports beside those taken, silent ones last. A single port is never taken."""
+        return list(self.named) if len(self.named) == 1 else [one for one in self.working() if one not in taken]
 
 
 class Session:
@@ -148,9 +146,9 @@ class Session:
         working = self._reach_first(ports, release)
         # each port of Nanonis serves one client, one call at a time: a blocking call needs a port of its own
         try:
-            at = ports.besides(working)
-            self._data_at = ports.besides(working, at) if len(ports.named) > 1 else None
-            second = None if at is None else self._connected(at, self._link.release)
+            at, second = self._reach_second(ports, working)
+            others = ports.besides(working, at) if len(ports.named) > 1 else []
+            self._data_at = next((one for one in others if one not in ports.silent), None)
             if second is None:
                 self._log.warning(_ALONE)
             silent = ports.silent.add
@@ -175,6 +173,21 @@ class Session:
                 ports.silent.discard(address)
                 return address
         raise AssertionError("there is a port")
+
+    def _reach_second(self, ports: Ports, working: Address) -> tuple[Address | None, Link | None]:
+        """Return the port for blocking calls and its connection; one that was silent must answer a question first."""
+        for address in ports.besides(working):
+            link = self._connected(address, self._link.release)
+            try:
+                if address in ports.silent:
+                    link.ask("Scan.StatusGet")
+            except ControllerLost as error:
+                self._log.warning("the port %d still stays silent: %s", address[1], error)
+                link.close()
+                continue
+            ports.silent.discard(address)
+            return address, link
+        return None, None
 
     def _open_first(self, address: Address, ports: Ports, release: int | None) -> None:
         try:
@@ -215,6 +228,8 @@ class Session:
             if self._data is None:
                 self._data = self._connected(self._data_at, self._link.release)
             return self._data.ask(name, *arguments)
+        except UnreadableReply:
+            raise
         except ControllerLost as error:
             self._log.warning("the data of scans comes over the first port from now on: %s", error)
             self._data_at = None
@@ -418,11 +433,14 @@ class WithdrawalPort:
             ("Scan.Action", stop, no_direction),
             *((f"{module}.Stop",) for module in MODULES.values()),
         )
-        for name, *arguments in stops:
-            try:
-                self._asked(str(name), *arguments)
-            except NanonisError as error:  # most often what does not run, or was not purchased
-                self._log.info("%s before the tip is withdrawn: %s", name, error)
+        try:
+            for name, *arguments in stops:
+                try:
+                    self._asked(str(name), *arguments)
+                except (NanonisError, UnreadableReply) as error:  # most often it does not run, or was not purchased
+                    self._log.info("%s before the tip is withdrawn: %s", name, error)
+        except ControllerLost as error:  # a connection that was held for a minute may be gone
+            self._log.warning("the port kept for withdrawing the tip is connected again: %s", error)
         self._asked("ZCtrl.Withdraw", at_once, no_timeout)
 
     def _asked(self, name: str, *arguments: object) -> None:
@@ -430,6 +448,8 @@ class WithdrawalPort:
             self._link = self._connected(_WITHDRAWS_WITHIN_S)
         try:
             self._link.ask(name, *arguments)
+        except UnreadableReply:
+            raise
         except ControllerLost:
             self.close()
             raise

@@ -79,4 +79,5 @@ class TipShaper:
 
 
 def _is_same(found: float, wanted: float) -> bool:
-    return math.isclose(found, wanted, rel_tol=1e-6)  # float32
+    # a time may be rounded to a cycle of the controller, and a length to a step of its converters
+    return math.isclose(found, wanted, rel_tol=0.01, abs_tol=1e-12)

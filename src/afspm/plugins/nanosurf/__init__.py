@@ -71,6 +71,7 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
     maker: ClassVar[str] = "Nanosurf"
     software: ClassVar[str] = "Nanosurf Studio"
     program: ClassVar[str] = StudioActivity.program
+    serves_several: ClassVar[bool] = True
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
     never_shows: ClassVar = {
@@ -168,10 +169,6 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
     def stop_spec(self) -> None:
         self.session().do(commands.STOP_CURVE)
         self.activity.stopped()
-
-    @property
-    def withdraws_aside(self) -> bool:
-        return True  # each withdrawal has a connection of its own
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:

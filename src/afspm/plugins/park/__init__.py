@@ -63,6 +63,7 @@ class Park(ScriptedDriver[Session, SmartScanActivity]):
     maker: ClassVar[str] = "Park Systems"
     software: ClassVar[str] = "SmartScan"
     program: ClassVar[str] = SmartScanActivity.program
+    serves_several: ClassVar[bool] = True
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0 + SETTLE_S
     coarse_commands: ClassVar[str] = r"\b(zstage|xystage)\b"
@@ -164,10 +165,6 @@ class Park(ScriptedDriver[Session, SmartScanActivity]):
     def stop_spec(self) -> None:
         self.session().do(STOP_CURVE)
         self.activity.stopped()
-
-    @property
-    def withdraws_aside(self) -> bool:
-        return True  # each withdrawal has a connection of its own
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:

@@ -13,6 +13,7 @@ from afspm.model import RETRACE, XY, ActByHand, ChannelRoles, TipStatus
 from afspm.plugins.web.frames import ChannelFrame
 from afspm.record import Overview, ScanSummary
 
+_MOST_LINES = 512
 _LAST_LINES, _FEWEST = 32, 8
 Facts = list[tuple[str, str]]
 """Pairs of label and text."""
@@ -77,6 +78,7 @@ def _unrest(frame: ChannelFrame) -> Facts:
     rows = frame.values
     if frame.newest_row is not None:  # the last lines, whichever way the scan goes
         rows = rows[max(0, frame.newest_row - _LAST_LINES + 1) : frame.newest_row + _LAST_LINES]
+    rows = rows[-_MOST_LINES:]  # of a finished scan: the page waits for it
     rows = rows[np.isfinite(rows).all(axis=1)]
     if frame.unit != "m" or min(rows.shape) < _FEWEST:
         return []
@@ -86,7 +88,8 @@ def _unrest(frame: ChannelFrame) -> Facts:
     lines_m = _rms(steps_m - np.median(steps_m)) / math.sqrt(2.0)
     if not min(points_m, lines_m) > 0.0:  # a height that is held, or rounded
         return []
-    where = f"last {len(rows)} lines" if frame.newest_row is not None else "all lines"
+    is_part = frame.newest_row is not None or len(frame.values) > _MOST_LINES
+    where = f"{'last ' if frame.newest_row is not None else ''}{len(rows)} lines" if is_part else "all lines"
     shown = [typeset(quantity(one, "m", 2)) for one in (points_m, lines_m)]
     return [("Unrest of z", f"{shown[0]} point to point, {shown[1]} line to line ({where}, with the surface)")]
 
