@@ -41,8 +41,8 @@ def act_after(
     owner, trigger, left = owner_of(made.emulator), of_frame if frame else of_value, [act]
     plain = getattr(owner, name)
 
-    def setting(*given: Any) -> object:
-        done = plain(*given)
+    def setting(*given: Any, **how: Any) -> object:
+        done = plain(*given, **how)
         # SmartScan is asked for a value by the same function
         if left and trigger in given and "get" not in given:
             left.pop()(made.emulator)
