@@ -124,6 +124,9 @@ def export(
     ] = "gwy",
     out: Annotated[Path | None, opt("Where to write. Default: export in the folder of the run.", metavar="DIR")] = None,
     scans: Annotated[str | None, opt("Only these scans, by their numbers; 7-: from 7 on.", metavar="1-5,8")] = None,
+    channel: Annotated[
+        list[str] | None, opt("Pictures of this channel alone, by role or name; several times.", metavar="CHANNEL")
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Write the scans and spectra of a recorded run in another format.
@@ -138,7 +141,7 @@ def export(
     with open_run(run) as record, ProgressLine(f"writing {to}", quiet=quiet) as line:
         folder = out or record.folder / "export" / to
         for count, file in enumerate(
-            exported(record, to, folder, scans, lambda text: line.say(f"left out: {text}")), 1
+            exported(record, to, folder, scans, lambda text: line.say(f"left out: {text}"), channel or ()), 1
         ):
             line.step(f"{count} files, {file.name}")
     if not quiet:

@@ -202,11 +202,12 @@ class Survey(Component):
             return
         self._keep(self._record)
         from afspm.components.surveying import figure  # matplotlib: needed at the end alone
+        from afspm.record.plotting import save_figure
 
         drawn = figure.survey_figure(self._record, title=self.name, simulated=self.simulated)
         path = Path(self.run_dir) / f"{self.file}.png"
         for suffix in (".png", ".pdf"):  # the second for `afspm export --to pdf`: the record does not have all of it
-            drawn.savefig(path.with_suffix(suffix), dpi=figure.DPI)
+            save_figure(drawn, path.with_suffix(suffix), figure.DPI)
         self.log.info("the survey is drawn: %s", path)
 
     def _set(self, parameters: Mapping[str, str | float]) -> None:

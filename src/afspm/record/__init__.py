@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from afspm.record.journal import JOURNAL_FILE
     from afspm.record.overview import ScanSummary
     from afspm.record.packets import RecordPlayback
-    from afspm.record.plotting import draw_scale_bar
+    from afspm.record.plotting import draw_scale_bar, save_figure
     from afspm.record.report.markup import document, section, table
     from afspm.record.run_json import ENDED, EXPERIMENT_FILE, STATE_DIR, experiment_name, run_json_or_empty
     from afspm.record.tables import ScanRow, SpectrumRow
@@ -128,6 +128,7 @@ __all__ = [
     "round_length_m",
     "rows_that_differ",
     "run_json_or_empty",
+    "save_figure",
     "section",
     "shadow_report",
     "shared_range",

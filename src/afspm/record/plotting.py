@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, cast
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -15,13 +15,22 @@ from afspm.record.drawing.palette import PALETTES, colour_map
 from afspm.record.drawing.raster import ValueRange, value_range
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from matplotlib.axes import Axes
     from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
 
     from afspm.model.scan import Scan
 
 KINDS: Final = ("image", "contour", "surface")
 _LEVELS: Final = 12
+
+
+WITH_ASPECT: Final = "compressed"
+"""Layout of a figure with a picture of fixed aspect: with "constrained" a first drawing cuts the labels beside it."""
+_EMBEDDED: Final = 42
+"""Type of fonts in a PDF whose texts stay texts; some journals refuse matplotlib's usual type 3."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +70,8 @@ def draw(
 
     given: Any = axes
     if given is None:
-        given = plt.figure(layout="constrained").add_subplot(projection="3d" if kind == "surface" else None)
+        layout, projection = ("constrained", "3d") if kind == "surface" else (WITH_ASPECT, None)
+        given = plt.figure(layout=layout).add_subplot(projection=projection)
         given.set_title(_title(scan), fontsize=9)
     is_first = not given.has_data()
     own, unit = scale(max(abs(low), abs(high)), scan.unit)
@@ -101,6 +111,15 @@ def _explain(scan: Scan, drawn: object, axes: Any, label: str, *, colorbar: bool
         axes.figure.colorbar(drawn, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), label=label)
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     draw_scale_bar(axes, (right - left, high - low), (left, low), 1.0)
+
+
+def save_figure(figure: Figure, file: Path | BinaryIO, dpi: float, suffix: str | None = None) -> None:
+    """Write a figure in the format of `suffix`, by default of the file's; `dpi`: of parts with pixels."""
+    import matplotlib
+
+    with matplotlib.rc_context({"pdf.fonttype": _EMBEDDED, "ps.fonttype": _EMBEDDED}):
+        figure.draw_without_rendering()  # the first layout of a picture with fixed aspect may still cut labels
+        figure.savefig(file, dpi=dpi, format=suffix)
 
 
 def draw_scale_bar(

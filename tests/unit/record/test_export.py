@@ -17,7 +17,7 @@ import pytest
 from record_lab import REGION, Night
 
 import afspm
-from afspm.basics.errors import FileError, InvalidValue
+from afspm.basics.errors import FileError, InvalidValue, NoSuchItem
 from afspm.model import Scan, ScopeState, Spectrum
 from afspm.model.line_levelling import flattened
 from afspm.record.export import chosen, eln, export, png
@@ -268,6 +268,24 @@ def test_pictures_are_there_for_every_channel(run: Run, tmp_path: Path) -> None:
     assert names[:2] == ["0001_Height.png", "0001_Height_Retrace.png"]
     assert len(names) == 2 + 2 + 1 + 1
     assert all((tmp_path / "out" / name).read_bytes().startswith(b"\x89PNG") for name in names)
+
+
+def test_pictures_of_one_channel_are_asked_for_by_role(run: Run, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    names = [file.name for file in export(run, "png", tmp_path / "out", "1-2", channels=["Height Retrace"])]
+    assert names == ["0001_Height_Retrace.png", "0002_Height_Retrace.png"]
+    with pytest.raises(NoSuchItem, match="there are Height"):
+        list(export(run, "pdf", tmp_path / "out", "1", channels=["current"]))
+    with pytest.raises(InvalidValue, match="--channel is for pictures"):
+        list(export(run, "gwy", tmp_path / "out", channels=["Height"]))
+
+
+def test_text_of_a_figure_for_print_is_text(run: Run, tmp_path: Path) -> None:
+    # some journals refuse fonts of type 3
+    pytest.importorskip("matplotlib")
+    (file, _) = export(run, "pdf", tmp_path / "out", "1")
+    assert b"/Type3" not in file.read_bytes()
+    assert b"/TrueType" in file.read_bytes() or b"/CIDFontType2" in file.read_bytes()
 
 
 def test_figures_for_print_are_those_of_each_measurement_and_of_the_night(run: Run, tmp_path: Path) -> None:

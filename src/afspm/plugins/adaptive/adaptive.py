@@ -141,11 +141,12 @@ class Adaptive(Component):
         with self._outage.trying():  # on a full disk the error is logged, and the picture is tried
             write_atomic(folder / f"{self.file}.csv", [self._table(found).encode()])
         from afspm.plugins.adaptive.map_picture import DPI, draw_map  # matplotlib: needed at the end alone
+        from afspm.record import save_figure
 
         drawn = draw_map(found, self._region, title=self.name, simulated=self.simulated)
         path = folder / f"{self.file}.png"
         for suffix in (".png", ".pdf"):  # the second for `afspm export --to pdf`: the fit is not in the record
-            drawn.savefig(path.with_suffix(suffix), dpi=DPI)
+            save_figure(drawn, path.with_suffix(suffix), DPI)
         self.log.info("the map is drawn: %s", path)
 
     def _table(self, found: MapProgress) -> str:

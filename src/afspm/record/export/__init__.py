@@ -1,7 +1,8 @@
 """A recorded run in other file formats: `afspm export`.
 
 An exporter is a module that a package declares by its format. `write(run, row)` yields (suffix, content) of each file
-of a scan or spectrum. Two functions are optional: `tables(run, scans, spectra)` yields (name, content) of files about
+of a scan or spectrum. Three functions are optional: `write_channels(channels, run, row)` is `write` for pictures of
+some channels, `tables(run, scans, spectra)` yields (name, content) of files about
 the whole run, and `grid_file(stack, metadata)` returns the spectra of a grid as one file.
 A format with one file for many measurements has `archive(run, scans, spectra, folder)` instead of `write`: it
 writes such files, which may be larger than memory, and yields their paths. Measurements whose file can't be opened are
@@ -14,6 +15,7 @@ import logging
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -36,7 +38,12 @@ Writer = Callable[[Run, ScanRow | SpectrumRow], Iterator[tuple[str, bytes]]]
 
 
 def export(
-    run: Run, to: str, folder: Path, scans: str | None = None, tell: Callable[[str], None] = _log.warning
+    run: Run,
+    to: str,
+    folder: Path,
+    scans: str | None = None,
+    tell: Callable[[str], None] = _log.warning,
+    channels: Sequence[str] = (),
 ) -> Iterator[Path]:
     """Write a run in another format, and yield the path of each written file.
 
@@ -45,15 +52,18 @@ def export(
         folder: created if it is missing.
         scans: numbers of scans, as for `chosen`, without spectra; None: all scans and spectra.
         tell: called with a message for each omitted measurement; by default it is logged as a warning.
+        channels: channels of scans to draw, by role or by the maker's names, for a format of pictures; none: all.
 
     Raises:
-        InvalidValue: there is no such format, or no such scan.
+        InvalidValue: there is no such format, or no such scan, or the format has all channels in one file.
         FileError: a file can't be written.
     """
     module = entry_points.load(entry_points.EXPORTERS, to)
     if module is None:
         hint = f"one of {', '.join(entry_points.names(entry_points.EXPORTERS))}"
         raise InvalidValue(f"there is no format {to!r}", hint=hint)
+    if channels and not hasattr(module, "write_channels"):
+        raise InvalidValue(f"{to} has all channels of a scan in one file", hint="--channel is for pictures: png, pdf")
     wanted = list(run.scans) if scans is None else chosen(list(run.scans), scans)
     for row in wanted:
         if not row.file:
@@ -68,7 +78,8 @@ def export(
             return
         for name, content in module.tables(run, wanted, spectra) if hasattr(module, "tables") else ():
             yield _written(folder / name, content)
-        yield from _write_each(module.write, run, [*wanted, *spectra], folder, tell)
+        write = partial(module.write_channels, channels) if channels else module.write
+        yield from _write_each(write, run, [*wanted, *spectra], folder, tell)
         for name, stack in grids(run, spectra, tell) if hasattr(module, "grid_file") else ():
             yield _written(folder / f"{name}.{to}", module.grid_file(stack, run.metadata))
     except OSError as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from afspm.record.export import png
 from afspm.record.report import pictures, story
@@ -14,7 +14,12 @@ _DPI = 300
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
     """Yield (suffix, content) of a figure for each channel of a scan, or of a spectrum."""
-    for suffix, figure in png.figures(run, row):
+    yield from write_channels((), run, row)
+
+
+def write_channels(channels: Sequence[str], run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
+    """Yield as `write`, of some channels by role or by the maker's names; none: all."""
+    for suffix, figure in png.figures(run, row, channels):
         for axes in figure.axes:
             for mesh in axes.collections:
                 mesh.set_rasterized(True)  # of one square for each pixel a viewer shows the seams

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ from afspm.basics.clock import iso_utc
 from afspm.model import Scan, Spectrum
 from afspm.model.line_levelling import flattened
 from afspm.record.export import file_word
+from afspm.record.plotting import WITH_ASPECT, save_figure
 from afspm.record.report.pictures import is_topography
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
@@ -25,15 +26,26 @@ _DPI = 150
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
     """Yield (suffix, content) of an image for each channel of a scan, or of a spectrum."""
-    for suffix, figure in figures(run, row):
+    yield from write_channels((), run, row)
+
+
+def write_channels(channels: Sequence[str], run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
+    """Yield as `write`, of some channels by role or by the maker's names; none: all."""
+    for suffix, figure in figures(run, row, channels):
         yield f"{suffix}.png", content(figure, "png")
 
 
-def figures(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, Figure]]:
-    """Yield (suffix, figure) of each channel of a scan, or of a spectrum."""
+def figures(run: Run, row: ScanRow | SpectrumRow, channels: Sequence[str] = ()) -> Iterator[tuple[str, Figure]]:
+    """Yield (suffix, figure) of each channel of a scan, or of a spectrum.
+
+    Raises:
+        NoSuchItem: the scan has no such channel.
+    """
     time = f"{iso_utc(row.time_ns)[:19].replace('T', ' ')} UTC"
     if isinstance(row, ScanRow):
-        for channel, scan in run.scan(row).items():
+        there = run.scan(row)
+        for scan in [there[name] for name in channels] or there.values():
+            channel = scan.channel
             is_levelled = is_topography(channel)
             shown = replace(scan, values=flattened(scan.values)) if is_levelled else scan
             title = _title(run, f"{channel}{', lines levelled' if is_levelled else ''}, {time}", row.interrupted)
@@ -47,7 +59,7 @@ def scan_figure(scan: Scan, title: str) -> Figure:
     """Return a figure of a scan with colour bar and scale bar."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(5.2, 4.6), layout="constrained")
+    figure = Figure(figsize=(5.2, 4.6), layout=WITH_ASPECT)
     axes = figure.add_subplot()
     if np.isfinite(scan.values).any():
         scan.plot(axes=axes)
@@ -73,7 +85,7 @@ def spectrum_figure(spectrum: Spectrum, title: str) -> Figure:
 def content(figure: Figure, suffix: str, dpi: int = _DPI) -> bytes:
     """Return a figure as a file of a format that matplotlib knows by this suffix; `dpi`: of parts with pixels."""
     file = io.BytesIO()
-    figure.savefig(file, dpi=dpi, format=suffix)
+    save_figure(figure, file, dpi, suffix)
     return file.getvalue()
 
 

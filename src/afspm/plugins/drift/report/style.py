@@ -18,7 +18,7 @@ from matplotlib.ticker import FuncFormatter
 from afspm import Array, flattened
 from afspm.basics import Plain, scale
 from afspm.plugins.drift.registration import DriftScan
-from afspm.record import ValueRange, draw_scale_bar, shared_range
+from afspm.record import ValueRange, draw_scale_bar, save_figure, shared_range
 
 WIDTH_IN = 7.2  # two columns of a journal
 ORANGE, BLUE, GREEN, MAGENTA, GREY = "#EE7733", "#0077BB", "#009988", "#EE3377", "#999999"  # P. Tol's vibrant scheme
@@ -56,7 +56,7 @@ def figure(width_in: float, height_in: float) -> Figure:
 
 def save(made: Figure, path: Path) -> None:
     """Write a figure in the format of the file's suffix."""
-    made.savefig(path, dpi=DPI)
+    save_figure(made, path, DPI)
 
 
 def unit_of(*lengths_m: Array | float) -> tuple[str, float]:
