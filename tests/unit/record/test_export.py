@@ -9,18 +9,21 @@ import json
 import re
 import struct
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from picture_borders import cut_sides
 from record_lab import REGION, Night
 
 import afspm
 from afspm.basics.errors import FileError, InvalidValue, NoSuchItem
-from afspm.model import Scan, ScopeState, Spectrum
+from afspm.model import Region, Scan, ScopeState, Spectrum
 from afspm.model.line_levelling import flattened
 from afspm.record.export import chosen, eln, export, png
+from afspm.record.plotting import save_figure
 from afspm.record.run import Run
 from afspm.record.store import RecordStore
 
@@ -268,6 +271,49 @@ def test_pictures_are_there_for_every_channel(run: Run, tmp_path: Path) -> None:
     assert names[:2] == ["0001_Height.png", "0001_Height_Retrace.png"]
     assert len(names) == 2 + 2 + 1 + 1
     assert all((tmp_path / "out" / name).read_bytes().startswith(b"\x89PNG") for name in names)
+
+
+SIDES = {"square": (1e-6, 1e-6), "wide": (3e-6, 0.6e-6), "high": (0.5e-6, 4e-6)}
+
+
+def of_size(size_m: tuple[float, float]) -> Scan:
+    values = 1e-9 * np.random.default_rng(1).normal(size=(24, 32))
+    return Scan(Region((0.0, 0.0), size_m, 0.2), "Height (retrace)", "m", values)
+
+
+def curve() -> Spectrum:
+    volts = np.linspace(-1.0, 1.0, 50)
+    values = np.column_stack([volts, 1e-9 * volts**3, 1e-10 * volts])
+    return Spectrum((0.0, 0.0), "IV", ("bias", "current", "conductance"), ("V", "A", "S"), values)
+
+
+def exported(name: str) -> Callable[[Path], None]:
+    return lambda path: save_figure(png.scan_figure(of_size(SIDES[name]), "a title"), path, 100)
+
+
+def plotted(kind: str, name: str) -> Callable[[Path], None]:
+    def plot(path: Path) -> None:
+        figure = of_size(SIDES[name]).plot(kind).get_figure(root=True)
+        assert figure is not None
+        figure.savefig(path)
+
+    return plot
+
+
+BORDERED: dict[str, Callable[[Path], None]] = {
+    **{f"export, {name}": exported(name) for name in SIDES},
+    **{f"plot, {name}": plotted("image", name) for name in SIDES},
+    "surface": plotted("surface", "square"),
+    "export, curve": lambda path: save_figure(png.spectrum_figure(curve(), "a title"), path, 100),
+}
+
+
+@pytest.mark.parametrize("name", BORDERED)
+def test_nothing_is_cut_at_the_border_of_a_picture(name: str, tmp_path: Path) -> None:
+    # users N1: labels were half outside
+    pytest.importorskip("matplotlib")
+    BORDERED[name](tmp_path / "picture.png")
+    assert cut_sides(tmp_path / "picture.png") == []
 
 
 def test_pictures_of_one_channel_are_asked_for_by_role(run: Run, tmp_path: Path) -> None:
