@@ -61,7 +61,7 @@ def read_other(path: Path, zone: tzinfo | None) -> FileContent:
         if done.returncode != 0 or not made.is_file():
             said = done.stderr.decode("utf-8", "replace").strip().splitlines()
             raise OtherFormat(f"can't be read by Gwyddion's converter either: {said[-1] if said else 'no reason'}")
-        content = read_gwyddion(made, zone)
+        content = read_gwyddion(made, zone, is_converted=True)
     by = f"Gwyddion, module {_module(done.stdout)}"
     scans = tuple(replace(one, region=one.region.moved_to((0.0, 0.0)), filename=str(path)) for one in content.scans)
     spectra = tuple(replace(spectrum, filename=str(path)) for spectrum in content.spectra)

@@ -1,7 +1,8 @@
 """Reader of Gwyddion's own files (.gwy): images, and the curves of graphs. The format: `record.export.gwyddion`.
 
 Of the files that `afspm export --to gwy` writes it takes the exact region and the unmeasured pixels: there a mask
-means "not measured", elsewhere anything. Volume data, selections and views are left out.
+means "not measured", as in files by Gwyddion's converter; in a person's own it may mean anything. Selections and views
+are left out.
 """
 
 from __future__ import annotations
@@ -12,11 +13,11 @@ import struct
 from collections.abc import Iterator, Mapping
 from datetime import tzinfo
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from afspm.basics.errors import FileError
+from afspm.basics.errors import FileError, UnitError
 from afspm.basics.plain_data import Plain
 from afspm.basics.units import convert
 from afspm.model import Frame, Region, Scan, Spectrum
@@ -27,16 +28,28 @@ from afspm.storage.formats.content import FileContent, text_of
 _MAGIC: Final = b"GWYP"
 _IMAGE: Final = re.compile(r"/(\d+)/data")
 _GRAPH: Final = re.compile(r"/(?:\d+/)?graph/graph/(\d+)")
+_OTHERS: Final = {"brick": "volume data", "surface": "points in space", "sps": "spectra"}
+_OTHER: Final = re.compile(rf"/({'|'.join(_OTHERS)})/(\d+)")
+_UNREADABLE: Final = (FileError, UnitError, KeyError, ValueError)
+_MOST: Final = {"m": 1.0, "N": 1e-3, "V": 1e5, "A": 10.0}
+"""Largest amounts of a measurement with a scanning probe, by unit."""
+_MOST_OF_ALL: Final = 1e30
 _NUMBERS: Final = {"b": "?", "c": "c", "i": "<i4", "q": "<i8", "d": "<f8"}
 _DEEPEST: Final = 20
 """Most objects in each other; a damaged file may announce any number."""
 
 
-def read_gwyddion(path: Path, zone: tzinfo | None) -> FileContent:
+def read_gwyddion(path: Path, zone: tzinfo | None, *, is_converted: bool = False) -> FileContent:
     """Return each image as a scan, and the curves over the same values as one spectrum.
 
+    An image or graph that can't be read is left out, and named with the reason in `left_out`; so is volume data.
+
+    Args:
+        is_converted: the file is by Gwyddion's converter: a mask means "not measured", and an image or graph with
+            impossible values is left out.
+
     Raises:
-        FileError, UnitError, KeyError, ValueError: the file is damaged, holds neither, or its sides are no lengths.
+        FileError: the file is damaged, or nothing of it can be read.
     """
     data = path.read_bytes()
     if not data.startswith(_MAGIC):
@@ -45,13 +58,45 @@ def read_gwyddion(path: Path, zone: tzinfo | None) -> FileContent:
     if end != len(data):
         raise FileError(f"has {len(data) - end} bytes after its last object")
     numbers = sorted(int(match[1]) for key in content if (match := _IMAGE.fullmatch(key)))
-    scans = tuple(_scan(content, number, str(path)) for number in numbers)
+    others = sorted(match.groups() for key in content if (match := _OTHER.fullmatch(key)))
+    left_out = [f"{_OTHERS[kind]} no. {number}: afspm reads images and graphs of Gwyddion" for kind, number in others]
+    scans: list[Scan] = []
+    for number in numbers:
+        try:
+            scans.append(_possible(_scan(content, number, str(path), is_converted), is_converted))
+        except _UNREADABLE as error:  # one channel must not cost the others
+            left_out.append(f"{content.get(f'/{number}/data/title', f'image {number}')}: {_reason(error)}")
     graphs = [(int(match[1]), graph) for key, graph in content.items() if (match := _GRAPH.fullmatch(key))]
     meta = _meta(content, numbers[0] if numbers else 0)
-    spectra = tuple(_spectra([graph for _, graph in sorted(graphs, key=lambda one: one[0])], meta, str(path)))
+    spectra: list[Spectrum] = []
+    try:
+        in_order = [graph for _, graph in sorted(graphs, key=lambda one: one[0])]
+        spectra += (_possible(one, is_converted) for one in _spectra(in_order, meta, str(path)))
+    except _UNREADABLE as error:
+        left_out.append(f"curves of graphs: {_reason(error)}")
     if not scans and not spectra:
-        raise FileError("holds neither images nor curves of graphs: afspm reads no volume data of Gwyddion")
-    return FileContent("Gwyddion", scans, spectra, meta, _whole(meta, "began_ns"), _whole(meta, "time_ns"))
+        raise FileError(f"holds no image and no graph that can be read{': ' if left_out else ''}{'; '.join(left_out)}")
+    times = _whole(meta, "began_ns"), _whole(meta, "time_ns")
+    return FileContent("Gwyddion", tuple(scans), tuple(spectra), meta, *times, left_out=tuple(left_out))
+
+
+def _reason(error: Exception) -> str:
+    return f"it lacks {error}" if isinstance(error, KeyError) else str(error)
+
+
+T = TypeVar("T", Scan, Spectrum)
+
+
+def _possible(found: T, is_converted: bool) -> T:
+    # the converter believes any bytes: half a file has become values up to 1e299 m, and a deflection newtons
+    if not is_converted:
+        return found
+    columns = [(found.unit, found.values)] if isinstance(found, Scan) else zip(found.units, found.values.T, strict=True)
+    for unit, values in columns:
+        most = float(np.nanmax(np.abs(values), initial=0.0))
+        if most > _MOST.get(unit, _MOST_OF_ALL):
+            raise FileError(f"has values up to {most:.3g} {unit}, which no measurement has: a wrong unit, or damage")
+    return found
 
 
 def _meta(content: Plain, number: int) -> dict[str, str]:
@@ -63,16 +108,17 @@ def _whole(meta: Mapping[str, str], name: str) -> int | None:
     return int(text) if text.isdecimal() else None
 
 
-def _scan(content: Plain, number: int, filename: str) -> Scan:
+def _scan(content: Plain, number: int, filename: str, is_converted: bool) -> Scan:
     field, meta = content[f"/{number}/data"], _meta(content, number)
     values, unit = _pixels(field)[::-1].copy(), _unit(field, "si_unit_z")
     title = content.get(f"/{number}/data/title", f"Channel {number + 1}")
+    mask = content.get(f"/{number}/mask")
+    if mask is not None and (is_converted or "angle_rad" in meta):
+        values[_pixels(mask)[::-1] > 0.5] = np.nan
     if "angle_rad" not in meta:
         return Scan(_region(field), title, unit, values, None, filename)
     angle_rad, frame = float(meta["angle_rad"]), Frame(meta["frame"])
     region = Region(_pair(meta["center_m"]), _pair(meta["size_m"]), angle_rad, frame)
-    if (mask := content.get(f"/{number}/mask")) is not None:
-        values[_pixels(mask)[::-1] > 0.5] = np.nan
     roles = tuple(filter(None, meta.get("roles", "").split(ROLES_APART)))
     return Scan(region, title, unit, values, _whole(meta, "time_ns"), meta.get("filename", ""), roles=roles)
 
@@ -147,7 +193,8 @@ def _value(kind: str, data: bytes, at: int, end: int, depth: int) -> tuple[Any, 
         return _object(data, at, end, depth + 1)
     if kind in _NUMBERS:
         size = np.dtype(_NUMBERS[kind]).itemsize
-        return np.frombuffer(data[at : at + size], _NUMBERS[kind])[0].item(), at + size
+        found = np.frombuffer(data[at : at + size], _NUMBERS[kind])[0].item()
+        return text_of(found) if kind == "c" else found, at + size
     (count,) = struct.unpack_from("<I", data, at)
     at, item = at + 4, kind.lower()
     if item in _NUMBERS:

@@ -118,7 +118,12 @@ def apply(
     for name in other(after, wanted):
         driver.put_in_force(former)
         made, asked = (table[name].quantity(one) for one in (after[name], wanted[name]))
-        raise refuse_value(name, f"the controller set {made} instead of {asked}; the former values were restored")
+        apart = ""
+        if made == asked and isinstance(after[name], float):  # equal in the digits shown
+            off = table[name].quantity(abs(float(after[name]) - float(wanted[name])))
+            apart = f", {off} off: if that is its precision, its row needs a `resolution`"
+        what = f"the controller set {made} instead of {asked}{apart}; the former values were restored"
+        raise refuse_value(name, what)
     return after
 
 

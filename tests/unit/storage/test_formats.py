@@ -250,3 +250,16 @@ def test_nothing_is_loaded_that_a_file_does_not_need(tmp_path: Path) -> None:
         [sys.executable, "-c", code, str(tmp_path / "a.sxm")], capture_output=True, encoding="utf-8", check=True
     )
     assert out.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("mode", ["r", "r+", "a"])
+@pytest.mark.parametrize("locking", [None, True, False, "best-effort"])
+def test_hdf5_file_that_this_process_has_open_is_read(tmp_path: Path, mode: str, locking: bool | str | None) -> None:
+    # contributors K3, results X7
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "nsid.h5"
+    WHOLE["nsid.h5"](path)
+    expected = afspm.read(path).scans[0].values
+    with h5py.File(path, mode, locking=locking):
+        np.testing.assert_array_equal(afspm.read(path).scans[0].values, expected)
+    np.testing.assert_array_equal(afspm.read(path).scans[0].values, expected)

@@ -552,6 +552,13 @@ def test_value_changed_by_the_controller_is_refused_and_restored(bench: Any) -> 
     assert bench.ask(PARAM, Parameter("scan-speed", "5", "um/s")).code == OK
 
 
+def test_difference_below_the_digits_shown_is_in_the_reason(bench: Any) -> None:
+    # contributors K4
+    bench.microscope.stuck = {"Bias": 100.00001}
+    reason = bench.ask(PARAM, Parameter("tip-bias-voltage", "100", "mV")).reason
+    assert "set 100 mV instead of 100 mV, 1e-05 mV off: if that is its precision" in reason
+
+
 def test_change_in_the_rest_of_the_frame_is_refused_and_restored(bench: Any, monkeypatch: Any) -> None:
     plain, values = bench.microscope.set, bench.microscope.values
 

@@ -43,6 +43,8 @@ class _Grid:
     records: Array
     parameters: tuple[tuple[str, str], ...]
     channels: tuple[tuple[str, str], ...]
+    cut_bytes: int
+    """Bytes of a last record that is not whole."""
 
     def parameter(self, name: str) -> Array | None:
         """Return a parameter of each point, or None without it."""
@@ -67,7 +69,8 @@ def read_grid(path: Path, zone: tzinfo | None) -> FileContent:
     region = _region(grid)
     scans = () if region is None else tuple(_scans(grid, region, end, str(path)))
     spectra = tuple(_spectra(grid, region, str(path)))
-    return FileContent(CONTROLLER, scans, spectra, grid.header, start, end, upwards=True)
+    cut = (f"the record of point {len(grid.records) + 1}: the file ends in it",) if grid.cut_bytes else ()
+    return FileContent(CONTROLLER, scans, spectra, grid.header, start, end, upwards=True, left_out=cut)
 
 
 def _parsed(content: bytes) -> _Grid:
@@ -87,10 +90,11 @@ def _parsed(content: bytes) -> _Grid:
     if min(columns, rows) < 1 or columns * rows > _MOST:
         raise FileError(f"its header announces a grid of {columns} x {rows} points")
     size = 4 * (len(parameters) + len(channels) * points)
-    if not data or len(data) % size or len(data) > size * columns * rows:
-        raise FileError(f"is incomplete: {len(data)} bytes of values, not up to {columns * rows} times {size}")
+    data, rest = data[: len(data) - len(data) % size], len(data) % size
+    if not data or len(data) > size * columns * rows:
+        raise FileError(f"is incomplete: {len(data) + rest} bytes of values, not up to {columns * rows} times {size}")
     records = np.frombuffer(data, ">f4").reshape(-1, size // 4).astype(np.float64)
-    return _Grid(header, columns, rows, records, parameters, channels)
+    return _Grid(header, columns, rows, records, parameters, channels, rest)
 
 
 def _field(header: dict[str, str], name: str) -> str:

@@ -14,6 +14,7 @@ beside its writer, so that a change of that format is made in one room.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import tzinfo
@@ -27,6 +28,7 @@ from afspm.storage.formats.content import FileContent, OtherFormat
 __all__ = ["FileContent", "OtherFormat", "read", "suffixes"]
 
 
+_log = logging.getLogger("afspm.storage")
 _ANY = "*"
 """The suffix of readers that try the files of all others."""
 Reader = Callable[[Path, tzinfo | None], FileContent]
@@ -45,7 +47,8 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     The suffix of the file selects the reader: of a maker's format, of Gwyddion's simple fields (.gsf), or of NeXus
     (.h5, .nxs), be it afspm's record, an exported grid of spectra or the file of another program. `afspm doctor`
     lists the suffixes. Gwyddion's converter, if it is installed (`afspm[formats]`), reads some 170 further formats. If
-    two channels have the same name, the second becomes "name #2".
+    two channels have the same name, the second becomes "name #2". What a file has and the reader leaves out is logged
+    as a warning, and stands in `left_out`.
 
     Args:
         zone: time zone of the controller's clock, which most files do not state; None: the zone of this computer.
@@ -57,7 +60,10 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     if not path.is_file():
         raise FileError("no such file", where=str(path), hint="a relative path begins in the current folder")
     try:
-        return _with_unique_channels(_first_that_reads(path, zone))
+        found = _with_unique_channels(_first_that_reads(path, zone))
+        for one in found.left_out:
+            _log.warning("%s: left out: %s", path, one)
+        return found
     except FileError as error:
         if error.where:
             raise

@@ -32,6 +32,7 @@ class FileContent:
         header: all further entries, unchanged.
         start_ns, end_ns: start and end of the measurement, ns since the Unix epoch; None if unknown.
         upwards: whether small y was scanned first; None if unknown.
+        left_out: what of the file was not read, each with its reason.
     """
 
     controller: str
@@ -41,6 +42,7 @@ class FileContent:
     start_ns: int | None = None
     end_ns: int | None = None
     upwards: bool | None = None
+    left_out: tuple[str, ...] = ()
 
     def __iter__(self) -> Iterator[Scan | Spectrum]:
         yield from self.scans

@@ -37,9 +37,14 @@ def opened(path: Path) -> h5py.File:
 
     if not is_hdf5(path):
         raise FileError("is not an HDF5 file", where=str(path))
-    _check_heaps(path.read_bytes(), path)
-    # without a lock: files are written whole, and another program (or a file system without locks) may hold one
-    file = h5py.File(path, "r", locking=False)
+    data = path.read_bytes()
+    _check_heaps(data, path)
+    try:
+        # without a lock: files are written whole, and another program (or a file system without locks) may hold one
+        file = h5py.File(path, "r", locking=False)
+    except OSError:
+        # if this process has the file open, as a notebook may, HDF5 opens it again with the same mode and lock alone
+        file = h5py.File(h5py.h5f.open_file_image(data))
     try:
         _check_links(file, path)
     except BaseException:  # after any error, Ctrl-C too, the caller has no file to close
