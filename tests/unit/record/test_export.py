@@ -293,8 +293,10 @@ def exported(name: str) -> Callable[[Path], None]:
 
 def plotted(kind: str, name: str) -> Callable[[Path], None]:
     def plot(path: Path) -> None:
-        figure = of_size(SIDES[name]).plot(kind).get_figure(root=True)
-        assert figure is not None
+        from matplotlib.figure import Figure
+
+        figure = of_size(SIDES[name]).plot(kind).figure
+        assert isinstance(figure, Figure)
         figure.savefig(path)
 
     return plot
