@@ -266,8 +266,9 @@ def test_a_phone_shows_one_part_at_a_time_below_a_bar_that_stays(
     assert page.evaluate("document.documentElement.scrollHeight") < 1600
     assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
     page.evaluate("window.scrollTo(0, 5000)")
-    page.locator("[data-part=mode]").wait_for(state="visible")
-    bar, tabs = (page.locator(part).bounding_box() for part in ("[data-part=mode]", ".tabs"))
+    # in one step: the page may replace a part between finding it and asking for its place
+    places = "['[data-part=mode]', '.tabs'].map((one) => document.querySelector(one).getBoundingClientRect().toJSON())"
+    bar, tabs = page.evaluate(places)
     assert 0 <= bar["y"] < 150
     assert page.locator("h1").is_visible(), "the name of the experiment"
     assert tabs["y"] + tabs["height"] == pytest.approx(844, abs=1)
