@@ -573,8 +573,13 @@ class DriverBase(ABC):
         """
         return self._reach
 
-    def refuse_unreachable(self, values: Mapping[str, Value]) -> None:  # noqa: B027 (most have nothing to ask)
+    def refuse_unreachable(  # noqa: B027 (most have nothing to ask)
+        self, values: Mapping[str, Value], before: Mapping[str, Value]
+    ) -> None:
         """Raise Refused for values that the controller would take as set, and could not bring about.
+
+        Args:
+            before: the values in force, at least of these parameters.
 
         Called after the table's ranges have been checked, before anything is set. Override where the controller
         reports present bounds.

@@ -15,7 +15,7 @@ from afspm.translator.driver_base import ControllerLost
 
 SILENT_S: Final = 1.0
 """Real time without an answer after which a withdrawal waits no longer."""
-EVERY_S: Final = 0.1
+_EVERY_S: Final = 0.1
 """Real time between two tests while an answer is awaited."""
 
 _of_thread = threading.local()
@@ -33,6 +33,11 @@ def hurried_by(withdraws: Callable[[], bool]) -> Iterator[None]:
         yield
     finally:
         _of_thread.withdraws = None
+
+
+def step_s(left_s: float) -> float:
+    """Return how long to wait before the next test: all of `left_s` in a thread that nothing hurries."""
+    return left_s if getattr(_of_thread, "withdraws", None) is None else min(left_s, _EVERY_S)
 
 
 @contextmanager

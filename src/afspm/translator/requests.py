@@ -6,7 +6,6 @@ import base64
 import hashlib
 import logging
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 
@@ -156,16 +155,11 @@ class RequestHandler:
     def _withdrawn(self, request: Request) -> CommandOutcome:
         # a retract is always possible: a reachable controller suffices, even if its state can't be read
         driver, connection = self._driver, self._connection
-        if connection.stands or not driver.withdraws_aside:
-            with nullcontext() if driver.withdraws_aside else unhurried():
-                connection.reach_for_retract()
-        try:
-            with nullcontext() if driver.withdraws_aside else unhurried():
+        if driver.withdraws_aside:  # a controller that is lost is not connected to first
+            try:
                 return self.commands.do(request)
-        except LOST as error:
-            if not driver.withdraws_aside:
-                raise
-            self._log.error("the tip can't be withdrawn over the connection kept for it: %s", error)
+            except LOST as error:
+                self._log.error("the tip can't be withdrawn over the connection kept for it: %s", error)
         with unhurried():
             connection.reach_for_retract()
             return self.commands.do(request)

@@ -86,7 +86,7 @@ def apply(
     wanted = {**before, **values}
     if framed or not values.keys().isdisjoint(POSITION):
         check_together(wanted, driver.reach(), driver.max_pixels)
-    driver.refuse_unreachable(values)
+    driver.refuse_unreachable(values, before)
     former = {name: value for name, value in before.items() if not table[name].read_only}
 
     def other(now: Mapping[str, Value], than: Mapping[str, Value]) -> dict[str, Value]:

@@ -11,7 +11,7 @@ from typing import Final, TypeVar
 
 from afspm.basics.errors import ConfigError
 from afspm.translator.driver_base import ControllerLost, ControllerSilent
-from afspm.translator.hurry import EVERY_S, end_if_hurried
+from afspm.translator.hurry import end_if_hurried, step_s
 from afspm.translator.trace import TCP, TRACE, TracedAnswer
 
 _AT_ONCE: Final = 1 << 20  # bounds the buffer of one `recv`: a reply may announce any size
@@ -50,7 +50,7 @@ class Receiver:
             left_s = self._until_s - self._monotonic_s()
             if left_s <= 0.0:
                 raise TimeoutError
-            self._socket.settimeout(min(left_s, EVERY_S))
+            self._socket.settimeout(step_s(left_s))
             with suppress(TimeoutError):
                 part = self._socket.recv(min(most, _AT_ONCE))
                 break

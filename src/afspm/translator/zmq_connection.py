@@ -11,7 +11,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from afspm.basics.errors import ConfigError
 from afspm.translator.driver_base import ControllerLost, ControllerSilent
-from afspm.translator.hurry import EVERY_S, end_if_hurried
+from afspm.translator.hurry import end_if_hurried, step_s
 from afspm.translator.trace import TRACE, ZEROMQ, TracedAnswer
 
 T = TypeVar("T")
@@ -141,7 +141,7 @@ class ZmqConnection:
 
     def _await_reply(self, what: str, until_s: float) -> None:
         asked_s = self._monotonic_s()
-        while not self._socket.poll(math.ceil(min(max(0.0, until_s - self._monotonic_s()), EVERY_S) * 1000.0)):
+        while not self._socket.poll(math.ceil(step_s(max(0.0, until_s - self._monotonic_s())) * 1000.0)):
             now_s = self._monotonic_s()
             if now_s >= until_s:
                 self.close()

@@ -197,7 +197,7 @@ class Asylum(ScriptedDriver[Session, AsylumActivity]):
             return self.session().text("GS", vendor)
         return self.session().values([vendor])[vendor]
 
-    def refuse_unreachable(self, values: Mapping[str, Value]) -> None:
+    def refuse_unreachable(self, values: Mapping[str, Value], before: Mapping[str, Value]) -> None:
         setpoint = values.get(names.ZCTRL_SETPOINT)
         is_amplitude = self.table[names.ZCTRL_SETPOINT].vendor == _AMPLITUDE
         if is_amplitude and setpoint is not None and float(setpoint) <= 0.0:

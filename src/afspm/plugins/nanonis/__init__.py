@@ -103,8 +103,8 @@ class Nanonis(Driver):
 
     Args:
         address: "host:port,port,port": ports at File > Settings Options > TCP Programming Interface; each serves one
-            client: for quick requests, for calls that last, and for withdrawing the tip alone; a fourth one
-            is taken if one of the first two stays silent. An emulator needs a single port.
+            client: for quick requests, for calls that last, for withdrawing the tip alone, and for the data of scans or
+            in place of one of the first two that stays silent. An emulator needs a single port.
         session_dir: local path of Nanonis' session folder. Default: the path that Nanonis reports. Data in unreachable
             files is fetched over TCP.
         release: release of Nanonis' software (Help > Info), if the software reports none or a wrong release.
@@ -277,12 +277,12 @@ class Nanonis(Driver):
     def _holds_current(self) -> bool:
         return self.table[names.ZCTRL_SETPOINT].si_unit == "A"
 
-    def refuse_unreachable(self, values: Mapping[str, Value]) -> None:
-        if names.ZCTRL_SETPOINT not in values or not self._holds_current:
+    def refuse_unreachable(self, values: Mapping[str, Value], before: Mapping[str, Value]) -> None:
+        setpoint = values.get(names.ZCTRL_SETPOINT)
+        if setpoint is None or not self._holds_current:
             return
-        in_force = self.in_force([names.ZCTRL_SETPOINT])
-        if not self.same(names.ZCTRL_SETPOINT, values[names.ZCTRL_SETPOINT], in_force[names.ZCTRL_SETPOINT], in_force):
-            self._preamplifier.refuse_beyond(float(values[names.ZCTRL_SETPOINT]))
+        if not self.same(names.ZCTRL_SETPOINT, before[names.ZCTRL_SETPOINT], setpoint, before):
+            self._preamplifier.refuse_beyond(float(setpoint))
 
     def get(self, vendor: str) -> Value:
         """Return a value by the prefix of a pair of functions: "Bias." means Bias.Get."""

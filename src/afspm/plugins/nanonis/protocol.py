@@ -141,20 +141,12 @@ class ReceivedText(str):
     def of(cls, raw: bytes, code_page: str) -> ReceivedText:
         """Decode as UTF-8, otherwise by the code page of Nanonis' computer, otherwise as `text_of`."""
         text = text_of(raw)
-        if code_page:
+        for encoding in (code_page, "utf-8") if code_page else ():  # the last one that fits
             with suppress(UnicodeDecodeError):
-                text = raw.decode("utf-8" if _is_utf8(raw) else code_page)
+                text = raw.decode(encoding)
         found = cls(text)
         found.raw = raw
         return found
-
-
-def _is_utf8(raw: bytes) -> bool:
-    try:
-        raw.decode("utf-8")
-    except UnicodeDecodeError:
-        return False
-    return True
 
 
 def results(name: str, body: bytes | bytearray, release: int = NEWEST, code_page: str = "") -> tuple[object, ...]:

@@ -45,24 +45,24 @@ class TipShaper:
             Refused: ACTION_ERROR: the module is closed, a qPlus sensor would ring, or other values are in force than
                 those just set.
         """
-        self._properties()  # before anything is set
+        self._properties("nothing was sent")
         bias_v = numbers(self._ask, "Bias.Get")[0]
         self._refuse_at(bias_v)
         ramp_s = depth_m / speed_m_s
         # the tip shaper's second lift undoes the first
         ramps = (-depth_m, ramp_s, bias_v, _SETTLE_S, depth_m, ramp_s, _SETTLE_S)
         self._ask("TipShaper.PropsSet", _SETTLE_S, _SAME_BIAS, bias_v, *ramps, _RESTORE)
-        *_, is_restored = found = self._properties()
+        *_, is_restored = found = self._properties("it was not started")
         if not is_restored or not all(map(_is_same, found[3:10], ramps)):
             values = ", ".join(f"{value:g}" for value in found)
             raise Refused(ControlResponse.ACTION_ERROR, f"the Tip Shaper has other values than those set: {values}")
         return 2 * ramp_s + 4 * _SETTLE_S
 
-    def _properties(self) -> tuple[Any, ...]:
+    def _properties(self, so: str) -> tuple[Any, ...]:
         try:
             return self._ask("TipShaper.PropsGet")
         except (NanonisError, UnreadableReply) as error:
-            reason = f"the Tip Shaper does not answer, so nothing was sent: open it at Nanonis ({error})"
+            reason = f"the Tip Shaper does not answer, so {so}: open it at Nanonis ({error})"
             raise Refused(ControlResponse.ACTION_ERROR, reason) from error
 
     def _refuse_at(self, bias_v: float) -> None:

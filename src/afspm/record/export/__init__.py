@@ -1,9 +1,9 @@
 """A recorded run in other file formats: `afspm export`.
 
 An exporter is a module that a package declares by its format. `write(run, row)` yields (suffix, content) of each file
-of a scan or spectrum. Three functions are optional: `write_channels(channels, run, row)` is `write` for pictures of
-some channels, `tables(run, scans, spectra)` yields (name, content) of files about
-the whole run, and `grid_file(stack, metadata)` returns the spectra of a grid as one file.
+of a scan or spectrum; a module with `PICTURES` has a third argument, the channels to draw. Two functions are optional:
+`tables(run, scans, spectra)` yields (name, content) of files about the whole run, and `grid_file(stack, metadata)`
+returns the spectra of a grid as one file.
 A format with one file for many measurements has `archive(run, scans, spectra, folder)` instead of `write`: it
 writes such files, which may be larger than memory, and yields their paths. Measurements whose file can't be opened are
 not among `scans` and `spectra`.
@@ -62,7 +62,7 @@ def export(
     if module is None:
         hint = f"one of {', '.join(entry_points.names(entry_points.EXPORTERS))}"
         raise InvalidValue(f"there is no format {to!r}", hint=hint)
-    if channels and not hasattr(module, "write_channels"):
+    if channels and not hasattr(module, "PICTURES"):
         raise InvalidValue(f"{to} has all channels of a scan in one file", hint="--channel is for pictures: png, pdf")
     wanted = list(run.scans) if scans is None else chosen(list(run.scans), scans)
     for row in wanted:
@@ -78,7 +78,7 @@ def export(
             return
         for name, content in module.tables(run, wanted, spectra) if hasattr(module, "tables") else ():
             yield _written(folder / name, content)
-        write = partial(module.write_channels, channels) if channels else module.write
+        write = partial(module.write, channels=channels) if channels else module.write
         yield from _write_each(write, run, [*wanted, *spectra], folder, tell)
         for name, stack in grids(run, spectra, tell) if hasattr(module, "grid_file") else ():
             yield _written(folder / f"{name}.{to}", module.grid_file(stack, run.metadata))

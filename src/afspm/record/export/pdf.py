@@ -9,16 +9,12 @@ from afspm.record.report import pictures, story
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 
+PICTURES = True
 _DPI = 300
 
 
-def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
+def write(run: Run, row: ScanRow | SpectrumRow, channels: Sequence[str] = ()) -> Iterator[tuple[str, bytes]]:
     """Yield (suffix, content) of a figure for each channel of a scan, or of a spectrum."""
-    yield from write_channels((), run, row)
-
-
-def write_channels(channels: Sequence[str], run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
-    """Yield as `write`, of some channels by role or by the maker's names; none: all."""
     for suffix, figure in png.figures(run, row, channels):
         for axes in figure.axes:
             for mesh in axes.collections:

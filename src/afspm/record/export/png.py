@@ -21,16 +21,12 @@ from afspm.record.tables import ScanRow, SpectrumRow
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+PICTURES = True
 _DPI = 150
 
 
-def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
+def write(run: Run, row: ScanRow | SpectrumRow, channels: Sequence[str] = ()) -> Iterator[tuple[str, bytes]]:
     """Yield (suffix, content) of an image for each channel of a scan, or of a spectrum."""
-    yield from write_channels((), run, row)
-
-
-def write_channels(channels: Sequence[str], run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
-    """Yield as `write`, of some channels by role or by the maker's names; none: all."""
     for suffix, figure in figures(run, row, channels):
         yield f"{suffix}.png", content(figure, "png")
 

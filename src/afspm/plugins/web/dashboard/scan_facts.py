@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm import SD_PER_MAD
 from afspm.basics import NS_PER_S, duration_text, quantity, scale, time_of_day, typeset, typeset_area
 from afspm.model import RETRACE, XY, ActByHand, ChannelRoles, TipStatus
 from afspm.plugins.web.frames import ChannelFrame
@@ -96,7 +97,7 @@ def _unrest(frame: ChannelFrame) -> Facts:
 
 def _rms(differences: NDArray[np.float64]) -> float:
     # robust: single steps and scars do not count
-    return float(1.4826 * np.median(np.abs(differences)))
+    return float(SD_PER_MAD * np.median(np.abs(differences)))
 
 
 def _channel(name: str, roles: ChannelRoles) -> str:
