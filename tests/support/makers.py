@@ -21,7 +21,7 @@ class Maker:
         name: as of `afspm emulate`; driver: the short name of the driver's class.
         heights: a channel with heights.
         address: of the controller at a "{port}" of this computer.
-        files: the setting for the folder of the controller's files, "{here}" in place of "{there}".
+        files: the settings that a replay needs, as of the folder of the files, "{here}" in place of "{there}".
         transports: of the emulator, beside the usual one.
     """
 
