@@ -597,6 +597,8 @@ class Run:
         self.unfinished = ""
         self._newest: Wanted | None = None
         self._states: list[ScopeState] = []
+        self._newest_ns: dict[bytes, int] = {}
+        """Over restarts: a translator that was killed publishes its last results again, which no component sees."""
         self._peer: Peer
 
     def log(self, text: str) -> None:
@@ -730,6 +732,7 @@ class Run:
 
     def _start_translator(self) -> None:
         self._peer = self._made.start()
+        self._peer.newest_ns = self._newest_ns
         self.log("translator started")
         until_s = time.monotonic() + 60.0
         while ScopeState.FREE not in self._states and time.monotonic() < until_s:

@@ -65,7 +65,7 @@ class Peer:
         for prefix in (b"", b"ScanLines"):  # by the first a plain socket means what version 1 has
             self._packets.subscribe(prefix)
         self._packets.connect(publish)
-        self._newest_ns: dict[bytes, int] = {}
+        self.newest_ns: dict[bytes, int] = {}
         for each in (self._request, self._packets):
             each.setsockopt(zmq.LINGER, 0)
             each.setsockopt(zmq.RCVTIMEO, int(DEADLINE_S * 1000))
@@ -109,8 +109,8 @@ class Peer:
             envelope, payload, stamp = self._packets.recv_multipart()
             time_ns = wire.frames.decode_time(stamp)
             # a plain socket that has just joined gets what is kept after what is published meanwhile
-            if time_ns > self._newest_ns.get(envelope, 0):
-                self._newest_ns[envelope] = time_ns
+            if time_ns > self.newest_ns.get(envelope, 0):
+                self.newest_ns[envelope] = time_ns
                 return wire.decode(envelope.decode(), payload)
 
     def until(self, wanted: Callable[[Any], bool] | ScopeState) -> list[Any]:
