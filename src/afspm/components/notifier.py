@@ -32,6 +32,7 @@ from afspm.components.notifications import (
 )
 from afspm.model import ControlMode, ControlState, JournalEntries, ProcessCondition, ProcessStates
 from afspm.model.events import LOGGED_AS, LogLines
+from afspm.model.problems import QUIET_HOURS
 from afspm.record.run_json import experiment_name
 
 MOST_TOLD = 1000
@@ -108,12 +109,14 @@ class Notifier(Component):
     def on_control(self, control_state: ControlState) -> None:
         since_ns = self.packet.time_ns if self.packet and self.packet.time_ns is not None else self.clock.now_ns()
         before: dict[str, int] = self.memory["flagged"]
-        for number in before.keys() - {str(number) for number in control_state.problems}:
+        quiet = self.scope.problems.get(QUIET_HOURS)  # no problem to anyone
+        flagged = {str(number) for number in control_state.problems if number != quiet}
+        for number in before.keys() - flagged:
             lasted_ns = since_ns - before[number]
             if lasted_ns >= self.unsolved_after * 1e9:
                 text = f"{self.scope.problems.name(int(number))} is solved, after {duration_text(lasted_ns * 1e-9)}"
                 self._queue_once(SOLVED, f"{number} {before[number]}", text)
-        now = {str(number): before.get(str(number), since_ns) for number in control_state.problems}
+        now = {number: before.get(number, since_ns) for number in flagged}
         if now != before:
             self.memory["flagged"] = now
             self.memory.save()

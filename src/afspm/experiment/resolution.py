@@ -30,7 +30,7 @@ from afspm.experiment.sections import parse, read_sections
 from afspm.experiment.toml_lines import Table
 from afspm.experiment.wiring_classes import BoundSocket
 from afspm.model import STOPPED_BY_AGENT, ChannelRoles, PacketHeader, Parameter, ProblemNames, Role
-from afspm.model.problems import HIGHEST_PROBLEM
+from afspm.model.problems import HIGHEST_PROBLEM, QUIET_HOURS
 from afspm.scheduler.publishing.envelopes import CacheSettings, Envelopes
 
 _WORDS = re.compile(r"[\w-]+")
@@ -138,6 +138,8 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
     )
     if resolved.declaring("needs_approval") or resolved.sections.control.agents:
         resolved.named_problems.setdefault(STOPPED_BY_AGENT, HIGHEST_PROBLEM)
+    if any(QUIET_HOURS in process.declared.flags for process in resolved.processes.values()):
+        resolved.named_problems.setdefault(QUIET_HOURS, HIGHEST_PROBLEM - 1)
     limits_table = parts.sections.get("limits", {})
     resolved.limits = reader.read(limits_table)
     for translator in translators:

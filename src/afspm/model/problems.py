@@ -11,6 +11,8 @@ from afspm.basics.errors import InvalidValue
 HIGHEST_PROBLEM = 255  # one byte on the wire
 STOPPED_BY_AGENT = "stopped-by-agent"
 """The problem flagged by an agent's tool `stop`. Every experiment with an agent has it, by default as number 255."""
+QUIET_HOURS = "quiet-hours"
+"""The problem that a `QuietHours` flags for its pause. Every experiment with one has it, by default as number 254."""
 CONDITIONS = "conditions"
 """The name under which the scheduler flags the problem of a condition, and clears it."""
 STOPPER = " stop"

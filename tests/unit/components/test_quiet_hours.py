@@ -1,0 +1,232 @@
+"""The pause of `QuietHours`: when it begins, what ends it, and what a person at the instrument changes in that."""
+
+from __future__ import annotations
+
+import datetime as dt
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from afspm.basics.errors import ConfigError
+from afspm.components.planned_scans import ScanSeries
+from afspm.components.quiet_hours import QuietHours, is_act
+from afspm.model import (
+    ActByHand,
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    ControlState,
+    JournalEntry,
+    PanelAct,
+)
+from afspm.scheduler.publishing.event_log import panel_entry
+from afspm.testing import Bench
+from afspm.testing.components.simulated_time import START_S
+
+UNIT_S = 600.0
+NUMBER = 254
+
+
+def utc(text: str) -> dt.datetime:
+    return dt.datetime.fromisoformat(text).replace(tzinfo=dt.UTC)
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "now", "until"),
+    [
+        ("22:00", "07:00", "2026-11-27T20:59:59", None),
+        ("22:00", "07:00", "2026-11-27T21:00:00", "2026-11-28T06:00:00"),
+        ("22:00", "07:00", "2026-11-28T05:59:59", "2026-11-28T06:00:00"),
+        ("22:00", "07:00", "2026-11-28T06:00:00", None),
+        ("09:00", "17:00", "2026-07-01T07:00:00", "2026-07-01T15:00:00"),
+        ("09:00", "17:00", "2026-07-01T15:00:00", None),
+        # the clocks go forward at 2:00 of 29 March, so the night has 8 hours
+        ("22:00", "07:00", "2026-03-29T04:59:59", "2026-03-29T05:00:00"),
+        # the hour from 2:00 to 3:00 of 25 October comes twice; the hours end in the first
+        ("22:00", "02:30", "2026-10-25T00:29:59", "2026-10-25T00:30:00"),
+        ("22:00", "02:30", "2026-10-25T01:15:00", None),
+        ("02:30", "04:00", "2026-03-29T01:29:59", None),  # there is no 2:30 that night
+        ("02:30", "04:00", "2026-03-29T01:30:00", "2026-03-29T02:00:00"),
+    ],
+)
+def test_hours_are_local_times_also_when_the_clocks_change(begin: str, end: str, now: str, until: str | None) -> None:
+    hours = QuietHours(begin, end, zone="Europe/Vienna").hours
+    ends = hours.end_after(utc(now))
+    assert (ends and ends.astimezone(dt.UTC)) == (until and utc(until))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"begin": "22", "end": "07:00"}, "begin: '22' is not a time of the day"),
+        ({"begin": "22:00", "end": "24:00"}, "end: '24:00'"),
+        ({"begin": "22:00", "end": "22:00"}, "leaves no time"),
+        ({"begin": "22:00", "end": "07:00", "zone": "Europe/Wien"}, "there is no time zone 'Europe/Wien'"),
+    ],
+)
+def test_impossible_hours_are_refused(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        QuietHours(**settings)
+
+
+class Night:
+    """An experiment of scans, with quiet hours from one to two units of ten minutes after its begin."""
+
+    def __init__(self, folder: Path, *, withdraw: bool = False) -> None:
+        begin, end = (
+            dt.datetime.fromtimestamp(START_S + units * UNIT_S, dt.UTC).strftime("%H:%M") for units in (1.0, 2.0)
+        )
+        self.bench = Bench(
+            QuietHours(begin, end, zone="UTC", withdraw=withdraw),
+            others={"series": ScanSeries((1e-6, 1e-6), pixels=(16, 16), every=60.0, scans=10_000)},
+            problems={"quiet-hours": NUMBER},
+            folder=folder,
+        )
+
+    def go_to(self, units: float) -> None:
+        self.bench.run(until=units * UNIT_S)
+
+    @property
+    def control(self) -> ControlState:
+        state: ControlState = self.bench.published("ControlState")[-1]
+        return state
+
+    @property
+    def scans(self) -> int:
+        return len(self.bench.scans)
+
+    @property
+    def is_paused(self) -> bool:
+        return self.control == ControlState(ControlMode.MANUAL, None, (NUMBER,))
+
+    @property
+    def is_at_work(self) -> bool:
+        before = self.scans
+        self.go_to(self.bench.now_s / UNIT_S + 0.25)
+        return self.control.mode is ControlMode.AUTOMATED and not self.control.problems and self.scans > before
+
+
+@pytest.fixture
+def night(tmp_path: Path) -> Iterator[Night]:
+    made = Night(tmp_path)
+    yield made
+    made.bench.close()
+
+
+def test_run_pauses_between_two_scans_and_goes_on(night: Night) -> None:
+    night.go_to(0.9)
+    assert not night.is_paused
+    night.go_to(1.3)
+    assert night.is_paused
+    during = night.scans
+    night.go_to(1.8)
+    assert (night.is_paused, night.scans) == (True, during)
+    night.go_to(2.2)
+    assert night.is_at_work
+    states = [one.state.name for one in night.bench.published("ScopeStateMsg")]
+    assert "INTERRUPTED" not in states
+
+
+def test_person_who_lets_the_run_continue_is_right_until_the_next_begin(night: Night) -> None:
+    night.go_to(1.2)
+    night.bench.set_mode(ControlMode.AUTOMATED)
+    assert night.is_at_work
+    night.go_to(1.9)
+    assert night.is_at_work
+
+
+def test_person_who_ends_a_pause_of_her_own_in_the_hours_is_right(night: Night) -> None:
+    night.go_to(0.9)
+    night.bench.set_mode(ControlMode.MANUAL)
+    night.go_to(1.3)
+    assert night.control == ControlState(ControlMode.MANUAL, None, ())
+    night.bench.set_mode(ControlMode.AUTOMATED)
+    assert night.is_at_work
+
+
+def test_pause_of_a_person_outlasts_the_hours(night: Night, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    night.go_to(1.5)
+    night.bench.set_mode(ControlMode.MANUAL)  # it is MANUAL already, and now a person wants it
+    night.go_to(2.2)
+    assert night.is_paused
+    (line,) = (one for one in caplog.messages if "waits for a person" in one)
+    assert "person: sets the mode MANUAL" in line
+    night.bench.set_mode(ControlMode.AUTOMATED)
+    assert night.is_at_work
+    assert any(one.startswith("no longer true: the quiet hours are over") for one in caplog.messages)
+
+
+def test_person_who_clears_the_flag_lets_the_run_go_on(night: Night) -> None:
+    night.go_to(1.5)
+    night.bench.clear("quiet-hours")
+    night.go_to(1.6)
+    assert night.control == ControlState(ControlMode.MANUAL, None, ())
+    night.bench.set_mode(ControlMode.AUTOMATED)
+    assert night.is_at_work
+
+
+@pytest.mark.parametrize("who", ["quiet_hours", "scheduler", "translator"])
+@pytest.mark.parametrize("when", [0.93, 1.93])
+def test_kill_changes_nothing(tmp_path: Path, who: str, when: float) -> None:
+    night = Night(tmp_path, withdraw=True)
+    night.bench.at(when * UNIT_S, night.bench.kill, who)
+    night.go_to(1.9)
+    assert night.is_paused
+    night.go_to(2.2)
+    assert night.is_at_work
+    night.bench.close()
+
+
+def test_tip_is_withdrawn_for_the_pause_and_brought_back_before_the_first_scan(tmp_path: Path) -> None:
+    night = Night(tmp_path, withdraw=True)
+    night.go_to(2.2)
+    assert night.is_at_work
+    entries = [one for batch in night.bench.published("JournalEntries") for one in batch.entries]
+    wanted = ("flagged", "x-", "mode", "cleared")
+    assert [one.what for one in entries if one.who == "quiet_hours" and one.what.startswith(wanted)] == [
+        "flagged quiet-hours",
+        "x-retract",
+        "mode MANUAL",
+        "mode AUTOMATED",
+        "x-engage",
+        "cleared quiet-hours",
+    ]
+    night.bench.close()
+
+
+def test_tip_that_does_not_come_back_is_left_to_a_person(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    night = Night(tmp_path, withdraw=True)
+    night.go_to(1.5)
+    night.bench.refuse("x-engage")
+    night.go_to(2.2)
+    assert night.is_paused
+    assert [one.getMessage() for one in caplog.records if one.levelno == logging.CRITICAL] == [
+        "the quiet hours are over, and the run waits for a person: the tip could not be brought back: "
+        "the action was refused: refused by the bench; `afspm continue` lets it go on"
+    ]
+    night.bench.set_mode(ControlMode.AUTOMATED)
+    assert night.is_at_work
+
+
+def asked(who: str, request: int, response: int = ControlResponse.SUCCESS, subject: str = "") -> JournalEntry:
+    return JournalEntry(1, "request", who, "", response, request=request, subject=subject)
+
+
+@pytest.mark.parametrize(
+    ("entry", "is_one"),
+    [
+        (panel_entry(1, "translator", ActByHand(1, PanelAct.WITHDRAW), []), True),
+        (asked("dashboard:ada", ControlRequest.ACTION, subject="start-scan"), True),
+        (asked("dashboard:ada", ControlRequest.PARAM, subject="tip-bias-voltage"), True),
+        (asked("terminal:ada", ControlRequest.SET_CONTROL_MODE), True),
+        (asked("dashboard:ada", ControlRequest.PARAM), False),  # a value is read
+        (asked("series", ControlRequest.SET_PROBE_POS, ControlResponse.NOT_IN_CONTROL), False),
+        (asked("quiet_hours", ControlRequest.ACTION, subject="x-retract"), False),
+    ],
+)
+def test_acts_of_a_person_differ_from_all_else(entry: JournalEntry, *, is_one: bool) -> None:
+    assert is_act(entry, "quiet_hours") is is_one
