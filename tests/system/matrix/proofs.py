@@ -25,7 +25,7 @@ from tests.system.matrix.true_scans import SimulatedTruth, TrueScan, Truth, trut
 import afspm
 from afspm import Levelling, levelled
 from afspm.basics.units import convert, si_unit
-from afspm.model import Problem, ScanSet
+from afspm.model import Problem, ScanSet, names
 from afspm.model.arrays import Array
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow
@@ -541,6 +541,19 @@ def faster(found: Evidence) -> str:
     return "" if abs(first / second - 2.0) < 0.04 else f"the second scan is {first / second:.2f} times as fast"
 
 
+def paused(found: Evidence) -> str:
+    """Prove that the tip was withdrawn and brought back, and that no scan was begun in the ten minutes between."""
+    entries = found.record.journal
+    done = [one for one in entries if one.who == "quiet_hours" and one.subject and one.response == 0]
+    if [one.subject for one in done] != [names.RETRACT, names.ENGAGE]:
+        return f"the tip was moved by {[one.subject for one in done]}"
+    away, back = (one.time_ns / _NS for one in done)
+    if not 500.0 < back - away < 700.0:
+        return f"the pause took {back - away:.0f} s"
+    began = sum(away <= one.start_s <= back for one in found.truth.scans)
+    return f"{began} scans were begun in the pause" if began else ""
+
+
 PROOFS: Mapping[str, Mapping[str, Proof]] = {
     "series": {
         "Scheduler": all_of(taken(4), controlled),
@@ -572,6 +585,7 @@ PROOFS: Mapping[str, Mapping[str, Proof]] = {
     "gap": {"Adaptive (gap)": mapped("gap", true_gap_ev)},
     "survey": {"Survey": all_of(taken(2), surveyed)},
     "lines": {"LineWatch": watched},
+    "hours": {"QuietHours": all_of(taken(4), paused)},
     "feedback": {"FeedbackAnalysis": flagged, "FeedbackTuner": tuned},
     "repair": {"TipCorrector": repaired},
     "agent": {"Agent": all_of(taken(1), curves(1), curve_on_the_highest)},
