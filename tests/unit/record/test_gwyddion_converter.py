@@ -249,6 +249,15 @@ def test_file_without_its_last_byte_is_refused(
         converted(cut, monkeypatch, module, meta, raw=raw[:end])
 
 
+def test_file_of_a_third_maker_is_refused_with_the_reasons_of_both(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # users N7: a .dat of Createc that Gwyddion refuses was "not a spectrum of Nanonis, or incomplete"
+    install(tmp_path, monkeypatch, "sys.exit('gwyconvert: File is truncated.')")
+    with pytest.raises(FileError, match=r"no \[DATA\]; it can't be read by Gwyddion's converter.*File is truncated"):
+        afspm.read(file(tmp_path, "a.dat"))
+
+
 def test_real_converter_keeps_values_and_size(tmp_path: Path) -> None:
     if gwyddion_converter._program() is None:
         pytest.skip("Gwyddion's converter is not installed")
