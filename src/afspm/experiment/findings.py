@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
@@ -69,20 +70,46 @@ class Findings:
         return sorted(self.found, key=lambda f: (not f.is_error, f.place.file, f.place.line))
 
 
+_PARTS = re.compile(r"[-_.\s]+")
+_SURE = 0.75
+_MOST_NAMES = 12
+
+
 def nearest(name: str, valid: Iterable[str], cutoff: float = 0.6) -> str:
-    """Return a hint with the valid name nearest to `name`, or up to 12 valid names; empty without any."""
+    """Return a hint with the valid name nearest to `name`, or up to 12 valid names; empty without any.
+
+    The nearest name is spelled alike, or else the only one with all parts of `name`: "bias" is of "tip-bias-voltage".
+    Of more than 12 names, those most alike are given.
+    """
     names = sorted(set(valid))
     close = closest(name, names, cutoff)
+    having = [one for one in names if _parts(name) and _parts(name) <= _parts(one)]
+    if close is None and len(having) == 1:
+        close = having[0]
     if close:
         return f"did you mean {close!r}?"
     if not names:
         return ""
-    shown = ", ".join(names[:12]) + (", …" if len(names) > 12 else "")
+    by_likeness = sorted(names, key=lambda one: (one not in having, -_likeness(name, one)))
+    shown = ", ".join(sorted(by_likeness[:_MOST_NAMES])) + (", …" if len(names) > _MOST_NAMES else "")
     return f"known here: {shown}"
 
 
 def closest(name: str, valid: Iterable[str], cutoff: float = 0.6) -> str | None:
-    """Return the valid name nearest to `name`, ignoring case; None if none is near."""
+    """Return the valid name nearest to `name`, ignoring case; None if none is near.
+
+    A name with another first letter must be nearer: "surface" is no misspelled "trace".
+    """
     by_fold = {v.casefold(): v for v in valid}
-    match = difflib.get_close_matches(name.casefold(), list(by_fold), n=1, cutoff=cutoff)
-    return by_fold[match[0]] if match else None
+    for match in difflib.get_close_matches(name.casefold(), list(by_fold), n=3, cutoff=cutoff):
+        if match[:1] == name.casefold()[:1] or _likeness(name, match) >= _SURE:
+            return by_fold[match]
+    return None
+
+
+def _parts(name: str) -> set[str]:
+    return set(filter(None, _PARTS.split(name.casefold())))
+
+
+def _likeness(name: str, other: str) -> float:
+    return difflib.SequenceMatcher(None, other.casefold(), name.casefold()).ratio()

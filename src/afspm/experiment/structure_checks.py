@@ -347,6 +347,34 @@ def _lends_microscope(process: ResolvedProcess) -> bool:
     return lends is not None and lends(process.settings)
 
 
+def check_measures(resolved: ResolvedExperiment) -> None:
+    """Warn of an experiment without errors in which no component can ask for a measurement: it would run for ever."""
+    if resolved.document.findings.errors or _microscope_elsewhere(resolved):
+        return
+    if any(_may_measure(one) for one in resolved.with_role(Role.COMPONENT)):
+        return
+    off = [name for name, table in resolved.parts.intermediaries.items() if table.get("component") is False]
+    hint = (
+        f"[{off[0]}] component = true"
+        if off
+        else "add a component that measures, such as a ScanSeries, or the Dashboard"
+    )
+    resolved.document.warning("nothing measures: no component of this experiment makes requests", hint=hint)
+
+
+def _may_measure(process: ResolvedProcess) -> bool:
+    # a class of the user's own may do anything in its handlers
+    if not process.class_path.startswith("afspm.") or process.acts:
+        return True
+    if any(process.declares(flag) for flag in (OPENS_PLAIN, "has_people", "needs_approval")):
+        return True
+    # requests need `scope`; components that only read from it count, too, so that the warning is never wrong
+    kinds = process.component.__mro__ if process.component is not None else ()
+    own = (one for one in kinds if issubclass(one, Component) and one is not Component)
+    functions = (getattr(one, "__func__", one) for kind in own for one in vars(kind).values())
+    return any("scope" in one.__code__.co_names for one in functions if inspect.isfunction(one))
+
+
 def check_clock(resolved: ResolvedExperiment) -> None:
     """Refuse simulated time if the microscope is not simulated."""
     has_microscope = bool(resolved.with_role(Role.TRANSLATOR)) or bool(_microscope_elsewhere(resolved))
@@ -558,4 +586,5 @@ CHECKS: Final[tuple[Check, ...]] = (
     check_listens_to,
     check_problems,
     check_envelopes,
+    check_measures,
 )

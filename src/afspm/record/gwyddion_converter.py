@@ -21,6 +21,7 @@ from tempfile import TemporaryDirectory
 from typing import Final
 
 from afspm.basics.errors import FileError
+from afspm.record.converted_files import checked
 from afspm.record.gwyddion_reader import read_gwyddion
 from afspm.storage.formats import suffixes
 from afspm.storage.formats.content import FileContent, OtherFormat
@@ -38,7 +39,7 @@ def read_other(path: Path, zone: tzinfo | None) -> FileContent:
 
     Raises:
         OtherFormat: the converter is not installed, or can't read the file.
-        FileError: the converter took too long.
+        FileError: the converter took too long, or the file is cut off.
     """
     program = _program()
     if program is None:
@@ -62,11 +63,12 @@ def read_other(path: Path, zone: tzinfo | None) -> FileContent:
             said = done.stderr.decode("utf-8", "replace").strip().splitlines()
             raise OtherFormat(f"can't be read by Gwyddion's converter either: {said[-1] if said else 'no reason'}")
         content = read_gwyddion(made, zone, is_converted=True)
-    by = f"Gwyddion, module {_module(done.stdout)}"
+    module = _module(done.stdout)
     scans = tuple(replace(one, region=one.region.moved_to((0.0, 0.0)), filename=str(path)) for one in content.scans)
     spectra = tuple(replace(spectrum, filename=str(path)) for spectrum in content.spectra)
-    header = {**content.header, "read by": by, "place": "unknown: the converter keeps neither the angle nor y's sign"}
-    return replace(content, controller="", scans=scans, spectra=spectra, header=header)
+    found = checked(replace(content, controller="", scans=scans, spectra=spectra), module, path, zone)
+    place = "unknown: the converter keeps neither the angle nor y's sign"
+    return replace(found, header={**found.header, "read by": f"Gwyddion, module {module}", "place": place})
 
 
 def _program() -> str | None:

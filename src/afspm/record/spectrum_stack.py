@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -140,7 +141,10 @@ def map_of(
         own_name, number_of = getattr(quantity, "__name__", "map").replace("<lambda>", "map"), quantity
     values = np.full((len(points.y_m), len(points.x_m), max(repeat_of) + 1), np.nan)
     for spectrum, cell, repeat in zip(spectra, points.cells, repeat_of, strict=True):
-        values[(*cell, repeat)] = number_of(spectrum)
+        found = np.asarray(number_of(spectrum), dtype=object)
+        if found.shape != () or not isinstance(found.item(), int | float | np.number):
+            raise InvalidValue(f"{own_name} returned {reprlib.repr(found.tolist())} for a spectrum, not a number")
+        values[(*cell, repeat)] = found.item()
     return Scan(
         _region(points, first.frame), name or own_name, unit, mean_over_repeats(values), spectra[-1].time_ns, ""
     )

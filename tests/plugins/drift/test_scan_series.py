@@ -60,6 +60,27 @@ def test_a_channel_without_two_scans_is_refused_with_the_existing_channels() -> 
         series([])
 
 
+def test_refusal_names_the_reasons_why_scans_were_left_out() -> None:
+    # users N3: "not 0 of 'Height' (in it: Height)", where the files had no time
+    nowhere = replace(content("Height", name="b.mi"), stated_place="")
+    with pytest.raises(InvalidValue) as refused:
+        series([content("Height", end_s=None, name="a.mi"), nowhere])
+    assert "a.mi: it does not say when it was taken; b.mi: it does not say where it was taken" in str(refused.value)
+
+
+def test_places_in_the_words_of_files_are_compared_only_if_equal() -> None:
+    # users N3: files by Gwyddion's converter, whose frames afspm does not know
+    here, there = (f"xoffset {x} nm" for x in (0, 700))
+    contents = [content("Height", end_s=100.0 * k, name=f"{k}.mi") for k in range(1, 5)]
+    contents[:3] = [replace(one, stated_place=place) for one, place in zip(contents, (here, there, here), strict=False)]
+    found = series(contents)
+    assert [one.key for one in found.scans] == ["1.mi", "3.mi"]
+    assert found.left_out == (
+        f"2.mi: its place ({there}) can't be compared with others' ({here})",
+        f"4.mi: its place (in m) can't be compared with others' ({here})",
+    )
+
+
 @pytest.mark.parametrize("correcting", [True, False])
 def test_place_on_the_sample_is_mapped_to_the_place_under_the_tip(correcting: bool) -> None:
     """A file of the record, where the controller's own files are elsewhere."""

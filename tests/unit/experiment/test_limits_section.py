@@ -135,7 +135,7 @@ def test_a_time_without_a_unit_is_a_warning(write: Write, value: str, is_clear: 
 
 
 def test_an_interval_without_a_unit_is_a_warning(write: Write) -> None:
-    (finding,) = write("[limits.actions.x-crash]\nevery = 10\n").check()
+    _, finding = write("[limits.actions.x-crash]\nevery = 10\n").check()
     assert not finding.is_error
     assert finding.what == "[limits.actions.x-crash] every = 10 has no unit, and counts in s"
     assert '"10 min"' in finding.hint

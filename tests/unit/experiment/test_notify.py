@@ -42,7 +42,7 @@ def test_experiment_without_notify_has_no_notifier(write: Write) -> None:
 
 def test_the_end_alone_needs_no_component(write: Write) -> None:
     experiment = write(HOOK + 'on = ["end"]\n')
-    assert experiment.check() == []
+    assert errors(experiment) == []
     assert "notifier" not in experiment.component_names
 
 

@@ -511,3 +511,33 @@ def test_line_that_is_not_utf_8_is_named(tmp_path: Path) -> None:
     file.write_bytes("a = 1\n# größe\n".encode("latin-1"))
     error = only_error(load(file))
     assert (error.place.line, error.hint) == (2, 'save it as "UTF-8" in your editor')
+
+
+SERIES = '[series]\ncomponent = {on}\nclass = "ScanSeries"\nsize = ["1 um", "1 um"]\nscans = 3\n'
+NOTHING_MEASURES = "nothing measures: no component of this experiment makes requests"
+
+
+@pytest.mark.parametrize(
+    ("text", "hint"),
+    [("", "add a component that measures"), (SERIES.format(on="false"), "[series] component = true")],
+    ids=["microscope and scheduler", "switched off"],
+)
+def test_experiment_in_which_nothing_measures_is_a_warning(write: Write, text: str, hint: str) -> None:
+    # users N9: it ran for ever, and the check said "nothing wrong"
+    (warning,) = write(text).check()
+    assert (warning.is_error, warning.what) == (False, NOTHING_MEASURES)
+    assert hint in warning.hint
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        SERIES.format(on="true"),
+        '[dashboard]\ncomponent = true\nclass = "Dashboard"\n',
+        '[agent]\ncomponent = true\nclass = "Agent"\n',
+        '[own]\ncomponent = true\nclass = "parts.Peaks"\n',
+        '[own]\ncomponent = true\ncommand = ["python3", "own.py"]\n',
+    ],
+)
+def test_experiment_whose_components_may_measure_has_no_warning(write: Write, text: str) -> None:
+    assert NOTHING_MEASURES not in [one.what for one in write(text).check()]

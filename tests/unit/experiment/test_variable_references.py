@@ -80,7 +80,7 @@ def test_the_last_of_several_overlays_wins(write: Write) -> None:
 
 def test_an_overlay_may_switch_a_component_off(write: Write) -> None:
     experiment = write(SCANNER + 'size = ["1 um", "1 um"]\n', "[scan]\ncomponent = false\n")
-    assert not experiment.check()
+    assert not errors(experiment)
     assert "scan" not in experiment.component_names
 
 

@@ -231,6 +231,8 @@ def test_map_of_a_grid_is_a_scan(night: Night, store: RecordStore, tmp_path: Pat
     assert slope.channel == "map"
     assert spectra.map(lambda one: one["Current"].max(), unit="A", name="largest current").channel == "largest current"
     assert spectra.map("Current", at=1.0, name="current").channel == "current"
+    with pytest.raises(InvalidValue, match=r"map returned \[.*\] for a spectrum, not a number"):  # users N7
+        spectra.map(lambda one: list(one["Current"]))  # type: ignore[arg-type,return-value]
 
 
 @pytest.mark.parametrize(

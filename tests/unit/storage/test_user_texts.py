@@ -141,3 +141,13 @@ def test_file_that_another_program_holds_open_is_read(tmp_path: Path) -> None:
             assert afspm.read(path).scans
         finally:
             other.kill()
+
+
+def test_nanonis_field_of_another_program_after_the_channels_changes_nothing(tmp_path: Path) -> None:
+    # users N7: a published converter of Createc's files writes it; "not enough values to unpack"
+    with_field = sxm().replace(b":SCANIT_END:", b":converted by:\nanother program\n:SCANIT_END:")
+    for one, other in zip(
+        read(tmp_path / "a.sxm", with_field).scans, read(tmp_path / "b.sxm", sxm()).scans, strict=True
+    ):
+        assert one.channel == other.channel
+        np.testing.assert_array_equal(one.values, other.values)

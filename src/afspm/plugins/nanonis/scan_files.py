@@ -6,6 +6,7 @@ SCAN_ANGLE clockwise in degrees, SCAN_RANGE from edge to edge of the pixels; REC
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from datetime import tzinfo
@@ -85,7 +86,9 @@ def _field(header: dict[str, str], name: str) -> str:
 
 
 def _images(table: str) -> list[tuple[str, str, str]]:
-    rows = [[column.strip() for column in line.strip().split("\t")] for line in table.splitlines() if line.strip()]
+    # a field that another program has added below may have a name in small letters, which the comment's end has not
+    lines = itertools.takewhile(lambda line: not _FIELD.fullmatch(line), table.splitlines())
+    rows = [[column.strip() for column in line.strip().split("\t")] for line in lines if line.strip()]
     return [(name, way, unit) for _, name, unit, ways, *_ in rows[1:] for way in _DIRECTIONS[ways]]
 
 

@@ -91,8 +91,12 @@ def _first_that_reads(path: Path, zone: tzinfo | None) -> FileContent:
             refusals.append(error)
     if unusable:  # the file may be of this reader
         raise FileError(unusable[0].what, hint=unusable[0].hint or "mend or uninstall the package")
-    # what the last reader of the suffix says is closer to the truth than what a converter says
-    raise refusals[max(len(own) - 1, 0)]
+    # what the last reader of the suffix says is closer to the truth than what a converter says; but the file may be of
+    # a third maker with this suffix, and then the converter's reason is the true one
+    nearest, last = refusals[max(len(own) - 1, 0)], refusals[-1]
+    if nearest is last or last.hint:  # with a hint the converter is not installed, and has tried nothing
+        raise nearest
+    raise OtherFormat(f"{nearest.what}; it {last.what}", hint=nearest.hint)
 
 
 def _readers(suffix: str) -> list[str]:

@@ -33,6 +33,8 @@ class FileContent:
         start_ns, end_ns: start and end of the measurement, ns since the Unix epoch; None if unknown.
         upwards: whether small y was scanned first; None if unknown.
         left_out: what of the file was not read, each with its reason.
+        stated_place: place of the frame in the file's own words, where their origin, signs or angle are unknown; empty
+            if the file states none. Regions are then about (0, 0). None: the regions are where the frame was.
     """
 
     controller: str
@@ -43,6 +45,7 @@ class FileContent:
     end_ns: int | None = None
     upwards: bool | None = None
     left_out: tuple[str, ...] = ()
+    stated_place: str | None = None
 
     def __iter__(self) -> Iterator[Scan | Spectrum]:
         yield from self.scans

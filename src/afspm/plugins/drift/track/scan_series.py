@@ -14,6 +14,8 @@ from afspm.model import Frame, Region, Scan
 from afspm.plugins.drift.registration import DriftScan
 from afspm.plugins.drift.track.mapping import Mapping
 
+_MOST_REASONS = 3
+
 
 @dataclass(frozen=True)
 class Series:
@@ -40,19 +42,22 @@ def series(contents: Sequence[FileContent], channel: str = "") -> Series:
     name = channel or topography(contents)
     found: list[DriftScan] = []
     left_out: list[str] = []
-    unit = ""
+    unit, common = "", _common_place(contents)
     for content in contents:
         for scan in content.scans:
             if scan.channel != name:
                 continue
-            if (why := _unfit(scan, content)) != "":
+            if (why := _unfit(scan, content, common)) != "":
                 left_out.append(f"{scan.filename}: {why}")
                 continue
             found.append(drift_scan(scan, content))
             unit = scan.unit
     if len(found) < 2:
         there = ", ".join(sorted({scan.channel for content in contents for scan in content.scans})) or "none"
-        raise InvalidValue(f"drift needs two scans of a channel, not {len(found)} of {name!r}", hint=f"in it: {there}")
+        reasons = "".join(f"; {why}" for why in left_out[:_MOST_REASONS])
+        raise InvalidValue(
+            f"drift needs two scans of a channel, not {len(found)} of {name!r}{reasons}", hint=f"in it: {there}"
+        )
     found.sort(key=lambda one: one.mid_s)
     return Series(name, unit, tuple(found), tuple(left_out))
 
@@ -87,9 +92,19 @@ def drift_scan(scan: Scan, content: FileContent) -> DriftScan:
     )
 
 
-def _unfit(scan: Scan, content: FileContent) -> str:
+def _common_place(contents: Sequence[FileContent]) -> str | None:
+    # places in the words of files can be compared only if they are equal
+    places = Counter(content.stated_place for content in contents if content.scans and content.stated_place != "")
+    return places.most_common(1)[0][0] if places else None
+
+
+def _unfit(scan: Scan, content: FileContent, common: str | None) -> str:
     if content.end_ns is None and content.start_ns is None:
         return "it does not say when it was taken"
+    if content.stated_place == "":
+        return "it does not say where it was taken"
+    if content.stated_place != common:
+        return f"its place ({content.stated_place or 'in m'}) can't be compared with others' ({common or 'in m'})"
     if scan.region.frame is Frame.SAMPLE and _mapping(content) is None:
         return "it says where it is on the sample, but not where that was under the tip"
     if missing := scan.lines_missing:
