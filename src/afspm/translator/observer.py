@@ -77,6 +77,7 @@ class Observer:
         self._outbox = Outbox(driver, state.kept["outbox"], state.stamp, log)
         self._polling = AdaptivePolling(driver.common.poll_period_s, driver.eager_poll_s)
         self._live = LiveLines(driver)
+        self._unreadable = ""
         self.values: dict[str, Value] = {}
         self._told: dict[str, Value] = {}
         # of real time at least, for an emulated controller
@@ -135,13 +136,18 @@ class Observer:
 
     def _new_lines(self) -> list[tuple[str, bytes]]:
         try:
-            return self._live.look(self._clock.now_s())
+            lines = self._live.look(self._clock.now_s())
         except LOST:
             raise
         except Exception as error:  # a driver may raise anything: without its lines the scan itself is as good
             self._live.end()
-            self._log.error("no more lines of this scan are published, since they can't be read: %s", error)
+            if str(error) != self._unreadable:  # a night may have hundreds of such scans
+                self._unreadable = str(error)
+                self._log.error("no more lines of this scan are published, since they can't be read: %s", error)
             return []
+        if lines:
+            self._unreadable = ""
+        return lines
 
     def wait_s(self) -> float:
         """Return the real seconds until the next reading is due."""
