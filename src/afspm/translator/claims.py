@@ -9,7 +9,7 @@ from afspm.model import ActByHand, MeasurementConditions, Parameter, Request, Ti
 from afspm.translator.driver_base import DriverBase
 from afspm.translator.judge import Claim, ResultVerdict, Stated, Witness, judge
 from afspm.translator.parameters import FEEDBACK_ON, Value
-from afspm.translator.setting_groups import FRAME, POSITION, frame
+from afspm.translator.setting_groups import FRAME, POSITION, frame, frame_outside
 from afspm.translator.state import Kept
 
 _PROVED_ELSEWHERE = frozenset((*FRAME, *POSITION, FEEDBACK_ON))
@@ -32,6 +32,7 @@ class Claims:
         self._end: dict[str, Value] = {}
         self._tip: TipStatus | None = None
         self.repeated = ""
+        self._beyond = ""
 
     @property
     def running(self) -> Claim | None:
@@ -106,7 +107,18 @@ class Claims:
         # by the rule alone, not by its numbers: a person who turns a knob gives another value each time
         again = bool(found.rule) and self._kept["contradicted"] == found.rule
         self.repeated, self._kept["contradicted"] = (found.sentence, "") if again else ("", found.rule)
-        return found
+        beyond = self._beyond_the_scanner(stated)
+        return replace(found, unproved=(*found.unproved, beyond)) if beyond else found
+
+    def _beyond_the_scanner(self, stated: Sequence[Stated]) -> str:
+        # a request for such a frame is refused; a person may set it, and many controllers take it and clip the voltages
+        frames = [one.frame for one in stated if one.frame is not None]
+        reach = self._driver.reach() if frames else {}
+        beyond = next((why for one in frames if (why := frame_outside(one, reach))), "")
+        if beyond and beyond != self._beyond:  # a panel may repeat the scan all night
+            self._driver.log.warning("the scan may not show the place that it names: %s", beyond)
+        self._beyond = beyond
+        return beyond
 
     def conditions(
         self, time_ns: int, filename: str, acts: Sequence[ActByHand], unproved: Sequence[str]

@@ -47,6 +47,8 @@ _AGAIN_S = 0.1
 """Real time until the feedback is read again, once it was found off though on is wished."""
 _SELDOM_S = 1.0
 """Real time: the longest one without a reading of all settings, in a series of short measurements."""
+_LEAVES_TIP_S = 5.0
+"""Time after a scan in which the tip's place counts as the scan's doing: a driver may show it some polls late."""
 _ROUNDING_S = 1e-5
 """More than the rounding of an experiment time, which has 16 digits since 1970."""
 
@@ -77,12 +79,13 @@ class Observer:
         self._outbox = Outbox(driver, state.kept["outbox"], state.stamp, log)
         self._polling = AdaptivePolling(driver.common.poll_period_s, driver.eager_poll_s)
         self._live = LiveLines(driver)
+        self._unreadable = ""
         self.values: dict[str, Value] = {}
         self._told: dict[str, Value] = {}
         # of real time at least, for an emulated controller
-        settles_s = max(driver.settles_s, driver.settles_s / self._clock.real_s(1.0))
-        feedback = WishedFeedback(state.kept, settles_s, follows=driver.only_reads)
-        self.panel = PanelWatch(state.kept, driver.table, driver.is_last_written, feedback)
+        slow = max(1.0, 1.0 / self._clock.real_s(1.0))
+        feedback = WishedFeedback(state.kept, slow * driver.settles_s, follows=driver.only_reads)
+        self.panel = PanelWatch(state.kept, driver.table, driver.is_last_written, feedback, slow * _LEAVES_TIP_S)
         self.claims = Claims(driver, state.kept)
         self._unproved: Sequence[str] = ()
         self._is_after_spectrum = False
@@ -135,13 +138,18 @@ class Observer:
 
     def _new_lines(self) -> list[tuple[str, bytes]]:
         try:
-            return self._live.look(self._clock.now_s())
+            lines = self._live.look(self._clock.now_s())
         except LOST:
             raise
         except Exception as error:  # a driver may raise anything: without its lines the scan itself is as good
             self._live.end()
-            self._log.error("no more lines of this scan are published, since they can't be read: %s", error)
+            if str(error) != self._unreadable:  # a night may have hundreds of such scans
+                self._unreadable = str(error)
+                self._log.error("no more lines of this scan are published, since they can't be read: %s", error)
             return []
+        if lines:
+            self._unreadable = ""
+        return lines
 
     def wait_s(self) -> float:
         """Return the real seconds until the next reading is due."""

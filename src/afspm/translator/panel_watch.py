@@ -18,6 +18,7 @@ back what it changed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import Final
@@ -50,6 +51,7 @@ class PanelWatch:
         kept: JSON values that outlive a kill: what a person did to the tip that keeps afspm from measuring.
         written: returns whether the run itself has set a parameter to this value last.
         feedback: the z feedback as wished.
+        leaves_tip_s: experiment seconds after a scan in which a controller may show where the scan has left the tip.
 
     Attributes:
         is_certain: whether a change of state now is certainly no effect of the run: the controller has answered all the
@@ -63,8 +65,11 @@ class PanelWatch:
         table: ParameterTable,
         written: Callable[[str, Value], bool],
         feedback: WishedFeedback,
+        leaves_tip_s: float = 0.0,
     ) -> None:
         self.feedback = feedback
+        self._leaves_tip_s = leaves_tip_s
+        self._scanned_ns: float = -math.inf
         self._kept = kept
         self._table = table
         self._written = written
@@ -157,9 +162,12 @@ class PanelWatch:
         acts += self._feedback_acts(now, state, now_ns, withdrew)
         in_request, self._in_request = self._in_request, []
         acts += [ActByHand(now_ns, PanelAct.VALUES, why, changes) for changes, why in in_request]
-        # a running scan moves the tip, and a spectrum may; a translator that begins in a scan reads it on its way
+        # a scan moves the tip and leaves it elsewhere, and a spectrum may; a translator that begins in a scan reads it
+        # on its way
         watched = self._settings
-        if ScopeState.SCANNING not in (last, state) and not is_after_spectrum:
+        if ScopeState.SCANNING in (last, state):
+            self._scanned_ns = now_ns
+        if now_ns - self._scanned_ns > NS_PER_S * self._leaves_tip_s and not is_after_spectrum:
             watched = watched | set(POSITION)
         if last in CALM and state in CALM and (changes := self._changes(before, now, watched)):
             acts.append(ActByHand(now_ns, PanelAct.VALUES, changes=tuple(changes.values())))

@@ -87,7 +87,7 @@ FACTS: Final[dict[str, Fact]] = {
     as_reported.OVER_RANGE: Fact("beyond the scanner", _sets_beyond),
     as_reported.CONTINUOUS: Fact(holds=lambda emulated: not emulated.software.scans.properties.continuous),
     as_reported.LATE_STATUS: Fact(),
-    as_reported.OTHER_LAYOUT: Fact("no more lines of this scan are published"),
+    as_reported.OTHER_LAYOUT: Fact("is chosen in Nanonis' Scan Control, and can't be read"),
     as_reported.WEDGED_PORT: Fact(holds=lambda emulated: not emulated._server._silent),
     as_reported.CLOSED_MODULES: Fact("Tip ?Shaper", lambda peer: [peer.act(names.CRASH)]),
     as_reported.BLOCKING_PULSE: Fact(tries=_pulses),

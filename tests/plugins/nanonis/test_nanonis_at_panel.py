@@ -23,6 +23,7 @@ from afspm.model import (
     ControlRequest,
     ControlResponse,
     Feedback,
+    MeasurementConditions,
     PanelAct,
     ProbePosition,
     ScopeState,
@@ -297,3 +298,44 @@ def test_own_requests_are_no_acts_by_hand(bench: Make) -> None:
     assert scans(peer.until(FREE))
     made.kill()
     assert "by hand" not in made.log_text()
+
+
+def test_tip_on_its_way_in_a_scan_not_yet_shown_is_no_move_by_hand(bench: Make) -> None:
+    made = bench(speed=1.0, as_reported=["late-status"])
+    peer = small(made)
+    call(made, "Scan.Action", 0, 1)
+    peer.until(ScopeState.SCANNING)
+    received = peer.until(FREE)
+    assert scans(received)
+    made.kill()
+    assert "a scan was begun at the microscope" in made.log_text()
+    assert "probe-pos" not in made.log_text()
+
+
+def test_tip_left_elsewhere_by_a_scan_is_no_move_by_hand(bench: Make) -> None:
+    made = bench(speed=1.0)
+    peer = small(made)
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.at_panel(lambda emulator: setattr(emulator.rig, "_probe_m", (55e-9, 44e-9)))
+    assert scans(peer.until(FREE))
+    peer.until(lambda one: one == ProbePosition((55e-9, 44e-9)))
+    call(made, "Bias.Set", 0.3)
+    (act,) = (one for one in until_act(peer) if isinstance(one, ActByHand))
+    assert [one.parameter for one in act.changes] == [names.TIP_BIAS_VOLTAGE]
+    made.kill()
+    assert "probe-pos" not in made.log_text()
+
+
+def test_scan_of_a_frame_beyond_the_scanner_is_published_with_a_warning_once(bench: Make) -> None:
+    made = bench(speed=5.0, range_m=2e-6, as_reported=["over-range"])
+    peer = small(made)
+    call(made, "Scan.FrameSet", 0.9e-6, 0.0, 400e-9, 400e-9, 0.0)
+    for _ in range(2):
+        call(made, "Scan.Action", 0, 1)
+        received = peer.until(FREE)
+        assert scans(received)
+        (conditions,) = (one for one in received if isinstance(one, MeasurementConditions))
+        assert "beyond the scanner's -1 to 1 µm" in conditions.unproved[-1]
+    made.kill()
+    assert made.log_text().count("the scan may not show the place that it names: its corners are at 0.7125") == 1

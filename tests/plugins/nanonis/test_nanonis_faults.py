@@ -490,9 +490,25 @@ def test_scan_that_is_not_shown_at_once_is_no_move_of_the_tip_by_hand(bench: Mak
 
 
 def test_unreadable_lines_end_the_lines_of_the_scan_alone(bench: Make) -> None:
-    # nanonis.md, fact 15: a channel that is not recorded
     made = bench(speed=SEEN, other_layout=["Scan.FrameDataGrab"])
     peer = small(made, live_lines_s=1.0)
-    assert scanned(peer)
+    for _ in range(2):
+        assert scanned(peer)
     made.until_logged("no more lines of this scan are published")
+    made.kill()
+    assert made.log_text().count("no more lines of this scan are published") == 1
     assert "lost contact" not in made.log_text()
+
+
+@pytest.mark.parametrize("autosave", ["all", "off"])
+def test_a_channel_that_is_not_recorded_is_left_out_of_lines_and_fetched_scans(bench: Make, autosave: str) -> None:
+    made = bench(speed=SEEN, as_reported=["other-layout"])
+    peer = small(made, live_lines_s=0.5, autosave=autosave == "all")
+    made.at_panel(lambda emulator: setattr(emulator.software.scans.properties, "autosave", autosave))
+    for _ in range(2):
+        assert peer.act_once_free(names.START_SCAN).ok
+        received = peer.until(FREE)
+        assert "Z Forward" in [one.channel for one in scans(received)]
+        assert "Z Forward" in [one.channel for one in received if isinstance(one, ScanLines)]
+    assert made.log_text().count("is chosen in Nanonis' Scan Control, and can't be read from its memory") == 1
+    assert "ERROR" not in made.log_text()

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from afspm.basics import entry_points
+from afspm.basics import FileError, entry_points
 from afspm.driver import Driver
-from afspm.model import Scan, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model import Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.plugins.nanonis import Nanonis
 from afspm.plugins.nanonis.emulator import NanonisEmulator
 
@@ -47,6 +47,13 @@ class OtherZNanonis(Nanonis):
     def _ask(self, name: str, *arguments: object, longer_s: float = 0.0) -> tuple[Any, ...]:
         found = super()._ask(name, *arguments, longer_s=longer_s)
         return (-found[0],) if name == "ZCtrl.ZPosGet" else found  # type: ignore[operator]
+
+
+class NoLinesNanonis(Nanonis):
+    """The lines of a running scan can't be read."""
+
+    def lines(self, start: int) -> Sequence[ScanLines]:
+        raise FileError("another layout")
 
 
 class LateEnd(Driver):

@@ -242,6 +242,16 @@ def test_z_that_counts_the_other_way_is_found_by_the_withdrawal(
     assert report.claims["withdrawn-limit"] == maker_claims.FALSE
 
 
+def test_lines_that_never_come_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    result = commissioned(tmp_path, "Nanonis", Person({"Is the tip at the sample": False}), "spoiled.NoLinesNanonis")
+    lines = result.progress.results["lines"]
+    assert (lines.outcome, lines.line[:40]) == (CheckOutcome.SKIPPED, "no line came while the scan ran: the log")
+    log = (result.folder / "log.txt").read_text(encoding="utf-8")
+    assert log.count("no more lines of this scan are published") == 1
+
+
 @not_on_wine("a process can't be stopped and continued there")
 def test_a_lost_connection_is_noticed_and_found_again(tmp_path: Path) -> None:
     def pid() -> int:

@@ -305,6 +305,8 @@ def test_translator_that_begins_in_a_scan_takes_the_way_of_its_tip_for_no_act(be
     end_scan(bench, scan)
     bench.look()
     assert acts(bench) == []
+    bench.clock.t_s += 10.0
+    bench.look()
     bench.microscope.values["PX"] = 0.1  # by a person
     bench.look()
     assert acts(bench) == [PanelAct.VALUES]

@@ -163,6 +163,7 @@ class Nanonis(Driver):
         self._code_page = _code_page(code_page)
         self._session: Session | None = None
         self._grabs_at_s = 0.0
+        self._left_out: set[str] = set()
         self._kept = KeptSettings(_AT_FIRST)
         ask = self._ask
         self._probe = geometry.Probe(ask, lambda: self.clock.now_s(), self._awaits_scan)
@@ -349,9 +350,19 @@ class Nanonis(Driver):
 
     def _images(self) -> list[fetched.Image]:
         try:
-            return fetched.images(self._there.ask_for_data, self._grabbing)
+            return fetched.images(self._there.ask_for_data, self._grabbing, self._leave_out)
         except protocol.UnreadableReply as error:
             raise FileError(f"the scan in Nanonis' memory can't be read: {error}") from error
+
+    def _leave_out(self, channel: str, error: protocol.UnreadableReply) -> None:
+        if channel not in self._left_out:  # lines are fetched once a second
+            self._left_out.add(channel)
+            self.log.warning(
+                "the channel %s is chosen in Nanonis' Scan Control, and can't be read from its memory, as one that is "
+                "not recorded: it is left out of lines, and of scans without a file (%s)",
+                channel,
+                error,
+            )
 
     # --- actions ---
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -15,6 +15,7 @@ from afspm.basics import ConfigError, FileError
 from afspm.driver import FileFacts, encode_scan, encode_spectrum
 from afspm.model import Region, Scan, ScanLines, Spectrum
 from afspm.plugins.nanonis.parameter_groups import Ask
+from afspm.plugins.nanonis.protocol import UnreadableReply
 from afspm.plugins.nanonis.session import CurveEnded
 
 ROWS: Final = ("top-first", "recorded")
@@ -66,17 +67,33 @@ class Image:
     upwards: bool
 
 
-def images(ask: Ask, how: Grabbing) -> list[Image]:
-    """Fetch all channels of the scan in Nanonis' memory, forward and backward."""
+def images(ask: Ask, how: Grabbing, leave_out: Callable[[str, UnreadableReply], None]) -> list[Image]:
+    """Fetch all channels of the scan in Nanonis' memory, forward and backward.
+
+    Args:
+        leave_out: called with the name of each channel that is chosen and not recorded, whose answer has another
+            layout. (! unrecorded-channel)
+
+    Raises:
+        UnreadableReply: no channel can be read.
+    """
     signals = ask("Signals.NamesGet")[0]
-    found = []
+    found, left_out = list[Image](), dict[str, UnreadableReply]()
     for channel in ask("Scan.BufferGet")[0]:
         name, unit = name_and_unit(signals[channel] if 0 <= channel < len(signals) else f"channel {channel}")
-        for way, number in (("Forward", _FORWARD), ("Backward", _BACKWARD)):
-            _, raw, direction = ask("Scan.FrameDataGrab", channel, number)
+        try:
+            grabbed = [ask("Scan.FrameDataGrab", channel, number) for number in (_FORWARD, _BACKWARD)]
+        except UnreadableReply as error:
+            left_out[name] = error
+            continue
+        for way, (_, raw, direction) in zip(("Forward", "Backward"), grabbed, strict=True):
             upwards = direction == _UP
-            values = how.image(raw, upwards=upwards, backward=number == _BACKWARD)
+            values = how.image(raw, upwards=upwards, backward=way == "Backward")
             found.append(Image(f"{name.replace(' ', '_')} {way}", unit, values, upwards))
+    for name, why in left_out.items():
+        if not found:  # of a scan that is wholly unreadable, no single channel is the cause
+            raise why
+        leave_out(name, why)
     return unscanned_as_nan(found)
 
 

@@ -19,6 +19,8 @@ from afspm.plugins.nanonis.protocol import BadReply, NanonisError
 
 _OUTPUT_V: Final = 10.0
 """Amount of the largest voltage of Nanonis' outputs, to which the piezo calibration belongs."""
+_SHOWS_SCAN_S: Final = 1.5
+"""Experiment time until a scan is shown as running, with a margin: others report a second. (! late-start)"""
 _DIGITS: Final = 1e-6  # relative precision of float32, with a margin
 _ADDED_UP: Final = frozenset(FRAME) - {names.SCAN_ANGLE, names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y}
 """Parameters calculated from centre and size: the rounding error of the largest value applies to each."""
@@ -64,6 +66,8 @@ def _share(pixels: int) -> float:
 class Probe(Group):
     """The position of the tip: during a move the target, during a scan the position before the scan.
 
+    A position that no request has set counts after `_SHOWS_SCAN_S`, since a scan may not be shown yet.
+
     Args:
         now_s: returns experiment time.
         awaits_scan: returns whether a scan was started that Nanonis does not show as running yet.
@@ -82,6 +86,7 @@ class Probe(Group):
         self.arrives_s = 0.0
         self._goal_m: tuple[float, float] | None = None
         self._seen_m: tuple[float, float] | None = None
+        self._left_s: float | None = None
         self._range_m: tuple[float, ...] = (math.inf, math.inf)
         self._unknown_range = "it was not asked"
 
@@ -94,19 +99,29 @@ class Probe(Group):
         if self._goal_m is not None:
             return self._goal_m
         if self._seen_m is not None and not between_scans and (self._ask("Scan.StatusGet")[0] or self._awaits_scan()):
+            self._left_s = None
             return self._seen_m
         # A difference below the converters' resolution does not count as a move.
         x, y = self._numbers("FolMe.XYPosGet", 0)
-        if self._seen_m is None or not self._near((x, y), self._seen_m):
-            self._seen_m = (x, y)
+        if self._seen_m is not None and self._near((x, y), self._seen_m):
+            self._left_s = None
+        elif self._seen_m is None or between_scans or self._is_no_scan():
+            self._seen_m, self._left_s = (x, y), None
         return self._seen_m
+
+    def _is_no_scan(self) -> bool:
+        # a scan that a person begins moves the tip before Nanonis shows it as running
+        now_s = self._now_s()
+        if self._left_s is None:
+            self._left_s = now_s
+        return now_s - self._left_s >= _SHOWS_SCAN_S
 
     def read(self) -> dict[str, Value]:
         return dict(zip(self.names, self.xy_m(), strict=True))
 
     def write(self, values: Mapping[str, Value]) -> None:
         # the values are read right before they are set, by the translator
-        before_m = self._goal_m or self._seen_m or self.xy_m()
+        before_m = self._goal_m or self.xy_m(between_scans=True)
         x, y = (float(values.get(name, was)) for name, was in zip(self.names, before_m, strict=True))
         # Nanonis would clip a position beyond its range without an error.
         if why := self._unknown_range:

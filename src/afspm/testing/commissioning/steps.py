@@ -313,6 +313,8 @@ def _lines(guide: Guide) -> str:
     client.observations.lines.clear()
     # long enough in real time for some readings
     taken = kit.take_scan(kit.frames.plain, LINES_REAL_S / client.clock.real_s(1.0))
+    if not client.observations.lines:
+        raise Skipped("no line came while the scan ran: the log of this run may say why")
     roles = client.observations.newest(ChannelRoles) or ChannelRoles()
     found = [roles.shown(one) for one in taken.scans]
     places = [place for one in found for place in lines_in_scan.places(one, client.observations.lines)]
