@@ -7,6 +7,7 @@ import io
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+from afspm import wire
 from afspm.basics.clock import iso_utc
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow, Table
@@ -38,6 +39,19 @@ def tables(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow]) -> Iterat
         columns = table.columns()
         rows = zip(*(_cells(column, values) for column, values in columns.items()), strict=True)
         yield f"{name}.csv", _csv([column.removesuffix("_ns") for column in columns], rows)
+    yield from _own_messages(run)
+
+
+def _own_messages(run: Run) -> Iterator[tuple[str, bytes]]:
+    by_name: dict[str, list[dict[str, object]]] = {}
+    for packet, name, message in run.own_messages():
+        who = packet.envelope.removeprefix(name).removeprefix("_")
+        plain = wire.as_plain(message)
+        fields = plain if isinstance(plain, dict) else {"value": plain}
+        by_name.setdefault(name, []).append({"time": iso_utc(packet.time_ns or 0), "component": who, **fields})
+    for name, messages in by_name.items():
+        columns = list(dict.fromkeys(column for one in messages for column in one))
+        yield f"{name}.csv", _csv(columns, ([one.get(column, "") for column in columns] for one in messages))
 
 
 def _cells(column: str, values: list[Any]) -> list[object]:
