@@ -541,7 +541,7 @@ class Run:
 def declare_described(folder: Path) -> bool:
     """Declare the types of messages that a record describes, as relayed; return whether there are any."""
     try:
-        with Run(folder) as run:
+        with open_run(folder) as run:
             types = run._described_types()
     except FileError:
         return False

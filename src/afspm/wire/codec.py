@@ -11,7 +11,6 @@ from google.protobuf.message import Message
 from afspm import model
 from afspm.basics.errors import AfspmError, InvalidValue, UnitError, WireError
 from afspm.basics.formatting import counted
-from afspm.basics.plain_data import Plain
 from afspm.basics.units import convert as convert_unit
 from afspm.model.scan import ShapeChange
 from afspm.wire import unit_conversion
@@ -28,12 +27,17 @@ _LONGEST_VALUE = 200
 _LONGEST_TEXT = 1000
 
 
-def as_plain(message: Any) -> Plain:
-    """Return a message of a generated class in JSON's types, by the names in its .proto file."""
-    from google.protobuf.json_format import MessageToDict  # slow to import, and rarely needed
+def as_plain(message: Any) -> Any:
+    """Return a message of a generated class in JSON's types, by the names in its .proto file.
 
-    plain: Plain = MessageToDict(message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
-    return plain
+    A message with content that JSON can't have, such as a time after the year 9999, is returned as one text.
+    """
+    from google.protobuf.json_format import Error, MessageToDict  # slow to import, and rarely needed
+
+    try:
+        return MessageToDict(message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
+    except (Error, TypeError, ValueError):
+        return " ".join(str(message).split())
 
 
 def as_text(message: Any) -> str:

@@ -101,9 +101,9 @@ def test_own_messages_are_read_from_the_record_and_exported(run: Path, is_descri
         assert record.unread_messages() == ([] if is_described else [UNREAD])
         files = {file.name: file for file in export(record, "csv", tmp_path / "csv")}
     assert read == ([0.1, 0.0084000000000000012] if is_described else [])
-    assert ("LaserPower.csv" in files) is is_described
+    assert ("message-LaserPower.csv" in files) is is_described
     if is_described:
-        first, _ = csv.DictReader(files["LaserPower.csv"].read_text(encoding="utf-8").splitlines())
+        first, _ = csv.DictReader(files["message-LaserPower.csv"].read_text(encoding="utf-8").splitlines())
         assert (first["component"], first["power_w"]) == ("laser", "0.1")
 
 
@@ -127,6 +127,12 @@ def test_description_in_a_record_replaces_no_message_of_afspm(monkeypatch: pytes
 @pytest.mark.parametrize("damaged", [{"files": ["AAAA"], "types": {"Own": "Own"}}, {"files": 1}, [], "text"])
 def test_damaged_description_of_messages_describes_nothing(damaged: Any) -> None:
     assert described_types.read(damaged) == {}
+
+
+def test_text_of_a_message_with_an_impossible_time_is_shown() -> None:
+    power = laser_power()()
+    power.at.seconds = 10**12
+    assert wire.as_text(power) == "at { seconds: 1000000000000 }"
 
 
 def test_text_of_a_message_has_fields_of_value_zero() -> None:

@@ -43,15 +43,16 @@ def tables(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow]) -> Iterat
 
 
 def _own_messages(run: Run) -> Iterator[tuple[str, bytes]]:
-    by_name: dict[str, list[dict[str, object]]] = {}
+    by_name: dict[str, list[tuple[str, str, dict[str, object]]]] = {}
     for packet, name, message in run.own_messages():
-        who = packet.envelope.removeprefix(name).removeprefix("_")
         plain = wire.as_plain(message)
         fields = plain if isinstance(plain, dict) else {"value": plain}
-        by_name.setdefault(name, []).append({"time": iso_utc(packet.time_ns or 0), "component": who, **fields})
+        who = packet.envelope.removeprefix(name).removeprefix("_")
+        by_name.setdefault(name, []).append((iso_utc(packet.time_ns or 0), who, fields))
     for name, messages in by_name.items():
-        columns = list(dict.fromkeys(column for one in messages for column in one))
-        yield f"{name}.csv", _csv(columns, ([one.get(column, "") for column in columns] for one in messages))
+        columns = list(dict.fromkeys(column for _, _, fields in messages for column in fields))
+        rows = ([time, who, *(fields.get(column, "") for column in columns)] for time, who, fields in messages)
+        yield f"message-{name}.csv", _csv(["time", "component", *columns], rows)
 
 
 def _cells(column: str, values: list[Any]) -> list[object]:
