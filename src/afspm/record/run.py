@@ -384,7 +384,7 @@ class Run:
         sql = f"SELECT envelope, count(*) FROM packets WHERE source = ? AND message IN ({', '.join('?' * len(unread))})"
         rows = self._query(f"{sql} GROUP BY envelope ORDER BY envelope", (SCHEDULER, *unread)) if unread else []
         modules = ", ".join((self.facts.get("guest") or {}).get("messages") or ()) or "the module of their type"
-        why = f"this record does not describe their type, and {modules} is not imported"
+        why = f"this record does not describe the type, and {modules} is not imported"
         return [f"{counted(count, 'message')} {envelope} can't be read: {why}" for envelope, count in rows]
 
     def overview(self, messages: Sequence[str] | None = None, problems: ProblemNames | None = None) -> Overview:

@@ -30,7 +30,7 @@ from afspm.wire import described_types
 
 POWER = "power_w: 0.0084, at: 2026-03-14T20:00:00Z, image: 4000 bytes, trace: [0, 1, 2, 3, 4, 5, 6, 7, … 900 values]"
 UNREAD = (
-    "2 messages LaserPower_laser can't be read: this record does not describe their type, and laser_messages is not "
+    "2 messages LaserPower_laser can't be read: this record does not describe the type, and laser_messages is not "
     "imported"
 )
 
