@@ -113,10 +113,12 @@ class Night(AfspmProcess):
         lines: float = 2.0,
         more: str = "",
         options: tuple[str, ...] = (),
+        messages: tuple[str, ...] = (),
         every: str = "4 h",
     ) -> None:
         file = folder / "experiment.toml"
-        file.write_text(EXPERIMENT.format(speed=speed, lines=lines, every=every) + more, encoding="utf-8")
+        own = f"messages = {[*messages]}\n"
+        file.write_text(own + EXPERIMENT.format(speed=speed, lines=lines, every=every) + more, encoding="utf-8")
         super().__init__("run", str(file), "--runs", str(folder / "runs"), *options, folder=folder)
         try:
             self.url = self.wait_for_url("dashboard")

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 BAR = 24
-LONGEST_MESSAGE = 200
 # processes in these conditions share one line; all others have a line each
 WELL = (ProcessCondition.ALIVE, ProcessCondition.BUSY)
 BAD = (ProcessCondition.SILENT, ProcessCondition.GIVEN_UP, ProcessCondition.RESTARTING)
@@ -262,8 +261,7 @@ class StatusText:
 
     def _announced(self) -> Iterator[Text]:
         for envelope, (time_ns, message) in self._seen.announced.items():
-            text = " ".join(str(message).split())
-            yield _label("message").append(f"{time_of_day(time_ns)} {envelope}: {text[:LONGEST_MESSAGE]}")
+            yield _label("message").append(f"{time_of_day(time_ns)} {envelope}: {wire.as_text(message)}")
 
     def as_json(self) -> dict[str, object]:
         """Return the status for programs.

@@ -188,14 +188,21 @@ class ComponentLoop:
         has_handlers = self._is_script and self._dispatcher.wants_anything
         between = self._handle_backlog if has_handlers else lambda: None
         frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
-        component.scope = Scope(self._link, context.problems, state_dir, between, frame)
-        component.clock = self._clock
-        component.log = context.log
-        component.name = context.name
-        component.memory = Memory(state_dir / f"{context.name}.json" if state_dir else None)
-        component.run_dir = Path(launch.run_dir or ".")
-        component.simulated = launch.simulated
-        component.packet = None
+        given = {
+            "scope": Scope(self._link, context.problems, state_dir, between, frame),
+            "clock": self._clock,
+            "log": context.log,
+            "name": context.name,
+            "memory": Memory(state_dir / f"{context.name}.json" if state_dir else None),
+            "run_dir": Path(launch.run_dir or "."),
+            "simulated": launch.simulated,
+            "packet": None,
+        }
+        for name, value in given.items():
+            if hasattr(component, name):
+                what = f"{type(component).__name__} has its own {name!r}, which afspm gives to each component"
+                raise ConfigError(what, where=context.name, hint=f"give yours another name, such as own_{name}")
+            setattr(component, name, value)
         component._publish = self._publish
 
     def _publish(self, message: object, envelope: str | None) -> None:

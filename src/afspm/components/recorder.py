@@ -138,6 +138,7 @@ def record_last_reports(launch: Launch, clock: Clock) -> None:
 
 def _settings(launch: Launch, clock: Clock, *, scans: bool) -> RecordSettings:
     from afspm.record.store import RecordSettings
+    from afspm.wire.described_types import describe
 
     run_dir = Path(launch.run_dir or ".")
     frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
@@ -150,7 +151,8 @@ def _settings(launch: Launch, clock: Clock, *, scans: bool) -> RecordSettings:
         METADATA: run_json_or_empty(run_dir).get(METADATA, {}),
     }
     problems = ProblemNames(launch.problems)
-    return RecordSettings(facts, problems, frame, measured=scans, speed=1.0 / clock.real_s(1.0))
+    speed = 1.0 / clock.real_s(1.0)
+    return RecordSettings(facts, problems, frame, measured=scans, speed=speed, messages=describe())
 
 
 def _seeds(file: Path) -> Plain:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import inspect
+import re
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
@@ -26,6 +27,7 @@ from afspm.experiment.toml_lines import Table
 from afspm.model import Role
 
 _OTHER_MAKE = "is it written for the published implementation? see docs/how-to/from-the-published-implementation.md"
+_DOORS = ("afspm", "afspm.basics", "afspm.model", "afspm.driver", "afspm.emulation", "afspm.record", "afspm.processes")
 # Roles by the package of a base class: a user's class is recognised by its bases.
 _ROLE_BY_BASE = (
     ("afspm.scheduler", Role.SCHEDULER),
@@ -130,7 +132,7 @@ def load(path: str) -> Any:
     except ModuleNotFoundError as error:
         raise _no_module(module_name, error) from error
     except (Exception, SystemExit) as error:  # the user's module may do anything when imported, even exit
-        raise Unloadable(f"importing {module_name} fails: {_error_line(error)}") from error
+        raise Unloadable(f"importing {module_name} fails: {_error_line(error)}", _door_hint(error)) from error
     return _attribute(module, name)
 
 
@@ -187,6 +189,14 @@ def _shadowing_hint(module: ModuleType) -> str:
                 "" if own and file.samefile(own) else f"Python imported another module of this name: rename {file.name}"
             )
     return ""
+
+
+def _door_hint(error: BaseException) -> str:
+    # ImportError has the name as an attribute from Python 3.12 on
+    found = re.match(r"cannot import name '(\w+)' from '(?=afspm\b)", str(error))
+    named = found[1] if found and isinstance(error, ImportError) else ""
+    doors = [door for door in _DOORS if named in getattr(importlib.import_module(door), "__all__", ())]
+    return f"write `from {doors[0]} import {named}`" if doors else ""
 
 
 def _no_module(module: str, error: ModuleNotFoundError) -> Unloadable:

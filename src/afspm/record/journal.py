@@ -16,6 +16,8 @@ from afspm.basics.errors import FileError
 
 JOURNAL_FILE = "journal.sqlite"
 FORMAT = "afspm record 1"
+OWN_MESSAGES = "messages"
+"""The fact about a run that describes the types of its user's messages; see `described_types`."""
 SCHEDULER = ""
 """The source of the scheduler's packets; other publishers are recorded by address."""
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import sys
-from collections import defaultdict, deque
-from collections.abc import Callable, Sequence
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from afspm import wire
 from afspm.basics.clock import NS_PER_S
@@ -101,6 +101,17 @@ class ProcessRestart:
     last_exit: str
 
 
+@dataclass(frozen=True, slots=True)
+class Announcement:
+    """The newest message of a component's own type: its fields as text, and the number of such messages so far."""
+
+    time_ns: int
+    who: str
+    name: str
+    text: str
+    count: int
+
+
 @dataclass(slots=True)
 class Readings:
     """The newest settings and position of the microscope; None before the first packet of each."""
@@ -159,7 +170,9 @@ class Overview:
         status, control, tip: the newest state of the microscope, of control and of the tip; None before the first.
         processes, progress_reports: the newest state and progress of each process, by name.
         instruments: the curve of each instrument parameter, by its name.
-        announced: time and newest message of each envelope that the scheduler relays for a component.
+        announced, announced_count: time and newest message of each envelope that the scheduler relays for a component,
+            and the number of its messages.
+        unread: sentences about messages of the record that can't be read.
         proposals: the proposals of agents by id, newest last, bounded.
         approvals: the approvals in force.
         of_conditions: the numbers of the problems flagged by conditions.
@@ -186,7 +199,9 @@ class Overview:
         self.processes: dict[str, ProcessState] = {}
         self.instruments: dict[str, ReadingCurve] = {}
         self.progress_reports: dict[str, Progress] = {}
-        self.announced: dict[str, tuple[int, object]] = {}
+        self.announced: dict[str, tuple[int, Any]] = {}
+        self.announced_count: Counter[str] = Counter()
+        self.unread: tuple[str, ...] = ()
         self.proposals: dict[str, Proposal] = {}
         self.approvals = Approvals()
         self._approved_ns: dict[str, int] = {}
@@ -361,7 +376,7 @@ class Overview:
         return silent_ns if silent_ns > OLD_S * speed * NS_PER_S else None
 
     def take(self, message: str, thing: object, time_ns: int, envelope: str = "") -> None:
-        """Process a published packet. Unknown messages are ignored.
+        """Process a published packet. Of a message without a handler the newest is kept, if the scheduler relays it.
 
         Args:
             message: the name of the message, e.g. "Scan2d".
@@ -378,8 +393,16 @@ class Overview:
         handler: Callable[[object, int], None] | None = getattr(self, f"_{_handler(message)}", None)
         if handler is not None:
             handler(thing, time_ns)
-        elif wire.is_relayed(message):
+        elif wire.is_relayed(message) or message not in wire.known_messages():  # as a record describes its type
             self.announced[key] = time_ns, thing
+            self.announced_count[key] += 1
+
+    def announcements(self) -> Iterator[Announcement]:
+        """Yield the newest message of each envelope that the scheduler relays for a component."""
+        for envelope, (time_ns, message) in self.announced.items():
+            name = message.DESCRIPTOR.name
+            who = envelope.removeprefix(name).removeprefix("_")
+            yield Announcement(time_ns, who, name, wire.as_text(message), self.announced_count[envelope])
 
     @property
     def _holder(self) -> str | None:

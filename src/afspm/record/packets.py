@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,10 +15,12 @@ from afspm.basics.errors import FileError, WireError
 from afspm.model import Frame, Packet, Scan, Spectrum
 from afspm.record.journal import SCHEDULER, measured_file
 from afspm.record.measured_tables import Row
+from afspm.wire.messages import parse
 from afspm.wire.values import with_nan, with_values
 
 if TYPE_CHECKING:
     import numpy as np
+    from google.protobuf.message import Message
     from numpy.typing import NDArray
 
     from afspm.storage.formats.content import FileContent
@@ -87,17 +89,23 @@ def packets(
 
 
 def without_reading_files(
-    query: Query, frame: Frame, messages: Sequence[str] | None
+    query: Query, frame: Frame, messages: Sequence[str] | None, types: Mapping[str, type[Message]]
 ) -> Iterator[tuple[Packet, str, Any]]:
     """Yield packet, message name and decoded content; scans and spectra have the right shape and NaN for values.
 
     Lines of running scans and unreadable packets are left out.
+
+    Args:
+        types: the types of the user's messages that the record describes.
     """
     for time_ns, envelope, message, payload, scan, spectrum, _, _, _ in _rows(query, -1, messages):
         if not message or message == "ScanLines":
             continue
         try:
-            thing = wire.decode(message, payload if spectrum is None else with_nan(payload))
+            if message in types:
+                thing = parse(types[message], payload)
+            else:
+                thing = wire.decode(message, payload if spectrum is None else with_nan(payload))
             if isinstance(thing, Scan) and scan is not None:
                 thing = replace(thing, values=_nan(thing.shape))
             elif isinstance(thing, Spectrum):

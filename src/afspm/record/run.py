@@ -49,10 +49,13 @@ from afspm.record.packets import PacketLookup, packets, without_reading_files
 from afspm.record.run_json import EXPERIMENT_FILE, METADATA, REPLAY_OF, latest_run, run_json_or_empty
 from afspm.record.tables import ControlRow, NoteRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
 from afspm.record.treatment_ledger import KEEP_AWAY_M, TreatmentLedger, treatment_ledger, treatment_times
+from afspm.wire import described_types
 from afspm.wire.message_types import register_all
 from afspm.wire.messages import SpatialROIWithScoreList, TipVerdict, WatchCounts
 
 if TYPE_CHECKING:
+    from google.protobuf.message import Message
+
     from afspm.record.allowed_bands import AllowedBands
     from afspm.record.film import Film
     from afspm.record.overview import DriftPoint, Overview
@@ -367,7 +370,22 @@ class Run:
 
         Scans and spectra have NaN for values; lines of running scans and unreadable packets are left out.
         """
-        yield from without_reading_files(self._query, self.frame, messages)
+        yield from without_reading_files(self._query, self.frame, messages, self._described_types())
+
+    def own_messages(self) -> Iterator[tuple[Packet, str, Any]]:
+        """Yield as `messages` the messages of the user's own types that the scheduler published."""
+        names = self._own_names()
+        return self.messages(names) if names else iter(())
+
+    def unread_messages(self) -> list[str]:
+        """Return a sentence for each envelope whose messages can't be read: the record lacks their description."""
+        types, known = self._described_types(), wire.known_messages()
+        unread = [name for name in self._own_names() if name not in types and name not in known]
+        sql = f"SELECT envelope, count(*) FROM packets WHERE source = ? AND message IN ({', '.join('?' * len(unread))})"
+        rows = self._query(f"{sql} GROUP BY envelope ORDER BY envelope", (SCHEDULER, *unread)) if unread else []
+        modules = ", ".join((self.facts.get("guest") or {}).get("messages") or ()) or "the module of their type"
+        why = f"this record does not describe the type, and {modules} is not imported"
+        return [f"{counted(count, 'message')} {envelope} can't be read: {why}" for envelope, count in rows]
 
     def overview(self, messages: Sequence[str] | None = None, problems: ProblemNames | None = None) -> Overview:
         """Return the overview that the dashboard shows, without reading the files of scans.
@@ -381,6 +399,7 @@ class Run:
         overview = Overview(problems or self.problem_names, bands=self._bands)
         for packet, message, thing in self.messages(messages):
             overview.take(message, thing, packet.time_ns or 0, packet.envelope)
+        overview.unread = tuple(self.unread_messages())
         return overview
 
     # --- the run itself ---
@@ -485,6 +504,14 @@ class Run:
         except sqlite3.DatabaseError as error:
             raise journal.damaged(self.folder / journal.JOURNAL_FILE, error) from error
 
+    def _described_types(self) -> dict[str, type[Message]]:
+        return described_types.read(self._note(journal.OWN_MESSAGES) or {})
+
+    def _own_names(self) -> list[str]:
+        # of all sources: the index then has the answer, and payloads are not read
+        names = self._query("SELECT DISTINCT message FROM packets")
+        return [name for (name,) in names if not wire.is_of_afspm(name)]
+
     def _note(self, name: str) -> Any:
         rows = self._query("SELECT value FROM about WHERE name = ?", (name,))
         return from_json(rows[0][0]) if rows else None
@@ -509,6 +536,18 @@ class Run:
             return wire.decode(message, payload)
         except WireError:
             return None
+
+
+def declare_described(folder: Path) -> bool:
+    """Declare the types of messages that a record describes, as relayed; return whether there are any."""
+    try:
+        with open_run(folder) as run:
+            types = run._described_types()
+    except FileError:
+        return False
+    for message in types.values():
+        wire.declare(wire.MessageDeclaration(type=message, relayed=True))
+    return bool(types)
 
 
 def _folder(path: Path) -> Path:

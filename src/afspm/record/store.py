@@ -61,6 +61,7 @@ class RecordSettings:
         frame: the coordinate frame of published positions; of the sample only where drift is corrected.
         measured: write scans and spectra; otherwise only the journal.
         speed: experiment seconds per real second.
+        messages: the types of the user's messages, as `described_types.describe` returns them.
     """
 
     facts: dict[str, object] = field(default_factory=dict)
@@ -68,6 +69,7 @@ class RecordSettings:
     frame: Frame = Frame.TIP
     measured: bool = True
     speed: float = 1.0
+    messages: dict[str, object] = field(default_factory=dict)
 
 
 class RecordStore:
@@ -100,6 +102,8 @@ class RecordStore:
         self._roles = ChannelRoles()
         for name, value in about.facts.items():
             self.note(name, value)
+        if about.messages:
+            self.note(journal.OWN_MESSAGES, about.messages)
 
     def waiting(self) -> list[Packet]:
         """Return the packets that wait for other packets of their scan."""

@@ -55,9 +55,9 @@ def own_homes(folder: Path) -> list[Path] | None:
 
 
 def register_own_messages(folder: Path, messages: Sequence[str]) -> None:
-    """Register the messages that run.json names, if this user has made the run; else warn.
+    """Register the messages that run.json names, if this user has made the run; else as its record describes them.
 
-    Importing them would run modules of another person's choice.
+    Importing them would run modules of another person's choice. A warning is logged if the record has no description.
 
     Raises:
         ConfigError: as for `register_all`.
@@ -65,6 +65,10 @@ def register_own_messages(folder: Path, messages: Sequence[str]) -> None:
     if not messages:
         return
     if (homes := own_homes(folder)) is None:
+        from afspm.record.run import declare_described
+
+        if declare_described(folder):
+            return
         _log.warning("messages of %s are not read: %s is not known as a run of yours", ", ".join(messages), folder)
         return
     # imported late: few experiments have messages of their own

@@ -14,7 +14,7 @@ handler of a component for it. Every other list of messages is derived from the 
 
 from __future__ import annotations
 
-from afspm.wire.codec import as_plain, decode, encode, header
+from afspm.wire.codec import as_plain, as_text, decode, encode, header
 from afspm.wire.frames import (
     BEAT,
     CLOSE,
@@ -40,6 +40,7 @@ from afspm.wire.messages import (
     declare,
     declared,
     followed_messages,
+    is_of_afspm,
     is_relayed,
     known_messages,
     message_of,
@@ -61,6 +62,7 @@ __all__ = [
     "MessageDeclaration",
     "MessageKind",
     "as_plain",
+    "as_text",
     "declaration",
     "declare",
     "declared",
@@ -82,6 +84,7 @@ __all__ = [
     "followed_messages",
     "header",
     "id_of",
+    "is_of_afspm",
     "is_relayed",
     "known_messages",
     "message_of",

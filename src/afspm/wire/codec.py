@@ -10,7 +10,7 @@ from google.protobuf.message import Message
 
 from afspm import model
 from afspm.basics.errors import AfspmError, InvalidValue, UnitError, WireError
-from afspm.basics.plain_data import Plain
+from afspm.basics.formatting import counted
 from afspm.basics.units import convert as convert_unit
 from afspm.model.scan import ShapeChange
 from afspm.wire import unit_conversion
@@ -22,14 +22,53 @@ from afspm.wire.split import Buffer, doubles, nested, packed, split
 _VALUES_OF_SCAN = _VALUES_OF_LINES = 4
 _DATA_OF_SPECTRUM = 4
 _VALUES_OF_DATA = 5
+_MOST_VALUES = 8
+_LONGEST_VALUE = 200
+_LONGEST_TEXT = 1000
 
 
-def as_plain(message: Any) -> Plain:
-    """Return a message of a generated class in JSON's types, by the names in its .proto file."""
-    from google.protobuf.json_format import MessageToDict  # slow to import, and rarely needed
+def as_plain(message: Any) -> Any:
+    """Return a message of a generated class in JSON's types, by the names in its .proto file.
 
-    plain: Plain = MessageToDict(message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
-    return plain
+    A message with content that JSON can't have, such as a time after the year 9999, is returned as one text.
+    """
+    from google.protobuf.json_format import Error, MessageToDict  # slow to import, and rarely needed
+
+    try:
+        return MessageToDict(message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
+    except (Error, TypeError, ValueError):
+        return " ".join(str(message).split())
+
+
+def as_text(message: Any) -> str:
+    """Return a message of a generated class as "tilt_rad: 0.01, …" for people, in one line.
+
+    Of long lists the first values are shown, of long texts the beginning, and of bytes their number.
+    """
+    plain = as_plain(message)
+    if not isinstance(plain, dict):
+        return _value_text(plain)
+    names = [field.name for field in message.DESCRIPTOR.fields if field.name in plain]
+    values = {name: getattr(message, name) for name in names}  # of bytes, JSON has a text
+    shown = {name: value if isinstance(value, bytes) else plain[name] for name, value in values.items()}
+    text = ", ".join(f"{name}: {_value_text(value)}" for name, value in shown.items())
+    return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]} …"
+
+
+def _value_text(value: object) -> str:
+    match value:
+        case dict():
+            return "{" + ", ".join(f"{name}: {_value_text(one)}" for name, one in value.items()) + "}"
+        case list():
+            more = f", … {len(value)} values" if len(value) > _MOST_VALUES else ""
+            return f"[{', '.join(map(_value_text, value[:_MOST_VALUES]))}{more}]"
+        case bytes():
+            return counted(len(value), "byte")
+        case float():
+            return f"{value:.10g}"  # without the rounding error of a calculation
+        case str() if len(value) > _LONGEST_VALUE:
+            return f"{value[:_LONGEST_VALUE]}… {len(value)} characters"
+    return str(value)
 
 
 def encode(thing: object) -> tuple[str, bytes]:

@@ -348,6 +348,7 @@ _declared: dict[str, MessageDeclaration] = {
 for _module in _MODULES:
     for _name in _module.DESCRIPTOR.message_types_by_name:
         _declared.setdefault(_name, MessageDeclaration(type=getattr(_module, _name)))
+_OF_AFSPM = frozenset(_declared)
 
 
 def declare(declaration: MessageDeclaration) -> MessageDeclaration:
@@ -386,6 +387,11 @@ def declared() -> tuple[MessageDeclaration, ...]:
 def is_relayed(name: str) -> bool:
     """Return whether the scheduler publishes the message `name` for components; False if it is not declared."""
     return name in _declared and _declared[name].relayed
+
+
+def is_of_afspm(name: str) -> bool:
+    """Return whether the message `name` is part of afspm, and not of a user's package."""
+    return name in _OF_AFSPM
 
 
 def declaration(name: str) -> MessageDeclaration:

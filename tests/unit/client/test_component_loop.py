@@ -607,3 +607,20 @@ def test_a_handler_that_fails_over_a_message_is_at_fault_if_it_had_control_and_n
     else:
         with pytest.raises(ValueError, match="read that"):
             run(Reacts(*does), lab, tmp_path)
+
+
+class OwnLog(Component):
+    def __init__(self) -> None:
+        self.log = []  # type: ignore[assignment]
+
+
+class OwnName(Component):
+    name = "mine"
+
+
+@pytest.mark.parametrize(("kind", "attribute"), [(OwnLog, "log"), (OwnName, "name")])
+def test_own_attribute_with_a_name_that_afspm_gives_is_refused(
+    lab: Lab, kind: type[Component], attribute: str
+) -> None:  # results X9
+    with pytest.raises(ConfigError, match=f"has its own '{attribute}'"):
+        run(kind(), lab)

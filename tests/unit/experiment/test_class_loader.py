@@ -26,3 +26,23 @@ def test_modules_beside_the_file_are_unloaded_and_modules_of_an_environment_in_i
         assert {"beside", "package", "library"} <= set(sys.modules)
     assert not {"beside", "package"} & set(sys.modules)
     del sys.modules["library"]  # it was there still
+
+
+@pytest.mark.parametrize(
+    ("line", "hint"),
+    [
+        ("from afspm.translator import Driver", "write `from afspm.driver import Driver`"),
+        ("from afspm.driver import Region", "write `from afspm import Region`"),
+        ("from afspm.driver import NoSuchName", ""),
+    ],
+)
+def test_module_that_imports_a_moved_name_is_pointed_to_its_door(
+    line: str, hint: str, tmp_path: Path
+) -> None:  # contributors K5
+    (tmp_path / "older.py").write_text(line, encoding="utf-8")
+    with (
+        class_loader.importing_from([tmp_path]),
+        pytest.raises(class_loader.Unloadable, match="cannot import") as found,
+    ):
+        class_loader.load("older.Mine")
+    assert found.value.hint == hint

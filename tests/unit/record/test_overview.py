@@ -284,9 +284,9 @@ def test_spectrum_summary_has_its_position() -> None:
     assert (told.time_ns, told.position_m, told.kind, told.holder) == (4 * S, (1e-9, 2e-9), "IV", "grid")
 
 
-def test_unknown_messages_are_ignored() -> None:
-    night = seen(("Own", object(), 1))
-    assert night.newest_ns == S
+def test_newest_message_without_a_declaration_is_kept() -> None:
+    night = seen(("Own", 1, 1), ("Own", 2, 3))
+    assert night.announced == {"Own": (3 * S, 2)}
 
 
 def test_progress_is_the_newest_of_each_component() -> None:

@@ -7,6 +7,7 @@ import io
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+from afspm import wire
 from afspm.basics.clock import iso_utc
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow, Table
@@ -38,6 +39,20 @@ def tables(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow]) -> Iterat
         columns = table.columns()
         rows = zip(*(_cells(column, values) for column, values in columns.items()), strict=True)
         yield f"{name}.csv", _csv([column.removesuffix("_ns") for column in columns], rows)
+    yield from _own_messages(run)
+
+
+def _own_messages(run: Run) -> Iterator[tuple[str, bytes]]:
+    by_name: dict[str, list[tuple[str, str, dict[str, object]]]] = {}
+    for packet, name, message in run.own_messages():
+        plain = wire.as_plain(message)
+        fields = plain if isinstance(plain, dict) else {"value": plain}
+        who = packet.envelope.removeprefix(name).removeprefix("_")
+        by_name.setdefault(name, []).append((iso_utc(packet.time_ns or 0), who, fields))
+    for name, messages in by_name.items():
+        columns = list(dict.fromkeys(column for _, _, fields in messages for column in fields))
+        rows = ([time, who, *(fields.get(column, "") for column in columns)] for time, who, fields in messages)
+        yield f"message-{name}.csv", _csv(["time", "component", *columns], rows)
 
 
 def _cells(column: str, values: list[Any]) -> list[object]:

@@ -48,6 +48,7 @@ def html(
         section("Treatments of the tip", _treatments(story)),
         section("Parameters changed", parameters.html(story.changes, clock)),
         section("Other instruments", _instruments(story)),
+        section("Messages of components", _messages(story, clock)),
         section("Agents", agents.html(story.agents, clock)),
         section("Drift", _drift(story, clock)),
         section("Notes", _notes(story, clock)),
@@ -291,6 +292,21 @@ def _instruments(story: RunStory) -> str:
             ]
         )
     return table(["parameter", "known beside", "values meanwhile", "outside a condition"], rows)
+
+
+def _messages(story: RunStory, clock: PageTimes) -> str:
+    rows = [
+        [
+            escape(one.who),
+            escape(one.name),
+            str(one.count),
+            clock.both(one.time_ns),
+            f'<span class="text">{escape(one.text)}</span>',
+        ]
+        for one in story.overview.announcements()
+    ]
+    unread = "".join(f'<p class="note">{escape(one)}.</p>' for one in story.overview.unread)
+    return table(["component", "message", "how many", "newest", "its fields"], rows) + unread
 
 
 def _notes(story: RunStory, clock: PageTimes) -> str:

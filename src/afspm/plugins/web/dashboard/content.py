@@ -55,12 +55,14 @@ class SlowContent:
     Attributes:
         sample_map_near: map of only the area of measurements and the present scan region.
         time_line_unfolded: time line with a row for each process.
+        messages: the newest message of each component's own type; empty without any.
     """
 
     sample_map: str = ""
     sample_map_near: str = ""
     time_line: str = ""
     time_line_unfolded: str = ""
+    messages: str = ""
     drift: Chart = field(default_factory=lambda: Chart(""))
 
 
@@ -194,7 +196,12 @@ class Contents:
             for unfolded in (False, True)
         )
         return SlowContent(
-            map_html(content), map_html(content, whole=False), folded, unfolded, drift_chart(overview.drift)
+            map_html(content),
+            map_html(content, whole=False),
+            folded,
+            unfolded,
+            messages_html(overview),
+            drift_chart(overview.drift),
         )
 
     def _strip(self, overview: Overview) -> Iterator[tuple[int, str]]:
@@ -372,6 +379,17 @@ def notes_html(overview: Overview) -> str:
     notes = sorted(overview.notes, key=lambda note: -note.time_ns)
     rows = "".join(_note(note, scans.get(note.scan_ns or 0)) for note in notes)
     return f'<ul class="notes">{rows}</ul>' if rows else '<p class="nothing">No notes yet.</p>'
+
+
+def messages_html(overview: Overview) -> str:
+    """Return the newest message of each component's own type as HTML; empty without any."""
+    rows = "".join(
+        f'<li><time>{time_of_day(one.time_ns)}</time> <b class="{tint_class(one.who)}">{escape(one.who)}</b> '
+        f"{escape(one.name)} <span>{escape(one.text)}</span></li>"
+        for one in overview.announcements()
+    )
+    unread = "".join(f"<li>{escape(one)}</li>" for one in overview.unread)
+    return f'<ul class="notes">{rows}{unread}</ul>' if rows or unread else ""
 
 
 def _note(note: Note, scan: ScanSummary | None) -> str:

@@ -68,6 +68,7 @@ class Night:
         with open_run(self.folder) as run:
             self.scans = [row for row in run.scans if row.file]
             self.events = sorted(_events(run), key=lambda event: event.time_ns)
+            self.unread_messages = tuple(run.unread_messages())
 
     @property
     def begin_ns(self) -> int:
@@ -158,6 +159,7 @@ class NightWatch(Watch):
             self._events = self._night.events
             self._playback = RecordPlayback(self._events)
             self.overview, self.frames = Overview(self.problems, bands=self._bands), ChannelNames()
+            self.overview.unread = self._night.unread_messages
             self.tip_to_sample = None
         self.moment.time_ns = time_ns
         for event in self._playback.due(time_ns):

@@ -203,6 +203,8 @@ class Sections:
         with ui.element("div").classes("further"):
             with section("Notes", "noted"):
                 self._notes = NotesPanel(services.watch, services.steering, visitor)
+            with section("Messages of components", "messages") as self._messages_section:
+                self._messages = ui.html("", sanitize=False).classes("scrolled").props('tabindex="0"')
             with section("Processes", "health"):
                 self._health = HealthPanel(session)
             with section("Spectra", "spectra") as self._spectra_section:
@@ -222,6 +224,8 @@ class Sections:
         self._health.show(content.processes, content.unheard)
         self._log.show(content.log, (process.name for process in content.processes))
         self._notes.show(content.notes)
+        self._messages.set_content(content.slow.messages)
+        self._messages_section.set_visibility(bool(content.slow.messages))
         self._spectra_section.set_visibility(self._spectra.show())
         if self._steering is not None:
             self._steering.show(content)

@@ -187,7 +187,8 @@ def _data(thing: object, time_ns: int, problems: ProblemNames) -> dict[str, obje
         case JournalEntries():
             return {"entries": [_entry(one, problems) for one in thing.entries]}
         case Message():
-            return wire.as_plain(thing)
+            content = wire.as_plain(thing)
+            return content if isinstance(content, dict) else {"value": content}
     plain: dict[str, object] = _without_large_numbers(to_plain(thing, lists=True))
     return plain
 
