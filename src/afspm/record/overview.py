@@ -102,7 +102,7 @@ class ProcessRestart:
 
 
 @dataclass(frozen=True, slots=True)
-class Announcement:
+class NewestMessage:
     """The newest message of a component's own type: its fields as text, and the number of such messages so far."""
 
     time_ns: int
@@ -397,12 +397,12 @@ class Overview:
             self.announced[key] = time_ns, thing
             self.announced_count[key] += 1
 
-    def announcements(self) -> Iterator[Announcement]:
+    def announcements(self) -> Iterator[NewestMessage]:
         """Yield the newest message of each envelope that the scheduler relays for a component."""
         for envelope, (time_ns, message) in self.announced.items():
             name = message.DESCRIPTOR.name
             who = envelope.removeprefix(name).removeprefix("_")
-            yield Announcement(time_ns, who, name, wire.as_text(message), self.announced_count[envelope])
+            yield NewestMessage(time_ns, who, name, wire.as_text(message), self.announced_count[envelope])
 
     @property
     def _holder(self) -> str | None:
