@@ -315,6 +315,17 @@ def test_scan_stopped_at_the_panel_is_interrupted(bench: Make) -> None:
     assert not scans(received)
 
 
+def test_scan_stopped_within_its_first_line_is_no_scan_of_zeros(bench: Make) -> None:
+    made = bench(speed=1.0, unscanned="zeros")
+    peer = small(made)
+    assert peer.act(names.START_SCAN).ok
+    peer.until(ScopeState.SCANNING)
+    made.at_panel(lambda emulator: emulator.software.functions.call("Scan.Action", [1, 0]))
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not scans(received)
+
+
 def test_safe_tip_blocks_measurements_until_the_tip_is_engaged(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made)

@@ -100,8 +100,8 @@ def images(ask: Ask, how: Grabbing, leave_out: Callable[[str, UnreadableReply], 
 def unscanned_as_nan(found: list[Image]) -> list[Image]:
     """Return images in which rows not yet scanned are NaN: of real instruments both NaN and zeros are reported.
 
-    Zeros in all channels and both directions are not scanned where they reach the end of the scan, if another row is
-    not zero: a flat frame stays as it is, and one without any value is wholly NaN.
+    Zeros in all channels and both directions are not scanned where they reach the end of the scan. No controller
+    measures an exact zero in every pixel of every channel, so a frame of zeros alone was stopped within its first line.
     """
     if not found or len({(image.values.shape, image.upwards) for image in found}) > 1:
         return found  # the channels are fetched one after the other, and a person may have changed the frame
@@ -109,7 +109,7 @@ def unscanned_as_nan(found: list[Image]) -> list[Image]:
     stack = np.stack([image.values if upwards else image.values[::-1] for image in found])  # rows in scanning order
     empty = (np.nan_to_num(stack) == 0.0).all(axis=(0, 2))
     if empty.all():
-        return found
+        return [replace(image, values=np.full_like(image.values, np.nan)) for image in found]
     last = int(np.flatnonzero(~empty)[-1])
     stack[:, last + 1 :] = np.nan
     for way in ("Forward", "Backward"):  # of the row that is being scanned, the rest is zero too
