@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import datetime as dt
-from typing import ClassVar
+from collections.abc import Callable
+from typing import ClassVar, Literal
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from afspm.basics.errors import ConfigError, ControlLost, NoResponse, Refused
@@ -18,6 +19,7 @@ from afspm.model import (
     JournalEntry,
     ScopeState,
     ScopeStatus,
+    TipStatus,
     names,
 )
 from afspm.model.events import NO_LONGER_TRUE
@@ -26,7 +28,10 @@ from afspm.model.problems import QUIET_HOURS
 WORKS, WAITS, PAUSES, PAUSED, RETURNS, LEFT = "works", "waits", "pauses", "paused", "returns", "left to a person"
 _ASKS_FOR_S = 2.0  # real time; then other packets are handled before it asks again
 _PUBLISHED_WITHIN_S = 10.0
+_ACCEPTED_WITHIN_S = 30.0
 _MOVED_WITHIN_S = 600.0  # real time: an approach may take minutes
+_SETTLED_TICKS = 3
+SCHEDULER = "scheduler"
 _ALARM = "the quiet hours are over, and the run waits for a person"
 _COMMANDS = frozenset(
     {
@@ -62,8 +67,9 @@ class QuietHours(Component):
 
     solves: ClassVar = (QUIET_HOURS,)
     flags: ClassVar = (QUIET_HOURS,)
-    listens: ClassVar = ("ControlState", "ScopeStateMsg", "JournalEntries")
-    period_s = 5.0
+    listens: ClassVar = ("ControlState", "ScopeStateMsg", "JournalEntries", "TipStatus")
+    period_s = 1.0
+    period_time: Literal["experiment", "real"] = "real"
 
     def __init__(self, begin: str, end: str, zone: str = "", withdraw: bool = False) -> None:
         self.hours = DailyHours(_time(begin, "begin"), _time(end, "end"), _zone(zone))
@@ -74,20 +80,32 @@ class QuietHours(Component):
 
     def on_start(self) -> None:
         self.memory.setdefault("phase", WORKS)
-
-    def on_state(self, status: ScopeStatus) -> None:
-        if status.state is ScopeState.FREE:  # between two scans, which a tick would seldom meet
-            self._act()
+        self.memory.setdefault("since_ns", 0)
+        self._ticks = self._over = 0
 
     def on_tick(self) -> None:
+        self._ticks += 1
+        self._over = 0 if self._end() else self._over + 1
         self._act()
+
+    def on_state(self, status: ScopeStatus) -> None:
+        is_busy = status.state not in (ScopeState.FREE, ScopeState.UNDEFINED)
+        time_ns = None if self.packet is None else self.packet.time_ns
+        if is_busy and self._is_away and time_ns is not None and time_ns > self.memory.get("still_ns", 0):
+            self._touched(f"the microscope was busy ({status.state.name})", tip=True)
+        elif not is_busy:  # between two scans, which a tick would seldom meet
+            self._act()
+
+    def on_tip_status(self, status: TipStatus) -> None:
+        if self.memory["phase"] == PAUSED and status.engaged is True and self.memory.get("withdrawn"):
+            self._touched("the tip was brought back", tip=True)
 
     def on_control(self, control_state: ControlState) -> None:
         is_manual = self._is_manual  # the newest: an older state must not look like a change
         was_manual = self.memory.get("was_manual", False)
         if is_manual is not was_manual:
             self._note(was_manual=is_manual)
-        if was_manual and not is_manual and self.memory["phase"] != RETURNS:
+        if was_manual and not is_manual:
             end = self._end()
             if end is not None:
                 self._let_go(end, "a person lets the run continue")
@@ -96,52 +114,63 @@ class QuietHours(Component):
         self._act()
 
     def on_journal_entries(self, entries: JournalEntries) -> None:
-        if self.memory["phase"] not in (PAUSED, LEFT) or self.memory.get("touched"):
-            return
-        for entry in entries.entries:
-            if entry.time_ns > self.memory["paused_ns"] and is_act(entry, self.name):
-                self._note(touched=f"{entry.who}: {entry.what}")
-                return
+        for entry in entries.entries if self._is_away else ():
+            if (entry.sent_ns or entry.time_ns) > self.memory["since_ns"] and is_act(entry, self.name):
+                is_of_tip = entry.event is ControlEvent.BY_HAND or entry.request == ControlRequest.ACTION
+                self._touched(f"{entry.who}: {entry.what}", tip=is_of_tip)
+
+    def _touched(self, how: str, *, tip: bool) -> None:
+        first = self.memory.get("touched") or how
+        self._note(touched=first, tip_touched=self.memory.get("tip_touched", False) or tip)
 
     # --- decisions
 
     def _act(self) -> None:
         end, is_manual = self._end(), self._is_manual
         is_due = end is not None and end.timestamp() > self.memory.get("not_before_s", 0.0)
-        if self.memory["phase"] == PAUSES:  # this process was killed in between
-            self._note(phase=PAUSED if is_manual else WAITS)
-        if self.memory["phase"] == WORKS and is_due and not is_manual and self._is_free:
+        phase = self.memory["phase"]
+        if phase == PAUSES:  # this process was killed in between
+            self._note(phase=PAUSED if is_manual else WAITS, held=is_manual)
+        elif phase in (PAUSED, LEFT) and not is_manual and (self.memory.get("held") or not self._is_flagged()):
+            self._note(phase=RETURNS)  # a person let the run continue while this process was away, or cleared the flag
+        elif phase == WORKS and is_due and not is_manual and self._is_free:
             self._note(phase=WAITS)
             self.scope.flag(QUIET_HOURS)
             self.scope.wait_until(self._is_flagged, timeout_s=_PUBLISHED_WITHIN_S)
-        if self.memory["phase"] == WAITS and not is_due:
-            self._note(phase=RETURNS)
-        if self.memory["phase"] == WAITS and end is not None and not is_manual and self._is_free:
-            self._pause(end)
-        elif self.memory["phase"] == PAUSED and end is None:
+        elif phase == RETURNS and is_due and not is_manual:  # it could not get control for all the day
+            self._note(phase=WAITS)
+        if self.memory["phase"] == WAITS:
+            if is_due and end is not None and not is_manual and self._is_free:
+                self._pause(end)
+            elif not is_due and is_manual:
+                self._leave("a person paused it")
+            elif not is_due:
+                self._note(phase=RETURNS)
+        # a tick later every act from within the hours is in the journal, and what was kept for a new process is handled
+        is_over = self._over >= _SETTLED_TICKS and self._ticks >= _SETTLED_TICKS
+        if self.memory["phase"] == PAUSED and is_over:
             self._go_on()
-        if self.memory["phase"] == RETURNS and not self._is_manual and self._is_tip_back():
-            self.scope.clear(QUIET_HOURS)
-            if self.memory.get("alarmed"):
-                self.log.info("%s%s", NO_LONGER_TRUE, _ALARM)
-            self._note(phase=WORKS, alarmed=False, withdrawn=False)
-            self.log.info("the run goes on")
+        if self.memory["phase"] == RETURNS and not self._is_manual and self._is_free:
+            self._return()
 
     def _pause(self, end: dt.datetime) -> None:
-        try:
-            with self.scope.control(solving=QUIET_HOURS, timeout_s=_ASKS_FOR_S):
-                not_withdrawn = self._withdraw()
-                self._note(phase=PAUSES, paused_ns=self.clock.now_ns(), touched=not_withdrawn)
-                if why := self._set_mode(ControlMode.MANUAL):
-                    self.log.error("the mode stays AUTOMATED, and the flag alone keeps all from measuring: %s", why)
-        except ControlLost as lost:
-            if self._is_flagged():
-                self.log.debug("waiting for control: %s", lost.what)
-                return
-            self._let_go(end, "a person cleared quiet-hours")
-            self._note(phase=RETURNS)
+        def withdraw() -> str:
+            self._note(since_ns=self.clock.now_ns(), touched="", tip_touched=False)
+            why = self._withdraw()
+            if not self.scope.in_control:
+                raise ControlLost("control was lost before the pause", where=self.name)
+            self._note(phase=PAUSES, still_ns=self.clock.now_ns(), touched=why, tip_touched=bool(why))
+            return self._set_mode(ControlMode.MANUAL)
+
+        refused = self._in_control(withdraw)
+        if refused is None:
+            if not self._is_flagged() and self.memory["phase"] == WAITS:
+                self._let_go(end, "a person cleared quiet-hours")
+                self._note(phase=RETURNS)
             return
-        self._note(phase=PAUSED, was_manual=self._is_manual)
+        if refused:
+            self.log.error("the mode stays AUTOMATED, and the flag alone keeps all from measuring: %s", refused)
+        self._note(phase=PAUSED, was_manual=self._is_manual, held=not refused)
         how = " with the tip withdrawn" if self.memory.get("withdrawn") else ""
         self.log.info("paused%s until %s; `afspm continue` lets the run go on before", how, _clock_time(end))
 
@@ -150,52 +179,76 @@ class QuietHours(Component):
         if not self.withdraw or ((tip := self.scope.tip) is not None and tip.engaged is False):
             return ""
         self._note(withdrawn=True)  # before, since after a kill it may be so
-        try:
-            self._move(names.RETRACT)
-        except (Refused, NoResponse) as error:
-            self.log.critical("the tip could not be withdrawn for the pause: %s", error.what)
-            return f"the tip could not be withdrawn for the pause: {error.what}"
-        return ""
+        if why := self._move(names.RETRACT):
+            why = f"the tip could not be withdrawn for the pause: {why}"
+            self.log.critical("%s (%s)", why, self._date())
+        return why
 
     def _go_on(self) -> None:
         why = self.memory.get("touched", "")
         if not why:
             if not self._is_flagged():  # else others would measure before the tip is back
                 self.scope.flag(QUIET_HOURS)
-            why = self._set_mode(ControlMode.AUTOMATED)
+                self.scope.wait_until(self._is_flagged, timeout_s=_PUBLISHED_WITHIN_S)
+            why = self._set_mode(ControlMode.AUTOMATED) if self._is_manual else ""
         if why:
             self._leave(why)
         else:
             self._note(phase=RETURNS, was_manual=False)
 
-    def _is_tip_back(self) -> bool:
-        if not self.memory.get("withdrawn"):
-            return True
-        try:
-            if not self._is_flagged():
-                self.scope.flag(QUIET_HOURS)
-                self.scope.wait_until(self._is_flagged, timeout_s=_PUBLISHED_WITHIN_S)
-            with self.scope.control(solving=QUIET_HOURS, timeout_s=_ASKS_FOR_S):
-                if self._is_to_engage:
-                    self._move(names.ENGAGE)
-                    if (tip := self.scope.tip) is not None and tip.engaged is False:
-                        raise NoResponse("the microscope says that the tip is still withdrawn", where=self.name)
-        except ControlLost as lost:
-            self.log.debug("waiting for control: %s", lost.what)
-            return False
-        except (Refused, NoResponse) as error:
-            self._set_mode(ControlMode.MANUAL)
-            self._leave(f"the tip could not be brought back: {error.what}")
-            return False
-        return True
+    def _return(self) -> None:
+        if self._is_flagged():
+            why = self._in_control(self._bring_back)
+            if why is None:
+                return
+            if why:
+                self._set_mode(ControlMode.MANUAL)
+                self._leave(why)
+                return
+        elif self.memory.get("withdrawn") and not self._is_back_by_hand:
+            self.scope.flag(QUIET_HOURS)  # and at the next tick the tip is brought back
+            return
+        if self.memory.get("alarmed"):
+            self.log.info("%s%s", NO_LONGER_TRUE, _ALARM)
+        self._note(phase=WORKS, alarmed=False, withdrawn=False, touched="", tip_touched=False)
+        self.log.info("the run goes on")
+
+    def _bring_back(self) -> str:
+        # returns why the tip could not be brought back
+        if self.memory.get("withdrawn"):
+            tip = self.scope.tip
+            is_engaged = None if tip is None else tip.engaged
+            if is_engaged is None and self.memory.get("tip_touched"):
+                return (
+                    "the microscope does not report its tip, which was moved by hand: bring it to the sample,"
+                    " and clear quiet-hours"
+                )
+            if is_engaged is not True and (why := self._move(names.ENGAGE)):
+                return f"the tip could not be brought back: {why}"
+            if (tip := self.scope.tip) is not None and tip.engaged is False:
+                return "the tip could not be brought back: the microscope reports it as withdrawn"
+            self._note(withdrawn=False)
+        self.scope.clear(QUIET_HOURS)
+        return ""
 
     def _leave(self, why: str) -> None:
-        self._note(phase=LEFT, alarmed=True, was_manual=self._is_manual)
-        self.log.critical("%s: %s; `afspm continue` lets it go on", _ALARM, why)
+        self._note(phase=LEFT, alarmed=True, was_manual=self._is_manual, held=self._is_manual)
+        # with the date, since people are called once for each text
+        self.log.critical("%s: %s (%s); `afspm continue` lets it go on", _ALARM, why, self._date())
 
     def _let_go(self, end: dt.datetime, who: str) -> None:
         self._note(not_before_s=end.timestamp())
         self.log.info("%s in the quiet hours: it goes on, also after %s", who, _clock_time(end))
+
+    def _in_control(self, do: Callable[[], str]) -> str | None:
+        # returns what `do` returns; None: control was not given, or lost, and it is tried again
+        found: str | None = None
+        try:
+            with self.scope.control(solving=QUIET_HOURS, timeout_s=_ASKS_FOR_S, unbroken=True):
+                found = do()
+        except (ControlLost, NoResponse, Refused) as error:
+            self.log.debug("waiting for control: %s", error.what)
+        return found
 
     def _set_mode(self, mode: ControlMode) -> str:
         # returns why it was refused
@@ -206,20 +259,27 @@ class QuietHours(Component):
         self.scope.wait_until(lambda: self.scope.mode is mode, timeout_s=_PUBLISHED_WITHIN_S)
         return ""
 
-    def _move(self, action: str) -> None:
+    def _move(self, action: str) -> str:
+        # returns why the action was not carried out
         with self.scope.events("ScopeStateMsg", timeout_s=_MOVED_WITHIN_S) as states:
-            self.scope.action(action)
+            try:
+                self.scope.action(action, timeout_s=_ACCEPTED_WITHIN_S)
+            except (Refused, NoResponse) as error:
+                return error.what
             was_busy = False
             for event in states:
                 if event.message.state is ScopeState.FREE and was_busy:
-                    return
+                    return ""
                 was_busy = was_busy or event.message.state is not ScopeState.FREE
-        raise NoResponse(f"{action} did not end within {_MOVED_WITHIN_S:g} s", where=self.name)
+        return f"{action} did not end within {_MOVED_WITHIN_S:g} s"
 
     # --- knowledge
 
     def _end(self) -> dt.datetime | None:
         return self.hours.end_after(dt.datetime.fromtimestamp(self.clock.now_s(), dt.UTC))
+
+    def _date(self) -> str:
+        return dt.datetime.fromtimestamp(self.clock.now_s(), dt.UTC).astimezone(self.hours.zone).date().isoformat()
 
     def _note(self, **known: object) -> None:
         self.memory.update(known)
@@ -227,6 +287,10 @@ class QuietHours(Component):
 
     def _is_flagged(self) -> bool:
         return self.scope.is_flagged(QUIET_HOURS)
+
+    @property
+    def _is_away(self) -> bool:
+        return self.memory["phase"] in (PAUSES, PAUSED, RETURNS, LEFT)
 
     @property
     def _is_manual(self) -> bool:
@@ -237,13 +301,10 @@ class QuietHours(Component):
         return self.scope.state is ScopeState.FREE
 
     @property
-    def _is_to_engage(self) -> bool:
-        if not self.memory.get("withdrawn"):
-            return False
+    def _is_back_by_hand(self) -> bool:
+        # the flag was cleared: where the microscope does not report its tip, a person's word for it
         tip = self.scope.tip
-        if tip is None or tip.engaged is None:  # a person who used the microscope has looked at the tip
-            return not self.memory.get("touched")
-        return not tip.engaged
+        return bool(self.memory.get("tip_touched")) if tip is None or tip.engaged is None else tip.engaged
 
 
 class DailyHours:
@@ -296,10 +357,15 @@ def _clock_time(time: dt.datetime) -> str:
 
 
 def is_act(entry: JournalEntry, me: str) -> bool:
-    """Return whether an entry is an act at the microscope, or a command or change of mode by another than `me`."""
+    """Return whether an entry is an act at the microscope, or a command or change of mode by another than `me`.
+
+    A command without an answer counts, since it may have been carried out; a stop by the scheduler does not.
+    """
     if entry.event is ControlEvent.BY_HAND:
         return True
-    if entry.who == me or entry.response != ControlResponse.SUCCESS:
+    if entry.who == me or entry.response not in (ControlResponse.SUCCESS, ControlResponse.NO_RESPONSE):
         return False
+    if entry.who == SCHEDULER:
+        return entry.subject == names.RETRACT
     sets = entry.request == ControlRequest.PARAM and bool(entry.subject)
     return sets or entry.request in _COMMANDS

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import datetime as dt
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from afspm.basics.errors import ConfigError
+from afspm.client.component import Component
 from afspm.components.planned_scans import ScanSeries
 from afspm.components.quiet_hours import QuietHours, is_act
 from afspm.model import (
@@ -75,13 +76,21 @@ def test_impossible_hours_are_refused(settings: dict[str, Any], words: str) -> N
 class Night:
     """An experiment of scans, with quiet hours from one to two units of ten minutes after its begin."""
 
-    def __init__(self, folder: Path, *, withdraw: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        withdraw: bool = False,
+        panel: Sequence[tuple[float, str]] = (),
+        others: Mapping[str, Component] | None = None,
+    ) -> None:
         begin, end = (
             dt.datetime.fromtimestamp(START_S + units * UNIT_S, dt.UTC).strftime("%H:%M") for units in (1.0, 2.0)
         )
         self.bench = Bench(
             QuietHours(begin, end, zone="UTC", withdraw=withdraw),
-            others={"series": ScanSeries((1e-6, 1e-6), pixels=(16, 16), every=60.0, scans=10_000)},
+            others={"series": ScanSeries((1e-6, 1e-6), pixels=(16, 16), every=60.0, scans=10_000), **(others or {})},
+            microscope={"panel": [{"at_s": at_s, "action": action} for at_s, action in panel]},
             problems={"quiet-hours": NUMBER},
             folder=folder,
         )
@@ -93,6 +102,13 @@ class Night:
     def control(self) -> ControlState:
         state: ControlState = self.bench.published("ControlState")[-1]
         return state
+
+    @property
+    def entries(self) -> list[JournalEntry]:
+        return [one for batch in self.bench.published("JournalEntries") for one in batch.entries]
+
+    def actions_of(self, who: str) -> list[str]:
+        return [one.subject for one in self.entries if one.who == who and one.subject.startswith(("x-", "start"))]
 
     @property
     def scans(self) -> int:
@@ -185,9 +201,8 @@ def test_tip_is_withdrawn_for_the_pause_and_brought_back_before_the_first_scan(t
     night = Night(tmp_path, withdraw=True)
     night.go_to(2.2)
     assert night.is_at_work
-    entries = [one for batch in night.bench.published("JournalEntries") for one in batch.entries]
     wanted = ("flagged", "x-", "mode", "cleared")
-    assert [one.what for one in entries if one.who == "quiet_hours" and one.what.startswith(wanted)] == [
+    assert [one.what for one in night.entries if one.who == "quiet_hours" and one.what.startswith(wanted)] == [
         "flagged quiet-hours",
         "x-retract",
         "mode MANUAL",
@@ -206,10 +221,73 @@ def test_tip_that_does_not_come_back_is_left_to_a_person(tmp_path: Path, caplog:
     assert night.is_paused
     assert [one.getMessage() for one in caplog.records if one.levelno == logging.CRITICAL] == [
         "the quiet hours are over, and the run waits for a person: the tip could not be brought back: "
-        "the action was refused: refused by the bench; `afspm continue` lets it go on"
+        "the action was refused: refused by the bench (2025-06-15); `afspm continue` lets it go on"
     ]
     night.bench.set_mode(ControlMode.AUTOMATED)
     assert night.is_at_work
+
+
+@pytest.mark.parametrize(
+    "panel", [[(700.0, "x-engage"), (800.0, "x-retract")], [(700.0, "x-engage")]], ids=["and back", "alone"]
+)
+def test_tip_that_a_person_has_moved_is_left_to_a_person(tmp_path: Path, panel: list[tuple[float, str]]) -> None:
+    night = Night(tmp_path, withdraw=True, panel=panel)
+    night.go_to(2.2)
+    assert night.is_paused
+    assert night.actions_of("quiet_hours") == ["x-retract"]
+    night.bench.close()
+
+
+@pytest.mark.parametrize("at_s", [559.9, 560.0, 560.1, 560.3, 561.0])
+def test_pause_of_a_person_while_the_tip_is_withdrawn_outlasts_the_hours(tmp_path: Path, at_s: float) -> None:
+    night = Night(tmp_path, withdraw=True)
+    night.bench.at(at_s, night.bench.set_mode, ControlMode.MANUAL)
+    night.go_to(2.2)
+    assert night.control.mode is ControlMode.MANUAL
+    assert "x-engage" not in night.actions_of("quiet_hours")
+    night.bench.set_mode(ControlMode.AUTOMATED)
+    assert night.is_at_work
+    night.bench.close()
+
+
+def test_act_while_the_component_was_away_is_seen(tmp_path: Path) -> None:
+    night = Night(tmp_path, withdraw=True)
+    night.go_to(1.9)
+    night.bench.kill("quiet_hours", restarts=False)
+    night.bench.set_mode(ControlMode.MANUAL)
+    night.bench.run(until=1170.0)
+    process = night.bench._processes["quiet_hours"]
+    process.banned = False
+    process.start()
+    night.go_to(2.2)
+    assert night.is_paused
+    assert "x-engage" not in night.actions_of("quiet_hours")
+    night.bench.close()
+
+
+class Repair(Component):
+    """Scans once to solve tip-shape-changed."""
+
+    solves = ("tip-shape-changed",)
+
+    def run(self) -> None:
+        with self.scope.events("ControlState") as states:
+            for _ in states:
+                if self.scope.is_flagged("tip-shape-changed"):
+                    with self.scope.control(solving="tip-shape-changed"):
+                        self.scope.scan()
+                        self.scope.clear("tip-shape-changed")
+
+
+def test_no_problem_is_solved_while_the_tip_is_withdrawn(tmp_path: Path) -> None:
+    night = Night(tmp_path, withdraw=True, others={"repair": Repair()})
+    night.bench.at(570.0, night.bench.flag, "tip-shape-changed")
+    night.go_to(2.2)
+    assert night.is_at_work
+    moved = [one.subject for one in night.entries if one.time_ns * 1e-9 > START_S + 565.0 and one.response == 0]
+    assert next(one for one in moved if one in ("x-engage", "start-scan")) == "x-engage"
+    assert night.actions_of("repair") == ["start-scan"]
+    night.bench.close()
 
 
 def asked(who: str, request: int, response: int = ControlResponse.SUCCESS, subject: str = "") -> JournalEntry:
@@ -226,6 +304,9 @@ def asked(who: str, request: int, response: int = ControlResponse.SUCCESS, subje
         (asked("dashboard:ada", ControlRequest.PARAM), False),  # a value is read
         (asked("series", ControlRequest.SET_PROBE_POS, ControlResponse.NOT_IN_CONTROL), False),
         (asked("quiet_hours", ControlRequest.ACTION, subject="x-retract"), False),
+        (asked("dashboard:ada", ControlRequest.ACTION, ControlResponse.NO_RESPONSE, "x-engage"), True),
+        (asked("scheduler", ControlRequest.ACTION, subject="stop-scan"), False),
+        (asked("scheduler", ControlRequest.ACTION, subject="x-retract"), True),
     ],
 )
 def test_acts_of_a_person_differ_from_all_else(entry: JournalEntry, *, is_one: bool) -> None:

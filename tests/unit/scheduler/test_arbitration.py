@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from afspm.model import STOPPED_BY_AGENT, ControlMode, ControlResponse, ProblemNames
+from afspm.model.problems import QUIET_HOURS
 from afspm.model.snapshot import from_plain, to_plain
 from afspm.scheduler.control.arbitration import (
     OTHERWISE,
@@ -72,7 +73,9 @@ def test_every_row_can_apply() -> None:
     met = set()
     stopping = Rules(problems=ProblemNames({STOPPED_BY_AGENT: 99}), agents=frozenset({"a"}))
     approving = Rules(RoleTable(approve=("boss",)))
-    for rules in (RULES, Rules(roles), approving, Rules(end_on=frozenset({TIP})), Rules(shadow=True), stopping):
+    resting = Rules(problems=ProblemNames({QUIET_HOURS: 99}))
+    plain = (RULES, Rules(roles), approving, Rules(end_on=frozenset({TIP})), Rules(shadow=True))
+    for rules in (*plain, stopping, resting):
         for control in _states():
             for event in ArbitrationEvent:
                 for who in ("a", "b", "boss"):

@@ -23,6 +23,7 @@ from afspm.model import (
     ProblemNames,
     component_of,
 )
+from afspm.model.problems import QUIET_HOURS
 
 _NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
 
@@ -276,6 +277,15 @@ SOLVES_OTHER_THAN_MALFUNCTION = Condition(
     "device-malfunction is flagged and it names another problem",
     lambda c, a, r: a.number not in (0, Problem.DEVICE_MALFUNCTION) and Problem.DEVICE_MALFUNCTION in c.problems,
 )
+# the tip may be withdrawn until the component that flagged it has brought it back
+SOLVES_OTHER_THAN_QUIET_HOURS = Condition(
+    "quiet-hours is flagged, it names another problem than this and device-malfunction, and is not in control",
+    lambda c, a, r: (
+        r.problems.get(QUIET_HOURS) in c.problems
+        and a.number not in (0, r.problems.get(QUIET_HOURS), Problem.DEVICE_MALFUNCTION)
+        and c.holder != a.who
+    ),
+)
 UNKNOWN_PROBLEM = Condition("the experiment knows no such problem", lambda c, a, r: a.number not in r.problems.values())
 IS_FLAGGED = Condition("it is flagged already", lambda c, a, r: a.number in c.problems)
 ENDS_EXPERIMENT = Condition("[control] end_on names it", lambda c, a, r: a.number in r.end_on)
@@ -343,6 +353,11 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
             SOLVES_OTHER_THAN_MALFUNCTION,
             _R.WRONG_EXP_PROBLEM,
             "flagged: {problems}; until device-malfunction is cleared, only components that solve it get control",
+        ),
+        _refuse(
+            SOLVES_OTHER_THAN_QUIET_HOURS,
+            _R.WRONG_EXP_PROBLEM,
+            "flagged: {problems}; until quiet-hours is cleared, no other problem is solved",
         ),
         _refuse(
             SOLVES_NONE,
