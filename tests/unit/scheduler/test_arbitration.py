@@ -338,7 +338,7 @@ def test_no_sequence_of_events_breaks_the_invariants(story: list[ControlInput]) 
 
 def _states() -> list[ArbitrationState]:
     states = [ArbitrationState(ended=True)]
-    for flagged in ({}, {1: "a"}, {1: "a", 2: "b"}, {99: "a"}):
+    for flagged in ({}, {1: "a"}, {1: "a", 2: "b"}, {99: "a"}, {1: "a", 99: "b"}):
         problems = MappingProxyType(flagged)
         states += [ArbitrationState(m, None, 0, problems) for m in (ControlMode.MANUAL, ControlMode.AUTOMATED)]
         states += [ArbitrationState(ControlMode.AUTOMATED, "a", solving, problems) for solving in (flagged or {0: ""})]
