@@ -19,7 +19,6 @@ from afspm.model import (
     JournalEntry,
     ScopeState,
     ScopeStatus,
-    TipStatus,
     names,
 )
 from afspm.model.events import NO_LONGER_TRUE
@@ -67,7 +66,7 @@ class QuietHours(Component):
 
     solves: ClassVar = (QUIET_HOURS,)
     flags: ClassVar = (QUIET_HOURS,)
-    listens: ClassVar = ("ControlState", "ScopeStateMsg", "JournalEntries", "TipStatus")
+    listens: ClassVar = ("ControlState", "ScopeStateMsg", "JournalEntries")
     period_s = 1.0
     period_time: Literal["experiment", "real"] = "real"
 
@@ -86,6 +85,9 @@ class QuietHours(Component):
     def on_tick(self) -> None:
         self._ticks += 1
         self._over = 0 if self._end() else self._over + 1
+        tip = self.scope.tip
+        if self.memory["phase"] == PAUSED and self.memory.get("withdrawn") and tip is not None and tip.engaged is True:
+            self._touched("the tip was brought back", tip=True)
         self._act()
 
     def on_state(self, status: ScopeStatus) -> None:
@@ -95,10 +97,6 @@ class QuietHours(Component):
             self._touched(f"the microscope was busy ({status.state.name})", tip=True)
         elif not is_busy:  # between two scans, which a tick would seldom meet
             self._act()
-
-    def on_tip_status(self, status: TipStatus) -> None:
-        if self.memory["phase"] == PAUSED and status.engaged is True and self.memory.get("withdrawn"):
-            self._touched("the tip was brought back", tip=True)
 
     def on_control(self, control_state: ControlState) -> None:
         is_manual = self._is_manual  # the newest: an older state must not look like a change
@@ -147,7 +145,7 @@ class QuietHours(Component):
             elif not is_due:
                 self._note(phase=RETURNS)
         # a tick later every act from within the hours is in the journal, and what was kept for a new process is handled
-        is_over = self._over >= _SETTLED_TICKS and self._ticks >= _SETTLED_TICKS
+        is_over = end is None and min(self._over, self._ticks) >= _SETTLED_TICKS
         if self.memory["phase"] == PAUSED and is_over:
             self._go_on()
         if self.memory["phase"] == RETURNS and not self._is_manual and self._is_free:
@@ -170,6 +168,7 @@ class QuietHours(Component):
             return
         if refused:
             self.log.error("the mode stays AUTOMATED, and the flag alone keeps all from measuring: %s", refused)
+        self._over = 0
         self._note(phase=PAUSED, was_manual=self._is_manual, held=not refused)
         how = " with the tip withdrawn" if self.memory.get("withdrawn") else ""
         self.log.info("paused%s until %s; `afspm continue` lets the run go on before", how, _clock_time(end))
