@@ -523,6 +523,41 @@ def test_refused_scan_does_not_count(agent: AgentLab) -> None:
     assert "used up" in agent.do(ACTION, names.START_SCAN)
 
 
+def start(request_id: str, agent: AgentLab, subject: Any = names.START_SCAN, kind: int = ACTION) -> Request:
+    return Request(kind, subject, agent.lab.codec.encode(subject), f"{AGENT}/1/{request_id}")
+
+
+def test_use_that_certainly_failed_counts_when_it_is_sent_again_under_its_id(agent: AgentLab) -> None:
+    # faults, mutant of grants.py: the id stayed spent, so that the second sending was not counted
+    agent.begin(agent.grant(counts=(GrantedCount(names.START_SCAN, 1),)))
+    assert agent.do(SCAN, ScanParameters(HERE)) == ""
+    checker, now_ns, first = agent.lab.core.state.grants, agent.lab.now_ns, start("a", agent)
+    checker = checker.sending(AGENT, first, now_ns, None).not_done(AGENT, first)
+    checker = checker.sending(AGENT, first, now_ns, None)
+    assert checker.book.approvals().approvals[0].left == (GrantedCount(names.START_SCAN, 0),)
+
+
+def test_spent_id_stands_for_its_content_alone(agent: AgentLab) -> None:
+    # faults, mutant of grants.py; the scheduler's memory of answers may have forgotten the id
+    agent.begin(agent.grant())
+    low, high = (Parameter(names.TIP_BIAS_VOLTAGE, value, "V") for value in ("0.1", "0.2"))
+    checker, now_ns = agent.lab.core.state.grants, agent.lab.now_ns
+    checker = checker.sending(AGENT, start("a", agent, low, PARAM), now_ns, None)
+    assert checker.refused(AGENT, start("a", agent, low, PARAM), now_ns, None, LimitState()) is None
+    refusal = checker.refused(AGENT, start("a", agent, high, PARAM), now_ns, None, LimitState())
+    assert refusal is not None
+    assert refusal.reason == "this id is of another request"
+
+
+def test_agent_sets_its_place_again_after_it_gave_control_back(agent: AgentLab) -> None:
+    # faults, mutant of grants.py: others may have moved the frame meanwhile
+    agent.begin(agent.grant())
+    assert agent.do(SCAN, ScanParameters(HERE)) == ""
+    assert agent.lab.says(AGENT, int(ControlRequest.RELEASE_CTRL)) is OK
+    assert agent.lab.take_control(AGENT) is OK
+    assert "has not set the place" in agent.do(ACTION, names.START_SCAN)
+
+
 def test_counts_survive_a_kill_before_the_answer(agent: AgentLab) -> None:
     agent.begin(agent.grant(counts=(GrantedCount(names.START_SCAN, 1),)))
     assert agent.do(SCAN, ScanParameters(HERE)) == ""

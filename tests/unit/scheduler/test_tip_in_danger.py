@@ -366,6 +366,20 @@ def test_refused_switch_off_of_the_feedback_is_no_danger() -> None:
     assert sent(lab)[-1] != "x-retract"
 
 
+def test_retract_is_sent_though_the_feedback_is_no_longer_known() -> None:
+    # faults, mutant of watchdog.py: only a feedback that is on makes the retract unnecessary
+    lab = in_control(SchedulerSettings())
+    lab.scope_is(ScopeState.SCANNING)
+    lab.ask("experiment", ControlRequest.SET_ZCTRL_PARAMS, OFF, "experiment/a/1")
+    in_flight = lab.forwarded[-1]
+    lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
+    lab.answer(in_flight, ControlResponse.PARAM_ERROR)
+    assert sent(lab)[-1] == "stop-scan"
+    lab.answer(lab.forwarded[-1])
+    lab.scope_is(ScopeState.FREE)
+    assert sent(lab)[-1] == "x-retract"
+
+
 def test_a_scheduler_that_was_killed_knows_that_the_feedback_is_off() -> None:
     again = killed(feedback_off_and_saved(), SchedulerSettings())
     for _ in range(3):

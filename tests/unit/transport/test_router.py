@@ -215,6 +215,22 @@ def test_second_sender_of_a_name_gets_no_answers_of_the_first(open_: Any, plain:
         assert bare.recv_multipart() == [b""]  # a look whether it is there
 
 
+def test_identity_is_not_taken_over_by_another_key(open_: Any, plain: Any) -> None:
+    # faults, mutant of router.py: the owner of the key was not compared
+    run = Run(open_)
+    heard = []
+    for n, owner in enumerate(("series", "thief")):
+        bare, own = plain(zmq.DEALER), run.keys(owner)
+        bare.setsockopt(zmq.ROUTING_ID, b"series")
+        bare.curve_publickey, bare.curve_secretkey = own.public, own.secret
+        bare.curve_serverkey = own.server_key(run.listening.router.address)
+        bare.connect(run.listening.router.address)
+        bare.send_multipart([b"", *wire.encode_request(Request(CLOCK_REQUEST, id=f"series/{n}/1"))])
+        heard.append(run.listening.until(n + 1)[-1])
+    assert [one.user for one in heard] == ["series", "thief"]
+    assert heard[0].connection != heard[1].connection
+
+
 def test_restarted_sender_has_its_name_while_its_old_connection_stands(open_: Any) -> None:
     run = Run(open_)
     for life in range(2):
