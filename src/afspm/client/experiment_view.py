@@ -23,6 +23,7 @@ from afspm.model import (
     TipStatus,
 )
 from afspm.model.state import FeedbackUnits
+from afspm.transport.process.parent import StopRequested
 
 _PROBLEM = Argument(
     "a problem's name or number", lambda value: isinstance(value, str | Integral), '"tip-shape-changed"'
@@ -120,7 +121,7 @@ class ExperimentView:
     @property
     def channels(self) -> ChannelRoles:
         """Return the microscope's channels by their roles, also after the end; empty if it has declared none."""
-        with suppress(ExperimentEnded):
+        with suppress(ExperimentEnded, StopRequested):
             self._catch_up()
         return self._link.view.channels
 

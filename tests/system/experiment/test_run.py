@@ -131,6 +131,19 @@ def test_ctrl_c_ends_all_cleanly(run: Run) -> None:
         one.wait_for(f" {name} ", "ended as it was asked to")  # by itself: nothing had to be killed
 
 
+@can_interrupt
+def test_components_know_the_channels_after_ctrl_c(run: Run, tmp_path: Path) -> None:
+    # DriftPictures drew nothing of a run that a person stopped
+    log = "self.log.info('%d roles', len(self.scope.channels.names))"
+    code = f"import afspm\n\nclass Last(afspm.Component):\n    def on_end(self):\n        {log}\n"
+    (tmp_path / "last.py").write_text(code, encoding="utf-8")
+    one = run(scans=1000, more="[last]\ncomponent = true\nclass = 'last.Last'\n")
+    one.wait_for("scan 1 of 1000")
+    interrupt(one.process)
+    assert one.end() == 130, one.output
+    one.wait_for(" last ", r"[1-9]\d* roles")
+
+
 def test_a_killed_supervisor_leaves_no_process_behind(run: Run) -> None:
     code = "import os, threading; print('pid', os.getpid(), flush=True); threading.Event().wait()"
     more = f"[foreign]\ncomponent = true\nheartbeats = false\ncommand = ['python', '-c', {code!r}]\n"
