@@ -129,6 +129,9 @@ class QuietHours(Component):
         phase = self.memory["phase"]
         if phase == PAUSES:  # this process was killed in between
             self._note(phase=PAUSED if is_manual else WAITS, held=is_manual)
+        elif phase == PAUSED and is_manual and self.memory.get("held") and not self._is_flagged():
+            if not self.memory.get("touched"):
+                self._touched("a person cleared quiet-hours", tip=True)
         elif phase in (PAUSED, LEFT) and not is_manual and (self.memory.get("held") or not self._is_flagged()):
             self._note(phase=RETURNS)  # a person let the run continue while this process was away, or cleared the flag
         elif phase == WORKS and is_due and not is_manual and self._is_free:
@@ -153,6 +156,10 @@ class QuietHours(Component):
 
     def _pause(self, end: dt.datetime) -> None:
         def withdraw() -> str:
+            # answered after a start that was on its way, and after the scheduler's stop of it
+            self.scope.supports(names.STOP_SCAN)
+            if not self.scope.wait_until(lambda: self._is_free, timeout_s=_PUBLISHED_WITHIN_S):
+                raise ControlLost("the microscope is not free yet", where=self.name)
             self._note(since_ns=self.clock.now_ns(), touched="", tip_touched=False)
             why = self._withdraw()
             if not self.scope.in_control:
@@ -224,8 +231,6 @@ class QuietHours(Component):
                 )
             if is_engaged is not True and (why := self._move(names.ENGAGE)):
                 return f"the tip could not be brought back: {why}"
-            if (tip := self.scope.tip) is not None and tip.engaged is False:
-                return "the tip could not be brought back: the microscope reports it as withdrawn"
             self._note(withdrawn=False)
         self.scope.clear(QUIET_HOURS)
         return ""
@@ -265,12 +270,27 @@ class QuietHours(Component):
                 self.scope.action(action, timeout_s=_ACCEPTED_WITHIN_S)
             except (Refused, NoResponse) as error:
                 return error.what
-            was_busy = False
+            has_begun = False
             for event in states:
-                if event.message.state is ScopeState.FREE and was_busy:
-                    return ""
-                was_busy = was_busy or event.message.state is not ScopeState.FREE
+                state = event.message.state
+                if has_begun and state is ScopeState.FREE:
+                    return self._where_it_should_be(action)
+                if has_begun and state in (ScopeState.INTERRUPTED, ScopeState.UNDEFINED):
+                    return f"{action} was broken off"
+                has_begun = has_begun or state in (ScopeState.COARSE_MOTOR, ScopeState.MOVING, ScopeState.BUSY_PARAM)
         return f"{action} did not end within {_MOVED_WITHIN_S:g} s"
+
+    def _where_it_should_be(self, action: str) -> str:
+        # the tip is published some readings after the state; a controller that does not report it is believed
+        wrong = action == names.RETRACT
+
+        def is_there() -> bool:
+            tip = self.scope.tip
+            return tip is None or tip.engaged is not wrong
+
+        if self.scope.wait_until(is_there, timeout_s=_PUBLISHED_WITHIN_S):
+            return ""
+        return f"the microscope reports that the tip is {'at the sample' if wrong else 'withdrawn'} after {action}"
 
     # --- knowledge
 

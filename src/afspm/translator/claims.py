@@ -104,10 +104,10 @@ class Claims:
         witness = Witness(None if withdrew else tip, self._differences(claim, self._end))
         verdicts = [judge(claim, witness, one) for one in stated or [Stated()]]
         found = next((one for one in verdicts if one.rule), verdicts[0])
+        beyond = self._beyond_the_scanner(stated)  # before anything is kept, since the controller may be lost in it
         # by the rule alone, not by its numbers: a person who turns a knob gives another value each time
         again = bool(found.rule) and self._kept["contradicted"] == found.rule
         self.repeated, self._kept["contradicted"] = (found.sentence, "") if again else ("", found.rule)
-        beyond = self._beyond_the_scanner(stated)
         return replace(found, unproved=(*found.unproved, beyond)) if beyond else found
 
     def _beyond_the_scanner(self, stated: Sequence[Stated]) -> str:

@@ -258,6 +258,10 @@ class DriverBase(ABC):
     """Experiment seconds after a spectrum or an action in which the controller may still hold the z feedback, or values
     that it changed by itself: a reading within them proves nothing."""
 
+    leaves_tip_s: ClassVar[float] = 0.0
+    """Experiment seconds after a scan in which a moved tip is no act by hand, for a controller that shows late where a
+    scan has left the tip."""
+
     only_reads: ClassVar[bool] = False
     """True for a shadow, which only reads the controller."""
 

@@ -47,8 +47,6 @@ _AGAIN_S = 0.1
 """Real time until the feedback is read again, once it was found off though on is wished."""
 _SELDOM_S = 1.0
 """Real time: the longest one without a reading of all settings, in a series of short measurements."""
-_LEAVES_TIP_S = 5.0
-"""Time after a scan in which the tip's place counts as the scan's doing: a driver may show it some polls late."""
 _ROUNDING_S = 1e-5
 """More than the rounding of an experiment time, which has 16 digits since 1970."""
 
@@ -85,7 +83,7 @@ class Observer:
         # of real time at least, for an emulated controller
         slow = max(1.0, 1.0 / self._clock.real_s(1.0))
         feedback = WishedFeedback(state.kept, slow * driver.settles_s, follows=driver.only_reads)
-        self.panel = PanelWatch(state.kept, driver.table, driver.is_last_written, feedback, slow * _LEAVES_TIP_S)
+        self.panel = PanelWatch(state.kept, driver.table, driver.is_last_written, feedback, slow * driver.leaves_tip_s)
         self.claims = Claims(driver, state.kept)
         self._unproved: Sequence[str] = ()
         self._is_after_spectrum = False

@@ -265,6 +265,16 @@ def test_act_while_the_component_was_away_is_seen(tmp_path: Path) -> None:
     night.bench.close()
 
 
+def test_flag_that_a_person_cleared_leaves_the_tip_to_the_person(tmp_path: Path) -> None:
+    night = Night(tmp_path, withdraw=True)
+    night.go_to(1.5)
+    night.bench.clear("quiet-hours")
+    night.go_to(2.2)
+    assert night.control.mode is ControlMode.MANUAL
+    assert "x-engage" not in night.actions_of("quiet_hours")
+    night.bench.close()
+
+
 class Repair(Component):
     """Scans once to solve tip-shape-changed."""
 

@@ -127,6 +127,7 @@ class Nanonis(Driver):
     counts_clockwise: ClassVar[bool] = True
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
+    leaves_tip_s: ClassVar[float] = 5.0
     coarse_commands: ClassVar[str] = r"^\s*Motor\.Start"
     never_shows: ClassVar = {
         "another one begun": "a stop and a start between two looks seem one scan, unless the stop saves a file",
@@ -178,6 +179,7 @@ class Nanonis(Driver):
 
     def connect(self) -> None:
         self._close_session()
+        self._probe.forget()
         if self._ports.named != (named := _addresses(self.controller_at)):
             self._ports = Ports(named)
         if self._withdrawal is None and self.withdraws_aside:

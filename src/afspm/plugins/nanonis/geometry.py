@@ -66,7 +66,7 @@ def _share(pixels: int) -> float:
 class Probe(Group):
     """The position of the tip: during a move the target, during a scan the position before the scan.
 
-    A position that no request has set counts after `_SHOWS_SCAN_S`, since a scan may not be shown yet.
+    A position that neither a request nor a scan has left counts after `_SHOWS_SCAN_S`: a scan may not be shown yet.
 
     Args:
         now_s: returns experiment time.
@@ -87,6 +87,7 @@ class Probe(Group):
         self._goal_m: tuple[float, float] | None = None
         self._seen_m: tuple[float, float] | None = None
         self._left_s: float | None = None
+        self._scanned = False
         self._range_m: tuple[float, ...] = (math.inf, math.inf)
         self._unknown_range = "it was not asked"
 
@@ -99,15 +100,19 @@ class Probe(Group):
         if self._goal_m is not None:
             return self._goal_m
         if self._seen_m is not None and not between_scans and (self._ask("Scan.StatusGet")[0] or self._awaits_scan()):
-            self._left_s = None
+            self._left_s, self._scanned = None, True
             return self._seen_m
         # A difference below the converters' resolution does not count as a move.
         x, y = self._numbers("FolMe.XYPosGet", 0)
         if self._seen_m is not None and self._near((x, y), self._seen_m):
             self._left_s = None
-        elif self._seen_m is None or between_scans or self._is_no_scan():
-            self._seen_m, self._left_s = (x, y), None
+        elif self._seen_m is None or between_scans or self._scanned or self._is_no_scan():
+            self._seen_m, self._left_s, self._scanned = (x, y), None, False
         return self._seen_m
+
+    def forget(self) -> None:
+        """Forget the position that was seen: a scan may have moved the tip while Nanonis was away."""
+        self._seen_m = self._left_s = None
 
     def _is_no_scan(self) -> bool:
         # a scan that a person begins moves the tip before Nanonis shows it as running
@@ -141,7 +146,7 @@ class Probe(Group):
         """
         try:
             self._range_m, self._unknown_range = self._numbers("Piezo.RangeGet")[:2], ""
-        except NanonisError as error:
+        except (NanonisError, BadReply) as error:
             self._unknown_range = str(error)
             return reach
         rows = zip(self.names, self._range_m, strict=True)
