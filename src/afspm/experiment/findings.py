@@ -83,7 +83,8 @@ def nearest(name: str, valid: Iterable[str], cutoff: float = 0.6) -> str:
     """
     names = sorted(set(valid))
     close = closest(name, names, cutoff)
-    having = [one for one in names if _parts(name) and _parts(name) <= _parts(one)]
+    parts = _parts(name)
+    having = [one for one in names if parts and parts <= _parts(one)]
     if close is None and len(having) == 1:
         close = having[0]
     if close:

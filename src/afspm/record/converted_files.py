@@ -144,5 +144,5 @@ def _end_of_tiff(path: Path) -> int:
             file.seek(directory.next)
             directory.load(file)
             strips = zip(directory.get(_STRIPS, ()), directory.get(_STRIP_SIZES, ()), strict=True)
-            end = max(end, *(at + count for at, count in strips), end)
+            end = max([end, *(at + count for at, count in strips)])
     return end

@@ -167,8 +167,7 @@ class PanelWatch:
         watched = self._settings
         if ScopeState.SCANNING in (last, state):
             self._scanned_ns = now_ns
-        is_left = now_ns - self._scanned_ns <= NS_PER_S * self._leaves_tip_s
-        if ScopeState.SCANNING not in (last, state) and not is_left and not is_after_spectrum:
+        if now_ns - self._scanned_ns > NS_PER_S * self._leaves_tip_s and not is_after_spectrum:
             watched = watched | set(POSITION)
         if last in CALM and state in CALM and (changes := self._changes(before, now, watched)):
             acts.append(ActByHand(now_ns, PanelAct.VALUES, changes=tuple(changes.values())))
