@@ -216,9 +216,10 @@ class Observer:
             self._polling.over(self._clock.monotonic_s())
         gives_back = self._is_after_spectrum and status.state is ScopeState.FREE
         if is_over or gives_back:
-            # after the state: the tip may have been withdrawn between the reading of the values and the end
-            if self._has_changed(*_TIP):
-                self._observe_values(())
+            # after the state: the tip may have been withdrawn between the reading of the values and the end. The values
+            # that the result stands for are read by its verdict, and all others by the next look.
+            if changed := self._changed(*_TIP):
+                self._take_in_and_publish({**self.values, **changed})
             values = True
         if values:
             withdrew = self._driver.withdrew_tip()
@@ -287,7 +288,7 @@ class Observer:
     def look_before_start(self, request: Request) -> None:
         """Publish all changes, and what a person has just done to the tip, before a measurement is begun."""
         frame = setting_groups.FRAME if request.subject == names.START_SCAN else ()
-        before, is_changed = self.values, self._has_changed(*_TIP, *frame)
+        before, is_changed = self.values, bool(self._changed(*_TIP, *frame))
         self.observe(values=is_changed)
         if not is_changed:  # the same reading again is a second one
             state = self._of_controller(self._state.sequence.published.state)
@@ -398,10 +399,12 @@ class Observer:
             self._published_last[kind] = thing
             self._port.publish(*wire.encode(thing), self._state.stamp()[0])
 
-    def _has_changed(self, *shown: str) -> bool:
+    def _changed(self, *shown: str) -> dict[str, Value]:
         table, old = self._driver.table, self.values
         values = self._driver.in_force([name for name in shown if name in table])
-        return any(name not in old or not table[name].same(old[name], value) for name, value in values.items())
+        return {
+            name: value for name, value in values.items() if name not in old or not table[name].same(old[name], value)
+        }
 
     def _conditions(self, time_ns: int, filename: str) -> MeasurementConditions:
         return self.claims.conditions(time_ns, filename, self._acts, self._unproved)
@@ -487,7 +490,11 @@ class Observer:
         return ScopeState.FREE if state is ScopeState.MOVING and self._settled_s is not None else state
 
     def _observe_values(self, announce: Sequence[str]) -> None:
-        self._take_in(self._read())
+        self._take_in_and_publish(self._read(), announce)
+        self._plan_reading()
+
+    def _take_in_and_publish(self, values: dict[str, Value], announce: Sequence[str] = ()) -> None:
+        self._take_in(values)
         old, self._told = self._told, self._as_told()
         if announce or self._told != old:
             self._publish_channels()
@@ -495,7 +502,6 @@ class Observer:
             for name, thing in setting_groups.messages(self._told).items():
                 if name in announce or before.get(name) != thing:
                     self.publish(thing)
-        self._plan_reading()
 
     def _plan_reading(self) -> None:
         self._all_read_s = self._clock.monotonic_s()
