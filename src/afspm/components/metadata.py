@@ -10,10 +10,12 @@ from typing import ClassVar
 
 from afspm.basics.clock import iso_utc
 from afspm.basics.errors import UnitError
+from afspm.basics.plain_data import Plain
 from afspm.basics.units import convert, si_unit_or_none
 from afspm.client.component import Component
 from afspm.components.line_file import LineFile, csv_line
 from afspm.model import (
+    BegunMeasurement,
     ControlEvent,
     ControlMode,
     ControlRequest,
@@ -24,6 +26,7 @@ from afspm.model import (
     JournalEntry,
     Note,
     Scan,
+    ScanHistory,
     ScopeState,
     ScopeStatus,
     Spectrum,
@@ -38,7 +41,6 @@ COLUMNS = (
 )  # fmt: skip
 _BIASES_KEPT = 8
 """Number of kept values of the bias: the value at the start of a scan is needed at its end."""
-_BUSY = {ScopeState.SCANNING: "scan", ScopeState.SPEC: "spectrum"}
 
 
 class Metadata(Component):
@@ -62,52 +64,69 @@ class Metadata(Component):
     """
 
     listens: ClassVar = (
-        "Scan2d", "Spec1d", "ControlState", "ScopeStateMsg", "Note", "ZCtrlParameters", "ZCtrlUnits",
-        "JournalEntries",
+        "Scan2d", "Spec1d", "ControlState", "ScopeStateMsg", "MeasurementConditions", "Note", "ZCtrlParameters",
+        "ZCtrlUnits", "JournalEntries",
     )  # fmt: skip
 
     file_suffix: ClassVar[str] = ""
 
     def __init__(self, file: str = "metadata.csv") -> None:
         self.file = file
-        self._control: ControlState | None = None
-        self._feedback = Feedback()
+        self._history = ScanHistory()
         self._follows_journal = False
-        self._saw_begin = False
-        self._under_way: str | None = None
 
     def on_start(self) -> None:
+        self._history = self._recalled()
         self._table = LineFile(Path(self.run_dir) / self.file, ",".join(COLUMNS))
         self._written = {_row_key(dict(zip(COLUMNS, row, strict=False))) for row in csv.reader(self._table.lines())}
 
     def on_control(self, control_state: ControlState) -> None:
-        self._control = control_state
+        self._history = self._history.step(control_state, self._packet_ns)
 
     def on_state(self, status: ScopeStatus) -> None:
-        what = _BUSY.get(status.state)
-        now_ns = self.packet.time_ns if self.packet else None
-        goes_on, self._under_way = what == self._under_way, what
-        if status.state is ScopeState.UNDEFINED and now_ns is not None:
-            self._keep_bias(now_ns, None)  # a controller that starts again has its own value
-        if what is None:
-            self._saw_begin = self._saw_begin and status.state is not ScopeState.FREE
+        if status.state is ScopeState.UNDEFINED:
+            self._keep_bias(self._packet_ns, None)  # a controller that starts again has its own value
+        self._follow_scans(status)
+
+    def _follow_scans(self, thing: object) -> None:
+        # kept by number: what a measurement began with is needed at its end, perhaps by a later life of this component
+        before, self._history = self._history, self._history.step(thing, self._packet_ns)
+        if self._history.begun == before.begun:
             return
-        if goes_on:
-            return  # a scan that goes on after a pause began before it
-        if now_ns is not None and now_ns <= self.memory.get("began_ns", -1):
-            return  # replayed after a restart: the first entry counts
-        self._saw_begin = True
-        self.memory["before_ns"] = self.memory.get("began_ns", -1)
-        self.memory["began_ns"] = -1 if now_ns is None else now_ns
-        self.memory["what"], self.memory["finished_ns"] = what, None
-        self.memory["conditions"] = self._now(status)
+        kept = {one["number"]: one for one in self.memory.get("begun", ())}
+        if self._history.count > before.count:
+            newest = self._history.begun[-1]
+            kept[newest.number] = {"number": newest.number, "conditions": self._at_start(newest)} | {
+                "doing": newest.doing.name, "began_ns": newest.began_ns, "before_ns": self.memory.get("newest_ns", -1)
+            }  # fmt: skip
+            self.memory["newest_ns"] = newest.began_ns
+        self.memory["begun"] = [
+            kept[one.number] | {"ended_ns": one.ended_ns, "channels": one.channels} for one in self._history.begun
+        ]
+        self.memory["state_ns"] = self._history.state_ns
         self.memory.save()
 
-    def _now(self, status: ScopeStatus) -> dict[str, str]:
-        found = {"state": status.state.name.lower()}
-        if self._feedback.setpoint is not None:
-            found["setpoint"] = _number(self._feedback.setpoint)
-        if (control := self._control) is None:
+    def _recalled(self) -> ScanHistory:
+        begun = tuple(
+            BegunMeasurement(
+                ScopeState[one["doing"]], one["number"], one["began_ns"],
+                ended_ns=one["ended_ns"], channels=tuple(one["channels"]),
+            )
+            for one in self.memory.get("begun", ())
+        )  # fmt: skip
+        count = max((one.number for one in begun), default=0)
+        return ScanHistory(begun=begun, count=count, is_observed=bool(begun), state_ns=self.memory.get("state_ns", -1))
+
+    @property
+    def _packet_ns(self) -> int:
+        time_ns = self.packet.time_ns if self.packet else None
+        return self.clock.now_ns() if time_ns is None else time_ns
+
+    def _at_start(self, begun: BegunMeasurement) -> dict[str, str]:
+        found = {"state": begun.doing.name.lower()}
+        if begun.feedback is not None and begun.feedback.setpoint is not None:
+            found["setpoint"] = _number(begun.feedback.setpoint)
+        if (control := begun.control) is None:
             return found
         problems = " ".join(map(self.scope.problems.name, control.problems))
         return found | {
@@ -117,13 +136,14 @@ class Metadata(Component):
         }
 
     def on_feedback(self, feedback: Feedback) -> None:
-        self._feedback = feedback
+        self._history = self._history.step(feedback, self._packet_ns)
 
     def on_feedback_units(self, units: FeedbackUnits) -> None:
         if units.setpoint:
             self.memory["setpoint_units"] = units.setpoint
 
     def on_message(self, envelope: str, message: object) -> None:
+        self._history = self._history.step(message, self._packet_ns)
         if isinstance(message, JournalEntries) and message.entries:
             known_ns = self.memory.get("journal_ns", -1)
             if not self._follows_journal and 0 <= known_ns < message.entries[0].time_ns:
@@ -152,9 +172,10 @@ class Metadata(Component):
     def _keep_bias(self, time_ns: int, volts: float | None) -> None:
         self.memory["bias"] = [*self.memory.get("bias", ()), [time_ns, volts]][-_BIASES_KEPT:]
 
-    def _settings(self, conditions: Mapping[str, str]) -> dict[str, str]:
-        settings = {"setpoint_units": self.memory.get("setpoint_units", "")} if "setpoint" in conditions else {}
-        before_ns, began_ns = self.memory.get("before_ns", -1), self.memory.get("began_ns", -1)
+    def _settings(self, kept: Plain) -> dict[str, str]:
+        units = self.memory.get("setpoint_units", "")
+        settings = {"setpoint_units": units} if "setpoint" in kept["conditions"] else {}
+        before_ns, began_ns = kept["before_ns"] or -1, kept["began_ns"]
         started_ns = self.memory.get("started_ns")
         # the journal comes later than the states: it is complete up to this measurement once it has the start of it
         if started_ns is not None and before_ns < started_ns <= began_ns:
@@ -171,18 +192,19 @@ class Metadata(Component):
             angle = _number(math.degrees(scan.region.angle_rad))
             pixels = {"columns": str(columns), "rows": str(rows), "units": scan.unit}
             self._write("scan", scan, {"channel": scan.channel, **place, "angle_deg": angle, **pixels})
+            self._follow_scans(scan)
 
     def on_spectrum(self, spectrum: Spectrum) -> None:
         points, variables = spectrum.values.shape
         x, y = ("", "") if spectrum.position_m is None else map(_number, spectrum.position_m)
         of_values = {"columns": str(variables), "rows": str(points), "units": " ".join(spectrum.units)}
         self._write("spectrum", spectrum, {"channel": spectrum.kind, "center_x": x, "center_y": y, **of_values})
+        self._follow_scans(spectrum)
 
     def on_note(self, note: Note) -> None:
         self._append({"time": iso_utc(note.time_ns), "measurement": "note", "note": f"{note.who}: {note.text}"})
 
     def _write(self, what: str, measured: Scan | Spectrum, columns: dict[str, str]) -> None:
-        self._under_way = None  # if the state stays SCANNING, the next scan begins now
         time_ns = measured.time_ns
         if time_ns is None and self.packet is not None:
             time_ns = self.packet.time_ns  # distinguishes rows
@@ -193,7 +215,7 @@ class Metadata(Component):
             "length_units": "m",
         } | columns
         if _row_key(row) not in self._written:
-            self._append(row | self._conditions(what, measured.time_ns))
+            self._append(row | self._conditions(measured))
 
     def _append(self, row: dict[str, str]) -> None:
         if (identity := _row_key(row)) in self._written:
@@ -201,17 +223,13 @@ class Metadata(Component):
         self._table.append([csv_line(row.get(column, "") for column in COLUMNS)])
         self._written.add(identity)
 
-    def _conditions(self, what: str, time_ns: int | None) -> dict[str, str]:
-        if self.memory.get("what") != what:
-            return {}
-        finished_ns = self.memory["finished_ns"]
-        if finished_ns is None and time_ns is not None:
-            self.memory["finished_ns"] = time_ns
-            self.memory.save()
-        elif finished_ns != time_ns and not self._saw_begin:
-            return {}  # a later measurement, which began while this component did not run
-        conditions: dict[str, str] = self.memory["conditions"]
-        return conditions | self._settings(conditions)
+    def _conditions(self, measured: Scan | Spectrum) -> dict[str, str]:
+        begun = self._history.of(measured, self._packet_ns)
+        kept = next((one for one in self.memory.get("begun", ()) if one["number"] == begun.number), None)
+        if kept is None or kept["began_ns"] is None:  # it began while this component did not run
+            return {"in_control": begun.asked_by} if begun.asked_by else {}
+        conditions: dict[str, str] = kept["conditions"]
+        return conditions | self._settings(kept)
 
 
 def _row_key(row: Mapping[str, str]) -> tuple[str, ...]:

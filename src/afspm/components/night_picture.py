@@ -20,6 +20,7 @@ from afspm.model import (
     JournalEntries,
     RescanKind,
     Scan,
+    ScanHistory,
     ScopeState,
     ScopeStatus,
 )
@@ -44,9 +45,7 @@ class NightPicture(Component):
 
     def __init__(self, channel: ChannelName = TOPOGRAPHY, file: str = "night.png", title: str = "") -> None:
         self.channel, self.file, self.title = channel, file, title
-        self._control: ControlState | None = None
-        self._begin: tuple[int | None, str | None] = (None, None)
-        self._is_scanning = False
+        self._history = ScanHistory()
 
     def on_start(self) -> None:
         self._file = LineFile(Path(self.run_dir) / "state" / f"{self.name}.night.jsonl")
@@ -56,24 +55,22 @@ class NightPicture(Component):
         self._loading.start()
 
     def on_control(self, control_state: ControlState) -> None:
-        self._control = control_state
+        self._history = self._history.step(control_state, self._packet_ns())
         self._add(control_entry(control_state, self._packet_ns()))
 
     def on_state(self, status: ScopeStatus) -> None:
-        goes_on, self._is_scanning = self._is_scanning, status.state is ScopeState.SCANNING
-        if self._is_scanning and not goes_on:  # a scan that goes on after a pause began before it
-            self._begin = (self._packet_ns(), self._control.holder if self._control else None)
-        elif status.state is ScopeState.INTERRUPTED:
+        self._history = self._history.step(status, self._packet_ns())
+        if status.state is ScopeState.INTERRUPTED:
             self._add({"kind": "interrupted", "time_ns": self._packet_ns()})
 
     def on_scan(self, scan: Scan) -> None:
         if scan.is_of(self.channel) and scan.values.size:
-            start_ns, holder = self._begin
-            self._add(scan_entry(scan, scan.time_ns or self._packet_ns(), start_ns, holder))
-            self._begin = (None, None)
-            self._is_scanning = False  # if the state stays SCANNING, the next scan begins now
+            begun = self._history.of(scan, self._packet_ns())
+            self._add(scan_entry(scan, scan.time_ns or self._packet_ns(), begun.began_ns, begun.holder))
+        self._history = self._history.step(scan, self._packet_ns())
 
     def on_message(self, envelope: str, message: Any) -> None:
+        self._history = self._history.step(message, self._packet_ns())
         by = envelope.partition("_")[2]
         if envelope.startswith("DriftRescan") and message.kind == RescanKind.OPPOSITE:
             self._add({"kind": "routine", "time_ns": message.timestamp.ToNanoseconds()})

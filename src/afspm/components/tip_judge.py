@@ -23,7 +23,6 @@ particles and stamper. On rough ground and steps only debris was detected, as ab
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
 
@@ -156,16 +155,16 @@ class TipReference:
         return max(size / pixels for size, pixels in zip(self.size_m, reversed(self.shape), strict=True))
 
     def fits(self, region: Region, shape: tuple[int, int]) -> bool:
-        sizes = zip(region.size_m, self.size_m, strict=True)
-        same_size = all(abs(a / b - 1.0) < SAME_SIZE for a, b in sizes)
-        turned_rad = math.remainder(region.angle_rad - self.angle_rad, math.tau)
-        return same_size and abs(turned_rad) < SAME_SIZE and shape == self.shape
+        by = self._at(region.center_m).compared(region)
+        return max(by.size, abs(by.turned_rad)) < SAME_SIZE and shape == self.shape
+
+    def _at(self, center_m: tuple[float, float]) -> Region:
+        return Region(center_m, self.size_m, self.angle_rad)
 
     def place(self, region: Region) -> KnownPlace | None:
         """Return the known place at a region; None if there is none."""
         for place in reversed(self.places):
-            away = (abs(a - b) / size for a, b, size in zip(region.center_m, place.center_m, self.size_m, strict=True))
-            if max(away) < SAME_PLACE:
+            if self._at(place.center_m).compared(region).apart < SAME_PLACE:
                 return place
         return None
 

@@ -80,6 +80,7 @@ if TYPE_CHECKING:
         request_name,
     )
     from afspm.model.scan import Scan, ScanLines, ScanParameters, ScanSet
+    from afspm.model.scan_history import BegunMeasurement, ScanHistory
     from afspm.model.spectrum import Spectrum
     from afspm.model.state import (
         ControlMode,
@@ -111,6 +112,7 @@ __all__ = [
     "ActByHand",
     "Approval",
     "Approvals",
+    "BegunMeasurement",
     "ChangedValue",
     "ChannelName",
     "ChannelRoles",
@@ -158,6 +160,7 @@ __all__ = [
     "ResponseDetail",
     "Role",
     "Scan",
+    "ScanHistory",
     "ScanLines",
     "ScanParameters",
     "ScanSet",

@@ -29,6 +29,27 @@ class Frame(Enum):
 
 
 @dataclass(frozen=True)
+class RegionDifference:
+    """How another region differs from one.
+
+    Attributes:
+        along, across: offset of its centre along the width and the height of the one, as shares of these.
+        size: largest relative difference of width and height.
+        turned_rad: its angle less the angle of the one, from -pi to pi.
+    """
+
+    along: float
+    across: float
+    size: float
+    turned_rad: float
+
+    @property
+    def apart(self) -> float:
+        """The larger offset: below 1 the regions overlap, if they are equal and not turned."""
+        return max(abs(self.along), abs(self.across))
+
+
+@dataclass(frozen=True)
 class Region:
     """A rectangle turned about its centre.
 
@@ -123,6 +144,14 @@ class Region:
         cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
         along, across = (cos * x + sin * y) / self.size_m[0], (cos * y - sin * x) / self.size_m[1]
         return (across + 0.5) * (shape[0] - 1), (along + 0.5) * (shape[1] - 1)
+
+    def compared(self, other: Region) -> RegionDifference:
+        """Return how `other` differs; the frames of both are not compared."""
+        x, y = other.center_m[0] - self.center_m[0], other.center_m[1] - self.center_m[1]
+        cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
+        along, across = (cos * x + sin * y) / self.size_m[0], (cos * y - sin * x) / self.size_m[1]
+        size = max(abs(b / a - 1.0) for a, b in zip(self.size_m, other.size_m, strict=True))
+        return RegionDifference(along, across, size, math.remainder(other.angle_rad - self.angle_rad, math.tau))
 
     def has_size_of(self, other: Region, tolerance: float) -> bool:
         """Return whether width and height agree with `other` within a relative tolerance."""

@@ -177,9 +177,8 @@ def same_region(first: ScanRow, second: ScanRow) -> bool:
     one, other = first.region, second.region
     if one is None or other is None or one.frame is not other.frame:
         return False
-    apart_m = math.dist(one.center_m, other.center_m)
-    turned_rad = abs(math.remainder(one.angle_rad - other.angle_rad, math.tau))
-    return one.has_size_of(other, _ALIKE) and apart_m <= _CENTRES * max(one.size_m) and turned_rad <= _ANGLE_RAD
+    by, apart_m = one.compared(other), math.dist(one.center_m, other.center_m)
+    return by.size <= _ALIKE and apart_m <= _CENTRES * max(one.size_m) and abs(by.turned_rad) <= _ANGLE_RAD
 
 
 def _common_places(scans: Sequence[Sequence[ScanRow]]) -> list[list[ScanRow | None]]:

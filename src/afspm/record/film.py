@@ -244,10 +244,9 @@ def _place(row: ScanRow, drift: Mapping[int, XY]) -> Region:
 
 
 def _is_same_place(first: Region, second: Region) -> bool:
-    apart = [abs(a - b) / size for a, b, size in zip(first.center_m, second.center_m, first.size_m, strict=True)]
-    sizes = [abs(a / b - 1.0) for a, b in zip(first.size_m, second.size_m, strict=True)]
-    turned = abs(math.remainder(first.angle_rad - second.angle_rad, math.tau))
-    return max(apart) <= _MOST_OFFSET and max(sizes) <= _SIZE_TOLERANCE and turned <= _TURN_TOLERANCE_RAD
+    by = first.compared(second)
+    is_alike = by.size <= _SIZE_TOLERANCE and abs(by.turned_rad) <= _TURN_TOLERANCE_RAD
+    return is_alike and by.apart <= _MOST_OFFSET
 
 
 def _scan(run: RecordedScans, row: ScanRow, channel: str) -> Scan | None:

@@ -11,7 +11,7 @@ from typing import Any
 
 from afspm import wire
 from afspm.basics.clock import iso_utc
-from afspm.model import TOPOGRAPHY, Packet, ProblemNames, Scan, ScopeState
+from afspm.model import TOPOGRAPHY, Packet, ProblemNames, Scan
 from afspm.record import nexus_writer, provenance
 from afspm.record.journal import SCHEDULER
 from afspm.record.nexus_writer import FileProvenance
@@ -93,7 +93,7 @@ class MeasuredFiles:
             new.setdefault(scan.channel, scan)
         known = self._find_recorded(new, measured_ns)
         if known is None:
-            stood = provenance.control_at_start(self._journal, published_ns, ScopeState.SCANNING, measured_ns)
+            stood = provenance.control_at_start(self._journal, published_ns, first)
             number = self._add_scan(list(new.values()), measured_ns, stood, published_ns, interrupted=False)
         else:
             number = known[0]
@@ -118,7 +118,7 @@ class MeasuredFiles:
 
     def _write_interrupted(self, taken: AssembledScan, time_ns: int) -> None:
         scans = taken.as_seen()
-        stood = provenance.control_at_start(self._journal, time_ns, ScopeState.SCANNING)
+        stood = provenance.control_at_start(self._journal, time_ns, None)
         number = self._add_scan(scans, time_ns, stood, time_ns, interrupted=True)
         self._insert_scan_packets(taken, number)
 
@@ -190,7 +190,7 @@ class MeasuredFiles:
             (time_ns, spectrum.filename, spectrum.kind),
         ).fetchone()
         if known is None:
-            stood = provenance.control_at_start(self._journal, published_ns, ScopeState.SPEC, time_ns)
+            stood = provenance.control_at_start(self._journal, published_ns, spectrum)
             number, name = self._next(SPECTRA, time_ns)
             facts = {**self._facts, **stood.facts(self._problems), "number": number}
             facts |= self._surroundings(published_ns, stood, {spectrum.filename}, time_ns)

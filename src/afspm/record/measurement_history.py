@@ -10,7 +10,16 @@ from statistics import median
 from typing import TYPE_CHECKING, TypeVar
 
 from afspm.basics.units import convert, same_kind
-from afspm.model import Frame, MeasurementConditions, Region, RegistrationOutcome, Scan, Spectrum
+from afspm.model import (
+    BegunMeasurement,
+    Frame,
+    MeasurementConditions,
+    Region,
+    RegistrationOutcome,
+    Scan,
+    ScanParameters,
+    Spectrum,
+)
 from afspm.model.geometry import XY
 from afspm.record.drift_mapping import drift_at, drift_knowledge
 from afspm.record.running_scan import DoneScan, RunningScan
@@ -160,6 +169,20 @@ class MeasurementHistory:
         took_ns = [scan.took_ns for scan in reversed(self._done) if scan.resembles(self.running)][:COMPARED]
         return self.running.progress(now_ns, round(median(took_ns)) if took_ns else None)
 
+    def begin_scan(self, begun: BegunMeasurement | None, parameters: ScanParameters | None, time_ns: int) -> None:
+        """Take a scan for the running one, unless it is known.
+
+        Args:
+            parameters: the scan parameters in force.
+            time_ns: the end of the one before, if that has its result.
+        """
+        running = self.running
+        if begun is None or (running is not None and running.begun.number == begun.number):
+            return
+        if running is not None and running.published:
+            self.end_scan(time_ns, interrupted=False)
+        self.running = RunningScan(begun, begun.began_ns, parameters)
+
     def end_scan(self, time_ns: int, *, interrupted: bool) -> None:
         """End the running scan. After an interruption, add a summary for each channel with received lines.
 
@@ -174,27 +197,31 @@ class MeasurementHistory:
             for channel, lines in running.channels.items():
                 summary = ScanSummary(
                     time_ns, running.began_ns, channel, lines.unit, lines.region, lines.shape,
-                    holder=running.holder, interrupted=True,
+                    holder=running.holder, interrupted=True, setpoint=_setpoint(running.begun),
                 )  # fmt: skip
                 self._add_channel(summary)
         elif running.began_ns is not None:
             self._done.append(DoneScan(running.parameters, time_ns - running.began_ns))
         self.running = None
 
-    def add_scan(self, scan: Scan, time_ns: int, holder: str | None, outside: Iterable[str] = ()) -> None:
-        """Add a channel of a scan; `holder` counts only where no scan is running.
+    def add_scan(
+        self, scan: Scan, time_ns: int, begun: BegunMeasurement, holder: str | None, outside: Iterable[str] = ()
+    ) -> None:
+        """Add a channel of a scan.
 
         Args:
+            begun: its start, as far as known.
+            holder: the component in control now, which counts if the start was not seen.
             outside: the conditions that do not hold now.
         """
-        began_ns, outside = None, set(outside)
-        if self.running is not None:
-            began_ns, holder = self.running.began_ns, self.running.holder
+        began_ns, outside = begun.began_ns, set(outside)
+        if self.running is not None and self.running.begun.number == begun.number:
+            began_ns = self.running.began_ns if began_ns is None else began_ns
             self.running.published = True
             outside |= self.running.outside
         summary = ScanSummary(
-            scan.time_ns or time_ns, began_ns, scan.channel, scan.unit, scan.region, scan.shape, scan.filename, holder,
-            outside=tuple(sorted(outside)),
+            scan.time_ns or time_ns, began_ns, scan.channel, scan.unit, scan.region, scan.shape, scan.filename,
+            begun.holder if begun.number else holder, setpoint=_setpoint(begun), outside=tuple(sorted(outside)),
         )  # fmt: skip
         self._add_channel(summary)
 
@@ -206,8 +233,7 @@ class MeasurementHistory:
             return
         if last is None or last.number != self.count or not summary.is_of_scan(last):
             self.count += 1
-        setpoint = self.running.setpoint if self.running else None
-        _keep(self._scans, key, replace(summary, number=self.count, setpoint=setpoint))
+        _keep(self._scans, key, replace(summary, number=self.count))
 
     def add_spectrum(self, spectrum: Spectrum, time_ns: int, holder: str | None) -> None:
         measured_ns = spectrum.time_ns or time_ns
@@ -250,6 +276,10 @@ class MeasurementHistory:
             for point, unit, one in found
             if same_kind(unit, "m")
         )
+
+
+def _setpoint(begun: BegunMeasurement) -> float | None:
+    return begun.feedback.setpoint if begun.feedback else None
 
 
 def _sharing(summary: ScanSummary, last: ScanSummary | None) -> ScanSummary:

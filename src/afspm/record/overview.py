@@ -38,6 +38,7 @@ from afspm.model import (
     Proposal,
     RescanKind,
     Scan,
+    ScanHistory,
     ScanLines,
     ScanParameters,
     ScopeState,
@@ -217,6 +218,7 @@ class Overview:
         self.timelines = Timelines()
         self.process_history = ProcessHistory(most_entries)
         self._measured = MeasurementHistory()
+        self._story = ScanHistory()
         self._newest_of: dict[str, int] = {}
 
     @property
@@ -390,6 +392,7 @@ class Overview:
             return
         self._newest_of[key] = time_ns
         self.newest_ns = max(self.newest_ns, time_ns)
+        self._story = self._story.step(thing, time_ns)
         handler: Callable[[object, int], None] | None = getattr(self, f"_{_handler(message)}", None)
         if handler is not None:
             handler(thing, time_ns)
@@ -409,18 +412,10 @@ class Overview:
         return self.control.holder if self.control else None
 
     def _on_state(self, status: ScopeStatus, time_ns: int) -> None:
-        before, self.status = self.status, status
+        self.status = status
         self.timelines.scope_state.change(sys.intern(status.state.name.lower()), time_ns)
         if status.state is ScopeState.SCANNING:
-            if before is None or before.state is not ScopeState.SCANNING or self.running is None:
-                readings = self.readings
-                setpoint = readings.feedback.setpoint if readings.feedback else None
-                # a late joiner has not observed the start of a scan that was running already; nor has anyone after a
-                # loss of contact with the controller
-                observed = before is not None and before.state is not ScopeState.UNDEFINED
-                self._measured.running = RunningScan(
-                    time_ns if observed else None, self._holder, readings.scan_parameters, setpoint
-                )
+            self._measured.begin_scan(self._story.running, self.readings.scan_parameters, time_ns)
         elif status.state in (ScopeState.FREE, ScopeState.INTERRUPTED):
             self._measured.end_scan(time_ns, interrupted=status.state is ScopeState.INTERRUPTED)
 
@@ -437,16 +432,20 @@ class Overview:
         self.channels = roles
 
     def _on_scan_lines(self, lines: ScanLines, time_ns: int) -> None:
+        story = self._story.running
+        if story is not None and story.is_presumed:  # the state stays SCANNING, and the next scan shows its lines
+            self._measured.begin_scan(story, self.readings.scan_parameters, time_ns)
         if self.running is not None:
             self.running.take(lines)
 
     def _on_scan(self, scan: Scan, time_ns: int) -> None:
         # readings are published when they change: the last ones are true until the next
         outside = (name for names in self._outside.values() for name in names)
-        self._measured.add_scan(scan, time_ns, self._holder, outside)
+        self._measured.add_scan(scan, time_ns, self._story.of(scan, time_ns), self._holder, outside)
 
     def _on_spectrum(self, spectrum: Spectrum, time_ns: int) -> None:
-        self._measured.add_spectrum(spectrum, time_ns, self._holder)
+        begun = self._story.of(spectrum, time_ns)
+        self._measured.add_spectrum(spectrum, time_ns, begun.holder if begun.number else self._holder)
 
     def _on_instrument_readings(self, report: InstrumentReadings, time_ns: int) -> None:
         for one in report.readings:

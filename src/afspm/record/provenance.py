@@ -20,30 +20,40 @@ from afspm.model import (
     MeasurementConditions,
     Parameter,
     ProblemNames,
+    Scan,
+    ScanHistory,
     ScopeState,
     ScopeStatus,
+    Spectrum,
     TipStatus,
 )
 from afspm.record.drift_mapping import drift_knowledge
 from afspm.record.instrument_values import RecordedReadings, earliest_ns
 
 _BACK = 20
-"""The number of earlier states that are searched for the start of a measurement."""
+"""The number of earlier packets of each kind that are searched for the start of a measurement."""
 _IN_FILES = ("name", "value", "unit", "target", "age_s", "reason", "lowest", "highest")
 """The facts of an instrument's value that each file has."""
 
 
 @dataclass(frozen=True)
 class ControlAtStart:
-    """Control and feedback at the start of a measurement; None if unknown."""
+    """Control and feedback at the start of a measurement; None if unknown.
+
+    Attributes:
+        asked_by: the component that asked for it, as its translator says; empty: not known.
+    """
 
     began_ns: int | None
     control: ControlState | None
     feedback: Feedback | None
+    asked_by: str = ""
 
     def facts(self, problems: ProblemNames) -> Plain:
         """Return the facts in JSON's types, with readable names."""
         facts: dict[str, object] = {}
+        if self.control is None and self.asked_by:
+            facts["in_control"] = self.asked_by
         if self.control is not None:
             facts |= {
                 "in_control": self.control.holder,
@@ -60,38 +70,30 @@ class ControlAtStart:
         return facts
 
 
-def control_at_start(
-    journal: sqlite3.Connection, time_ns: int, doing: ScopeState, measured_ns: int | None = None
-) -> ControlAtStart:
+def control_at_start(journal: sqlite3.Connection, time_ns: int, result: Scan | Spectrum | None) -> ControlAtStart:
     """Return control and feedback at the start of a measurement, or at its publication if the start is unknown.
 
     Args:
-        time_ns: the time of publication.
-        doing: the state of the microscope during the measurement.
-        measured_ns: the end of the measurement; a later start counts as unknown.
+        time_ns: the time of publication, or of the interruption.
+        result: a channel of the scan, or the spectrum; None: of the scan that was interrupted.
     """
-    told = None if measured_ns is None else _conditions(journal, time_ns, (), measured_ns)
-    began_ns = _began(journal, time_ns, doing) if told is None or told.began_ns is None else told.began_ns
-    if began_ns is not None and measured_ns is not None and began_ns > measured_ns:
-        began_ns = None  # the start was not observed: a restarted translator published the state later
+    history = _history(journal, time_ns if result else time_ns - 1)
+    begun = history.of(result, time_ns) if result else history.running
+    began_ns, asked_by = (None, "") if begun is None else (begun.began_ns, begun.asked_by)
     at_ns = time_ns if began_ns is None else began_ns
     control, feedback = _last(journal, "ControlState", at_ns), _last(journal, "ZCtrlParameters", at_ns)
     return ControlAtStart(
         began_ns,
         control if isinstance(control, ControlState) else None,
         feedback if isinstance(feedback, Feedback) else None,
+        asked_by,
     )
 
 
 def _conditions(
     journal: sqlite3.Connection, time_ns: int, filenames: Collection[str], measured_ns: int
 ) -> MeasurementConditions | None:
-    rows = journal.execute(
-        "SELECT payload FROM packets WHERE message = 'MeasurementConditions' AND time_ns <= ?"
-        f" ORDER BY time_ns DESC LIMIT {_BACK}",
-        (time_ns,),
-    )
-    for (payload,) in rows:
+    for _, payload in _newest(journal, "MeasurementConditions", time_ns):
         one = _decoded("MeasurementConditions", payload)
         if not isinstance(one, MeasurementConditions):
             continue
@@ -211,20 +213,31 @@ def last_state(journal: sqlite3.Connection) -> ScopeState:
     return status.state if isinstance(status, ScopeStatus) else ScopeState.UNDEFINED
 
 
-def _began(journal: sqlite3.Connection, time_ns: int, doing: ScopeState) -> int | None:
+def _history(journal: sqlite3.Connection, until_ns: int) -> ScanHistory:
+    found: list[tuple[int, object]] = []
+    for message in ("ScopeStateMsg", "MeasurementConditions"):
+        found += [(at_ns, _decoded(message, payload)) for at_ns, payload in _newest(journal, message, until_ns)]
+    for table, column, doing in (("scans", "scan", ScopeState.SCANNING), ("spectra", "spectrum", ScopeState.SPEC)):
+        message = "Scan2d" if doing is ScopeState.SCANNING else "Spec1d"
+        rows = journal.execute(
+            f"SELECT packets.time_ns, {table}.time_ns, {table}.filename, packets.channel FROM packets"
+            f" JOIN {table} ON packets.{column} = {table}.number WHERE packets.message = ? AND packets.time_ns <= ?"
+            f" ORDER BY packets.time_ns DESC LIMIT {_BACK}",
+            (message, until_ns),
+        )
+        found += [(at_ns, (doing, at_ns, ended_ns, name, channel or "")) for at_ns, ended_ns, name, channel in rows]
+    history = ScanHistory()
+    for at_ns, thing in sorted(found, key=lambda one: one[0]):
+        history = history.with_result(*thing) if isinstance(thing, tuple) else history.step(thing, at_ns)
+    return history
+
+
+def _newest(journal: sqlite3.Connection, message: str, until_ns: int) -> list[tuple[int, bytes]]:
     rows = journal.execute(
-        "SELECT time_ns, payload FROM packets WHERE message = 'ScopeStateMsg' AND time_ns <= ?"
-        f" ORDER BY time_ns DESC LIMIT {_BACK}",
-        (time_ns,),
+        f"SELECT time_ns, payload FROM packets WHERE message = ? AND time_ns <= ? ORDER BY time_ns DESC LIMIT {_BACK}",
+        (message, until_ns),
     )
-    began_ns: int | None = None
-    for at_ns, payload in rows:
-        status = _decoded("ScopeStateMsg", payload)
-        if isinstance(status, ScopeStatus) and status.state is doing:
-            began_ns = at_ns  # a paused scan, or one published again to a restarted scheduler, began earlier
-        elif began_ns is not None or (isinstance(status, ScopeStatus) and status.state is ScopeState.FREE):
-            break
-    return began_ns
+    return rows.fetchall()
 
 
 def _last(journal: sqlite3.Connection, message: str, time_ns: int) -> Any:

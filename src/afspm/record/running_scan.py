@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from afspm.model import Region, ScanLines, ScanParameters
+from afspm.model import BegunMeasurement, Region, ScanLines, ScanParameters
 
 
 @dataclass(slots=True)
@@ -35,22 +35,25 @@ class RunningScan:
     """The running scan.
 
     Attributes:
+        begun: its start, as far as known.
         began_ns: None if the start was not observed.
-        holder: the component in control at the start.
         parameters: the scan parameters in force at the start; None if unknown.
-        setpoint: the feedback setpoint at the start; None if not published.
         channels: received lines of each channel, where the microscope delivers lines.
         published: whether a whole channel was published.
         outside: the conditions whose band did not contain a value of an instrument so far.
     """
 
+    begun: BegunMeasurement
     began_ns: int | None
-    holder: str | None
     parameters: ScanParameters | None
-    setpoint: float | None = None
     channels: dict[str, ChannelLines] = field(default_factory=dict)
     published: bool = False
     outside: set[str] = field(default_factory=set)
+
+    @property
+    def holder(self) -> str | None:
+        """The component in control at the start."""
+        return self.begun.holder
 
     def take(self, lines: ScanLines) -> None:
         if self.began_ns is None:

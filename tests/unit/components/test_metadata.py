@@ -42,6 +42,7 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 def scanned(lab: Lab, at_s: float) -> None:
     """Let another client take a scan of 100 s."""
+    lab.at(at_s, lambda: lab.go(ScopeState.FREE))
     lab.at(at_s, lambda: lab.go(ScopeState.SCANNING))
     lab.at(at_s + 100.0, lambda: lab.publish_scan(REGION))
     lab.at(at_s + 100.0, lambda: lab.go(ScopeState.FREE))

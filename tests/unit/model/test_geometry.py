@@ -96,3 +96,24 @@ def test_pixel_of_a_position_is_the_inverse_of_the_position_of_a_pixel(shape: tu
     row, column = region.pixel_at(*region.pixels_m(shape), shape)
     np.testing.assert_allclose(row, np.indices(shape)[0], atol=1e-12)
     np.testing.assert_allclose(column, np.indices(shape)[1], atol=1e-12)
+
+
+@given(sizes, sizes, angles, st.floats(-0.9, 0.9), st.floats(-0.9, 0.9), st.floats(-1.0, 1.0))
+def test_difference_of_regions_is_along_the_sides(
+    width: float, height: float, angle: float, along: float, across: float, turn: float
+) -> None:
+    # of similar sides, since the shorter one loses digits to the longer
+    region = Region((0.0, 0.0), (width, max(height, width / 100.0)), angle)
+    cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
+    u, v = along * region.size_m[0], across * region.size_m[1]
+    center = (region.center_m[0] + cos * u - sin * v, region.center_m[1] + sin * u + cos * v)
+    by = region.compared(Region(center, region.size_m, region.angle_rad + turn))
+    assert (by.along, by.across) == pytest.approx((along, across), abs=1e-6)
+    assert (by.size, by.turned_rad) == pytest.approx((0.0, turn), abs=1e-9)
+
+
+def test_a_wide_frame_turned_upright_overlaps_little_when_moved_across_its_short_side() -> None:
+    # house: the offset is turned into the frame
+    one = Region((0.0, 0.0), (2e-6, 1e-6), math.pi / 2)
+    assert one.compared(one.moved_to((0.9e-6, 0.0))).apart == pytest.approx(0.9)
+    assert one.compared(one.moved_to((0.0, 0.9e-6))).apart == pytest.approx(0.45)

@@ -59,7 +59,8 @@ def test_scan_is_found_by_its_key(night: Night, store: RecordStore, tmp_path: Pa
 def test_key_leads_to_the_whole_scan_after_a_run_was_cut_off_in_it(
     night: Night, store: RecordStore, tmp_path: Path
 ) -> None:
-    store.take([start(night, "tile-1"), night.state(ScopeState.SCANNING), night.lines()])
+    begun = [night.state(ScopeState.FREE), start(night, "tile-1"), night.state(ScopeState.SCANNING), night.lines()]
+    store.take(begun)
     ended_ns = night.now_ns
     resumed = night.state(ScopeState.FREE)  # not INTERRUPTED: nobody saw the end of the scan
     store.take([resumed, start(night, "tile-1"), *night.whole_scan(1)])

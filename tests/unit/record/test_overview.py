@@ -204,7 +204,7 @@ def test_progress_of_a_scan_without_lines_follows_earlier_scans() -> None:
 
 
 def test_scan_found_running_after_lost_contact_has_no_start_and_predicts_no_other() -> None:
-    states = (ScopeState.FREE, ScopeState.SCANNING, ScopeState.UNDEFINED, ScopeState.SCANNING)
+    states = (ScopeState.FREE, ScopeState.FREE, ScopeState.UNDEFINED, ScopeState.SCANNING)
     packets: list[tuple[str, object, int]] = [
         ("ScopeStateMsg", status(state), time_s) for time_s, state in zip((1, 10, 30, 70), states, strict=True)
     ]

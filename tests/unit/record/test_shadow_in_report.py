@@ -181,7 +181,7 @@ def test_drift_across_a_tip_change_is_marked() -> None:
 
 def test_verdicts_that_components_publish_are_rows(night: Night, store: RecordStore, tmp_path: Path) -> None:
     (tmp_path / "experiment.toml").write_text("[control]\nshadow = true\n", encoding="utf-8")
-    store.take(night.whole_scan(1))
+    store.take([night.state(ScopeState.FREE), *night.whole_scan(1)])
     (scan,) = open_run(tmp_path).scans
     assert scan.began_ns is not None
     bad = verdict_message(Scan(REGION, "Height", "m", np.zeros((6, 8)), scan.time_ns), BAD)

@@ -48,15 +48,15 @@ from afspm.storage.formats import read
 def test_scan_is_one_file_with_all_channels_and_its_provenance(
     night: Night, store: RecordStore, tmp_path: Path
 ) -> None:
-    given = [night.control("series", (1,)), night.feedback(), *night.whole_scan(1)]
+    given = [night.control("series", (1,)), night.feedback(), night.state(ScopeState.FREE), *night.whole_scan(1)]
     store.take(given)
     run = afspm.open_run(tmp_path)
     (row,) = run.scans
     assert (row.holder, row.mode, row.problems) == ("series", "automated", ("tip-shape-changed",))
     assert (row.channels, row.shape) == ((("Height", "m"), ("Height Retrace", "m")), (6, 8))
-    assert row.began_ns == given[2][0].time_ns
-    assert row.file == "scans/20260314T200000_003000Z-00001.h5"
-    for packet, _ in given[3:5]:
+    assert row.began_ns == given[3][0].time_ns
+    assert row.file == "scans/20260314T200000_004000Z-00001.h5"
+    for packet, _ in given[4:6]:
         scan = wire.decode("Scan2d", packet.payload)
         assert np.array_equal(run.scan(0)[scan.channel].values, scan.values)
         assert run.scan(0)[scan.channel].region == scan.region
@@ -249,12 +249,12 @@ def test_channel_that_comes_after_a_kill_joins_the_others(night: Night, tmp_path
 
 
 def test_interrupted_scan_keeps_its_received_lines(night: Night, store: RecordStore, tmp_path: Path) -> None:
-    given = [night.control(), night.state(ScopeState.SCANNING), night.lines(2, 0), night.lines(1, 2)]
-    given += [night.state(ScopeState.INTERRUPTED), night.state(ScopeState.FREE)]
+    given = [night.control(), night.state(ScopeState.FREE), night.state(ScopeState.SCANNING)]
+    given += [night.lines(2, 0), night.lines(1, 2), night.state(ScopeState.INTERRUPTED), night.state(ScopeState.FREE)]
     store.take(given)
     run = afspm.open_run(tmp_path)
     (row,) = run.scans
-    assert (row.interrupted, row.holder, row.began_ns) == (True, "series", given[1][0].time_ns)
+    assert (row.interrupted, row.holder, row.began_ns) == (True, "series", given[2][0].time_ns)
     values = run.scan(row)["Height"].values
     assert np.isfinite(values[:3]).all()
     assert np.isnan(values[3:]).all()

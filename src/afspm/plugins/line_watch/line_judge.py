@@ -242,10 +242,8 @@ class KindReference:
         return rows + down * (ny - 1), columns + along * (nx - 1)
 
     def _away(self, place: Place, region: Region) -> tuple[float, float]:
-        x, y = (a - b for a, b in zip(region.center_m, place.region.center_m, strict=True))
-        cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
-        width, height = self.kind.size_m
-        return (cos * x + sin * y) / width, (cos * y - sin * x) / height
+        by = region.compared(place.region)
+        return -by.along, -by.across
 
 
 @dataclass

@@ -519,5 +519,5 @@ def _place(xy_m: tuple[float, float]) -> str:
 def _same_frame(scan: ScanRow, other: ScanRow) -> bool:
     if scan.region is None or other.region is None:
         return False
-    pairs = zip(scan.region.center_m + scan.region.size_m, other.region.center_m + other.region.size_m, strict=True)
-    return all(abs(a - b) <= _SAME_FRAME * min(scan.region.size_m) for a, b in pairs)
+    by = scan.region.compared(other.region)
+    return max(by.apart, by.size, abs(by.turned_rad)) <= _SAME_FRAME

@@ -185,8 +185,8 @@ class SampleFrame:
     def recalled(self, packets: Iterable[LoggedPacket]) -> SampleFrame:
         draft = DriftDraft(self.state, self.env, ArbitrationState(), 0.0, 0)
         for packet, source_ns, _ in packets:
-            if packet.envelope == "ScopeStateMsg":
-                scan_intake.note_state(draft, packet.payload, packet.time_ns if source_ns is None else source_ns)
+            time_ns = packet.time_ns if source_ns is None else source_ns
+            scan_intake.note_timing(draft, packet.envelope, packet.payload, time_ns)
         return self._with(draft.finish())
 
 

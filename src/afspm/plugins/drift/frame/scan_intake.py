@@ -84,8 +84,7 @@ def take_packet(draft: DriftDraft, event: PacketIn) -> None:
         _find_channel(draft, before, event)
         return
     message, packet = event.header.message, event.packet
-    if message == "ScopeStateMsg":
-        note_state(draft, packet.payload, packet.time_ns)
+    note_timing(draft, message, packet.payload, packet.time_ns)
     scan = draft.env.codec.decode_packet(message, packet.payload) if message == "Scan2d" else None
     if not isinstance(scan, Scan) or not scan.values.size:
         draft.outputs.append(event)
@@ -94,9 +93,9 @@ def take_packet(draft: DriftDraft, event: PacketIn) -> None:
     if key in draft.gate.settled:
         draft.outputs.append(_relocated(event, scan, draft.gate.settled[key], draft.env.codec))
         return
-    draft.timing = draft.timing.scan_came()
     until_s = draft.now_s + draft.env.settings.longest_registration
     held = HeldScan(key, _middle_s(draft, scan, event), until_s, scan.filename, scan.region.center_m)
+    draft.timing = draft.timing.after(scan, _published_ns(event, draft.now_ns), draft.places.upwards)
     draft.gate = replace(draft.gate, held=held).keep(event)
     draft.outputs.append(HoldControl(until_s))
     _find_channel(draft, held, event)
@@ -133,7 +132,7 @@ def _find_channel(draft: DriftDraft, held: HeldScan, event: PacketIn) -> None:
 def _register(draft: DriftDraft, held: HeldScan, scan: Scan, event: PacketIn) -> None:
     end_s = _end_s(scan, event, draft.now_ns)
     start_s, upwards = 2 * held.middle_s - end_s, None
-    begun = draft.timing.of_scan(end_s)
+    begun = draft.timing.of_scan(scan, _published_ns(event, draft.now_ns))
     # a scan that was broken off shows neither how long such a scan takes, nor when its middle row was taken
     if begun is not None and not begun.was_paused and not scan.lines_missing:
         upwards = begun.upwards
@@ -159,14 +158,15 @@ def _requested_region(draft: DriftDraft, scan: Scan) -> Region | None:
 def _middle_s(draft: DriftDraft, scan: Scan, event: PacketIn) -> float:
     # from the scan's own end, so that a late file causes no error
     expected_s = draft.places.durations.expected_s(scan.shape, scan.region.size_m)
-    return draft.timing.middle_s(_end_s(scan, event, draft.now_ns), expected_s)
+    end_s, begun = _end_s(scan, event, draft.now_ns), draft.timing.of_scan(scan, _published_ns(event, draft.now_ns))
+    return end_s - expected_s / 2 if begun is None else (begun.time_s + end_s) / 2
 
 
-def note_state(draft: DriftDraft, payload: bytes | memoryview, time_ns: int | None) -> None:
-    """Track the start of scans from a published scope state."""
-    status = draft.env.codec.decode_packet("ScopeStateMsg", payload)
-    if isinstance(status, ScopeStatus) and time_ns is not None:
-        draft.timing = draft.timing.with_state(status, time_ns * 1e-9, draft.places.upwards)
+def note_timing(draft: DriftDraft, message: str, payload: bytes | memoryview, time_ns: int | None) -> None:
+    """Track the start of scans from a published scope state, or from the conditions before a scan."""
+    if message in ("ScopeStateMsg", "MeasurementConditions") and time_ns is not None:
+        thing = draft.env.codec.decode_packet(message, payload)
+        draft.timing = draft.timing.after(thing, time_ns, draft.places.upwards)
 
 
 # --- reports of the worker --------------------------------------------------------------------------------------------
@@ -349,9 +349,12 @@ def scan_key(scan: Scan, packet: Packet) -> str:
     return f"at {packet.time_ns if scan.time_ns is None else scan.time_ns} ns"
 
 
+def _published_ns(event: PacketIn, now_ns: int) -> int:
+    return now_ns if event.packet.time_ns is None else event.packet.time_ns
+
+
 def _end_s(scan: Scan, event: PacketIn, now_ns: int) -> float:
-    time_ns = scan.time_ns if scan.time_ns is not None else event.packet.time_ns
-    return (now_ns if time_ns is None else time_ns) * 1e-9
+    return (_published_ns(event, now_ns) if scan.time_ns is None else scan.time_ns) * 1e-9
 
 
 def _relocated(event: PacketIn, scan: Scan, matrix: Matrix | None, codec: DriftCodec) -> PacketIn:

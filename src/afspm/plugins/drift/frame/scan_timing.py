@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from afspm.basics import replace
-from afspm.model import ScopeState, ScopeStatus
+from afspm.model import Scan, ScanHistory
 
 XY = tuple[float, float]
 Shape = tuple[int, int]
 
-_KEPT = 16
+_KEPT, _STARTS = 16, 8
 
 
 @dataclass(frozen=True)
@@ -30,40 +30,29 @@ class ScanStart:
 
 @dataclass(frozen=True)
 class ScanStartTracker:
-    """Tracker of the microscope's states, which finds the start of scans.
+    """The starts of scans, and the scan direction in force at each.
 
-    SCANNING is also published after a pause, and to a restarted scheduler, although the scan began earlier.
+    Attributes:
+        history: of the microscope's measurements.
+        upwards: of the newest measurements, by their number; None if unknown.
     """
 
-    begun: ScanStart | None = None
-    is_scanning: bool = False
+    history: ScanHistory = field(default_factory=ScanHistory)
+    upwards: tuple[tuple[int, bool | None], ...] = ()
 
-    def with_state(self, status: ScopeStatus, time_s: float, upwards: bool | None) -> ScanStartTracker:
-        """Process a scope state, with the scan direction in force.
+    def after(self, thing: object, time_ns: int, upwards: bool | None) -> ScanStartTracker:
+        """Process a published message, with the scan direction in force."""
+        history = self.history.step(thing, time_ns)
+        if history.count == self.history.count:
+            return replace(self, history=history)
+        return ScanStartTracker(history, (*self.upwards, (history.count, upwards))[-_STARTS:])
 
-        UNDEFINED is ignored, because a disconnected microscope continues its scan.
-        """
-        if status.state is ScopeState.UNDEFINED:
-            return self
-        is_scanning, begun = status.state is ScopeState.SCANNING, self.begun
-        if is_scanning and not self.is_scanning:
-            begun = ScanStart(time_s, upwards, status.paused is True)
-        elif is_scanning and begun is not None and status.paused is True:
-            begun = replace(begun, was_paused=True)
-        return ScanStartTracker(begun, is_scanning)
-
-    def scan_came(self) -> ScanStartTracker:
-        """Mark the scan as finished: the next SCANNING starts another scan, even without a state in between."""
-        return replace(self, is_scanning=False)
-
-    def of_scan(self, end_s: float) -> ScanStart | None:
-        """Return the start of the scan that ended at `end_s`; None if unknown."""
-        return self.begun if self.begun is not None and self.begun.time_s < end_s else None
-
-    def middle_s(self, end_s: float, expected_s: float) -> float:
-        """Return the middle of the scan that ended at `end_s`, from its start or, if unknown, `expected_s`."""
-        begun = self.of_scan(end_s)
-        return end_s - expected_s / 2 if begun is None else (begun.time_s + end_s) / 2
+    def of_scan(self, scan: Scan, published_ns: int) -> ScanStart | None:
+        """Return the start of a scan; None if unknown."""
+        begun = self.history.of(scan, published_ns)
+        if begun.began_ns is None:
+            return None
+        return ScanStart(begun.began_ns * 1e-9, dict(self.upwards).get(begun.number), begun.was_paused)
 
 
 @dataclass(frozen=True)
