@@ -11,7 +11,7 @@ from fastapi.staticfiles import StaticFiles
 from nicegui import app as nicegui
 from nicegui import ui
 
-from afspm.basics.clock import Clock
+from afspm.basics import Clock
 from afspm.plugins.web.archive import Archive
 from afspm.plugins.web.asgi import AsgiApp
 from afspm.plugins.web.dashboard.access import Visitor
@@ -20,7 +20,7 @@ from afspm.plugins.web.dashboard.page import ASSETS, Page, Services
 from afspm.plugins.web.dashboard.sign_in import VISITOR, Guard, add_sign_in
 from afspm.plugins.web.passwords import is_loopback
 from afspm.plugins.web.watch import Bell
-from afspm.transport.rate_limited_log import RateLimitedLog
+from afspm.processes import RateLimitedLog
 
 
 def application(
