@@ -56,8 +56,8 @@ def stop_is_a_step_of_a_plan(patch: Patch) -> None:
 def approved_plan_is_reusable(patch: Patch) -> None:
     real = GrantChecker.sending
 
-    def sending(self: GrantChecker, *args: Any) -> GrantChecker:
-        after = real(self, *args)
+    def sending(self: GrantChecker, *args: Any, **given: Any) -> GrantChecker:
+        after = real(self, *args, **given)
         plans = {name: replace(one, step=self.book.plans[name].step) for name, one in after.book.plans.items()}
         return replace(after, book=replace(after.book, plans=plans))
 

@@ -153,6 +153,12 @@ class TransportError(AfspmError):
     code = "transport"
 
 
+class NoThread(AfspmError):
+    """Error: the system starts no further thread for this process."""
+
+    code = "no-thread"
+
+
 class FileError(AfspmError):
     """A file that can't be read or written, or whose content does not match its name."""
 

@@ -185,11 +185,13 @@ class SchedulerCore:
     def deadline_ns(self) -> int | None:
         """Return when a Tick is due at the latest, in experiment time; None: no deadline.
 
-        Deadlines are a lease of the experiment file, and the end of an approval of the agent in control.
+        Deadlines are a lease of the experiment file, and the end of an approval: of the agent in control, or of a
+        running measurement.
         """
         lease_ns = self.state.lease.deadline_ns(is_free=self.state.microscope.is_free)
         approved_ns = self.state.grants.ends_ns(self.state.control.holder)
-        return min((one for one in (lease_ns, approved_ns) if one is not None), default=None)
+        measured_ns = approvals.measurement_ends_ns(self.state)
+        return min((one for one in (lease_ns, approved_ns, measured_ns) if one is not None), default=None)
 
     def snapshot(self) -> SavedState:
         """Return the state that must survive a kill, without the cache."""

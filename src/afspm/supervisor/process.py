@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from afspm.basics.errors import AfspmError
+from afspm.basics.errors import AfspmError, NoThread
 from afspm.basics.interpreter import python_command, python_environment
 from afspm.basics.launch import Launch
 from afspm.experiment import ProcessStart
@@ -130,9 +130,17 @@ class ChildProcess:
         self.pid = self._popen.pid
         self._job = _WindowsJob(self._popen, has_tip=has_tip)
         self._fed = threading.Event()
-        readers = [self._reader("stdout", self._popen.stdout), self._reader("stderr", self._popen.stderr)]
-        feeding = (task.launch.to_json(), readers)
-        threading.Thread(target=self._feed_and_wait, args=feeding, name=f"{name}-wait", daemon=True).start()
+        try:
+            readers = [self._reader("stdout", self._popen.stdout), self._reader("stderr", self._popen.stderr)]
+            feeding = (task.launch.to_json(), readers)
+            threading.Thread(target=self._feed_and_wait, args=feeding, name=f"{name}-wait", daemon=True).start()
+        except RuntimeError as error:  # Python has no type of its own for a thread that can't start
+            with self._popen:  # closes its pipes, and waits for it
+                self.kill()
+            raise NoThread(
+                f"the system starts no thread for the output of {name}",
+                hint="raise its limit of processes, as with `ulimit -u 4096`",
+            ) from error
 
     def close_stdin(self) -> None:
         """Ask the child to end. A child that has not read its launch line yet is killed."""

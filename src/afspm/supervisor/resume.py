@@ -26,7 +26,7 @@ from afspm.storage.atomic import load_checkpoint
 from afspm.storage.packet_log import log_folder, logged_packets
 from afspm.supervisor import run as running
 from afspm.supervisor.own_runs import HOMES
-from afspm.supervisor.ports import require_free
+from afspm.supervisor.ports import require_free, require_limits
 from afspm.supervisor.run import FILES, HOW, ONLY, RUN, WITHOUT, FinishedRun, RunOptions
 from afspm.supervisor.run_identity import RunIdentity, new_identity
 from afspm.supervisor.supervision.run_end import EndReason
@@ -115,6 +115,7 @@ def resume(found: ResumableRun, options: RunOptions, terminal: TextIO | None = N
             what = "the scheduler has begun another run meanwhile"
             raise ConfigError(what, where=str(folder), hint="begin a new run here, too: `afspm run FILE --only …`")
         require_free(running.addresses_of(starts))
+        require_limits(len(starts))
         names = [*facts.get("processes", ()), *found.added]
         return running.go(experiment, options, common, folder, found.name, terminal, names)
 

@@ -40,7 +40,7 @@ from afspm.storage.disk import run_bounded
 from afspm.storage.packet_log import discard_if_recorded, expect_recorder, log_folder
 from afspm.supervisor import key_handout, own_runs, post_run, run_folder, run_identity
 from afspm.supervisor.log import RunLog
-from afspm.supervisor.ports import FreePorts, new_addresses, require_free
+from afspm.supervisor.ports import FreePorts, new_addresses, require_free, require_limits
 from afspm.supervisor.post_run import EndedRun
 from afspm.supervisor.process import from_start
 from afspm.supervisor.reporter import reporter_of
@@ -108,6 +108,7 @@ def run(experiment: Experiment, options: RunOptions = RunOptions(), terminal: Te
     key_handout.hand_over(experiment, first)
     names = [start.launch.name for start in first]
     require_free(addresses_of(first))
+    require_limits(len(first))
     common = common_identity(experiment, first, own, options, terminal)
     folder = run_folder.create(options.runs, experiment.name, now())
     with lock_run(folder):

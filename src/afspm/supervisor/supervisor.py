@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from afspm.basics.clock import ExperimentClock
-from afspm.basics.errors import AfspmError
+from afspm.basics.errors import AfspmError, NoThread
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.formatting import duration_text
 from afspm.model import Role
@@ -136,7 +136,11 @@ class Supervisor:
         return replace(task, launch=replace(launch, beat_token=token, sockets=sockets, keys=own))
 
     def run(self) -> RunOutcome:
-        """Start all processes, and return when none of them runs any more."""
+        """Start all processes, and return when none of them runs any more.
+
+        Raises:
+            NoThread: the system starts no further thread; no process is left.
+        """
         began_s = self._clock.monotonic_s()
         self._reaper.begin()
         if self._reporter is not None:
@@ -266,6 +270,8 @@ class Supervisor:
         try:
             process = ChildProcess(task, self._wakeup.post, has_tip=has_tip, may_begin=self._may_begin_of(task))
         except AfspmError as error:
+            if isinstance(error, NoThread) and not self._core.children[name].starts:
+                raise  # in a run under way the system may have room later, at its start the limit is too low
             self._step(StartFailed(name, str(error)))
             return
         self._processes[name] = process

@@ -287,10 +287,13 @@ def _bind_hint(error: zmq.ZMQError) -> str:
 CONNECTED = int(zmq.EVENT_HANDSHAKE_SUCCEEDED)
 DISCONNECTED = int(zmq.EVENT_DISCONNECTED)
 ACCEPTED = int(zmq.EVENT_ACCEPTED)
-REFUSED = int(
-    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
-)
-"""The peer has no key, or an unknown key. A peer without keys may also hang up first: an event without a detail."""
+KEY_REFUSED = int(zmq.EVENT_HANDSHAKE_FAILED_AUTH)
+"""The peer's key is unknown."""
+MISMATCHED = int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL)
+"""The peer has no key, or does not know the server's key."""
+CUT = int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL)
+"""The connection ended in its handshake. A peer without keys may also hang up before the mismatch is seen."""
+REFUSED = KEY_REFUSED | MISMATCHED | CUT
 _EVENT = struct.Struct("=hi")
 _numbers = itertools.count()
 

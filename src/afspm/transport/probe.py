@@ -11,7 +11,7 @@ import zmq
 
 from afspm.basics.clock import ExperimentClock
 from afspm.transport.diagnosis import Handshake, Reach, Versions
-from afspm.transport.network import CONNECTED, REFUSED, Monitor, Network
+from afspm.transport.network import CONNECTED, KEY_REFUSED, REFUSED, Monitor, Network
 
 WITHIN_S = 5.0
 _ZMTP = b"\xff"  # the first byte of ZeroMQ's greeting (ZMTP)
@@ -64,9 +64,7 @@ def handshake(network: Network, address: str, within_s: float = WITHIN_S) -> Han
     while found in (Handshake.SILENT, Handshake.FAILED) and (left_s := until_s - clock.monotonic_s()) > 0.0:
         monitor.socket.poll(round(left_s * 1000))
         for kind, _ in monitor.drain():
-            found = {CONNECTED: Handshake.DONE, int(zmq.EVENT_HANDSHAKE_FAILED_AUTH): Handshake.KEY_REFUSED}.get(
-                kind, Handshake.FAILED
-            )
+            found = {CONNECTED: Handshake.DONE, KEY_REFUSED: Handshake.KEY_REFUSED}.get(kind, Handshake.FAILED)
     return found
 
 

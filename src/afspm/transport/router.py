@@ -21,7 +21,7 @@ import zmq
 from afspm.basics.clock import Clock
 from afspm.transport.frames import descriptor_of, property_of, receive_frames, send_frames, user_of
 from afspm.transport.keys import MARK
-from afspm.transport.network import DISCONNECTED, REFUSED, Monitor, Network
+from afspm.transport.network import CUT, DISCONNECTED, KEY_REFUSED, MISMATCHED, REFUSED, Monitor, Network
 from afspm.transport.rate_limited_log import RateLimitedLog
 
 _LAST_WORDS = 200
@@ -29,6 +29,14 @@ _LAST_WORDS = 200
 _LOOKS_S = (0.0, 0.02, 0.5)
 """Real times after the end of a connection at which all senders are probed: ZeroMQ reports the end a moment before it
 forgets the peer."""
+
+_REFUSALS = {
+    KEY_REFUSED: "refused a connection: its key is not among the public keys of this experiment",
+    MISMATCHED: "refused a connection: it has no key, or an old public key of this process; [security] insecure = true "
+    "admits programs without keys",
+    CUT: "a connection ended before its key was checked: the link was cut, or a program without keys gave up",
+}
+"""The warning for each kind of failed handshake. A port scan, too, is CUT: that is no reason to give up keys."""
 
 
 class PeerConnected(NamedTuple):
@@ -79,7 +87,7 @@ class Router:
         self._log, self._clock = log, clock
         keys = network.keys
         self._keys = keys if keys is not None and keys.binds_encrypted(address, requests=True) else None
-        self._has_refused = False
+        self._warned: set[int] = set()
         self._numbers = 0
         self._senders: dict[bytes, _Sender] = {}
         self._identities: dict[int, bytes] = {}  # by the sender's number
@@ -194,20 +202,17 @@ class Router:
                     sender.is_gone |= sender.is_req and sender.descriptor == descriptor
                 self._look_soon()
             else:
-                self._warn_refused()
+                self._warn_refused(kind)
 
     def _look_soon(self) -> None:
         now_s = self._clock.monotonic_s()
         self._looks_s = [now_s + after_s for after_s in _LOOKS_S]
 
-    def _warn_refused(self) -> None:
-        # only once: a refused peer tries again without end
-        if self._keys is not None and not self._has_refused:
-            self._has_refused = True
-            self._log.warning(
-                f"refused a connection to {self.address}: its key is missing or unknown; [security] insecure = true "
-                "admits programs without keys"
-            )
+    def _warn_refused(self, kind: int) -> None:
+        # each kind only once: a refused peer tries again without end
+        if self._keys is not None and kind not in self._warned:
+            self._warned.add(kind)
+            self._log.warning(f"{self.address}: {_REFUSALS[kind]}")
 
 
 def _name(identity: bytes) -> str:

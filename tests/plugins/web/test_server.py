@@ -252,6 +252,43 @@ def test_body_that_does_not_come_ends_the_connection(serve: Serve) -> None:
     assert closes(connection)
 
 
+# faults 9
+def test_requests_with_slow_bodies_do_not_count(serve: Serve) -> None:
+    async def read(scope: Any, receive: Any, send: Any) -> None:
+        while scope["type"] == "http" and (await receive()).get("more_body"):
+            pass
+        await hello(scope, receive, send)
+
+    connect = serve(read, most_requests=2)
+    slow = [connect() for _ in range(20)]
+    for one in slow:
+        one.sendall(b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 9\r\n\r\n1234")
+        whole = connect()
+        whole.sendall(b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 4\r\n\r\n1234")
+        assert status(whole) == 200
+    slow[0].sendall(b"56789")
+    assert status(slow[0]) == 200
+
+
+def test_long_body_reaches_the_application_whole(serve: Serve) -> None:
+    sizes: list[int] = []
+
+    async def read(scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] == "http":
+            more = True
+            while more:
+                message = await receive()
+                sizes.append(len(message["body"]))
+                more = message.get("more_body", False)
+        await hello(scope, receive, send)
+
+    connection = serve(read, most_requests=2)()
+    long = 4 * web_server.MOST_AHEAD_BYTES
+    connection.sendall(b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: %d\r\n\r\n" % long + b"a" * long)
+    assert status(connection) == 200
+    assert sum(sizes) == long
+
+
 def test_only_requests_in_progress_count(serve: Serve) -> None:
     go_on, loops = asyncio.Event(), list[asyncio.AbstractEventLoop]()
 

@@ -91,7 +91,7 @@ class Client:
             answer = connection.getresponse()
             read, told = answer.read(), dict(answer.headers)
             is_json = told.get("content-type", "").startswith("application/json")
-            return Answer(answer.status, json.loads(read) if is_json else read, told)
+            return Answer(answer.status, json.loads(read) if is_json and read else read, told)
         finally:
             connection.close()
 

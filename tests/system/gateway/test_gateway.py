@@ -38,6 +38,13 @@ def test_a_night_by_http_alone_is_in_the_record_under_its_name(started: Started)
     assert {one["name"] for one in looker.get("/parameters")} > {"scan-speed", "tip-bias-voltage", "x-feedback-on"}
     assert {one["name"] for one in looker.get("/actions")} > {"stop-scan", "x-retract"}
 
+    for path in ("/state", "/events"):  # faults 15; the second has no end
+        head = looker.ask("HEAD", path)
+        assert (head.status, head.body) == (200, b"")
+    assert int(looker.ask("HEAD", "/state").headers["content-length"]) > 100
+    assert looker.ask("HEAD", "/scans/no-such").status == 422
+    assert looker.ask("HEAD", "/nowhere").status == 404
+    assert looker.ask("DELETE", "/state").headers["allow"] == "HEAD, GET"
     assert looker.ask("POST", "/control", {}).code == "name-needed"
     assert ada.ask("POST", "/scans", {"region": REGION}).code == "not-in-control"
     assert ada.done("POST", "/control", {"lease_s": 30}) == {"holder": "gateway:ada", "lease_s": 30}

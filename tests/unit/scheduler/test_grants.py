@@ -321,6 +321,142 @@ def test_agent_keeps_control_while_another_approval_is_in_force(agent: AgentLab)
     assert agent.lab.holder == AGENT
 
 
+# faults 4
+def scanning(agent: AgentLab) -> None:
+    assert agent.do(SCAN, ScanParameters(HERE)) == ""
+    assert agent.do(ACTION, names.START_SCAN) == ""
+    agent.lab.scope_is(ScopeState.SCANNING)
+
+
+def stopped(agent: AgentLab) -> bool:
+    return names.STOP_SCAN in [one.request.subject for one in sent(agent.lab)]
+
+
+def passes(agent: AgentLab, experiment_s: float) -> None:
+    agent.lab.later(experiment_s=experiment_s)
+    agent.lab.step(Tick())
+
+
+def test_scan_ends_with_its_grant_although_an_unused_plan_is_in_force(agent: AgentLab) -> None:
+    agent.begin(agent.grant(lasts_s=200.0))
+    assert agent.give(plan_of(agent)) is OK
+    scanning(agent)
+    due_ns = agent.lab.core.deadline_ns()
+    assert due_ns is not None
+    assert due_ns <= agent.lab.now_ns + 200 * 10**9
+    passes(agent, 201.0)
+    assert stopped(agent)
+    assert agent.lab.holder == AGENT
+    agent.lab.answer(sent(agent.lab)[-1])
+    agent.lab.scope_is(ScopeState.FREE)
+    later_ns = agent.lab.core.deadline_ns()
+    assert later_ns is not None
+    assert later_ns > due_ns
+    # the plan can still be carried out, and nothing beside it
+    assert "the grant has run out" in agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.1", "V"))
+    assert agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.9", "V")) == ""
+
+
+def test_start_that_is_refused_does_not_lengthen_the_running_scan(agent: AgentLab) -> None:
+    agent.begin(agent.grant(lasts_s=200.0))
+    scanning(agent)
+    assert agent.give(agent.plan((ACTION, names.START_SCAN))) is OK
+    assert agent.do(ACTION, names.START_SCAN, answers=ControlResponse.NOT_FREE) == ""
+    passes(agent, 201.0)
+    assert stopped(agent)
+
+
+def test_start_right_after_a_start_does_not_lengthen_the_scan(agent: AgentLab) -> None:
+    agent.lab.scope_is(ScopeState.FREE)
+    agent.begin(agent.grant(lasts_s=200.0))
+    assert agent.do(SCAN, ScanParameters(HERE)) == ""
+    assert agent.do(ACTION, names.START_SCAN) == ""
+    agent.lab.scope_is(ScopeState.FREE)  # a packet from before the start
+    assert agent.give(agent.plan((ACTION, names.START_SCAN))) is OK
+    assert agent.do(ACTION, names.START_SCAN, answers=ControlResponse.NOT_FREE) == ""
+    agent.lab.scope_is(ScopeState.SCANNING)
+    passes(agent, 201.0)
+    assert stopped(agent)
+
+
+def test_last_scan_of_a_plan_ends_with_the_plan(agent: AgentLab) -> None:
+    agent.begin(agent.plan((SCAN, ScanParameters(HERE)), (ACTION, names.START_SCAN)))
+    scanning(agent)
+    assert agent.lab.core.state.grants.book.approvals() == Approvals()
+    passes(agent, 1700.0)
+    assert not stopped(agent)
+    passes(agent, 101.0)
+    assert stopped(agent)
+    assert agent.lab.holder is None
+
+
+def test_last_scan_of_a_plan_outlasts_a_grant_that_has_run_out(agent: AgentLab) -> None:
+    agent.begin(agent.grant(lasts_s=60.0), agent.plan((SCAN, ScanParameters(HERE)), (ACTION, names.START_SCAN)))
+    scanning(agent)
+    passes(agent, 61.0)
+    assert not stopped(agent)
+    assert agent.lab.holder == AGENT
+
+
+def test_control_after_a_plan_without_a_scan_ends_with_the_plan(agent: AgentLab) -> None:
+    bias = Parameter(names.TIP_BIAS_VOLTAGE, "0.9", "V")
+    agent.begin(agent.plan((PARAM, bias)))
+    assert agent.do(PARAM, bias) == ""
+    assert agent.lab.holder == AGENT
+    passes(agent, 1801.0)
+    assert agent.lab.holder is None
+
+
+def test_scan_ends_with_its_approval_after_its_agent_released_control(agent: AgentLab) -> None:
+    agent.begin(agent.grant(lasts_s=200.0))
+    scanning(agent)
+    agent.lab.says(AGENT, ControlRequest.RELEASE_CTRL)
+    assert not stopped(agent)
+    passes(agent, 201.0)
+    assert stopped(agent)
+
+
+def test_revocation_stops_the_scan_of_an_agent_without_control(agent: AgentLab) -> None:
+    agent.begin(agent.grant(lasts_s=200.0))
+    scanning(agent)
+    agent.lab.says(AGENT, ControlRequest.RELEASE_CTRL)
+    assert agent.give(Grant(AGENT)) is OK
+    assert stopped(agent)
+
+
+@pytest.mark.parametrize(("lasts_s", "at_s"), [(60.0, 61.0), (900.0, 201.0)])
+def test_replaced_grant_shortens_a_scan_and_never_lengthens_it(agent: AgentLab, lasts_s: float, at_s: float) -> None:
+    agent.begin(agent.grant(lasts_s=200.0))
+    scanning(agent)
+    assert agent.give(agent.grant(lasts_s=lasts_s)) is OK
+    passes(agent, at_s - 2.0)
+    assert not stopped(agent)
+    passes(agent, 2.0)
+    assert stopped(agent)
+
+
+def test_approval_of_an_ended_scan_stops_no_later_scan_of_another(agent: AgentLab) -> None:
+    agent.begin(agent.grant(lasts_s=200.0))
+    scanning(agent)
+    agent.lab.scope_is(ScopeState.FREE)
+    agent.lab.says(AGENT, ControlRequest.RELEASE_CTRL)
+    assert agent.lab.take_control("series") is OK
+    assert agent.do(ACTION, names.START_SCAN, who="series") == ""
+    agent.lab.scope_is(ScopeState.SCANNING)
+    passes(agent, 201.0)
+    assert not stopped(agent)
+
+
+def test_end_of_a_scan_survives_the_death_of_the_scheduler(agent: AgentLab) -> None:
+    agent.begin(agent.grant(lasts_s=200.0))
+    assert agent.give(plan_of(agent)) is OK
+    scanning(agent)
+    agent.lab = killed(agent.lab, agent.settings)
+    agent.lab.scope_is(ScopeState.SCANNING)
+    passes(agent, 201.0)
+    assert stopped(agent)
+
+
 def test_one_packet_revokes_and_takes_control(agent: AgentLab) -> None:
     agent.begin(agent.grant())
     assert agent.do(SCAN, ScanParameters(HERE)) == ""

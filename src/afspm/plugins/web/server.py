@@ -30,6 +30,9 @@ MOST_UNFINISHED = 200
 Beyond a limit the oldest of these connections is closed.
 """
 
+MOST_AHEAD_BYTES = 64 << 10
+"""Size of a request body that is awaited before the request counts; the rest of a longer body comes later."""
+
 
 def listening(
     host: str, port: int | None, wanted: Iterable[int] = (USUAL_PORT,), *, what: str = "dashboard"
@@ -176,7 +179,7 @@ def _impatient(stalled_s: float, head_s: float, listener: _TlsListener | None) -
 
 
 def _limited(app: AsgiApp, most: int) -> AsgiApp:
-    # connections without a request do not count: a client could open many of them and block all others
+    # connections without a complete request do not count: a client could open many of them and block all others
     running = 0
 
     async def limited(scope: Message, receive: Receive, send: Send) -> None:
@@ -184,6 +187,13 @@ def _limited(app: AsgiApp, most: int) -> AsgiApp:
         if scope["type"] != "http":
             await app(scope, receive, send)
             return
+        came = [await receive()]
+        while came[-1].get("more_body") and sum(len(one["body"]) for one in came) <= MOST_AHEAD_BYTES:
+            came.append(await receive())
+
+        async def receive_again() -> Message:
+            return came.pop(0) if came else await receive()
+
         if running >= most:
             headers = [(b"content-type", b"text/plain"), (b"retry-after", b"1"), (b"connection", b"close")]
             await send({"type": "http.response.start", "status": 503, "headers": headers})
@@ -191,7 +201,7 @@ def _limited(app: AsgiApp, most: int) -> AsgiApp:
             return
         running += 1
         try:
-            await app(scope, receive, send)
+            await app(scope, receive_again, send)
         finally:
             running -= 1
 
@@ -204,7 +214,7 @@ class WebServer:
     Args:
         bound: the bound socket, which `stop` closes.
         certificate, key: PEM files, for https; None: http.
-        most_requests: limit of simultaneous requests; further requests get the status 503. None: no limit.
+        most_requests: limit of simultaneous complete requests; further requests get the status 503. None: no limit.
         stalled_s, head_s: real seconds; see `STALLED_S` and `HEAD_S`.
 
     Raises:

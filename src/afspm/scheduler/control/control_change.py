@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from afspm.basics.frozen import replace
-from afspm.model import ControlMode, ControlRequest, ControlResponse, Problem, ResponseDetail
+from afspm.model import ControlMode, ControlResponse, Problem, ResponseDetail
 from afspm.model.idempotency_cache import RequestStatus
 from afspm.model.microscope_status import feedback_of
 from afspm.model.sessions import token_of
@@ -146,13 +146,10 @@ def _alert_watchdog(draft: StateDraft, change: _Change) -> list[str]:
     # a request in flight can't be called back: it may still switch the feedback off
     if feedback is not None and feedback.on is False:
         draft.microscope = draft.microscope.feedback_may_be_off()
-    in_flight = None
-    if flight is not None and flight.request.kind == ControlRequest.ACTION:
-        in_flight = str(flight.request.subject)
     before = draft.watchdog
     draft.watchdog = before.control_taken(
         cause,
-        in_flight,
+        draft.forwarder.action_in_flight,
         draft.microscope,
         had_died=change.had_died,
         by_holder=ask.who == former,

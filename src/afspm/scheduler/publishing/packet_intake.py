@@ -25,6 +25,7 @@ from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlInput
 from afspm.scheduler.control.control_change import TRANSLATOR
 from afspm.scheduler.events import PacketIn, Publish
 from afspm.scheduler.publishing.event_log import panel_entry
+from afspm.scheduler.requests import approvals
 from afspm.scheduler.safety import safety_commands
 from afspm.scheduler.state import StateDraft
 from afspm.wire.messages import CONTROL_STATE
@@ -125,6 +126,7 @@ def _update_scope_state(draft: StateDraft, state: ScopeState) -> None:
     was_free = draft.microscope.is_free
     draft.microscope = draft.microscope.with_state(state, draft.now_s)
     draft.watchdog = draft.watchdog.state_reported(draft.microscope)
+    approvals.state_changed(draft)
     if draft.microscope.is_free != was_free:
         draft.lease = draft.lease.used(draft.now_ns)
     flagged_by = draft.control.problems.get(Problem.DEVICE_MALFUNCTION)

@@ -6,6 +6,7 @@ import math
 
 from afspm.model import ControlRequest, ControlResponse, ProbePosition, Request, Response
 from afspm.model.geometry import XY
+from afspm.model.microscope_status import STARTS, STOPS
 from afspm.scheduler.control import control_change
 from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlInput
 from afspm.scheduler.coordinate_frame import MappedRequest
@@ -13,8 +14,9 @@ from afspm.scheduler.events import RequestIn
 from afspm.scheduler.publishing.own_packets import publish
 from afspm.scheduler.requests import answers
 from afspm.scheduler.requests.forwarder import ForwardedRequest
+from afspm.scheduler.safety import safety_commands
 from afspm.scheduler.safety.grants import limits_digest
-from afspm.scheduler.state import StateDraft
+from afspm.scheduler.state import SchedulerState, StateDraft
 from afspm.wire.messages import APPROVALS
 
 _ORIGIN = Request(int(ControlRequest.SET_PROBE_POS), ProbePosition((0.0, 0.0)))
@@ -30,17 +32,52 @@ def decide(draft: StateDraft, event: RequestIn) -> None:
     draft.log("INFO", f"{event.name} {'revoked the approvals of' if grant.revokes else 'approved'} {grant.agent}")
     if not draft.grants.has_approval(grant.agent, draft.now_ns):
         control_change.decide(draft, ControlInput(ArbitrationEvent.REVOKED, grant.agent))
+    if grant.revokes:
+        end(draft)
     answers.answer(draft, event, ControlResponse.SUCCESS)
 
 
 def end(draft: StateDraft) -> None:
-    """Remove the approvals of the agent in control that have run out; it loses control, and its scan is stopped."""
+    """Stop a measurement whose approval has run out; an agent in control without any approval left loses control."""
     holder = draft.control.holder
-    if holder is None or (ends_ns := draft.grants.ends_ns(holder)) is None or draft.now_ns < ends_ns:
+    if holder is not None and (ends_ns := draft.grants.ends_ns(holder)) is not None and draft.now_ns >= ends_ns:
+        draft.grants = draft.grants.without(holder)
+        draft.log("WARNING", f"the approval of {holder} has run out")
+        control_change.decide(draft, ControlInput(ArbitrationEvent.REVOKED, holder))
+    until_ns, stop = measurement_ends_ns(draft), _stop(draft)
+    if stop is None or until_ns is None or draft.now_ns < until_ns:
         return
-    draft.grants = draft.grants.without(holder)
-    draft.log("WARNING", f"the approval of {holder} has run out")
-    control_change.decide(draft, ControlInput(ArbitrationEvent.REVOKED, holder))
+    who = draft.grants.book.measurement.who
+    draft.grants = draft.grants.measured()
+    stopping = draft.watchdog.stopping(stop)
+    if stopping is not draft.watchdog:  # the end of control has not stopped it already
+        draft.log("WARNING", f"the approval under which {who} measures has run out: {stop} is sent to the microscope")
+        draft.watchdog = stopping
+        safety_commands.send(draft)
+
+
+def measurement_ends_ns(state: SchedulerState | StateDraft) -> int | None:
+    """Return the experiment time at which the approval of the running measurement runs out; None: it needs none."""
+    measurement = state.grants.book.measurement
+    return measurement.until_ns if measurement.who and _stop(state) is not None else None
+
+
+def _stop(state: SchedulerState | StateDraft) -> str | None:
+    # None also while the controller is lost: the measurement is stopped once the controller is back
+    return state.watchdog.to_stop(state.forwarder.action_in_flight, state.microscope)
+
+
+def _may_measure(draft: StateDraft) -> bool:
+    # packets of older states may come after the answer to a start
+    scope = draft.microscope
+    states = {scope.risk.state, *scope.possible_states(draft.now_s)}
+    return not STOPS.keys().isdisjoint(states) or draft.forwarder.action_in_flight in STARTS
+
+
+def state_changed(draft: StateDraft) -> None:
+    """Forget the newest measurement of an agent once it has ended: the next one may be of another client."""
+    if not _may_measure(draft):
+        draft.grants = draft.grants.measured()
 
 
 def publish_changes(draft: StateDraft) -> None:
@@ -87,7 +124,9 @@ def refusal(draft: StateDraft, job: ForwardedRequest) -> Response | None:
 
 def sending(draft: StateDraft, job: ForwardedRequest) -> None:
     """Count a command, about to be sent, against its approval."""
-    draft.grants = draft.grants.sending(job.client, job.request, draft.now_ns, offset_m(draft))
+    draft.grants = draft.grants.sending(
+        job.client, job.request, draft.now_ns, offset_m(draft), is_measuring=_may_measure(draft)
+    )
 
 
 def done(draft: StateDraft, job: ForwardedRequest) -> None:

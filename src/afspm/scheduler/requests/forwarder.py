@@ -172,6 +172,12 @@ class Forwarder:
         """Whether a request can be sent."""
         return self.up and self.flight is None
 
+    @property
+    def action_in_flight(self) -> str | None:
+        """The action that the translator executes; None: none."""
+        request = None if self.flight is None else self.flight.request
+        return str(request.subject) if request is not None and request.kind == ControlRequest.ACTION else None
+
     def ask(self, job: ForwardedRequest, now_s: float) -> tuple[Forwarder, SettledRequest | None]:
         """Queue a client's request; return its refusal if it can't be queued."""
         if not self.up:

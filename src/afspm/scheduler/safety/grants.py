@@ -136,12 +136,32 @@ class HeldGrant:
 
 
 @dataclass(frozen=True)
+class AgentMeasurement:
+    """The newest scan or spectrum begun by an agent: it ends with the approval under which it was begun.
+
+    Attributes:
+        who: the agent; empty: the newest measurement is not of an agent, or has ended.
+        until_ns: the experiment time at which that approval runs out.
+        is_planned: whether that approval is a plan.
+    """
+
+    who: str = ""
+    until_ns: int = 0
+    is_planned: bool = False
+
+
+@dataclass(frozen=True)
 class AgentPlace:
-    """The places that the agent in control has set since it got control."""
+    """The places that the agent in control has set since it got control.
+
+    Attributes:
+        until_ns: the experiment time until which the agent keeps control after a completed plan; 0: no completed plan.
+    """
 
     who: str = ""
     region: Region | None = None
     probe_m: XY | None = None
+    until_ns: int = 0
 
     def after(self, who: str, request: Request) -> AgentPlace:
         """Return the places after a request was carried out."""
@@ -174,6 +194,7 @@ class GrantBook:
         plans, grants: the approved plans and the grants, by agent.
         spent: the requests of the last hour, oldest first, by agent or component with limits of its role.
         placed: the places set by the agent in control.
+        measurement: the newest measurement of an agent; it may go on after its agent has given control back.
         disturbed_ns: the last experiment time at which a problem was flagged or the mode changed.
     """
 
@@ -182,6 +203,7 @@ class GrantBook:
     spent: Mapping[str, tuple[SpentRequest, ...]] = field(default_factory=dict)
     placed: AgentPlace = field(default_factory=AgentPlace)
     disturbed_ns: int = 0
+    measurement: AgentMeasurement = field(default_factory=AgentMeasurement)
 
     def approvals(self) -> Approvals:
         """Return the approvals in their published form."""
@@ -214,14 +236,19 @@ class GrantChecker:
         if not self.rules.is_agent(grant.agent):
             agents = ", ".join(sorted(self.rules.agents)) or "none"
             return self, f"{grant.agent} is not an agent of this experiment; agents: {agents}"
+        begun = self.book.measurement
         if grant.revokes:
-            return self.without(grant.agent), ""
+            # its measurement ends with its approvals, also one that goes on without control
+            ended = replace(begun, until_ns=min(begun.until_ns, now_ns)) if begun.who == grant.agent else begun
+            return self.without(grant.agent)._with(measurement=ended), ""
         if why := self._stale(grant, now_ns, offset_m):
             return self, f"the approval is stale: {why}"
         held = HeldGrant(grant, by, now_ns)
+        if (begun.who, begun.is_planned) == (grant.agent, bool(grant.plan)):  # its approval is replaced
+            begun = replace(begun, until_ns=min(begun.until_ns, held.until_ns))
         if grant.plan:
-            return self._with(plans={**self.book.plans, grant.agent: held}), ""
-        return self._with(grants={**self.book.grants, grant.agent: held}), ""
+            return self._with(plans={**self.book.plans, grant.agent: held}, measurement=begun), ""
+        return self._with(grants={**self.book.grants, grant.agent: held}, measurement=begun), ""
 
     def without(self, agent: str) -> GrantChecker:
         """Remove all approvals of an agent."""
@@ -229,12 +256,18 @@ class GrantChecker:
 
     def has_approval(self, agent: str, now_ns: int) -> bool:
         """Return whether an approval of an agent is in force."""
-        ends_ns = self.ends_ns(agent)
-        return ends_ns is not None and now_ns < ends_ns
+        return any(now_ns < approval.until_ns for approval in self._held(agent))
 
     def ends_ns(self, agent: str | None) -> int | None:
-        """Return the experiment time at which the last approval of an agent runs out; None: it has none."""
-        return None if agent is None else max((approval.until_ns for approval in self._held(agent)), default=None)
+        """Return the experiment time at which the last approval of an agent runs out; None: it has none.
+
+        The approval of a plan that the agent has completed since it got control counts, too.
+        """
+        if agent is None:
+            return None
+        placed = self.book.placed
+        completed = [placed.until_ns] if placed.who == agent and placed.until_ns else []
+        return max((*completed, *(approval.until_ns for approval in self._held(agent))), default=None)
 
     def control_changed(
         self, before: ArbitrationState, after: ArbitrationState, by_hand: frozenset[int], now_ns: int
@@ -254,6 +287,8 @@ class GrantChecker:
             book = replace(book, plans={}, disturbed_ns=now_ns)
         if is_manual or flagged & {*by_hand, self.rules.stop}:
             book = replace(book, grants={})
+        if is_manual:  # the next measurement may be of the person at the panel
+            book = replace(book, measurement=AgentMeasurement())
         if before.holder != after.holder:
             # a plan is approved for one run without interruption
             former = before.holder or ""
@@ -361,23 +396,42 @@ class GrantChecker:
         refused = self._refused_by_grant(grant, who, request, now_ns, state)
         return f"{refused}; {why_not}" if refused and plan is not None else refused
 
-    def sending(self, who: str, request: Request, now_ns: int, offset_m: XY | None) -> GrantChecker:
-        """Count a checked request, about to be sent, against its approval or the limits of its role."""
-        is_agent = self.rules.is_agent(who)
-        if not is_agent and self._role(who) is None:
-            return self
+    def measured(self) -> GrantChecker:
+        """Register that the newest measurement has ended, or is ordered to stop."""
+        is_known = self.book.measurement != AgentMeasurement()
+        return self._with(measurement=AgentMeasurement()) if is_known else self
+
+    def sending(
+        self, who: str, request: Request, now_ns: int, offset_m: XY | None, *, is_measuring: bool = False
+    ) -> GrantChecker:
+        """Count a checked request, about to be sent, against its approval or the limits of its role.
+
+        Args:
+            is_measuring: whether a measurement may be running, which the microscope then goes on with.
+        """
         if request.id and self._spent(who, request.id) is not None:
             return self
-        book, plan = self.book, self.book.plans.get(who)
+        is_agent = self.rules.is_agent(who)
         action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
-        approved = ""
+        begins = bool(action) and action not in _STOPS
+        if not is_agent and begins and not is_measuring:
+            return self.measured().sending(who, request, now_ns, offset_m, is_measuring=True)
+        if not is_agent and self._role(who) is None:
+            return self
+        book, plan = self.book, self.book.plans.get(who)
+        approved, held = "", None
         if plan is not None and not self._refused_by_plan(plan, request, now_ns, offset_m):
-            approved = plan.grant.plan
+            approved, held = plan.grant.plan, plan
             sent = replace(plan, step=plan.step + 1, unsettled=request.id)
             book = replace(book, plans={**book.plans, who: sent})
-        elif action and action not in _STOPS and (grant := book.grants.get(who)) is not None:
-            used = {**grant.used, action: grant.used.get(action, 0) + 1}
-            book = replace(book, grants={**book.grants, who: replace(grant, used=used)})
+        elif begins and (held := book.grants.get(who)) is not None:
+            used = {**held.used, action: held.used.get(action, 0) + 1}
+            book = replace(book, grants={**book.grants, who: replace(held, used=used)})
+        if begins and held is not None:
+            begun = AgentMeasurement(who, held.until_ns, bool(approved))
+            # this start may be refused: the measurement that runs already keeps its earlier end
+            is_earlier = is_measuring and book.measurement.who and book.measurement.until_ns < begun.until_ns
+            book = book if is_earlier else replace(book, measurement=begun)
         lately = tuple(use for use in book.spent.get(who, ()) if now_ns - use.at_ns < _HOUR_NS)
         spent = SpentRequest(request.id, request.kind, request.payload, now_ns, approved, action)
         return replace(self, book=replace(book, spent={**book.spent, who: (*lately, spent)}))
@@ -405,6 +459,9 @@ class GrantChecker:
         plan = book.plans.get(who)
         if plan is not None and plan.unsettled and plan.unsettled == request.id:
             is_last = plan.step >= len(plan.grant.steps)
+            if is_last:  # its last scan may go on, and the agent waits for it in control
+                placed = book.placed if book.placed.who == who else AgentPlace(who)
+                book = replace(book, placed=replace(placed, until_ns=plan.until_ns))
             settled = {} if is_last else {who: replace(plan, unsettled="")}
             book = replace(book, plans={**_less(book.plans, who), **settled})
         return self if book is self.book else replace(self, book=book)

@@ -273,11 +273,17 @@ class Watchdog:
             dog = dog.seen_to()
         if dog.can_retract and (had_died or not knows) and microscope.danger is not None:
             dog = dog._endangered(microscope)
-        stop = STOPS.get(microscope.state) or dog.starting or STARTS.get(in_flight or "")
-        if stop is None or stop in dog.tip.stops:
-            return dog
+        stop = dog.to_stop(in_flight, microscope)
         is_to_stop = cause in dog.settings.stop_when or dog.owes_retract
-        return dog._with_stops((stop, *dog.tip.stops)) if is_to_stop else dog
+        return dog.stopping(stop) if is_to_stop and stop is not None else dog
+
+    def to_stop(self, in_flight: str | None, microscope: MicroscopeStatus) -> str | None:
+        """Return the action that stops the running measurement, or the one about to begin; None: neither is known."""
+        return STOPS.get(microscope.state) or self.starting or STARTS.get(in_flight or "")
+
+    def stopping(self, stop: str) -> Watchdog:
+        """Require a stop of the running measurement."""
+        return self if stop in self.tip.stops else self._with_stops((stop, *self.tip.stops))
 
     def left_to_person(self, *, is_unsent: bool) -> Watchdog:
         """Drop all duties: a person at the microscope sees to the tip, and may have begun a scan.

@@ -17,7 +17,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from afspm.basics import Plain
-from afspm.plugins.web.asgi import AsgiApp
+from afspm.plugins.web.asgi import AsgiApp, Message, Receive, Send
 from afspm.plugins.web.gateway.command_routes import CommandRoutes
 from afspm.plugins.web.gateway.guard import GatewayGuard, answer
 from afspm.plugins.web.gateway.problems import RefusalCode, RefusalModel, RefusedRequest, of_error
@@ -65,7 +65,7 @@ def application(
     for error in (RefusedRequest, Exception):
         app.add_exception_handler(error, refused)
     # outside of FastAPI: an unauthorised request must not reach a validator
-    guarded: AsgiApp = GatewayGuard(app, passwords, host, origins)
+    guarded: AsgiApp = GatewayGuard(_answering_head(app), passwords, host, origins)
     if not origins:
         return guarded
     methods, headers = ("GET", "POST", "PUT", "DELETE"), ("Authorization", "Content-Type", "Last-Event-ID")
@@ -77,6 +77,23 @@ def application(
         expose_headers=("Location", "Retry-After"),
     )
     return allowing
+
+
+def _answering_head(app: AsgiApp) -> AsgiApp:
+    # FastAPI's routes know no HEAD: it is answered as GET, without the body, which may be an endless stream of events
+    async def answering(scope: Message, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await app(scope, receive, send)
+            return
+
+        async def send_head(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                await send(message)
+                await send({"type": "http.response.body"})
+
+        await app({**scope, "method": "GET"}, receive, send_head)
+
+    return answering
 
 
 async def _invalid(_: Request, error: Exception) -> Response:
@@ -101,5 +118,6 @@ def _methods(paths: Plain, path: str) -> list[str]:
     # each method of a path is a route of its own
     for template, of_path in paths.items():
         if re.fullmatch(re.sub(r"{\w+}", "[^/]+", template), path):
-            return [method.upper() for method in of_path]
+            methods = [method.upper() for method in of_path]
+            return ["HEAD", *methods] if "GET" in methods else methods
     return []
