@@ -7,7 +7,7 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 DEV := .venv/.dev
 
-.PHONY: demo demo-drift dev test test-times test-all test-slow test-power-cut test-apart test-lowest mutants test-samples test-matrix test-nion coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
+.PHONY: demo demo-drift dev test test-times test-programs test-all test-slow test-power-cut test-apart test-lowest mutants test-samples test-matrix test-nion coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
 .PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift bench-guests soak chaos crowd scanner-nights simulate replay-nights power-cut acts as-reported docs release-check test-plug-ins changelog clean
 .DEFAULT_GOAL := demo
 
@@ -55,11 +55,16 @@ QUICK := tests/unit tests/simulation tests/plugins tests/docs $(addprefix tests/
 MOST_TIME ?=
 TIMED = PYTHONDONTWRITEBYTECODE= $(BIN)/python tools/processor_time.py $(addprefix --fail-above=,$(MOST_TIME)) $(BIN)/pytest
 test: $(COLLECTED)
-	@$(TIMED) -n $(TESTS_AT_A_TIME) --dist worksteal -m "not slow" $(TABLE) $(QUICK)
+	@$(TIMED) -n $(TESTS_AT_A_TIME) --dist worksteal -m "not slow and not program" $(TABLE) $(QUICK)
 
 ## the same, with the processor time of each folder and the most expensive tests
 test-times: TABLE := --processor-times
 test-times: test
+
+## what is compared with a program or library that `make test` does not install: Gwyddion, GXSM, QCoDeS, sidpy; says which
+## of them this computer lacks
+test-programs: $(COLLECTED)
+	@$(PYTEST) -m program tests/unit tests/plugins
 
 ## the rest: whole experiments, samples, snippets of the docs, faults of controllers, mutants; of the largest sets a part,
 ## another at each commit (tests/support/rotation.py), and all with AFSPM_CASES=all. What is APART, or needs more (root,

@@ -53,6 +53,7 @@ IN_TURN: Final = {
 }
 """Targets with the settings by which they take minutes."""
 NOT_IN_TURN: Final = {
+    "test-programs": "skips what the computer of the changes lacks, which is all of it",
     "bench": "judges speed, which other work on the computer changes; test-apart runs each row once",
     "coverage": "the tests of `make test` once more",
     "test-all": "its parts run at every change",

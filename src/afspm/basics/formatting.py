@@ -10,10 +10,10 @@ from datetime import UTC, datetime, tzinfo
 from afspm.basics.clock import NS_PER_S, utc_time
 
 _PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"),
-             (1e-12, "p"), (1e-15, "f"))  # fmt: skip
+             (1e-12, "p"), (1e-15, "f"), (1e-18, "a"))  # fmt: skip
 # all other units (px, deg, min, %) are shown without a prefix
 PREFIXABLE = frozenset(
-    {"m", "V", "A", "s", "N", "Hz", "W", "F", "m/s", "m/V", "V/m", "C", "S", "Pa", "Ohm", "Ω", "T", "g"}
+    {"m", "V", "A", "s", "N", "Hz", "W", "F", "m/s", "m/V", "V/m", "C", "S", "Pa", "Ohm", "Ω", "T", "g", "J"}
 )
 LONGEST_FOREIGN = 200
 """Greatest number of characters shown of a text from outside, such as a message of a controller."""

@@ -59,6 +59,10 @@ class KeyedResults:
         self._outage = OutageLog("keyed measurements can't be saved", _log)
         self._memory = Memory(folder / f"{name}.scope.json" if folder else None)
 
+    def close(self) -> None:
+        """End the thread that writes; a later measurement starts another."""
+        self._memory.close()
+
     @property
     def disk_is_full(self) -> bool:
         """Return whether the disk of the run is full."""

@@ -91,6 +91,8 @@ class ComponentLoop:
         finally:
             self._backlog.close()
             self._link.port.close()
+            self._component.memory.close()
+            self._component.scope._results.close()
         return code
 
     def _fail(self, error: Exception, state_dir: Path) -> ExitCode:

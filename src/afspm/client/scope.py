@@ -560,6 +560,7 @@ class Scope(ExperimentView):
         """
         self._control.leave()
         self._link.leave()
+        self._results.close()
 
     def __enter__(self) -> Scope:
         return self

@@ -34,7 +34,8 @@ def lock_run(folder: Path) -> Iterator[None]:
     """Hold the lock of a run in the block; the system releases the lock of a killed process.
 
     Raises:
-        FileError: another process holds the lock: the run is still going on; or its file can't be written.
+        FileError: another process holds the lock: the run is still going on, or writes its report; or its file can't be
+            written.
     """
     with writing_to(folder):
         opened = (folder / STATE_DIR / LOCK_FILE).open("a+b")
@@ -42,7 +43,10 @@ def lock_run(folder: Path) -> Iterator[None]:
         try:
             lock(file)
         except OSError as error:
-            raise FileError("this run is still going on", where=str(folder), hint="`afspm status` shows it") from error
+            what, hint = "this run is still going on", "`afspm status` shows it"
+            if run_json_or_empty(folder).get(ENDED):
+                what, hint = "this run has ended, and its report is still being written", "try again in a minute"
+            raise FileError(what, where=str(folder), hint=hint) from error
         yield
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from afspm.basics.plain_data import Plain
 from afspm.storage.atomic import OutageLog
-from afspm.storage.disk import DiskThread
+from afspm.storage.disk import DEADLINE_S, DiskThread
 
 
 class Truth:
@@ -37,6 +37,10 @@ class Truth:
         line = json.dumps({"n": number, "time_s": time_s, "event": event, **facts}, default=_plain)
         with self._outage.trying():
             self._disk.run(lambda: self._append(line), len(line))
+
+    def close(self) -> None:
+        """End the thread that writes; a later event starts another."""
+        self._disk.close(DEADLINE_S)
 
     def _append(self, line: str) -> None:
         self._path.parent.mkdir(parents=True, exist_ok=True)

@@ -142,12 +142,18 @@ class DiskThread:
         return task
 
     def close(self, within_s: float) -> bool:
-        """Finish the queued tasks within a time limit; return whether all are finished. Safe to repeat."""
+        """Finish the queued tasks within a time limit, and end the thread; return whether all are finished.
+
+        Safe to repeat. A later task starts another thread.
+        """
         if self._thread is None:
             return True
         self._backlog.tasks.put(None)
         self._thread.join(within_s)
-        return not self._thread.is_alive()
+        if self._thread.is_alive():
+            return False
+        self._thread = None
+        return True
 
 
 def run_bounded(work: Callable[[], T], within_s: float) -> T:

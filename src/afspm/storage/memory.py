@@ -66,6 +66,10 @@ class Memory(MutableMapping[str, Any]):
         if (text := self._text()) != self._saved:
             self._write(text, synced=True)
 
+    def close(self) -> None:
+        """End the thread that writes; a later save starts another."""
+        self._disk.close(DEADLINE_S)
+
     @property
     def saved_text(self) -> str:
         """All values as JSON, as of the last successful save."""

@@ -6,6 +6,7 @@ import csv
 import logging
 import math
 import os
+import signal
 import subprocess
 import threading
 from collections import Counter
@@ -24,9 +25,10 @@ from afspm.experiment import Role, implied_parts
 from afspm.model.events import LOGGED_AS
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.run import open_run
-from afspm.record.run_lock import resume_command
+from afspm.record.run_lock import quoted, resume_command
 from afspm.storage.disk import DiskTimeout, run_bounded
 from afspm.supervisor.supervision.run_end import EndReason
+from afspm.transport.process import signals
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -149,14 +151,21 @@ def report(folder: Path, log: RunLog) -> None:
     if not (folder / JOURNAL_FILE).is_file():
         return  # no record, no report
     log.write(LOGGED_AS, logging.INFO, "writing the report …")
+    again = f"`afspm report {quoted(folder)}` writes it"
     command = [*python_command("afspm.record.report"), str(folder)]
     environment = {**os.environ, **python_environment(), "MPLBACKEND": "agg"}
     try:
-        with ProgressLine("writing the report"):
+        with signals.caught(_stop, -1), ProgressLine("writing the report"):
             exit_code, output = _until_done(command, environment)
+    except _Stopped as stopped:
+        log.write(LOGGED_AS, logging.WARNING, f"no report: {stopped} came while it was written; {again}")
+        if stopped.number == signal.SIGINT:
+            raise KeyboardInterrupt from None
+        signal.raise_signal(stopped.number)
+        return
     except subprocess.TimeoutExpired:
         stalled = f"its process has not worked for {REPORT_STALLED_S:g} s, as if the disk did not answer"
-        log.write(LOGGED_AS, logging.WARNING, f"no report: {stalled}; try afspm report")
+        log.write(LOGGED_AS, logging.WARNING, f"no report: {stalled}; {again}")
         return
     except OSError as error:
         log.write(LOGGED_AS, logging.WARNING, f"no report: {error}")
@@ -168,6 +177,18 @@ def report(folder: Path, log: RunLog) -> None:
         from afspm.record.report import REPORT_FILE
 
         log.write(LOGGED_AS, logging.INFO, f"the report is {folder / REPORT_FILE}")
+
+
+class _Stopped(BaseException):
+    """Not an Exception, so that no broad `except` takes it for an error of the report."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+def _stop(number: int) -> None:
+    raise _Stopped(number)
 
 
 def _until_done(command: Sequence[str], environment: Mapping[str, str]) -> tuple[int, bytes]:

@@ -32,7 +32,7 @@ FRAME = Region((10e-9, -5e-9), (50e-9, 30e-9), math.radians(20.0))
 SHAPE = (24, 32)
 
 
-@pytest.fixture(params=[*EMULATED, "real"])
+@pytest.fixture(params=[*EMULATED, pytest.param("real", marks=pytest.mark.program)])
 def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench | None]:
     """A bench with an emulated GXSM; None for the real one."""
     with ExitStack() as stack:

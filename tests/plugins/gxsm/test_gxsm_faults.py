@@ -104,6 +104,34 @@ def test_tip_moved_with_its_frame_counts_as_moving(bench: Make) -> None:
         assert made.emulator.rig.probe_at(made.clock.now_s()) == pytest.approx(center_m)
 
 
+# results X6: of the same kind
+def test_scan_whose_files_waited_is_published_long_after_a_restart(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = small(made, result_timeout_s=100.0)
+    assert scanned(peer)
+    held: list[tuple[Path, bytes]] = []
+
+    def hold_files(emulator: Any) -> None:
+        emulator.program.saving.write = lambda contents, now_s: held.extend(contents)
+
+    made.at_panel(hold_files)
+    calls = Calls(made)
+    assert peer.act(names.START_SCAN).ok
+    until(made, lambda: any(call[0] == "autosave" for call in calls.answered))
+    until(made, lambda: calls.answered[-1][0] == "rtquery")  # after the questions about its end
+    made.strike("crash")
+    for path, content in held:
+        path.write_bytes(content)
+    made.start_controller_again(channels_set=False)
+    made.until_logged("GXSM reports no channel, as after a restart")
+    until_s = made.clock.now_s() + 60.0  # longer than the files are awaited
+    until(made, lambda: made.clock.now_s() >= until_s)
+    made.at_panel(lambda emulator: emulator.program.set_channels())
+    made.at_panel(lambda emulator: emulator.program.start_scan())
+    found = {Path(scan.filename).name for scan in scans(peer.until(FREE))}
+    assert found >= {path.name for path, _ in held}
+
+
 @pytest.mark.parametrize("settings", [BRIDGE, SHM], ids=["bridge", "shm"])
 def test_hanging_gxsm_is_lost_and_reconnected(bench: Make, settings: dict[str, Any]) -> None:
     made = bench(speed=1.0, **settings)

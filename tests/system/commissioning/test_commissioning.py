@@ -178,6 +178,18 @@ def test_angle_is_typed_as_the_panel_shows_it(driver: type[Driver], shown: str, 
     assert Guide(kit, person, tmp_path, counts_clockwise=driver.counts_clockwise).compare_angle(-20.0)
 
 
+# results X4: the advice turned every frame the wrong way
+def test_no_sign_is_changed_for_an_angle_that_differs(tmp_path: Path) -> None:
+    person = Person({"angle": "77", "Is the tip at the sample": False})
+    result = commissioned(tmp_path, "Gxsm", person)
+    found = result.progress.results["panel"]
+    assert found.outcome is CheckOutcome.FAILED
+    assert "77" in found.line
+    advice = [line for line in person.shown if "What to do" in line]
+    assert advice
+    assert not any("sign" in line for line in advice)
+
+
 def test_a_panel_that_shows_the_width_of_whole_pixels_is_right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.syspath_prepend(str(tmp_path))

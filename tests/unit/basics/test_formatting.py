@@ -82,6 +82,11 @@ def test_quantities_read_well(value: float | None, unit: str, text: str) -> None
     assert formatting.quantity(value, unit) == text
 
 
+# spectra F12: a map of the area of force curves had "J, 1e-17"
+def test_energy_has_a_prefix() -> None:
+    assert formatting.scale(3e-17, "J") == (pytest.approx(1e18), "aJ")
+
+
 def test_the_prefix_and_the_factor_belong_together() -> None:
     factor, unit = formatting.scale(3e-7, "m")
     assert (3e-7 * factor, unit) == (pytest.approx(300.0), "nm")

@@ -86,6 +86,7 @@ def test_scan_that_can_not_be_drawn_is_refused() -> None:
         Scan(SCAN.region, "Height", "m", np.full((3, 4), np.nan)).plot()
 
 
+@pytest.mark.program
 def test_a_scan_is_the_same_after_a_way_through_sidpy() -> None:
     pytest.importorskip("sidpy", reason="sidpy, a gigabyte, is not installed")
     dataset = SCAN.to_sidpy()

@@ -258,6 +258,7 @@ def test_file_of_a_third_maker_is_refused_with_the_reasons_of_both(
         afspm.read(file(tmp_path, "a.dat"))
 
 
+@pytest.mark.program
 def test_real_converter_keeps_values_and_size(tmp_path: Path) -> None:
     if gwyddion_converter._program() is None:
         pytest.skip("Gwyddion's converter is not installed")

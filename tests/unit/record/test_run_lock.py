@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from afspm.basics.errors import FileError
 from afspm.record.run_lock import cut_off_message, describe_state, lock_run, resume_command
 
 
@@ -27,6 +28,17 @@ def test_unlocked_run_without_an_end_is_cut_off(tmp_path: Path) -> None:
     with lock_run(folder):
         assert cut_off_message(folder) == ""
     assert cut_off_message(folder), "who ran it is gone"
+
+
+@pytest.mark.parametrize(
+    ("facts", "said"),
+    [({}, "this run is still going on"), ({"ended": "stopped"}, "has ended, and its report is still being written")],
+)
+def test_refused_resume_knows_the_run_from_its_report(tmp_path: Path, facts: dict[str, str], said: str) -> None:
+    # spectra F12: "still going on" for half a minute after the end
+    folder = folder_of(tmp_path, **facts)
+    with lock_run(folder), pytest.raises(FileError, match=said), lock_run(folder):
+        pass
 
 
 def test_state_query_does_not_block_a_resume(tmp_path: Path) -> None:

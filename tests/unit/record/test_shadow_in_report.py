@@ -80,6 +80,12 @@ def test_no_act_answers_drift() -> None:
     assert line[:5] == ("drift", "1", "", "", "1")
 
 
+def test_kind_without_a_decision_has_no_share() -> None:
+    night = compare([], [])
+    assert f"{ShadowKind.LINES}: none seen" in agreement_in_words(night)
+    assert not any("0 % to 100 %" in " ".join(line) for line in agreement_lines(night))
+
+
 def test_begun_scan_is_listed_and_answers_nothing() -> None:
     night = compare([decision(100.0, ShadowKind.SCAN)], [act(101.0, answers=False)])
     assert counted(night, ShadowKind.SCAN) == (1, 0)

@@ -116,6 +116,7 @@ def test_the_makers_own_reader_reads_the_same(written: dict[str, Path], tmp_path
     assert (point["fPosX"][0], point["fPosY"][0]) == pytest.approx((2.0, -3.0))
 
 
+@pytest.mark.program
 @pytest.mark.skipif(shutil.which("gwyddion") is None, reason="Gwyddion is not installed")
 def test_gwyddion_shows_the_same(written: dict[str, Path], tmp_path: Path) -> None:
     converted = tmp_path / "converted.gwy"

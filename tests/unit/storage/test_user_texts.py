@@ -4,13 +4,34 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from datetime import UTC
 from pathlib import Path
+from typing import Any
 from zoneinfo import ZoneInfo
 
+import h5py
 import numpy as np
 import pytest
-from tests.unit.storage.samples import ANGLE_DEG, HEIGHT_M, NOTE, NX, NY, OTHER, REGION, dat, nid, nsid, sxm, wave
+from scipy.io import netcdf_file
+from tests.unit.storage.samples import (
+    ANGLE_DEG,
+    HEIGHT_M,
+    NOTE,
+    NX,
+    NY,
+    OTHER,
+    REGION,
+    dat,
+    gsf,
+    gxsm3,
+    gxsm4,
+    nhf,
+    nid,
+    nsid,
+    sxm,
+    wave,
+)
 
 import afspm
 from afspm.basics.errors import FileError
@@ -60,6 +81,67 @@ def test_nanonis_names_and_units_are_read_in_both_encodings(tmp_path: Path, enco
     table = dat().replace(b"Current (A)\t", "Strom µ (A)\t".encode(encoding))
     (spectrum,) = read(tmp_path / "a.dat", table).spectra
     assert spectrum.names[1] == "Strom µ"
+
+
+def _gxsm3(path: Path, comment: bytes) -> None:
+    gxsm3(path)
+    file: Any
+    with netcdf_file(path, "a") as file:
+        file.comment = comment
+
+
+def _gxsm4(path: Path, comment: bytes) -> None:
+    gxsm4(path)
+    with h5py.File(path, "a") as file:
+        file["comment"] = np.frombuffer(comment, dtype="S1")
+
+
+def _gsf(path: Path, comment: bytes) -> None:
+    whole = gsf().partition(b"\0")[0] + b"comment = " + comment + b"\n"
+    path.write_bytes(whole + b"\0" * (4 - len(whole) % 4) + HEIGHT_M[::-1].astype("<f4").tobytes())
+
+
+def _nhf(path: Path, comment: bytes) -> None:
+    nhf(path)
+    with h5py.File(path, "a") as file:
+        file["measurement_0"].attrs.create("comment", comment, dtype=h5py.string_dtype())
+
+
+def _sxm(path: Path, comment: bytes) -> None:
+    path.write_bytes(sxm().replace(COMMENT, comment))
+
+
+Write = Callable[[Path, bytes], None]
+FORMATS: dict[str, tuple[str, Write]] = {
+    "GXSM 3": ("nc", _gxsm3),
+    "GXSM 4": ("nc", _gxsm4),
+    "Gwyddion": ("gsf", _gsf),
+    "Nanosurf": ("nhf", _nhf),
+    "Nanonis": ("sxm", _sxm),
+}
+
+
+def _comment(path: Path) -> str:
+    header = afspm.read(path).header
+    return str(header[next(key for key in header if key.casefold() == "comment")])
+
+
+@pytest.mark.parametrize(("suffix", "write"), FORMATS.values(), ids=FORMATS)
+@pytest.mark.parametrize("encoding", ["utf-8", "cp1252"])
+def test_comment_is_read_in_both_encodings(tmp_path: Path, suffix: str, write: Write, encoding: str) -> None:
+    path = tmp_path / f"a.{suffix}"
+    write(path, "30 µm, 4 °C".encode(encoding))
+    assert _comment(path) == "30 µm, 4 °C"
+    assert afspm.read(path).left_out == ()
+
+
+@pytest.mark.parametrize(("suffix", "write"), FORMATS.values(), ids=FORMATS)
+def test_comment_in_another_encoding_is_named(tmp_path: Path, suffix: str, write: Write) -> None:
+    path = tmp_path / f"a.{suffix}"
+    write(path, "プローブ".encode("shift-jis"))
+    (left_out,) = afspm.read(path).left_out
+    assert "comment" in left_out.casefold()
+    assert "neither UTF-8 nor cp1252" in left_out
 
 
 def test_columns_of_one_name_get_a_number(tmp_path: Path) -> None:
@@ -131,7 +213,6 @@ def test_place_of_an_older_nanosurf_image_is_read(tmp_path: Path, encoding: str)
 
 
 def test_file_that_another_program_holds_open_is_read(tmp_path: Path) -> None:
-    pytest.importorskip("h5py")
     nsid(path := tmp_path / "a.h5")
     hold = f"import h5py, sys; file = h5py.File({str(path)!r}, 'r+'); print('open', flush=True); sys.stdin.read()"
     with subprocess.Popen([sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:

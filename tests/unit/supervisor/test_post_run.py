@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 import logging
 import os
+import signal
+import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
+from deadlines import DEADLINE_S
 
 from afspm.basics.clock import ExperimentClock
 from afspm.components import notifications
@@ -123,6 +127,39 @@ def test_report_is_given_up_only_if_its_process_does_not_work(
     level, text = log.lines[-1]
     assert (level == logging.INFO) is works
     assert ("has not worked for" in text) is not works
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without a signal")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_signal_in_the_report_leaves_the_command_that_writes_it(number: int, tmp_path: Path) -> None:
+    # spectra, "small list": SIGTERM in the report left no word
+    RecordStore(tmp_path).close()
+    code = f"""
+import logging, sys, threading
+from pathlib import Path
+from afspm.supervisor import post_run
+
+class Log:
+    def write(self, name, level, text):
+        print(text, flush=True)
+
+post_run.python_command = lambda _: [sys.executable, "-c", "import time; print('x'); time.sleep(600)"]
+post_run.report(Path({str(tmp_path)!r}), Log())
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "writing the report …\n"
+        children: list[psutil.Process] = []
+        while not any("sleep" in str(child.cmdline()) for child in children):  # it is a program, and no fork any more
+            children = psutil.Process(process.pid).children()
+        process.send_signal(number)
+        said, _ = process.communicate(timeout=DEADLINE_S)
+    name = signal.Signals(number).name
+    assert said == f"no report: {name} came while it was written; `afspm report {tmp_path}` writes it\n"
+    assert process.returncode == -number
+    psutil.wait_procs(children, timeout=DEADLINE_S)
+    assert not any(child.is_running() for child in children)
+    assert not (tmp_path / REPORT_FILE).exists()
 
 
 def test_run_without_a_record_has_no_report_and_no_warning(tmp_path: Path) -> None:

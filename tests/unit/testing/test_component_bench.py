@@ -170,6 +170,20 @@ def test_benches_leave_no_thread() -> None:
     assert not [thread.name for thread in left if thread.is_alive()]
 
 
+# contributors K6: four of five threads waited for the garbage collector
+def test_closed_bench_leaves_no_thread() -> None:
+    before = set(threading.enumerate())
+    bench = series()
+    bench.run(until="1 min")
+    left = [thread for thread in threading.enumerate() if thread not in before and thread.name != "syncer"]
+    assert "disk" in {thread.name for thread in left}
+    bench.close()
+    for thread in left:
+        thread.join(60.0)
+    assert not [thread.name for thread in left if thread.is_alive()]
+    assert len(bench.scans) == 1
+
+
 def test_closed_bench_keeps_its_results_and_runs_no_more() -> None:
     bench = series()
     bench.run(until="1 min")

@@ -70,6 +70,7 @@ class GxsmFiles(ResultFiles):
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._before: dict[Path, FileContent] = {}
         self._half: set[Path] = set()
+        self._unsettled = False  # the last look found a new file, or one that had grown
         self._whole: dict[Path, FileContent] = {}
         self._outcome: bool | None = None  # of a measurement directly followed by the next
         self.upwards = False
@@ -275,7 +276,8 @@ class GxsmFiles(ResultFiles):
         elif ended is not None:
             files = self._new(ended)
             is_followed = "names" in ended
-            over = now_s >= ended["until_s"] or (is_followed and not ended["names"])
+            # the first look after a restart of GXSM or the translator may come after the deadline
+            over = not self._unsettled and (now_s >= ended["until_s"] or (is_followed and not ended["names"]))
             gaps = [file for file, content in files.items() if lines_missing(content)]
             has_more_rows = any(
                 lines_missing(content) < len(scan.values) - few(len(scan.values))
@@ -316,6 +318,7 @@ class GxsmFiles(ResultFiles):
     def _new(self, ended: Entry) -> dict[Path, FileContent]:
         # Complete files only: a file is read once its size has been the same in two looks.
         found = {}
+        self._unsettled = False
         not_before_ns = max(ended["newest_ns"], self._named_ns(ended))
         names = ended.get("names")
         there = _files(_folder(ended), ended["what"]) if names is None else [Path(name) for name in names]
@@ -327,6 +330,7 @@ class GxsmFiles(ResultFiles):
             if self._sizes.get(file) != size:
                 self._sizes[file] = size
                 self._whole.pop(file, None)
+                self._unsettled = True
             elif file not in self._whole:
                 try:
                     self._whole[file] = read_result(file)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from afspm.basics import FileError
-from afspm.driver import FileContent
+from afspm.driver import FileContent, text_of
 from afspm.model import Region, Scan
 
 _MAGIC = b"Gwyddion Simple Field 1.0\n"
@@ -30,7 +30,7 @@ def read_field(path: Path, zone: tzinfo | None) -> FileContent:
     end = data.find(b"\0")
     if not data.startswith(_MAGIC) or end < 0:
         raise FileError("is not a Gwyddion Simple Field")
-    lines = data[len(_MAGIC) : end].decode("utf-8").splitlines()
+    lines = text_of(data[len(_MAGIC) : end]).splitlines()
     header = {key.strip(): value.strip() for key, _, value in (line.partition("=") for line in lines)}
     nx, ny = int(header["XRes"]), int(header["YRes"])
     start = end + 4 - end % 4

@@ -56,6 +56,7 @@ _SAME_FRAME: Final = 1e-3
 
 
 _ANSWERED: Final = "the person acted at"
+NONE_SEEN: Final = "none seen"
 _AFTER_A_DECISION: Final = "afspm had decided before"
 _TIP_CHANGED: Final = "; the tip changed meanwhile, which may have shifted the image"
 
@@ -364,7 +365,7 @@ def agreement_lines(night: ShadowNight) -> list[tuple[str, ...]]:
     return [
         (
             *(row.kind.value, str(row.count)),
-            *((str(row.agreed), _between(row.interval)) if row.kind in (*COUNTED, ShadowKind.PERSON) else ("", "")),
+            *(_answered(row) if row.kind in (*COUNTED, ShadowKind.PERSON) else ("", "")),
             *(str(row.right), str(row.wrong), _between(row.interval_right) if row.right + row.wrong else ""),
         )
         for row in night.agreement
@@ -374,11 +375,17 @@ def agreement_lines(night: ShadowNight) -> list[tuple[str, ...]]:
 def agreement_in_words(night: ShadowNight) -> list[str]:
     """Return a sentence for each kind that an act answers, and one for the acts by hand."""
     return [
-        f"{kind}: {count}, {_AFTER_A_DECISION if kind == ShadowKind.PERSON else _ANSWERED} {agreed} of them"
+        f"{kind}: {NONE_SEEN}"
+        if share == NONE_SEEN
+        else f"{kind}: {count}, {_AFTER_A_DECISION if kind == ShadowKind.PERSON else _ANSWERED} {agreed} of them"
         f" ({share} with 95 %)"
         for kind, count, agreed, share, *_ in agreement_lines(night)
         if agreed
     ]
+
+
+def _answered(row: Agreement) -> tuple[str, str]:
+    return str(row.agreed), _between(row.interval) if row.count else NONE_SEEN
 
 
 def _between(share: tuple[float, float]) -> str:

@@ -187,6 +187,7 @@ class Simulator(Driver):
         self.faults: Faults | None = None
         self.demanded: Fault | None = None
         self._controller: SimulatedController | None = None
+        self._truth: Truth | None = None
         loop = _loop_of(self._world_settings)
         with errors:
             super().__init__(
@@ -262,6 +263,10 @@ class Simulator(Driver):
             self._controller = self._switch_on()
         self._reached(refuses=False)
 
+    def close(self) -> None:
+        if self._truth is not None:
+            self._truth.close()
+
     def _switch_on(self) -> SimulatedController:
         # in advance: otherwise the first saved file would be late; beside the start, since it takes half of its time
         in_background(_import_writer)
@@ -272,7 +277,7 @@ class Simulator(Driver):
             kept["faults"] = {}
         start_s = kept["start_s"]
         self.faults = Faults(self._faults_settings, FAULT_KINDS, start_s, kept["faults"])
-        truth = Truth(self.run_dir / "truth.jsonl", kept)
+        truth = self._truth = Truth(self.run_dir / "truth.jsonl", kept)
         instrument = SimulatedInstrument(
             self._world_settings, self._seed, start_s, run=self.run_drawing, note=truth.note
         )

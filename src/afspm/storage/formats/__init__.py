@@ -15,6 +15,7 @@ beside its writer, so that a change of that format is made in one room.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import tzinfo
@@ -29,6 +30,8 @@ __all__ = ["FileContent", "OtherFormat", "read", "suffixes"]
 
 
 _log = logging.getLogger("afspm.storage")
+_GUESSED = re.compile("[\x81\x8d\x8f\x90\x9d\ufffd]")
+"""Characters that only a text of another encoding than UTF-8 and cp1252 has, see `text_of`."""
 _ANY = "*"
 """The suffix of readers that try the files of all others."""
 Reader = Callable[[Path, tzinfo | None], FileContent]
@@ -61,6 +64,7 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
         raise FileError("no such file", where=str(path), hint="a relative path begins in the current folder")
     try:
         found = _with_unique_channels(_first_that_reads(path, zone))
+        found = replace(found, left_out=(*found.left_out, *_unreadable_texts(found)))
         for one in found.left_out:
             _log.warning("%s: left out: %s", path, one)
         return found
@@ -109,6 +113,12 @@ def _with_unique_channels(content: FileContent) -> FileContent:
     scans = (replace(scan, channel=name) for scan, name in zip(content.scans, names, strict=True))
     spectra = (replace(spectrum, names=_unique(spectrum.names)) for spectrum in content.spectra)
     return replace(content, scans=tuple(scans), spectra=tuple(spectra))
+
+
+def _unreadable_texts(content: FileContent) -> list[str]:
+    texts = {**content.header, **{scan.channel: scan.channel for scan in content.scans}}
+    guessed = [str(name) for name, text in texts.items() if isinstance(text, str) and _GUESSED.search(text)]
+    return [f"characters of {', '.join(guessed)}: in neither UTF-8 nor cp1252"] if guessed else []
 
 
 def _unique(names: Sequence[str]) -> tuple[str, ...]:

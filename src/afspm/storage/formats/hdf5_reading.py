@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.basics.errors import FileError
+from afspm.storage.formats.content import text_of
 
 if TYPE_CHECKING:
     import h5py
@@ -116,6 +117,8 @@ def text(value: object) -> str:
     """Return an attribute, or a dataset of characters, as text."""
     if isinstance(value, np.ndarray):
         value = value.tobytes()
+    if isinstance(value, str):
+        value = value.encode("utf-8", "surrogateescape")  # h5py keeps bytes that are not UTF-8 as surrogates
     if isinstance(value, bytes):
-        return value.split(b"\0", 1)[0].decode("utf-8", "replace").strip()
+        return text_of(value.split(b"\0", 1)[0]).strip()
     return str(value).strip()

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from afspm.basics.errors import FileError
 from afspm.basics.plain_data import Plain, PlainMapping
+from afspm.storage.formats.content import text_of
 
 Attributes = Mapping[str, str | float]
 
@@ -107,4 +108,4 @@ def _plain(attributes: PlainMapping) -> dict[str, str | float]:
 
 
 def _text(raw: bytes) -> str:
-    return raw.split(b"\0", 1)[0].decode("utf-8", "replace")
+    return text_of(raw.split(b"\0", 1)[0])

@@ -82,7 +82,8 @@ def _controller(guide: Guide) -> str:
     "Choose at the controller's panel a frame that is not in the middle, not square and turned by some 20 degrees. "
     "Then type what the panel shows. An empty line: it is not shown there. afspm's width and height are from the first "
     "pixel to the last; a panel that shows those of whole pixels has one pixel more.",
-    "Note both values and units. If a factor or a sign is wrong, change that row: [translator] parameters.",
+    "Note both values and units. Do not go on with a frame that differs: report it with the trace of this run. If the "
+    "bias or the setpoint differs by a factor, change its row in `parameters` of the translator's section.",
     after=("controller",),
     moves=False,
     needs_panel=True,

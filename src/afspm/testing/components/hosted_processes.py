@@ -366,7 +366,10 @@ class TranslatorProcess(BlockingProcess):
         self.memory = memory = Memory(self._folder / "translator.json")
         log, run = logging.getLogger("afspm.translator"), TranslatorRun(self._folder)
         self.translator = translator = Translator(self._make(), MemoryServerPort(self), memory, run, log)
-        return translator.run()
+        try:
+            return translator.run()
+        finally:
+            memory.close()
 
     # --- what comes ---
 
