@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         TOPOGRAPHY,
         ChannelName,
         ChannelRoles,
+        HeightChannelName,
         both_ways,
         of_role,
     )
@@ -125,6 +126,7 @@ __all__ = [
     "GrantedCount",
     "GrantedRange",
     "GrantedStep",
+    "HeightChannelName",
     "InstrumentOrder",
     "InstrumentReading",
     "InstrumentReadings",

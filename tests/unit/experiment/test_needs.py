@@ -129,6 +129,33 @@ def test_role_that_only_another_mode_has_is_refused(write: Write) -> None:
     assert error.what == "[analysis] channel: the microscope has no role 'amplitude'"
 
 
+# paper F5
+@pytest.mark.parametrize("channel", ["current", "Current", "current, retrace", "potential"])
+def test_channel_that_is_no_height_is_refused_where_heights_are_judged(write: Write, channel: str) -> None:
+    judge = f'[judge]\ncomponent = true\nclass = "TipClassifier"\nchannel = "{channel}"\n' + SOLVED
+    named = SIMULATED + '[microscope.channels]\n"current, retrace" = "Current Retrace"\npotential = "Bias"\n'
+    error = only_error(write(judge, frame=named))
+    quantity = channel.casefold().removesuffix(", retrace")
+    assert error.what == f"[judge] channel: {channel!r} is not a height: it measures the {quantity}"
+    assert "height (Height)" in error.hint
+
+
+@pytest.mark.parametrize(
+    ("component", "setting"),
+    [("TipClassifier", "retrace_channel"), ("LineWatch", "channel"), ("FeedbackAnalysis", "height")],
+)
+def test_each_setting_of_heights_refuses_a_current(write: Write, component: str, setting: str) -> None:
+    part = f'[part]\ncomponent = true\nclass = "{component}"\n{setting} = "current"\n'
+    judge = '[judge]\ncomponent = true\nclass = "TipClassifier"\n'
+    error = only_error(write(part + judge + SOLVED, frame=SIMULATED))
+    assert error.what == f"[part] {setting}: 'current' is not a height: it measures the current"
+
+
+def test_calibrated_deflection_is_a_height_to_the_check(write: Write) -> None:
+    judge = '[judge]\ncomponent = true\nclass = "TipClassifier"\nchannel = "deflection"\n' + SOLVED
+    assert errors(write(judge, frame=SIMULATED + '[microscope.channels]\ndeflection = "Deflection"\n')) == []
+
+
 def test_channel_of_drift_is_compared_too(write: Write) -> None:
     drifting = '[scheduler]\ncomponent = true\nclass = "DriftCompensatedScheduler"\ndrift = { channel = "Z" }\n'
     error = only_error(write("", frame=drifting + SIMULATED[SIMULATED.index("[microscope]") :] + SOLVED))

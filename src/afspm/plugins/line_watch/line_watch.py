@@ -24,9 +24,9 @@ from afspm.basics import NS_PER_S, UnitError, convert
 from afspm.model import (
     HEIGHT,
     HEIGHT_RETRACE,
-    ChannelName,
     ControlState,
     Feedback,
+    HeightChannelName,
     Scan,
     ScanLines,
     ScopeState,
@@ -167,8 +167,8 @@ class LineWatch(Component):
 
     def __init__(
         self,
-        channel: ChannelName = HEIGHT,
-        retrace_channel: ChannelName = HEIGHT_RETRACE,
+        channel: HeightChannelName = HEIGHT,
+        retrace_channel: HeightChannelName = HEIGHT_RETRACE,
         action: Literal["stop", "look"] = "look",
         problem: str = "tip-shape-changed",
     ) -> None:
