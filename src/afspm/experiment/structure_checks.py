@@ -285,7 +285,9 @@ def check_envelopes(resolved: ResolvedExperiment) -> None:
             key = next((k for k in ("envelopes", "subscriber") if k in process.part.own), "class")
             path = (name, key, i) if key == "envelopes" else (name, key)
             live = SCAN_LINES.name.startswith(prefix)
-            hint = 'give the microscope live_lines_s = "1 s"' if live else nearest(prefix, published)
+            shipped = class_loader.shipped_publishers(prefix)
+            hint = f"it is published by a {' or a '.join(shipped)}: add it" if shipped else nearest(prefix, published)
+            hint = 'give the microscope live_lines_s = "1 s"' if live else hint
             what = f"[{name}] subscribes to {prefix!r}, which no component publishes"
             if resolved.caching.mapping is not None:
                 resolved.document.warning(f"{what}, unless the mapping of [cache] makes it", *path, hint=hint)

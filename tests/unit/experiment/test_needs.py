@@ -177,6 +177,22 @@ def test_component_that_needs_lines_needs_a_microscope_that_publishes_them(write
     assert error.what == "[line_watch] subscribes to 'ScanLines', which no component publishes"
 
 
+# paper F7
+@pytest.mark.parametrize(
+    ("subscriber", "envelope", "supplier"),
+    [
+        ("LineWatch", "SpatialROIWithScoreList", 'component with class = "TipClassifier"'),
+        ("DriftTable", "DriftMapping", 'scheduler with class = "DriftCompensatedScheduler"'),
+    ],
+)
+def test_missing_input_is_named_with_the_class_that_publishes_it(
+    write: Write, subscriber: str, envelope: str, supplier: str
+) -> None:
+    error = only_error(write(f'[part]\ncomponent = true\nclass = "{subscriber}"\n' + SOLVED, frame=SIMULATED))
+    assert error.what == f"[part] subscribes to {envelope!r}, which no component publishes"
+    assert error.hint == f"it is published by a {supplier}: add it"
+
+
 def test_lines_that_a_fast_clock_does_not_wait_for_are_a_warning(write: Write) -> None:
     watch = (
         '[line_watch]\ncomponent = true\nclass = "LineWatch"\n'

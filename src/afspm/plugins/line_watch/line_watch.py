@@ -148,8 +148,8 @@ class LineWatch(Component):
     After each complete scan it publishes `WatchCounts`: how many scans it watched so far, and how many lines came late.
     The confidence is 1 - exp(-5 evidence), where the evidence is relative to the threshold: an assumed decay, which
     ranks alarms and is no measured probability. A `ScanSeries` with `missed = "rest"` then measures only the rest of
-    the scan. The microscope must publish lines of running scans. After an alarm, a component that judges complete scans
-    (the `TipClassifier`) finds when the tip is good again.
+    the scan. The microscope must publish lines of running scans. The experiment needs a `TipClassifier`, which
+    judges complete scans: after an alarm, it finds when the tip is good again.
 
     Args:
         channel: channel of the heights, by role or name.
