@@ -156,6 +156,33 @@ def test_calibrated_deflection_is_a_height_to_the_check(write: Write) -> None:
     assert errors(write(judge, frame=SIMULATED + '[microscope.channels]\ndeflection = "Deflection"\n')) == []
 
 
+# users N9
+@pytest.mark.parametrize(
+    "judge",
+    [
+        'class = "TipClassifier"\n',
+        'class = "TipCorrector"\njudge = "self"\nworkshop_center = ["4 um", "4 um"]\n',
+    ],
+)
+@pytest.mark.parametrize(("scans", "reference", "warns"), [(3, 40, True), (3, 3, True), (4, 3, False), (41, 40, False)])
+def test_judge_that_learns_from_all_planned_scans_is_a_warning(
+    write: Write, judge: str, scans: int, reference: int, warns: bool
+) -> None:
+    part = f"[judge]\ncomponent = true\n{judge}reference_scans = {reference}\n" + SOLVED
+    found = write(SERIES.replace("scans = 2", f"scans = {scans}") + part, frame=SIMULATED).check()
+    of_judge = [one for one in found if "judges no scan" in one.what]
+    assert len(of_judge) == warns
+    if warns:
+        assert of_judge[0].what.endswith(f"it learns from {reference} scans, and {scans} are planned")
+        assert of_judge[0].place.line > 0
+
+
+def test_judge_beside_a_series_without_end_may_learn_from_any_number(write: Write) -> None:
+    part = '[judge]\ncomponent = true\nclass = "TipClassifier"\nreference_scans = 40\n' + SOLVED
+    found = write(SERIES.replace("scans = 2\n", "") + part, frame=SIMULATED).check()
+    assert not any("judges no scan" in one.what for one in found)
+
+
 def test_channel_of_drift_is_compared_too(write: Write) -> None:
     drifting = '[scheduler]\ncomponent = true\nclass = "DriftCompensatedScheduler"\ndrift = { channel = "Z" }\n'
     error = only_error(write("", frame=drifting + SIMULATED[SIMULATED.index("[microscope]") :] + SOLVED))
