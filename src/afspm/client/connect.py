@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from afspm.basics import toml
 from afspm.basics.argument_checks import PATH, TEXT, checked
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError, FileError, NoResponse
@@ -237,11 +238,10 @@ def _started(run: Path) -> tuple[float, int]:
 
 
 def _name_in(file: Path) -> str | None:
-    import tomllib
 
     try:
         # editors of Windows write a byte-order mark
-        name = tomllib.loads(file.read_text(encoding="utf-8-sig")).get("name")
+        name = toml.loads(file.read_text(encoding="utf-8-sig")).get("name")
     except (OSError, ValueError) as error:
         raise FileError(f"can't be read: {error}", where=str(file)) from error
     return name if isinstance(name, str) and name else None

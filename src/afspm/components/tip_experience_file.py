@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 import math
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
+from afspm.basics import toml
 from afspm.basics.errors import FileError
 from afspm.components.tip_experience import (
     CURED,
@@ -104,7 +104,7 @@ def read_experience(path: Path) -> TipExperience:
         FileError: the file can't be read, or has other content.
     """
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = toml.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return TipExperience()
     except (OSError, ValueError) as error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sqlite3
-import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from afspm import wire
+from afspm.basics import toml
 from afspm.basics.argument_checks import PATH, checked
 from afspm.basics.errors import FileError, InvalidValue, NoSuchItem, WireError
 from afspm.basics.formatting import counted
@@ -408,7 +408,7 @@ class Run:
     def experiment(self) -> dict[str, Any]:
         """The content of the expanded experiment file. Raises FileError if the file can't be read."""
         try:
-            return tomllib.loads((self.folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
+            return toml.loads((self.folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise FileError(f"can't be read: {error}", where=str(self.folder / EXPERIMENT_FILE)) from error
 
