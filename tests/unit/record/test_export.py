@@ -373,6 +373,18 @@ def test_tables_have_their_columns_even_if_they_are_empty(run: Run, tmp_path: Pa
     assert float(curve[1].split(",")[1]) == run.spectrum(0)["Current"][0]
 
 
+# users N13
+def test_picture_is_laid_out_without_drawing_it(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("matplotlib")
+    from matplotlib.figure import Figure
+
+    drawn: list[Figure] = []
+    draw = Figure.draw
+    monkeypatch.setattr(Figure, "draw", lambda figure, renderer: drawn.append(figure) or draw(figure, renderer))
+    pictures = len(list(export(run, "png", tmp_path, "1")))
+    assert len(drawn) == 2 * pictures, "savefig alone draws twice"
+
+
 # users N6
 def test_tables_for_excel_have_its_separators_and_the_mark_of_utf8(run: Run, tmp_path: Path) -> None:
     files = {file.name: file for file in export(run, "excel", tmp_path / "out")}
