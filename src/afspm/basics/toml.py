@@ -10,7 +10,7 @@ MOST_LEVELS = 50
 """Tables and lists in each other: later code follows a document by recursion."""
 
 
-def loads(text: str) -> Plain:
+def parse_toml(text: str) -> Plain:
     """Return a TOML document.
 
     Raises:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 
 from afspm.basics.errors import ConfigError, InvalidValue, Refused, RequestError, UnitError
@@ -9,7 +11,7 @@ from afspm.basics.units import Length, convert, same_kind
 from afspm.client.component import Component
 from afspm.client.scope import Scope
 from afspm.components.feedback_metrics import FeedbackError, FeedbackLimits, feedback_error, relative_error
-from afspm.model import HEIGHT, ChannelName, HeightChannelName, Scan, names
+from afspm.model import HEIGHT, ChannelName, Scan, names
 
 ASKED_WITHIN_S = 5.0
 
@@ -119,7 +121,7 @@ class FeedbackObserver(Component):
     def __init__(
         self,
         channel: ChannelName | None = None,
-        height: HeightChannelName = HEIGHT,
+        height: Annotated[ChannelName, HEIGHT] = HEIGHT,
         threshold: float | None = None,
         limit: float = FeedbackLimits.pixels,
         relief_limit: float = FeedbackLimits.relief,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import UnitError
@@ -10,7 +10,7 @@ from afspm.client.component import Component
 from afspm.components import tip_verdict
 from afspm.components.channel_pairs import ChannelPairing, HeightPair, MissingChannels
 from afspm.components.tip_judge import Opinion, TipJudge, TipTolerance, Verdict, VerdictCounter
-from afspm.model import HEIGHT, HEIGHT_RETRACE, ControlState, HeightChannelName, Scan
+from afspm.model import HEIGHT, HEIGHT_RETRACE, ChannelName, ControlState, Scan
 
 ARRIVES_WITHIN_S = 600.0  # experiment time from the end of a scan to its arrival
 _SCORES = {Opinion.GOOD: tip_verdict.GOOD, Opinion.BAD: tip_verdict.BAD, Opinion.UNCLEAR: tip_verdict.UNCLEAR}
@@ -44,8 +44,8 @@ class TipClassifier(Component):
 
     def __init__(
         self,
-        channel: HeightChannelName = HEIGHT,
-        retrace_channel: HeightChannelName = HEIGHT_RETRACE,
+        channel: Annotated[ChannelName, HEIGHT] = HEIGHT,
+        retrace_channel: Annotated[ChannelName, HEIGHT] = HEIGHT_RETRACE,
         reference_scans: int = 4,
         flag_after: int = 1,
         clear_after: int = 1,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from afspm.basics.errors import AfspmError, ConfigError, ControlLost, FileError, NoResponse, Refused
 from afspm.basics.formatting import position_text
@@ -21,7 +21,7 @@ from afspm.components.tip_judge import Opinion, TipJudge, Verdict
 from afspm.components.tip_treatments import Treatment, TreatmentPlaces, treatments
 from afspm.components.tip_verdict import read_verdict
 from afspm.components.tip_workshop import DONE_ACTION, TipWorkshop
-from afspm.model import HEIGHT, HEIGHT_RETRACE, HeightChannelName, Problem, Region, Scan, ScanSet, names
+from afspm.model import HEIGHT, HEIGHT_RETRACE, ChannelName, Problem, Region, Scan, ScanSet, names
 
 Frame = list[list[float]]
 """Region and pixels in JSON's types: centre, size and angle; rows and columns.
@@ -99,8 +99,8 @@ class TipCorrector(Component):
         place_spacing: Length = 300e-9,
         keep_away: Length = 500e-9,
         judge: Literal["classifier", "self"] = "classifier",
-        channel: HeightChannelName = HEIGHT,
-        retrace_channel: HeightChannelName = HEIGHT_RETRACE,
+        channel: Annotated[ChannelName, HEIGHT] = HEIGHT,
+        retrace_channel: Annotated[ChannelName, HEIGHT] = HEIGHT_RETRACE,
         reference_scans: int = 4,
         problem: str = "tip-shape-changed",
         policy: Literal["list", "learn"] = "list",

@@ -7,8 +7,8 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from afspm.basics import toml
 from afspm.basics.errors import FileError
+from afspm.basics.toml import parse_toml
 from afspm.components.tip_experience import (
     CURED,
     OUTCOMES,
@@ -104,7 +104,7 @@ def read_experience(path: Path) -> TipExperience:
         FileError: the file can't be read, or has other content.
     """
     try:
-        content = toml.loads(path.read_text(encoding="utf-8"))
+        content = parse_toml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return TipExperience()
     except (OSError, ValueError) as error:

@@ -24,7 +24,7 @@ from afspm.experiment.document import Document
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.validation_messages import report
-from afspm.model.channels import NamesChannel
+from afspm.model.channels import HEIGHT, NamesChannel
 
 # units of the annotations in basics.units, tried in this order
 _ANNOTATED = ("m", "s", "rad", "V", "A", "m/s", "Hz")
@@ -116,17 +116,20 @@ def channels(component: type, settings: Table) -> Iterator[tuple[tuple[str, ...]
     for name, annotation in _annotations(component).items():
         value = everything.get(name)
         if (mark := _channel_mark(annotation)) is not None and isinstance(value, str):
-            yield (name,), value, mark.of_heights
+            yield (name,), value, mark
         elif isinstance(value, Mapping) and (inner := _dataclass_of(annotation)) is not None:
             for key, kind in typing.get_type_hints(inner, include_extras=True).items():
                 if (mark := _channel_mark(kind)) is not None and isinstance(value.get(key), str):
-                    yield (name, key), value[key], mark.of_heights
+                    yield (name, key), value[key], mark
 
 
-def _channel_mark(annotation: Any) -> NamesChannel | None:
-    inside = (*getattr(annotation, "__metadata__", ()), *typing.get_args(annotation))
-    marks = (part if isinstance(part, NamesChannel) else _channel_mark(part) for part in inside)
-    return next(filter(None, marks), None)
+def _channel_mark(annotation: Any) -> bool | None:
+    # whether a channel is one of heights; None for another setting
+    marks = getattr(annotation, "__metadata__", ())
+    if any(isinstance(mark, NamesChannel) for mark in marks):
+        return HEIGHT in marks
+    inside = map(_channel_mark, typing.get_args(annotation))
+    return next((mark for mark in inside if mark is not None), None)
 
 
 def _dataclass_of(annotation: Any) -> type | None:

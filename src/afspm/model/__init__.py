@@ -29,7 +29,6 @@ if TYPE_CHECKING:
         TOPOGRAPHY,
         ChannelName,
         ChannelRoles,
-        HeightChannelName,
         both_ways,
         of_role,
     )
@@ -126,7 +125,6 @@ __all__ = [
     "GrantedCount",
     "GrantedRange",
     "GrantedStep",
-    "HeightChannelName",
     "InstrumentOrder",
     "InstrumentReading",
     "InstrumentReadings",

@@ -40,19 +40,14 @@ Measured = TypeVar("Measured", bound=Scan | ScanLines)
 
 @dataclass(frozen=True)
 class NamesChannel:
-    """Annotation of a setting with the role or the name of a channel, which `afspm check` compares.
-
-    Attributes:
-        of_heights: True if the component converts the channel to metres.
-    """
-
-    of_heights: bool = False
+    """Annotation of a setting with the role or the name of a channel, which `afspm check` compares."""
 
 
 ChannelName = Annotated[str, NamesChannel()]
-"""The type of a setting that names a channel: a role of `ROLES`, or a maker's own name."""
-HeightChannelName = Annotated[str, NamesChannel(of_heights=True)]
-"""The type of a setting that names a channel of heights: `afspm check` refuses a current, a phase, a potential …"""
+"""The type of a setting that names a channel: a role of `ROLES`, or a maker's own name.
+
+Where a component needs heights, the type is `Annotated[ChannelName, HEIGHT]`: `afspm check` refuses a current there.
+"""
 
 
 @dataclass(frozen=True)

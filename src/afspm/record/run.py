@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from afspm import wire
-from afspm.basics import toml
 from afspm.basics.argument_checks import PATH, checked
 from afspm.basics.errors import FileError, InvalidValue, NoSuchItem, WireError
 from afspm.basics.formatting import counted
 from afspm.basics.plain_data import from_json
+from afspm.basics.toml import parse_toml
 from afspm.model import (
     ControlState,
     Feedback,
@@ -408,7 +408,7 @@ class Run:
     def experiment(self) -> dict[str, Any]:
         """The content of the expanded experiment file. Raises FileError if the file can't be read."""
         try:
-            return toml.loads((self.folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
+            return parse_toml((self.folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise FileError(f"can't be read: {error}", where=str(self.folder / EXPERIMENT_FILE)) from error
 

@@ -6,7 +6,7 @@ import tomllib
 
 import pytest
 
-from afspm.basics import toml
+from afspm.basics.toml import parse_toml
 
 # faults 6
 HOSTILE = {
@@ -22,10 +22,10 @@ HOSTILE = {
 def test_hostile_document_is_refused_with_a_reason(case: str) -> None:
     text, reason = HOSTILE[case]
     with pytest.raises(tomllib.TOMLDecodeError, match=reason):
-        toml.loads(text)
+        parse_toml(text)
 
 
 def test_document_of_usual_depth_is_read() -> None:
-    assert toml.loads("[a.b]\nc = [[1, 2], [3]]\nd = { e = [{ f = 4 }] }") == {
+    assert parse_toml("[a.b]\nc = [[1, 2], [3]]\nd = { e = [{ f = 4 }] }") == {
         "a": {"b": {"c": [[1, 2], [3]], "d": {"e": [{"f": 4}]}}}
     }

@@ -22,7 +22,7 @@ from mcp.server.lowlevel import Server
 from numpy.typing import NDArray
 
 from afspm import Levelling, levelled
-from afspm.basics import AfspmError, Plain, escaped, iso_utc, toml
+from afspm.basics import AfspmError, Plain, escaped, iso_utc, parse_toml
 from afspm.model import ControlMode, ControlResponse, ControlState, Proposal, names
 from afspm.plugins.agent import arguments
 from afspm.plugins.agent.approval import preflight_of
@@ -165,7 +165,7 @@ class AgentTools:
     async def _limits(self, person: str, given: arguments.Nothing) -> Content:
         file = self._place.run_dir / EXPERIMENT_FILE
         try:
-            limits = toml.loads(file.read_text(encoding="utf-8")).get("limits", {})
+            limits = parse_toml(file.read_text(encoding="utf-8")).get("limits", {})
         except (OSError, ValueError) as error:
             raise RefusedRequest(RefusalCode.FAILED, f"the limits can't be read: {error}") from error
         who = self._place.requests.name_of(person) if person else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
@@ -24,9 +24,9 @@ from afspm.basics import NS_PER_S, UnitError, convert
 from afspm.model import (
     HEIGHT,
     HEIGHT_RETRACE,
+    ChannelName,
     ControlState,
     Feedback,
-    HeightChannelName,
     Scan,
     ScanLines,
     ScopeState,
@@ -167,8 +167,8 @@ class LineWatch(Component):
 
     def __init__(
         self,
-        channel: HeightChannelName = HEIGHT,
-        retrace_channel: HeightChannelName = HEIGHT_RETRACE,
+        channel: Annotated[ChannelName, HEIGHT] = HEIGHT,
+        retrace_channel: Annotated[ChannelName, HEIGHT] = HEIGHT_RETRACE,
         action: Literal["stop", "look"] = "look",
         problem: str = "tip-shape-changed",
     ) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from afspm.basics import Plain, PlainMapping, toml
+from afspm.basics import Plain, PlainMapping, parse_toml
 from afspm.processes import MEANWHILE, RUNS, Where, opt
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ def _people_in(file: Path) -> dict[str, str]:
     from afspm.basics import ConfigError
 
     try:
-        found = toml.loads(file.read_text(encoding="utf-8"))
+        found = parse_toml(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ConfigError(f"can't be read: {error}", where=str(file), hint='lines like Ada = "scrypt:…"') from error
     table = found.get("people", found)
