@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from afspm.basics.progress_line import ProgressLine
     from afspm.basics.requirements import require
     from afspm.basics.shared_time import Publication
+    from afspm.basics.toml import parse_toml
     from afspm.basics.units import (
         Angle,
         Current,
@@ -134,6 +135,7 @@ __all__ = [
     "lengths_text",
     "load_plugin",
     "parse_quantity",
+    "parse_toml",
     "plugin_names",
     "position_text",
     "python_command",

@@ -247,7 +247,11 @@ def estimate_lines(works: Mapping[str, PlannedWork | None], speed: float, now: d
     from afspm.model.planned_work import planned_end_s
 
     for name, work in works.items():
-        yield f"no estimate for {name}" if work is None else f"{name} plans {work_text(work)}"
+        yield (
+            f"how long {name} works is not known: its class does not plan its work"
+            if work is None
+            else f"{name} plans {work_text(work)}"
+        )
     end_s = planned_end_s(works.values())
     if end_s is None:
         return

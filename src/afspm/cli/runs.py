@@ -118,8 +118,8 @@ def export(
         str,
         typer.Option(
             metavar="FORMAT",
-            help="gwy, h5 (NeXus), nc, png, csv, eln, gif and mp4 (films), documents (Bluesky), or another that "
-            "`afspm doctor` lists.",
+            help="gwy, h5 (NeXus), nc, png, csv, excel (csv with decimal commas), eln, gif and mp4 (films), documents "
+            "(Bluesky), or another that `afspm doctor` lists.",
         ),
     ] = "gwy",
     out: Annotated[Path | None, opt("Where to write. Default: export in the folder of the run.", metavar="DIR")] = None,

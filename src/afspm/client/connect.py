@@ -15,6 +15,7 @@ from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError, FileError, NoResponse
 from afspm.basics.launch import Launch, Sockets
 from afspm.basics.plain_data import Plain, from_json
+from afspm.basics.toml import parse_toml
 from afspm.client.experiment_link import ExperimentLink
 from afspm.model import Frame, ProblemNames
 from afspm.model.events import is_process_name
@@ -237,11 +238,10 @@ def _started(run: Path) -> tuple[float, int]:
 
 
 def _name_in(file: Path) -> str | None:
-    import tomllib
 
     try:
         # editors of Windows write a byte-order mark
-        name = tomllib.loads(file.read_text(encoding="utf-8-sig")).get("name")
+        name = parse_toml(file.read_text(encoding="utf-8-sig")).get("name")
     except (OSError, ValueError) as error:
         raise FileError(f"can't be read: {error}", where=str(file)) from error
     return name if isinstance(name, str) and name else None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 
 from afspm.basics.errors import ConfigError, InvalidValue, Refused, RequestError, UnitError
@@ -119,7 +121,7 @@ class FeedbackObserver(Component):
     def __init__(
         self,
         channel: ChannelName | None = None,
-        height: ChannelName = HEIGHT,
+        height: Annotated[ChannelName, HEIGHT] = HEIGHT,
         threshold: float | None = None,
         limit: float = FeedbackLimits.pixels,
         relief_limit: float = FeedbackLimits.relief,

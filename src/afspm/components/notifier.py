@@ -49,7 +49,8 @@ class Notifier(Component):
     after the delivery. The end of the experiment is reported by `afspm run` itself, which knows the reason of the end.
 
     Args:
-        program: a command with arguments, run in the experiment file's folder; the JSON is on its standard input.
+        program: a command with arguments, which [notify] calls `command`. It is run in the experiment file's folder;
+            the JSON is on its standard input.
         webhook: address for a POST of the JSON; "$NAME" is taken from the environment.
         on: occasions: "unsolved-problem", "given-up", "critical", "by-hand" (the run waits for a person at the panel);
             by default these. "solved": a problem that counted as unsolved is solved. ("end" is left to `afspm run`.)

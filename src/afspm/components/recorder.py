@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.plain_data import Plain
+from afspm.basics.toml import parse_toml
 from afspm.client.component import Component
 from afspm.model import Frame, ProblemNames, ProcessStates
 from afspm.record.run_json import EXPERIMENT_FILE, METADATA, experiment_name, run_json_or_empty
@@ -157,7 +157,7 @@ def _settings(launch: Launch, clock: Clock, *, scans: bool) -> RecordSettings:
 
 def _seeds(file: Path) -> Plain:
     try:
-        said = tomllib.loads(file.read_text(encoding="utf-8"))
+        said = parse_toml(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return {name: table["seed"] for name, table in said.items() if isinstance(table, dict) and "seed" in table}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import UnitError
@@ -44,8 +44,8 @@ class TipClassifier(Component):
 
     def __init__(
         self,
-        channel: ChannelName = HEIGHT,
-        retrace_channel: ChannelName = HEIGHT_RETRACE,
+        channel: Annotated[ChannelName, HEIGHT] = HEIGHT,
+        retrace_channel: Annotated[ChannelName, HEIGHT] = HEIGHT_RETRACE,
         reference_scans: int = 4,
         flag_after: int = 1,
         clear_after: int = 1,

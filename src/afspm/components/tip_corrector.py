@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from afspm.basics.errors import AfspmError, ConfigError, ControlLost, FileError, NoResponse, Refused
 from afspm.basics.formatting import position_text
@@ -99,8 +99,8 @@ class TipCorrector(Component):
         place_spacing: Length = 300e-9,
         keep_away: Length = 500e-9,
         judge: Literal["classifier", "self"] = "classifier",
-        channel: ChannelName = HEIGHT,
-        retrace_channel: ChannelName = HEIGHT_RETRACE,
+        channel: Annotated[ChannelName, HEIGHT] = HEIGHT,
+        retrace_channel: Annotated[ChannelName, HEIGHT] = HEIGHT_RETRACE,
         reference_scans: int = 4,
         problem: str = "tip-shape-changed",
         policy: Literal["list", "learn"] = "list",

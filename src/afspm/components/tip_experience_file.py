@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
 from afspm.basics.errors import FileError
+from afspm.basics.toml import parse_toml
 from afspm.components.tip_experience import (
     CURED,
     OUTCOMES,
@@ -104,7 +104,7 @@ def read_experience(path: Path) -> TipExperience:
         FileError: the file can't be read, or has other content.
     """
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = parse_toml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return TipExperience()
     except (OSError, ValueError) as error:

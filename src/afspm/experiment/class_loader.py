@@ -116,6 +116,20 @@ def full_path(name: str) -> str:
     return path
 
 
+def shipped_publishers(prefix: str) -> tuple[str, ...]:
+    """Return afspm's classes that publish envelopes with a prefix, each as 'component with class = "Name"'."""
+    found = []
+    for name in entry_points.names(entry_points.COMPONENTS, entry_points.SCHEDULERS):
+        path = full_path(name)
+        if not path.startswith("afspm."):
+            continue  # another package is not imported for a hint
+        with contextlib.suppress(Unloadable):  # its extra is not installed
+            declared = ComponentDeclaration.of_class(component := load(path))
+            if (role := role_of(component)) and any(one.startswith(prefix) for one in declared.publishes):
+                found.append(f'{role.value} with class = "{name}"')
+    return tuple(found)
+
+
 def load(path: str) -> Any:
     """Return the object `module.Name`.
 

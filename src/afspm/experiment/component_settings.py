@@ -24,7 +24,7 @@ from afspm.experiment.document import Document
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.validation_messages import report
-from afspm.model.channels import NamesChannel
+from afspm.model.channels import HEIGHT, NamesChannel
 
 # units of the annotations in basics.units, tried in this order
 _ANNOTATED = ("m", "s", "rad", "V", "A", "m/s", "Hz")
@@ -110,22 +110,26 @@ def listening(component: type, settings: Table) -> Iterator[tuple[str, str, bool
                 yield name, address, mark.keyed
 
 
-def channels(component: type, settings: Table) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield the path in the settings, and the role or name, of each channel that a component needs."""
+def channels(component: type, settings: Table) -> Iterator[tuple[tuple[str, ...], str, bool]]:
+    """Yield each channel that a component needs: its path in the settings, its role or name, True if of heights."""
     everything = {**{name: default_of(component, name) for name in _parameters(component)}, **settings}
     for name, annotation in _annotations(component).items():
         value = everything.get(name)
-        if _names_channel(annotation) and isinstance(value, str):
-            yield (name,), value
+        if (mark := _channel_mark(annotation)) is not None and isinstance(value, str):
+            yield (name,), value, mark
         elif isinstance(value, Mapping) and (inner := _dataclass_of(annotation)) is not None:
             for key, kind in typing.get_type_hints(inner, include_extras=True).items():
-                if _names_channel(kind) and isinstance(value.get(key), str):
-                    yield (name, key), value[key]
+                if (mark := _channel_mark(kind)) is not None and isinstance(value.get(key), str):
+                    yield (name, key), value[key], mark
 
 
-def _names_channel(annotation: Any) -> bool:
-    inside = (*getattr(annotation, "__metadata__", ()), *typing.get_args(annotation))
-    return any(isinstance(part, NamesChannel) or _names_channel(part) for part in inside)
+def _channel_mark(annotation: Any) -> bool | None:
+    # whether a channel is one of heights; None for another setting
+    marks = getattr(annotation, "__metadata__", ())
+    if any(isinstance(mark, NamesChannel) for mark in marks):
+        return HEIGHT in marks
+    inside = map(_channel_mark, typing.get_args(annotation))
+    return next((mark for mark in inside if mark is not None), None)
 
 
 def _dataclass_of(annotation: Any) -> type | None:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from afspm.basics.toml import parse_toml
 from afspm.experiment import toml_lines
 from afspm.experiment.findings import Findings, SourceLocation
 from afspm.experiment.toml_lines import Settings
@@ -90,7 +91,7 @@ def _text(file: Path, findings: Findings) -> str | None:
 
 def _parse(text: str, file: Path, findings: Findings) -> Settings | None:
     try:
-        return tomllib.loads(text)
+        return parse_toml(text)
     except tomllib.TOMLDecodeError as error:
         match = re.search(r"^(.*?) \(at (?:line (\d+), column (\d+)|end of document)\)$", str(error), re.S)
         line = text.count("\n") + 1

@@ -36,6 +36,11 @@ class Finding:
     place: SourceLocation
     hint: str = ""
 
+    def __post_init__(self) -> None:
+        # security: a file from elsewhere may name a table by commands to the terminal
+        object.__setattr__(self, "what", _visible(self.what))
+        object.__setattr__(self, "hint", _visible(self.hint))
+
     @property
     def is_error(self) -> bool:
         return self.level is Level.ERROR
@@ -106,6 +111,12 @@ def closest(name: str, valid: Iterable[str], cutoff: float = 0.6) -> str | None:
         if match[:1] == name.casefold()[:1] or _likeness(name, match) >= _SURE:
             return by_fold[match]
     return None
+
+
+def _visible(text: str) -> str:
+    return "".join(
+        one if one.isprintable() or one in "\n\xa0\u202f" else one.encode("unicode_escape").decode() for one in text
+    )
 
 
 def _parts(name: str) -> set[str]:

@@ -49,6 +49,7 @@ class PlannedMeasurements:
             the planned regions.
         pulse_voltages: voltages of the planned pulses of the tip, in V.
         workshop_center: (x, y) in m about which the tip is treated; None: it is not treated.
+        reference_scans: number of scans from which a judge of the tip learns before it judges; None: no such judge.
     """
 
     regions: tuple[Region, ...] = ()
@@ -67,6 +68,7 @@ class PlannedMeasurements:
     placed_later: Mapping[str, ScanParameters] = field(default_factory=dict)
     pulse_voltages: tuple[float, ...] = ()
     workshop_center: XY | None = None
+    reference_scans: int | None = None
 
     def sets(self, name: str) -> bool:
         """Return whether the plan sets this parameter."""
@@ -153,6 +155,7 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
         getattr(made, "placed_later", {}),
         tuple(getattr(made, "pulse_voltages", ())),
         getattr(made, "workshop_center", None),
+        getattr(getattr(made, "judge", None), "reference_scans", None),
     )
 
 

@@ -176,8 +176,8 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
 
 
 def _check_channels(process: ResolvedProcess, component: type, document: Document, there: ChannelRoles) -> None:
-    for path, channel in component_settings.channels(component, process.settings):
-        if reason := there.refuses(channel):
+    for path, channel, of_heights in component_settings.channels(component, process.settings):
+        if reason := there.refuses(channel) or (of_heights and there.refuses_as_height(channel)):
             what = f"[{process.name}] {'.'.join(path)}: {reason}"
             hint = f"it has {there.described()}; [microscope.channels] names others"
             document.error(what, process.name, *path, hint=hint)

@@ -13,7 +13,7 @@ from typing import Final
 from afspm import wire
 from afspm.basics.addresses import EXAMPLE, hint_on, is_address, reaches
 from afspm.basics.errors import InvalidValue
-from afspm.basics.formatting import quantity
+from afspm.basics.formatting import counted, quantity
 from afspm.client.component import Component
 from afspm.experiment import class_loader, component_settings
 from afspm.experiment.findings import Finding, Level, closest, nearest
@@ -285,7 +285,9 @@ def check_envelopes(resolved: ResolvedExperiment) -> None:
             key = next((k for k in ("envelopes", "subscriber") if k in process.part.own), "class")
             path = (name, key, i) if key == "envelopes" else (name, key)
             live = SCAN_LINES.name.startswith(prefix)
-            hint = 'give the microscope live_lines_s = "1 s"' if live else nearest(prefix, published)
+            shipped = class_loader.shipped_publishers(prefix)
+            hint = f"it is published by a {' or a '.join(shipped)}: add it" if shipped else nearest(prefix, published)
+            hint = 'give the microscope live_lines_s = "1 s"' if live else hint
             what = f"[{name}] subscribes to {prefix!r}, which no component publishes"
             if resolved.caching.mapping is not None:
                 resolved.document.warning(f"{what}, unless the mapping of [cache] makes it", *path, hint=hint)
@@ -512,6 +514,25 @@ def check_meant_treatments(resolved: ResolvedExperiment) -> None:
                 resolved.document.warning(what, name, "workshop_center", hint=hint)
 
 
+def check_reference_scans(resolved: ResolvedExperiment) -> None:
+    """Warn of a judge of the tip that learns from all scans of the experiment, and judges none."""
+    scans = 0
+    for name, process in resolved.processes.items():
+        if process.role is not Role.COMPONENT or not process.acts or process.declared.solves:
+            continue
+        plan = resolved.plans.get(name)
+        work = plan.work(None) if plan is not None and plan.work is not None else None
+        if work is None or work.scans is None:
+            return  # there may be any number of scans
+        scans += work.scans
+    for name, plan in resolved.plans.items():
+        if scans and plan.reference_scans is not None and plan.reference_scans >= scans:
+            needed = counted(plan.reference_scans, "scan")
+            what = f"[{name}] reference_scans: it judges no scan: it learns from {needed}, and {scans} are planned"
+            hint = "plan more scans, or set fewer reference_scans: at least 2, by default 4"
+            resolved.document.warning(what, name, "reference_scans", hint=hint)
+
+
 def check_handlers(resolved: ResolvedExperiment) -> None:
     """Check the names and arguments of methods that look like handlers."""
     for process in resolved.with_role(Role.COMPONENT):
@@ -577,6 +598,7 @@ ALWAYS: Final[tuple[Check, ...]] = (
     check_needs,
     check_treatments,
     check_meant_treatments,
+    check_reference_scans,
     check_handlers,
     check_notify,
 )

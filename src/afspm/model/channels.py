@@ -31,6 +31,8 @@ OTHER: Final = "other"
 """Under this name the experiment file lists channels without a role."""
 AT_CONSTANT_HEIGHT: Final = (FREQUENCY_SHIFT, CURRENT)
 """Roles of the topography while the z feedback is off; the first that the microscope has counts."""
+_NO_LENGTHS: Final = (CURRENT, "phase", FREQUENCY_SHIFT, "excitation", "potential", INTENSITY)
+"""Quantities that no microscope records in metres; an amplitude, a deflection or a friction may be calibrated to it."""
 ROLES: Final = (*QUANTITIES, *(quantity + RETRACE for quantity in QUANTITIES), TOPOGRAPHY)
 
 Measured = TypeVar("Measured", bound=Scan | ScanLines)
@@ -42,7 +44,10 @@ class NamesChannel:
 
 
 ChannelName = Annotated[str, NamesChannel()]
-"""The type of a setting that names a channel: a role of `ROLES`, or a maker's own name."""
+"""The type of a setting that names a channel: a role of `ROLES`, or a maker's own name.
+
+Where a component needs heights, the type is `Annotated[ChannelName, HEIGHT]`: `afspm check` refuses a current there.
+"""
 
 
 @dataclass(frozen=True)
@@ -107,6 +112,13 @@ class ChannelRoles:
             return ""
         kind = "role" if channel in ROLES else "channel"
         return f"the microscope has no {kind} {channel!r}"
+
+    def refuses_as_height(self, channel: str) -> str:
+        """Return why a channel, by its role or name, can't be converted to metres; empty if it may be."""
+        roles = (channel,) if channel in self.names else self.of(channel)
+        quantities = [role.removesuffix(RETRACE) for role in roles]
+        is_refused = bool(quantities) and all(quantity in _NO_LENGTHS for quantity in quantities)
+        return f"{channel!r} is not a height: it measures the {quantities[0]}" if is_refused else ""
 
     def all_names(self) -> tuple[str, ...]:
         """Return the names of all channels, each once."""

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from afspm.basics.errors import AfspmError
+from afspm.basics.toml import parse_toml
 from afspm.basics.units import si
 from afspm.model.parameter_names import START_SCAN, START_SPEC
 from afspm.record.drawing.timeline import DrawnBand, TimelineCurve
@@ -50,7 +50,7 @@ AllowedBands = Mapping[str, tuple[WrittenBand, ...]]
 def allowed_bands(folder: Path) -> AllowedBands:
     """Return the bands in the expanded experiment file of a run; empty without bands, or without a readable file."""
     try:
-        document = tomllib.loads((folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
+        document = parse_toml((folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     found: dict[str, tuple[WrittenBand, ...]] = {}

@@ -29,6 +29,8 @@ _LEVELS: Final = 12
 
 WITH_ASPECT: Final = "compressed"
 """Layout of a figure with a picture of fixed aspect: with "constrained" a first drawing cuts the labels beside it."""
+_LAYOUTS: Final = 2
+"""The first layout of a picture with fixed aspect may still cut labels."""
 _EMBEDDED: Final = 42
 """Type of fonts in a PDF whose texts stay texts; some journals refuse matplotlib's usual type 3."""
 
@@ -118,7 +120,10 @@ def save_figure(figure: Figure, file: Path | BinaryIO, dpi: float, suffix: str |
     import matplotlib
 
     with matplotlib.rc_context({"pdf.fonttype": _EMBEDDED, "ps.fonttype": _EMBEDDED}):
-        figure.draw_without_rendering()  # the first layout of a picture with fixed aspect may still cut labels
+        if (layout := figure.get_layout_engine()) is not None:
+            for _ in range(_LAYOUTS):
+                layout.execute(figure)
+            figure.set_layout_engine("none")  # it is settled: savefig would lay it out once more
         figure.savefig(file, dpi=dpi, format=suffix)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sqlite3
-import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
@@ -15,6 +14,7 @@ from afspm.basics.argument_checks import PATH, checked
 from afspm.basics.errors import FileError, InvalidValue, NoSuchItem, WireError
 from afspm.basics.formatting import counted
 from afspm.basics.plain_data import from_json
+from afspm.basics.toml import parse_toml
 from afspm.model import (
     ControlState,
     Feedback,
@@ -408,7 +408,7 @@ class Run:
     def experiment(self) -> dict[str, Any]:
         """The content of the expanded experiment file. Raises FileError if the file can't be read."""
         try:
-            return tomllib.loads((self.folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
+            return parse_toml((self.folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise FileError(f"can't be read: {error}", where=str(self.folder / EXPERIMENT_FILE)) from error
 

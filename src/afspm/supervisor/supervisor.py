@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import secrets
 import signal
 import threading
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -104,8 +106,12 @@ class Supervisor:
         self._hold_watch = HoldWatch(
             clock,
             lambda level, text: log.write(LOGGED_AS, level, text),
-            lambda: {process.pid: name for name, process in self._processes.items()},
+            lambda: {
+                os.getpid(): "the start of all processes",
+                **{process.pid: name for name, process in self._processes.items()},
+            },
         )
+        self._starting = ExitStack()
         self._status = ProcessStatus(policy.liveness)
         self._reported_s = -math.inf
         self._is_unreported = True  # whether an event came since then
@@ -149,6 +155,8 @@ class Supervisor:
             self._reporter.start()
         try:
             with signals.caught(self._on_signal, self._wakeup.writer_fileno()):
+                # imports take seconds, which a fast clock would make half an hour without a scan
+                self._starting.enter_context(self._clock.late())
                 self._step(RunBegan())
                 while not self._core.is_over:
                     self._wait()
@@ -156,6 +164,7 @@ class Supervisor:
                     self._step(TimePassed())
                     self._report()
         finally:  # also after an error in this loop: no process may be left behind
+            self._starting.close()
             for process in self._processes.values():
                 process.kill()
             if self._reporter is not None:
@@ -219,6 +228,8 @@ class Supervisor:
             self._log.write(LOGGED_AS, logging.WARNING, warning)
         self._hold_watch.look()
         now_s = self._clock.monotonic_s()
+        if self._status.all_begun(self._core.children.values(), now_s):
+            self._starting.close()
         overdue, lately_s = self._core.overdue(now_s)
         self._monitors = {
             name: self._monitors.get(name) or ActivityMonitor(pid, lately_s) for name, pid in overdue.items()

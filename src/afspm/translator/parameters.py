@@ -243,7 +243,7 @@ class ParameterTable(Mapping[str, ParameterSpec]):
                 content = tomllib.load(file)
         except (OSError, tomllib.TOMLDecodeError) as error:
             raise ConfigError(f"the file of parameters can't be read: {error}", where=str(path)) from error
-        return cls({}).extended(content.get("parameters", {}), where=path.name)
+        return cls({}).extended(content.get("parameters", {}), where=f"the driver's {path.name}")
 
     def extended(
         self, rows: Mapping[str, Mapping[str, object]], *, where: str, translated: Collection[str] = ()

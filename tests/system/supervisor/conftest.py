@@ -16,6 +16,8 @@ from afspm.supervisor.reporter import Reporter
 from afspm.supervisor.supervision.child import ChildPolicy
 from afspm.supervisor.supervisor import RunOutcome, Supervisor
 
+REAL = ExperimentClock.real()
+
 
 @pytest.fixture
 def run_tasks(tmp_path: Path) -> Iterator[RunTasks]:
@@ -23,9 +25,10 @@ def run_tasks(tmp_path: Path) -> Iterator[RunTasks]:
     running: list[Running] = []
     logs: list[RunLog] = []
 
-    def start(*tasks: Task, policy: ChildPolicy = QUICK, reporter: Reporter | None = None) -> Running:
+    def start(
+        *tasks: Task, policy: ChildPolicy = QUICK, reporter: Reporter | None = None, clock: ExperimentClock = REAL
+    ) -> Running:
         terminal = Terminal()
-        clock = ExperimentClock.real()
         log = RunLog(tmp_path / "log.txt", clock, terminal=terminal, level=0)  # type: ignore[arg-type]
         logs.append(log)
         supervisor = Supervisor(tasks, log, clock, policy, reporter)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from systems import KILLED_FROM_OUTSIDE, WINE, freeze, kill, not_on_wine
 from tests.system.supervisor.supervisor_lab import IMPATIENT, QUICK, RunTasks, peer
 
+from afspm.basics.clock import ExperimentClock
 from afspm.basics.exit_codes import ExitCode
 from afspm.experiment import Role
 from afspm.supervisor.process import Task
@@ -250,6 +252,32 @@ def test_program_without_heartbeats_is_not_killed_for_silence(run_tasks: RunTask
     running.terminal.wait_for(" beating ", "no first heartbeat", count=2)
     reports = {report.name: report.starts for report in running.stop().reports}
     assert reports["program"] == 1
+
+
+# paper F6
+def test_simulated_time_waits_for_the_first_heartbeats(run_tasks: RunTasks, tmp_path: Path) -> None:
+    clock = ExperimentClock.starting_now(speed=600.0).waiting_in(tmp_path / "clock")
+    silent = "import sys; sys.stdin.readline(); print('here', flush=True); sys.stdin.read()"
+    late = replace(peer("late"), command=(sys.executable, "-c", silent))
+    running = run_tasks(peer("begins"), late, clock=clock)
+    running.terminal.wait_for(" late ", "here")
+    assert _awaited(clock) == [os.getpid()]
+    running.stop()
+    assert _awaited(clock) == []
+
+
+def test_simulated_time_does_not_wait_for_a_second_start(run_tasks: RunTasks, tmp_path: Path) -> None:
+    clock = ExperimentClock.starting_now(speed=600.0).waiting_in(tmp_path / "clock")
+    silent = replace(peer("silent"), command=(sys.executable, "-c", "import sys; sys.stdin.read()"))
+    policy = replace(QUICK, liveness=replace(QUICK.liveness, start_s=0.5))
+    run_tasks(peer("begins"), silent, policy=policy, clock=clock).pid("silent", life=2)
+    assert _awaited(clock) == []
+
+
+def _awaited(clock: ExperimentClock) -> list[int]:
+    shared = clock.holds()
+    assert shared is not None
+    return [hold.pid for hold in shared.holds]
 
 
 def test_scheduler_stopped_by_another_program_is_restarted(run_tasks: RunTasks) -> None:

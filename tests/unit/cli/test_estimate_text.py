@@ -46,6 +46,12 @@ def test_default_speed_of_the_simulator_is_named(tmp_path: Path, speed: str, par
     assert work.why == why
 
 
+# users A: "no estimate for tiles" was not understood
+def test_component_without_planned_work_is_named_with_the_reason() -> None:
+    (line,) = estimate_lines({"tiles": None}, 600.0, datetime(2026, 3, 14, 12, 0, tzinfo=UTC))
+    assert line == "how long tiles works is not known: its class does not plan its work"
+
+
 def test_line_of_the_end_names_the_parts_left_out() -> None:
     works = {"series": PlannedWork(scans=3, duration_s=600.0, ends_experiment=True)}
     now = datetime(2026, 3, 14, 12, 0, tzinfo=UTC)

@@ -129,6 +129,60 @@ def test_role_that_only_another_mode_has_is_refused(write: Write) -> None:
     assert error.what == "[analysis] channel: the microscope has no role 'amplitude'"
 
 
+# paper F5
+@pytest.mark.parametrize("channel", ["current", "Current", "current, retrace", "potential"])
+def test_channel_that_is_no_height_is_refused_where_heights_are_judged(write: Write, channel: str) -> None:
+    judge = f'[judge]\ncomponent = true\nclass = "TipClassifier"\nchannel = "{channel}"\n' + SOLVED
+    named = SIMULATED + '[microscope.channels]\n"current, retrace" = "Current Retrace"\npotential = "Bias"\n'
+    error = only_error(write(judge, frame=named))
+    quantity = channel.casefold().removesuffix(", retrace")
+    assert error.what == f"[judge] channel: {channel!r} is not a height: it measures the {quantity}"
+    assert "height (Height)" in error.hint
+
+
+@pytest.mark.parametrize(
+    ("component", "setting"),
+    [("TipClassifier", "retrace_channel"), ("LineWatch", "channel"), ("FeedbackAnalysis", "height")],
+)
+def test_each_setting_of_heights_refuses_a_current(write: Write, component: str, setting: str) -> None:
+    part = f'[part]\ncomponent = true\nclass = "{component}"\n{setting} = "current"\n'
+    judge = '[judge]\ncomponent = true\nclass = "TipClassifier"\n'
+    error = only_error(write(part + judge + SOLVED, frame=SIMULATED))
+    assert error.what == f"[part] {setting}: 'current' is not a height: it measures the current"
+
+
+def test_calibrated_deflection_is_a_height_to_the_check(write: Write) -> None:
+    judge = '[judge]\ncomponent = true\nclass = "TipClassifier"\nchannel = "deflection"\n' + SOLVED
+    assert errors(write(judge, frame=SIMULATED + '[microscope.channels]\ndeflection = "Deflection"\n')) == []
+
+
+# users N9
+@pytest.mark.parametrize(
+    "judge",
+    [
+        'class = "TipClassifier"\n',
+        'class = "TipCorrector"\njudge = "self"\nworkshop_center = ["4 um", "4 um"]\n',
+    ],
+)
+@pytest.mark.parametrize(("scans", "reference", "warns"), [(3, 40, True), (3, 3, True), (4, 3, False), (41, 40, False)])
+def test_judge_that_learns_from_all_planned_scans_is_a_warning(
+    write: Write, judge: str, scans: int, reference: int, warns: bool
+) -> None:
+    part = f"[judge]\ncomponent = true\n{judge}reference_scans = {reference}\n" + SOLVED
+    found = write(SERIES.replace("scans = 2", f"scans = {scans}") + part, frame=SIMULATED).check()
+    of_judge = [one for one in found if "judges no scan" in one.what]
+    assert len(of_judge) == warns
+    if warns:
+        assert of_judge[0].what.endswith(f"it learns from {reference} scans, and {scans} are planned")
+        assert of_judge[0].place.line > 0
+
+
+def test_judge_beside_a_series_without_end_may_learn_from_any_number(write: Write) -> None:
+    part = '[judge]\ncomponent = true\nclass = "TipClassifier"\nreference_scans = 40\n' + SOLVED
+    found = write(SERIES.replace("scans = 2\n", "") + part, frame=SIMULATED).check()
+    assert not any("judges no scan" in one.what for one in found)
+
+
 def test_channel_of_drift_is_compared_too(write: Write) -> None:
     drifting = '[scheduler]\ncomponent = true\nclass = "DriftCompensatedScheduler"\ndrift = { channel = "Z" }\n'
     error = only_error(write("", frame=drifting + SIMULATED[SIMULATED.index("[microscope]") :] + SOLVED))
@@ -148,6 +202,22 @@ def test_component_that_needs_lines_needs_a_microscope_that_publishes_them(write
     assert errors(write(watch, frame=SIMULATED)) == []
     error = only_error(write(watch, frame=SIMULATED + "live_lines_s = 0.0\n"))
     assert error.what == "[line_watch] subscribes to 'ScanLines', which no component publishes"
+
+
+# paper F7
+@pytest.mark.parametrize(
+    ("subscriber", "envelope", "supplier"),
+    [
+        ("LineWatch", "SpatialROIWithScoreList", 'component with class = "TipClassifier"'),
+        ("DriftTable", "DriftMapping", 'scheduler with class = "DriftCompensatedScheduler"'),
+    ],
+)
+def test_missing_input_is_named_with_the_class_that_publishes_it(
+    write: Write, subscriber: str, envelope: str, supplier: str
+) -> None:
+    error = only_error(write(f'[part]\ncomponent = true\nclass = "{subscriber}"\n' + SOLVED, frame=SIMULATED))
+    assert error.what == f"[part] subscribes to {envelope!r}, which no component publishes"
+    assert error.hint == f"it is published by a {supplier}: add it"
 
 
 def test_lines_that_a_fast_clock_does_not_wait_for_are_a_warning(write: Write) -> None:

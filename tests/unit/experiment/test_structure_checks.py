@@ -541,3 +541,16 @@ def test_experiment_in_which_nothing_measures_is_a_warning(write: Write, text: s
 )
 def test_experiment_whose_components_may_measure_has_no_warning(write: Write, text: str) -> None:
     assert NOTHING_MEASURES not in [one.what for one in write(text).check()]
+
+
+# faults 6
+def test_hostile_file_is_one_error_with_its_place(write: Write) -> None:
+    error = only_error(write("a = " + "[" * 60_000 + "]" * 60_000 + "\n"))
+    assert error.what == "not valid TOML: tables and lists are nested more than 50 deep"
+
+
+def test_commands_to_the_terminal_are_escaped_in_findings(write: Write) -> None:
+    found = errors(write('["\\u001b[31mX"]\ncomponent = true\nclass = "Y\\u001b[31m"\n'))
+    assert found
+    assert not any("\x1b" in f"{one.what}{one.hint}" for one in found)
+    assert any("\\x1b[31mX" in one.what for one in found)

@@ -373,6 +373,34 @@ def test_tables_have_their_columns_even_if_they_are_empty(run: Run, tmp_path: Pa
     assert float(curve[1].split(",")[1]) == run.spectrum(0)["Current"][0]
 
 
+# users N13
+def test_picture_is_laid_out_without_drawing_it(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("matplotlib")
+    from matplotlib.figure import Figure
+
+    drawn: list[Figure] = []
+    draw = Figure.draw
+    monkeypatch.setattr(Figure, "draw", lambda figure, renderer: drawn.append(figure) or draw(figure, renderer))
+    pictures = len(list(export(run, "png", tmp_path, "1")))
+    assert len(drawn) == 2 * pictures, "savefig alone draws twice"
+
+
+# users N6
+def test_tables_for_excel_have_its_separators_and_the_mark_of_utf8(run: Run, tmp_path: Path) -> None:
+    files = {file.name: file for file in export(run, "excel", tmp_path / "out")}
+    plain = {file.name: file for file in export(run, "csv", tmp_path / "plain")}
+    assert files.keys() == plain.keys()
+    assert all(file.read_bytes().startswith(b"\xef\xbb\xbf") for file in files.values())
+    assert not any(file.read_bytes().startswith(b"\xef\xbb\xbf") for file in plain.values())
+    with files["scans.csv"].open(encoding="utf-8-sig", newline="") as file:
+        first = next(csv.DictReader(file, delimiter=";"))
+    assert re.fullmatch(r"2026-03-14 20:00:00,\d{3}", first["time"])
+    header, curve = files["spectrum-0001.csv"].read_text(encoding="utf-8-sig").splitlines()[:2]
+    assert header == "Bias [V];Current [A];dI/dV [S]"
+    assert "." not in curve
+    assert float(curve.split(";")[1].replace(",", ".")) == run.spectrum(0)["Current"][0]
+
+
 @pytest.mark.parametrize(("numbers", "meant"), [("2", [2]), ("1-2", [1, 2]), ("3, 1", [3, 1]), ("2-", [2, 3])])
 def test_scans_are_chosen_by_their_numbers(run: Run, numbers: str, meant: list[int]) -> None:
     assert [row.number for row in chosen(list(run.scans), numbers)] == meant

@@ -489,6 +489,15 @@ def test_time_in_control_is_summed_by_holder(run: Path) -> None:
     assert shares["series <b>"] == (1498 + 2001) * S
 
 
+# users A: columns that end at 31, 66 and 59 % left open where the rest is
+def test_shares_of_the_time_add_up_to_the_whole(report: Path) -> None:
+    text = report.read_text()
+    tables = text[text.index('<div class="shares">') :].split("</div>", 1)[0].split("</table>")[:-1]
+    sums = [sum(map(int, re.findall(r"(\d+) %", one))) for one in tables]
+    assert sums
+    assert all(98 <= one <= 102 for one in sums), sums
+
+
 def test_selection_of_many_scans_has_the_bad_and_some_between(run: Path) -> None:
     with open_run(run) as opened:
         row = opened.scans[0]

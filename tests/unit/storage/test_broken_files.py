@@ -85,6 +85,17 @@ def test_values_that_are_in_another_file_are_refused(
         read(file)
 
 
+# faults 7
+@pytest.mark.parametrize("number", [50, 51])
+def test_file_of_too_many_groups_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    monkeypatch.setattr(hdf5_reading, "_MOST_LINKS", 50)
+    with h5py.File(tmp_path / "many.h5", "w") as file:
+        for group in range(number):
+            file.create_group(f"g{group}")
+    with pytest.raises(FileError, match="more than 50 groups") if number > 50 else nullcontext():
+        hdf5_reading.opened(tmp_path / "many.h5").close()
+
+
 @pytest.mark.parametrize("depth", [90, 300])
 def test_groups_nested_without_end_are_refused(tmp_path: Path, depth: int) -> None:
     file = tmp_path / "scan.h5"

@@ -540,7 +540,8 @@ def test_a_turned_frame_whose_corner_is_out_of_reach_is_refused(bench: Any) -> N
 
 def test_the_reason_names_value_limit_and_where_it_was_set(bench: Any) -> None:
     reason = bench.ask(PARAM, Parameter("scan-speed", "200", "um/s")).reason
-    assert reason == "scan-speed: 200 µm/s is outside 0.001 µm/s to 100 µm/s (set in parameters.toml)"
+    # users A: no such file is beside the experiment file
+    assert reason == "scan-speed: 200 µm/s is outside 0.001 µm/s to 100 µm/s (set in the driver's parameters.toml)"
 
 
 def test_value_changed_by_the_controller_is_refused_and_restored(bench: Any) -> None:

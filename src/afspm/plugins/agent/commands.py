@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from afspm.basics import parse_toml
 from afspm.processes import MEANWHILE, RUNS, Where, acting, looking
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def approve(
         return
     if grant is not None:
         with acting(where) as scope:
-            wanted = of_table(tomllib.loads(grant.read_text(encoding="utf-8")), scope.approval_facts())
+            wanted = of_table(parse_toml(grant.read_text(encoding="utf-8")), scope.approval_facts())
             typer.echo("\n".join(grant_lines(wanted)))
             _confirm(yes)
             scope.approve(wanted)

@@ -12,7 +12,6 @@ import base64
 import json
 import logging
 import math
-import tomllib
 from collections.abc import Awaitable, Callable, Iterable
 from typing import Any, ClassVar
 
@@ -23,7 +22,7 @@ from mcp.server.lowlevel import Server
 from numpy.typing import NDArray
 
 from afspm import Levelling, levelled
-from afspm.basics import AfspmError, Plain, escaped, iso_utc
+from afspm.basics import AfspmError, Plain, escaped, iso_utc, parse_toml
 from afspm.model import ControlMode, ControlResponse, ControlState, Proposal, names
 from afspm.plugins.agent import arguments
 from afspm.plugins.agent.approval import preflight_of
@@ -166,7 +165,7 @@ class AgentTools:
     async def _limits(self, person: str, given: arguments.Nothing) -> Content:
         file = self._place.run_dir / EXPERIMENT_FILE
         try:
-            limits = tomllib.loads(file.read_text(encoding="utf-8")).get("limits", {})
+            limits = parse_toml(file.read_text(encoding="utf-8")).get("limits", {})
         except (OSError, ValueError) as error:
             raise RefusedRequest(RefusalCode.FAILED, f"the limits can't be read: {error}") from error
         who = self._place.requests.name_of(person) if person else None

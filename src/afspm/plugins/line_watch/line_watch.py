@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
@@ -148,8 +148,8 @@ class LineWatch(Component):
     After each complete scan it publishes `WatchCounts`: how many scans it watched so far, and how many lines came late.
     The confidence is 1 - exp(-5 evidence), where the evidence is relative to the threshold: an assumed decay, which
     ranks alarms and is no measured probability. A `ScanSeries` with `missed = "rest"` then measures only the rest of
-    the scan. The microscope must publish lines of running scans. After an alarm, a component that judges complete scans
-    (the `TipClassifier`) finds when the tip is good again.
+    the scan. The microscope must publish lines of running scans. The experiment needs a `TipClassifier`, which
+    judges complete scans: after an alarm, it finds when the tip is good again.
 
     Args:
         channel: channel of the heights, by role or name.
@@ -167,8 +167,8 @@ class LineWatch(Component):
 
     def __init__(
         self,
-        channel: ChannelName = HEIGHT,
-        retrace_channel: ChannelName = HEIGHT_RETRACE,
+        channel: Annotated[ChannelName, HEIGHT] = HEIGHT,
+        retrace_channel: Annotated[ChannelName, HEIGHT] = HEIGHT_RETRACE,
         action: Literal["stop", "look"] = "look",
         problem: str = "tip-shape-changed",
     ) -> None:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import logging
 import threading
-import tomllib
 from collections import OrderedDict
 from pathlib import Path
 
 from afspm import open_run, wire
-from afspm.basics import AfspmError, Plain, si
+from afspm.basics import AfspmError, Plain, parse_toml, si
 from afspm.model import PERSON, ProblemNames, Region, Scan, Spectrum
 from afspm.plugins.web.frames import ChannelFrame, FrameKey
 from afspm.record import EXPERIMENT_FILE, JOURNAL_FILE, Overview
@@ -118,7 +117,7 @@ def _section(folder: Path, name: str) -> Plain:
 
 def _sections(folder: Path) -> Plain:
     try:
-        return tomllib.loads((folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
+        return parse_toml((folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from afspm.basics import Plain, PlainMapping
+from afspm.basics import Plain, PlainMapping, parse_toml
 from afspm.processes import MEANWHILE, RUNS, Where, opt
 
 if TYPE_CHECKING:
@@ -129,12 +129,11 @@ def _print_password() -> None:
 
 def _people_in(file: Path) -> dict[str, str]:
     # keys may begin with `people.`, as `--make-password` prints them
-    import tomllib
 
     from afspm.basics import ConfigError
 
     try:
-        found = tomllib.loads(file.read_text(encoding="utf-8"))
+        found = parse_toml(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ConfigError(f"can't be read: {error}", where=str(file), hint='lines like Ada = "scrypt:…"') from error
     table = found.get("people", found)

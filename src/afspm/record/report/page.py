@@ -8,7 +8,7 @@ from html import escape
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.formatting import counted, day, duration_text, quantity
-from afspm.model import component_of
+from afspm.model import ScopeState, component_of
 from afspm.model.events import SUPERVISOR
 from afspm.record.allowed_bands import instrument_curves
 from afspm.record.drawing import timeline
@@ -62,6 +62,11 @@ def html(
         f"<footer>{escape(story.folder)}</footer>",
     ]
     return document(title, "".join(body))
+
+
+_UNDEFINED = ScopeState.UNDEFINED.name.lower()
+_NOT_KNOWN = "not known, at the start or end"
+_SMALLEST_REST = 0.005  # of the time: shown as 1 %
 
 
 def _timeline(story: RunStory) -> str:
@@ -172,16 +177,20 @@ def _shares(story: RunStory) -> str:
     overview, styles = story.overview, colours(story)
     return '<div class="shares">' + "".join(
         [
-            _share_table(story, "in control", overview.timelines.control, styles),
-            _share_table(story, "microscope", overview.timelines.scope_state, {}),
-            _share_table(story, "mode", overview.timelines.mode, {"manual": "manual"}),
+            _share_table(story, "in control", overview.timelines.control, styles, rest="no component"),
+            _share_table(story, "microscope", overview.timelines.scope_state, {}, rest=_NOT_KNOWN),
+            _share_table(story, "mode", overview.timelines.mode, {"manual": "manual"}, rest=_NOT_KNOWN),
         ]
     ) + "</div>"  # fmt: skip
 
 
-def _share_table(story: RunStory, heading: str, lane: Timeline, styles: dict[str, str]) -> str:
+def _share_table(story: RunStory, heading: str, lane: Timeline, styles: dict[str, str], *, rest: str) -> str:
     rows = []
-    for label, ns in story.shares(lane):
+    shares = [(label, ns) for label, ns in story.shares(lane) if label != _UNDEFINED]
+    rest_ns = story.lasted_ns - sum(ns for _, ns in shares)
+    if shares and rest_ns >= _SMALLEST_REST * story.lasted_ns:  # the columns add up to the whole time
+        shares.append((rest, rest_ns))
+    for label, ns in shares:
         part = 100.0 * ns / max(1, story.lasted_ns)
         style = styles.get(label, "state")
         words = label if styles else states_in_words(label)

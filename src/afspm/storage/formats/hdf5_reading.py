@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 MAGIC = b"\x89HDF\r\n\x1a\n"
 _HEAP = b"GCOL\x01\0\0\0"
 _DEEPEST = 100  # a visit takes time with the square of the depth: 1,500 groups in each other take 11 s
+_MOST_LINKS = 20_000  # to walk them takes 2 s, and 23 s with 60,000; a file of a scan has hundreds
 _OBJECT = 16  # bytes of the header of an object
 _VALUES_PER_BYTE = 16  # well compressed data; a damaged header may announce any size
 
@@ -59,8 +61,12 @@ def _check_links(file: h5py.File, path: Path) -> None:
     # scan would show its content
     import h5py
 
-    def is_elsewhere(name: bytes, info: h5py.h5l.LinkInfo) -> bytes | None:
+    seen = count(1)
+
+    def is_elsewhere(name: bytes, info: h5py.h5l.LinkInfo) -> bytes | int | None:
         # an error raised here would be lost in the library
+        if (number := next(seen)) > _MOST_LINKS:
+            return number
         return name if info.type == h5py.h5l.TYPE_EXTERNAL or name.count(b"/") > _DEEPEST else None
 
     def has_values_elsewhere(name: str, node: h5py.Dataset | h5py.Group) -> str | None:
@@ -68,6 +74,8 @@ def _check_links(file: h5py.File, path: Path) -> None:
 
     root = file["/"].id
     found = root.links.visit(is_elsewhere, info=True) or file.visititems(has_values_elsewhere)
+    if isinstance(found, int):
+        raise FileError(f"is refused: it has more than {_MOST_LINKS:,} groups and datasets", where=str(path))
     if found is not None:
         name = found.decode("utf-8", "replace") if isinstance(found, bytes) else found
         if name.count("/") > _DEEPEST:

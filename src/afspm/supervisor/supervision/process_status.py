@@ -53,6 +53,10 @@ class ProcessStatus:
             found.append(ProcessState(name, role, condition, since_ns, age_s, child.starts, pid, child.last_exit))
         return tuple(found), changed
 
+    def all_begun(self, children: Iterable[SupervisedChild], now_s: float) -> bool:
+        """Return whether no process is being started for the first time any more; `now_s` as in `states`."""
+        return all(condition_of(child, now_s, self._liveness) is not ProcessCondition.STARTING for child in children)
+
     def _alive_since_ns(self, name: str, pid: int, now_ns: int) -> int:
         # a process at work on a step, or late with a beat, counts as alive
         if self._alive.get(name, (0, 0))[0] != pid:

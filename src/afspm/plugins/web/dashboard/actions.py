@@ -185,8 +185,10 @@ def _result(response: Response, done: str) -> ActionResult:
 
 def refusal(response: Response) -> str:
     """Return the reason of a refusal as text for a person."""
+    if response.reason:
+        return f"Refused: {response.reason}"
     code = ControlResponse(response.code).name if response.code in ControlResponse._value2member_map_ else response.code
-    return f"Refused: {response.reason or 'no reason given'} ({code})"
+    return f"Refused: no reason given ({code})"
 
 
 def _in_force(parameter: str, response: Response) -> str:
