@@ -16,7 +16,6 @@ from typing import Any
 from afspm.model import (
     RELAY_REQUEST,
     ActByHand,
-    ChangedValue,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -38,6 +37,7 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
+from afspm.model.panel import ChangedValue
 from afspm.model.snapshot import restored, snapshot
 from afspm.scheduler.control.arbitration import RoleTable, Rules
 from afspm.scheduler.events import (

@@ -12,7 +12,6 @@ from afspm.basics.exit_codes import ExitCode
 from afspm.basics.plain_data import Plain
 from afspm.model import (
     ActByHand,
-    ChangedValue,
     ControlRequest,
     ControlResponse,
     Feedback,
@@ -31,6 +30,7 @@ from afspm.model import (
     TipStatus,
     names,
 )
+from afspm.model.panel import ChangedValue
 from afspm.testing.components.memory_network import ControlLine, Feed, Subscribers
 from afspm.testing.components.simulated_process import Process
 from afspm.testing.components.simulated_time import SimulatedTime, Timer

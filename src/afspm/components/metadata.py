@@ -15,7 +15,6 @@ from afspm.basics.units import convert, si_unit_or_none
 from afspm.client.component import Component
 from afspm.components.line_file import LineFile, csv_line
 from afspm.model import (
-    BegunMeasurement,
     ControlEvent,
     ControlMode,
     ControlRequest,
@@ -32,6 +31,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
+from afspm.model.scan_history import BegunMeasurement
 from afspm.model.state import FeedbackUnits
 
 COLUMNS = (

@@ -58,7 +58,7 @@ if TYPE_CHECKING:
         is_of_instrument,
     )
     from afspm.model.packet import LoggedPacket, Packet, PacketHeader
-    from afspm.model.panel import ActByHand, ChangedValue, MeasurementConditions, PanelAct, TipStatus
+    from afspm.model.panel import ActByHand, MeasurementConditions, PanelAct, TipStatus
     from afspm.model.problems import STOPPED_BY_AGENT, Problem, ProblemNames
     from afspm.model.registration_outcome import RegistrationOutcome, registration_summary
     from afspm.model.requests import (
@@ -80,7 +80,7 @@ if TYPE_CHECKING:
         request_name,
     )
     from afspm.model.scan import Scan, ScanLines, ScanParameters, ScanSet
-    from afspm.model.scan_history import BegunMeasurement, ScanHistory
+    from afspm.model.scan_history import ScanHistory
     from afspm.model.spectrum import Spectrum
     from afspm.model.state import (
         ControlMode,
@@ -112,8 +112,6 @@ __all__ = [
     "ActByHand",
     "Approval",
     "Approvals",
-    "BegunMeasurement",
-    "ChangedValue",
     "ChannelName",
     "ChannelRoles",
     "ControlEvent",

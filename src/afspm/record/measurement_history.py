@@ -10,17 +10,9 @@ from statistics import median
 from typing import TYPE_CHECKING, TypeVar
 
 from afspm.basics.units import convert, same_kind
-from afspm.model import (
-    BegunMeasurement,
-    Frame,
-    MeasurementConditions,
-    Region,
-    RegistrationOutcome,
-    Scan,
-    ScanParameters,
-    Spectrum,
-)
+from afspm.model import Frame, MeasurementConditions, Region, RegistrationOutcome, Scan, ScanParameters, Spectrum
 from afspm.model.geometry import XY
+from afspm.model.scan_history import BegunMeasurement
 from afspm.record.drift_mapping import drift_at, drift_knowledge
 from afspm.record.running_scan import DoneScan, RunningScan
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from afspm.model import BegunMeasurement, Region, ScanLines, ScanParameters
+from afspm.model import Region, ScanLines, ScanParameters
+from afspm.model.scan_history import BegunMeasurement
 
 
 @dataclass(slots=True)

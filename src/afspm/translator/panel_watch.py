@@ -24,8 +24,9 @@ from dataclasses import replace
 from typing import Final
 
 from afspm.basics.clock import NS_PER_S
-from afspm.model import ActByHand, ChangedValue, PanelAct, ScopeState, TipStatus, names
+from afspm.model import ActByHand, PanelAct, ScopeState, TipStatus, names
 from afspm.model.microscope_status import STARTS
+from afspm.model.panel import ChangedValue
 from afspm.translator.judge import SETTINGS
 from afspm.translator.parameters import FEEDBACK_ON, ParameterTable, Value
 from afspm.translator.setting_groups import FRAME, POSITION

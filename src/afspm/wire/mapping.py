@@ -18,6 +18,7 @@ from afspm.basics.errors import InvalidValue
 from afspm.basics.formatting import shortest_single
 from afspm.model.events import LogLines, MeasurementSettings
 from afspm.model.instruments import InstrumentOrders
+from afspm.model.panel import ChangedValue
 from afspm.model.state import FeedbackUnits
 from afspm.wire.generated import (
     channels_pb2,
@@ -300,7 +301,7 @@ TIP_STATUS = MessageMapping(
     by_hand=FieldMapping("by_hand", sparse=True),
 )
 _CHANGED_VALUE = MessageMapping(
-    model.ChangedValue,
+    ChangedValue,
     panel_pb2.ChangedValue,
     *("parameter", "before", "after"),
     unit=FieldMapping("units", sparse=True),

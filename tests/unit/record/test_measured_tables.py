@@ -14,7 +14,6 @@ import afspm
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.model import (
     ActByHand,
-    ChangedValue,
     ControlResponse,
     JournalEntries,
     JournalEntry,
@@ -25,6 +24,7 @@ from afspm.model import (
     names,
 )
 from afspm.model.events import MeasurementSettings
+from afspm.model.panel import ChangedValue
 from afspm.record.export import export
 from afspm.record.store import RecordStore
 from afspm.record.tables import SweptSetting

@@ -14,7 +14,8 @@ from record_lab import REGION, Night
 from afspm.basics.errors import InvalidValue
 from afspm.basics.formatting import duration_text
 from afspm.components.tip_verdict import OF_LINES, LineVerdict, line_verdict_message, verdict_message
-from afspm.model import ActByHand, ChangedValue, PanelAct, Region, Scan, ScopeState, names
+from afspm.model import ActByHand, PanelAct, Region, Scan, ScopeState, names
+from afspm.model.panel import ChangedValue
 from afspm.record.bad_scans import BAD, VERDICT_MESSAGE
 from afspm.record.measurement_history import DriftPoint
 from afspm.record.report.markup import PageTimes

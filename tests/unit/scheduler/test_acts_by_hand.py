@@ -9,7 +9,6 @@ from tests.unit.scheduler.logic_lab import Lab, killed, replies
 
 from afspm.model import (
     ActByHand,
-    ChangedValue,
     ControlEvent,
     ControlMode,
     ControlRequest,
@@ -23,6 +22,7 @@ from afspm.model import (
     TipStatus,
     names,
 )
+from afspm.model.panel import ChangedValue
 from afspm.scheduler.control.arbitration import RoleTable, Rules
 from afspm.scheduler.events import Log, Tick
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit

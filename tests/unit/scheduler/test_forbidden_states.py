@@ -10,7 +10,6 @@ from tests.unit.scheduler.logic_lab import Lab, in_control, replies
 
 from afspm.model import (
     ActByHand,
-    ChangedValue,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -20,6 +19,7 @@ from afspm.model import (
     Request,
     ScopeState,
 )
+from afspm.model.panel import ChangedValue
 from afspm.model.snapshot import from_plain, to_plain
 from afspm.scheduler.safety import rule_language
 from afspm.scheduler.safety.forbidden_states import PresentState, in_states, refusal

@@ -9,7 +9,6 @@ import pytest
 
 from afspm.model import (
     ActByHand,
-    ChangedValue,
     ControlRequest,
     ControlResponse,
     Feedback,
@@ -24,6 +23,7 @@ from afspm.model import (
     TipStatus,
     names,
 )
+from afspm.model.panel import ChangedValue
 
 OK = ControlResponse.SUCCESS
 ACTION, PARAM = ControlRequest.ACTION, ControlRequest.PARAM

@@ -21,7 +21,6 @@ from afspm.model import (
     GRANT_REQUEST,
     LEASE_REQUEST,
     RESTART_REQUEST,
-    ChangedValue,
     ControlMode,
     ControlRequest,
     Feedback,
@@ -37,6 +36,7 @@ from afspm.model import (
     names,
     request_name,
 )
+from afspm.model.panel import ChangedValue
 from afspm.model.scan import ShapeChange
 from afspm.scheduler.control.arbitration import (
     ArbitrationEvent,
