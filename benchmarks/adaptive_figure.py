@@ -11,9 +11,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from afspm.drawing.palette import CATEGORICAL, PROBLEM
+from afspm.drawing.plotting import draw_scale_bar, gold
 from afspm.plugins.adaptive.refinement import AdaptiveMap, NestedGrid
-from afspm.record.drawing.palette import CATEGORICAL, PROBLEM
-from afspm.record.plotting import draw_scale_bar, gold
 from afspm.simulation.property_map import PropertyMap
 from benchmarks.adaptive import GOAL, KINDS, REGION, Case, Course, course
 

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from afspm.basics.plain_data import Plain, from_json
-from afspm.record.bad_scans import BAD, last_scores
-from afspm.record.run import open_run
+from afspm.night.bad_scans import BAD, last_scores
+from afspm.night.run import open_run
 from benchmarks.compare import ROOT
 
 EXPERIMENTS = ROOT / "experiments"

@@ -34,7 +34,7 @@ from afspm.plugins.nanosurf.emulator import NanosurfEmulator
 from afspm.plugins.nanosurf.emulator.studio import StudioProgram
 from afspm.plugins.park.emulator import ParkEmulator
 from afspm.plugins.park.emulator.smartscan import SmartScanProgram
-from afspm.record.report.shadow import FILE, ShadowKind
+from afspm.report.shadow import FILE, ShadowKind
 from afspm.simulation.emulation.emulator import Emulator
 from afspm.translator.trace import FILE as TRACE
 from afspm.translator.trace import TracedExchange, TraceHeader, trace_lines

@@ -16,7 +16,7 @@ from typing import Any, Final
 from sheet import BAD, CONTROL, GOOD, GREY, INK, PAPER, QUIET, Sheet
 
 import afspm
-from afspm.record.bad_scans import BAD as BAD_SCORE
+from afspm.night.bad_scans import BAD as BAD_SCORE
 
 RECORD: Final = Path(__file__).resolve().parents[1] / "docs" / "pictures" / "control-transfer.json"
 BEFORE_S, AFTER_S = 1500.0, 900.0

@@ -20,7 +20,10 @@ from typing import Final
 ROOT: Final = Path(__file__).resolve().parents[1]
 LAST_GREEN: Final = Path("tests/ui/last_green.txt")
 OWN: Final = ("src/afspm/plugins/web", "tests/ui")
-SHOWN: Final = ("src/afspm/record/", "tests/", "benchmarks/")
+SHOWN: Final = (
+    *(f"src/afspm/{room}/" for room in ("record", "night", "drawing", "report")),
+    *("tests/", "benchmarks/"),
+)
 """Of the modules that files of `OWN` import, those in these folders count."""
 IMPORTED_FROM: Final = ("src", "tests/support", "")
 FRAMEWORK: Final = "nicegui"

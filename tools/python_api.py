@@ -31,9 +31,9 @@ GROUPS = {
     ],
     "After the night": [
         "afspm.Run",
-        "afspm.record.tables.Table",
-        *(f"afspm.record.measured_tables.{name}" for name in ("KeyedTable", "SpectrumTable")),
-        *(f"afspm.record.tables.{name}" for name in ("ScanRow", "SpectrumRow", "NoteRow")),
+        "afspm.night.tables.Table",
+        *(f"afspm.night.measured_tables.{name}" for name in ("KeyedTable", "SpectrumTable")),
+        *(f"afspm.night.tables.{name}" for name in ("ScanRow", "SpectrumRow", "NoteRow")),
     ],
     "Surveys": [
         *(f"afspm.components.surveying.{name}" for name in ("find_particles", "nearest", "lowest_beside", "Target")),

@@ -18,8 +18,8 @@ from matplotlib.patches import ConnectionPatch
 from PIL import Image
 
 import afspm
-from afspm.record.drawing.palette import CATEGORICAL, PROBLEM
-from afspm.record.plotting import gold
+from afspm.drawing.palette import CATEGORICAL, PROBLEM
+from afspm.drawing.plotting import gold
 
 PICTURE: Final = Path(__file__).resolve().parents[1] / "docs" / "pictures" / "repair.png"
 WIDTH_PX, HEIGHT_PX, DPI = 830, 390, 200

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from afspm.client.events import Events, PublishedEvent
     from afspm.client.scope import Scope
     from afspm.model import ControlMode, Problem, Region, Scan, ScanSet, ScopeState, Spectrum
-    from afspm.record.catalogue import find_runs
-    from afspm.record.run import Run, open_run
+    from afspm.night.catalogue import find_runs
+    from afspm.night.run import Run, open_run
     from afspm.storage.formats import read
     from afspm.storage.memory import Memory
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # components judge tips, pair channels, plan work, keep files
     from afspm.model.line_levelling import Levelling, flattened, levelled
     from afspm.model.planned_work import PlannedWork
     from afspm.model.snapshot import from_plain, restored, snapshot, to_plain
-    from afspm.record.notes import append_note
+    from afspm.night.notes import append_note
     from afspm.storage.atomic import OutageLog, replace_file, write_atomic
     from afspm.storage.formats import suffixes
 

@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 
 import afspm
-from afspm.record.run import Run
+from afspm.night.run import Run
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "python-api.md").read_text(encoding="utf-8")
 ENTRY = re.compile(r"^- ((?:`[^`:]*`, )*`[^`:]*`): ", re.MULTILINE)

@@ -10,7 +10,7 @@ import pytest
 from small_disk import fill, small_disk
 from tests.ui.ui_lab import Night, Opened
 
-from afspm.record.report import REPORT_FILE
+from afspm.report.night_report import REPORT_FILE
 
 
 def test_message_is_a_banner_until_it_is_over_and_a_viewer_may_hide_it(night: Night, opened: Opened) -> None:

@@ -13,7 +13,7 @@ import pytest
 from tests.ui.ui_lab import DEADLINE_S, Night, Opened
 
 import afspm
-from afspm.record.run import Run
+from afspm.night.run import Run
 
 MORE = """
 [restart]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from afspm import model, wire
-from afspm.record.report import write
 from afspm.record.store import RecordSettings, RecordStore
+from afspm.report.night_report import write
 
 START = 1_700_000_000_000_000_000
 

@@ -11,10 +11,10 @@ import pytest
 from tests.ui.ui_lab import Night, Opened
 
 import afspm
+from afspm.drawing.palette import colour_map
+from afspm.drawing.raster import Contrast, indices, value_range
 from afspm.model import Region, Scan
 from afspm.model.line_levelling import Levelling, levelled
-from afspm.record.drawing.palette import colour_map
-from afspm.record.drawing.raster import Contrast, indices, value_range
 
 TURNED = Region((0.4e-6, -0.3e-6), (0.8e-6, 0.5e-6), 0.4)
 

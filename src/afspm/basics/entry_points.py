@@ -32,7 +32,7 @@ EMULATORS = "afspm.emulators"  # class = "Name" of an emulated controller; `afsp
 SCHEDULERS = "afspm.schedulers"  # class = "Name" of a scheduler
 COMPONENTS = "afspm.components"  # class = "Name" of a component
 READERS = "afspm.readers"  # by the suffix of a file, without its dot: (path, zone) -> FileContent
-EXPORTERS = "afspm.exporters"  # afspm export --to NAME: a module, see afspm.record.export
+EXPORTERS = "afspm.exporters"  # afspm export --to NAME: a module, see afspm.report.export
 ESTIMATORS = "afspm.estimators"  # of drift, by name
 TRACKERS = "afspm.trackers"  # of drift, by name
 FIGURES = "afspm.figures"  # of the report: (run, title, again) yields names and figures of matplotlib

@@ -12,7 +12,7 @@ from afspm.basics.launch import Launch
 from afspm.client.connect import guest_of
 from afspm.client.experiment_link import ExperimentLink
 from afspm.model import Packet, ProblemNames
-from afspm.record.overview import Overview
+from afspm.night.overview import Overview
 from afspm.record.run_lock import cut_off_message
 from afspm.supervisor.own_runs import register_own_messages
 from afspm.transport.process.context import new_session

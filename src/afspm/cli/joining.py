@@ -72,7 +72,7 @@ def acting(where: Path) -> Iterator[Scope]:
 def describe(follower: Follower, *, fancy: bool = True) -> RunDescription:
     """Return facts about the run that are not in its packets."""
     from afspm.cli.status_text import RunDescription
-    from afspm.record.expected_end import plans_of
+    from afspm.night.expected_end import plans_of
     from afspm.record.run_json import REPLAY_OF, read_run_json
 
     clock, facts = follower.launch.clock, read_run_json(follower.folder)

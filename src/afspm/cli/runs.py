@@ -16,7 +16,7 @@ from afspm.cli.arguments import RUNS, Quiet, RecordedRun, Where, opt
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from afspm.record.catalogue import ProbeHistory, RunSummary
+    from afspm.night.catalogue import ProbeHistory, RunSummary
 
 
 _DAYS = ["%Y-%m-%d"]
@@ -41,7 +41,7 @@ def runs(
 
     An index is kept in runs.sqlite beside the runs; delete it at any time.
     """
-    from afspm.record.catalogue import find_runs
+    from afspm.night.catalogue import find_runs
 
     found = find_runs(folder, words or (), since and since.date(), until and until.date())
     if as_json:
@@ -50,7 +50,7 @@ def runs(
 
         typer.echo(json.dumps([asdict(run) for run in found], indent=2, ensure_ascii=False))
     elif page:
-        from afspm.record.catalogue_page import write_page
+        from afspm.report.catalogue_page import write_page
 
         typer.echo(write_page(folder, found))
     elif not found:
@@ -104,7 +104,7 @@ def report(where: Where = RUNS, quiet: Quiet = False) -> None:
     """
     from afspm.basics.progress_line import ProgressLine
     from afspm.client.connect import find_run
-    from afspm.record.report import write
+    from afspm.report.night_report import write
 
     with ProgressLine("writing the report", quiet=quiet) as line:
         written = write(find_run(where), line.step)
@@ -134,8 +134,8 @@ def export(
     Works during a run, and for a run that was killed. Interrupted scans are included as far as they were recorded.
     """
     from afspm.basics.progress_line import ProgressLine
-    from afspm.record.export import export as exported
-    from afspm.record.run import open_run
+    from afspm.night.run import open_run
+    from afspm.report.export import export as exported
 
     count = 0
     with open_run(run) as record, ProgressLine(f"writing {to}", quiet=quiet) as line:
@@ -162,7 +162,7 @@ def probes(
 
     The name of a probe is `probe` in [metadata] of the experiment file.
     """
-    from afspm.record.catalogue import find_runs, probe_histories
+    from afspm.night.catalogue import find_runs, probe_histories
 
     found = probe_histories(find_runs(folder, words or ()))
     if as_json:

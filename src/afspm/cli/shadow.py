@@ -52,8 +52,8 @@ def watch(
     from afspm.cli.experiment_file import require_no_errors
     from afspm.cli.run import with_overlay
     from afspm.experiment.shadow import shadow_file, shadow_overlay
-    from afspm.record.report import shadow as watched
-    from afspm.record.run import open_run
+    from afspm.night.run import open_run
+    from afspm.report import shadow as watched
     from afspm.supervisor import run as running
 
     with tempfile.TemporaryDirectory() as folder:
@@ -82,7 +82,7 @@ def pack(
     and kept is listed first. Nothing is sent: look at the folder, and then give it to whom you like.
     """
     from afspm.cli import shadow_pack
-    from afspm.record.run import open_run
+    from afspm.night.run import open_run
 
     with open_run(recorded) as run:
         found = shadow_pack.read(run, hide or ())

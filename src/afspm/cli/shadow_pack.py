@@ -23,11 +23,11 @@ from typing import Any, Final
 import numpy as np
 
 from afspm.basics.errors import AfspmError, FileError, InvalidValue
-from afspm.record.export.netcdf import scan_file
-from afspm.record.report import shadow
-from afspm.record.report.markup import PageTimes, document, section
-from afspm.record.run import Run
+from afspm.night.run import Run
 from afspm.record.run_json import COMPUTER
+from afspm.report import shadow
+from afspm.report.export.netcdf import scan_file
+from afspm.report.markup import PageTimes, document, section
 from afspm.storage import formats
 from afspm.translator.trace import (
     FILE,

@@ -63,7 +63,7 @@ def _text(follower: Follower) -> StatusText:
 
 def _goes_on(follower: Follower) -> bool:
     # the run's lock is tested only after a silence: it may lie on a slow network disk
-    from afspm.record.overview import OLD_S
+    from afspm.night.overview import OLD_S
 
     return not (follower.ended or (follower.silent_s() > OLD_S and follower.cut_off()))
 

@@ -10,9 +10,9 @@ from afspm import wire
 from afspm.basics.clock import NS_PER_S, utc_time
 from afspm.basics.formatting import area_text, day_and_time, duration_text, time_of_day
 from afspm.model import LogLine, ProcessCondition, ProcessState, Progress, Region, ScopeState
-from afspm.record.expected_end import Plans
-from afspm.record.overview import OLD_S, OVER, ROUTINE, Overview
-from afspm.record.timeline import Span
+from afspm.night.expected_end import Plans
+from afspm.night.overview import OLD_S, OVER, ROUTINE, Overview
+from afspm.night.timeline import Span
 
 if TYPE_CHECKING:
     from rich.console import Group

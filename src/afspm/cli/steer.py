@@ -128,10 +128,11 @@ def note(
     from afspm.basics.clock import ExperimentClock
     from afspm.cli.joining import acting, person
     from afspm.client.connect import find_one_run
-    from afspm.record.notes import append_note
-    from afspm.record.report import REPORT_FILE, shadow, write
-    from afspm.record.run import open_run
+    from afspm.night.notes import append_note
+    from afspm.night.run import open_run
     from afspm.record.run_lock import goes_on
+    from afspm.report import shadow
+    from afspm.report.night_report import REPORT_FILE, write
 
     *where, text = words
     if len(where) > 1:

@@ -25,7 +25,7 @@ from afspm.model import (
     ScopeStatus,
 )
 from afspm.model.problems import CONDITIONS
-from afspm.record.night_record import NightRecord, control_entry, mark_entry, scan_entry
+from afspm.night.night_record import NightRecord, control_entry, mark_entry, scan_entry
 
 
 class NightPicture(Component):
@@ -89,7 +89,7 @@ class NightPicture(Component):
             self.log.info("no scan, no picture")
             return
         self._loading.join()
-        from afspm.record.night_figure import draw
+        from afspm.report.night_figure import draw
 
         path = Path(self.run_dir) / self.file
         names = {number: self.scope.problems.name(number) for number in self.record.problems}
@@ -106,4 +106,4 @@ class NightPicture(Component):
 
 
 def _load_drawing() -> None:
-    importlib.import_module("afspm.record.night_figure").prepare()
+    importlib.import_module("afspm.report.night_figure").prepare()

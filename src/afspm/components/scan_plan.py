@@ -10,7 +10,7 @@ from typing import Any
 from afspm.basics.errors import InvalidValue, Refused
 from afspm.basics.formatting import lengths_text
 from afspm.model import Region
-from afspm.record.bad_scans import BAD
+from afspm.night.bad_scans import BAD
 
 XY = tuple[float, float]
 REST_OVERLAP = 2  # rows before the estimated change that are taken again

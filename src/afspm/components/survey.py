@@ -202,7 +202,7 @@ class Survey(Component):
             return
         self._keep(self._record)
         from afspm.components.surveying import figure  # matplotlib: needed at the end alone
-        from afspm.record.plotting import save_figure
+        from afspm.drawing.plotting import save_figure
 
         drawn = figure.survey_figure(self._record, title=self.name, simulated=self.simulated)
         path = Path(self.run_dir) / f"{self.file}.png"

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from afspm import wire
 from afspm.model import Region, Scan, ScanParameters
-from afspm.record.bad_scans import BAD, LINE_VERDICT_MESSAGE, VERDICT_MESSAGE, read_verdict
+from afspm.night.bad_scans import BAD, LINE_VERDICT_MESSAGE, VERDICT_MESSAGE, read_verdict
 from afspm.wire.messages import SpatialROIWithScoreList, TipVerdict
 
 __all__ = [

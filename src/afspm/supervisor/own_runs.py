@@ -65,7 +65,7 @@ def register_own_messages(folder: Path, messages: Sequence[str]) -> None:
     if not messages:
         return
     if (homes := own_homes(folder)) is None:
-        from afspm.record.run import declare_described
+        from afspm.night.run import declare_described
 
         if declare_described(folder):
             return

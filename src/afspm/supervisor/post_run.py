@@ -23,8 +23,8 @@ from afspm.components import notifications
 from afspm.components.notifications import END, GIVEN_UP, NotDelivered, Notification, Targets, Way
 from afspm.experiment import Role, implied_parts
 from afspm.model.events import LOGGED_AS
+from afspm.night.run import open_run
 from afspm.record.journal import JOURNAL_FILE
-from afspm.record.run import open_run
 from afspm.record.run_lock import quoted, resume_command
 from afspm.storage.disk import DiskTimeout, run_bounded
 from afspm.supervisor.supervision.run_end import EndReason
@@ -152,7 +152,7 @@ def report(folder: Path, log: RunLog) -> None:
         return  # no record, no report
     log.write(LOGGED_AS, logging.INFO, "writing the report …")
     again = f"`afspm report {quoted(folder)}` writes it"
-    command = [*python_command("afspm.record.report"), str(folder)]
+    command = [*python_command("afspm.report"), str(folder)]
     environment = {**os.environ, **python_environment(), "MPLBACKEND": "agg"}
     try:
         with signals.caught(_stop, -1), ProgressLine("writing the report"):
@@ -174,7 +174,7 @@ def report(folder: Path, log: RunLog) -> None:
         lines = output.decode(errors="replace").strip().splitlines()
         log.write(LOGGED_AS, logging.WARNING, f"no report: {lines[-1] if lines else f'exit code {exit_code}'}")
     else:
-        from afspm.record.report import REPORT_FILE
+        from afspm.report.night_report import REPORT_FILE
 
         log.write(LOGGED_AS, logging.INFO, f"the report is {folder / REPORT_FILE}")
 

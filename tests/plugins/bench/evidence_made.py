@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from afspm.model import ControlRequest, ControlResponse, JournalEntry, Region
-from afspm.record import ScanRow
+from afspm.night import ScanRow
 from afspm_bench.evidence import Evidence, Report
 
 MINUTE_NS = 60_000_000_000

@@ -32,7 +32,7 @@ from afspm.plugins.drift.report.drawings import (
     draw_offsets,
     draw_pairs,
 )
-from afspm.record import night_figure
+from afspm.report import night_figure
 
 SHOWN_PX = 800.0  # the width of a column of text in the report and the README
 LEAST_PX = 7.0

@@ -13,13 +13,14 @@ import pytest
 from afspm import wire
 from afspm.basics import InvalidValue
 from afspm.model import Approval, Approvals, Frame, GrantedCount, GrantedRange, Proposal
+from afspm.night import Overview
 from afspm.plugins.agent.approval import of_plan, of_table, simulated
 from afspm.plugins.agent.plan import read_plan
 from afspm.plugins.web.archive import agents_in
 from afspm.plugins.web.dashboard.approvals import in_force, in_words, title, waiting
 from afspm.plugins.web.dashboard.grant_dialog import GrantFields
 from afspm.plugins.web.dashboard.steering_panel import drawn_box
-from afspm.record import EXPERIMENT_FILE, Overview
+from afspm.record import EXPERIMENT_FILE
 
 PLAN = read_plan({
     "title": "look <b>here</b>\u202e",

@@ -16,6 +16,7 @@ import pytest
 
 from afspm import PlannedWork, wire
 from afspm.basics import ExperimentClock, time_of_day, typeset_position, zone_offset_s
+from afspm.drawing import timeline_html
 from afspm.model import (
     ControlMode,
     ControlState,
@@ -32,12 +33,12 @@ from afspm.model import (
     ScopeStatus,
     Spectrum,
 )
+from afspm.night import DriftPoint, Overview, ScanSummary, SpectrumSummary
 from afspm.plugins.web.dashboard.charts import drift_chart, spectrum_chart
 from afspm.plugins.web.dashboard.content import refusals_html, rows_of, status_html, unheard
 from afspm.plugins.web.dashboard.panels import log_html, process_words
 from afspm.plugins.web.dashboard.sample_map import MapContent, map_html, places_of
 from afspm.plugins.web.watch import Watch
-from afspm.record import DriftPoint, Overview, ScanSummary, SpectrumSummary, timeline_html
 
 S = 1_000_000_000
 HERE = Region((0.0, 0.0), (1e-6, 1e-6))

@@ -26,13 +26,13 @@ from afspm.model import (
     ScopeStatus,
     TipStatus,
 )
+from afspm.night import Overview
 from afspm.plugins.web.dashboard.actions import ActionResult
 from afspm.plugins.web.dashboard.conditions import Conditions
 from afspm.plugins.web.dashboard.pictures import SIDE_PX, Thumbnails
 from afspm.plugins.web.dashboard.scan_facts import scan_facts
 from afspm.plugins.web.frames import ChannelFrame
 from afspm.plugins.web.watch import Watch
-from afspm.record import Overview
 
 S = 1_000_000_000
 REGION = Region((1e-6, -5e-7), (1e-6, 5e-7), 0.1)

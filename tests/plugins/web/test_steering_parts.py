@@ -19,10 +19,10 @@ from afspm.model import (
     Region,
     RescanKind,
 )
+from afspm.night import Overview
 from afspm.plugins.web.dashboard.actions import unclear
 from afspm.plugins.web.dashboard.flags import flags
 from afspm.plugins.web.dashboard.scan_dialog import ScanChoice
-from afspm.record import Overview
 
 S = 1_000_000_000
 CHOICE = ScanChoice(Region((1e-6, 2e-6), (4e-7, 2e-7), 0.3), (32, 64))

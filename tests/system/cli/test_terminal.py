@@ -23,7 +23,7 @@ from afspm.cli.app import app
 from afspm.cli.follower import Follower
 from afspm.cli.joining import NOT_RUNNING, person
 from afspm.client.connect import find_run
-from afspm.record.run import open_run
+from afspm.night.run import open_run
 from afspm.record.run_json import latest_run
 
 pytestmark = can_interrupt

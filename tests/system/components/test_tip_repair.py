@@ -16,8 +16,8 @@ from systems import PATIENCE
 
 from afspm.basics.formatting import day_and_time
 from afspm.model import Problem
-from afspm.record.night_record import NightRecord
-from afspm.record.run import open_run
+from afspm.night.night_record import NightRecord
+from afspm.night.run import open_run
 
 SAMPLE = Path(__file__).parents[3] / "experiments" / "tip_repair" / "experiment.toml"
 SHORTER = """

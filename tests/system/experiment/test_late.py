@@ -14,7 +14,7 @@ from tests.system.experiment.experiment_lab import AfspmRun, Run
 
 import afspm
 from afspm.model import ControlRequest
-from afspm.record.report import write
+from afspm.report.night_report import write
 
 NIGHT = """
 [clock]

@@ -19,7 +19,7 @@ from typer.testing import CliRunner, Result
 from afspm.cli.app import app
 from afspm.client.connect import join
 from afspm.model import ControlRequest, ScopeState
-from afspm.record.run import open_run
+from afspm.night.run import open_run
 from afspm.simulation.emulation.playback import Playback
 from afspm.translator.trace import TracedExchange, read_trace
 

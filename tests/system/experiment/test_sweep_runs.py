@@ -9,7 +9,7 @@ import numpy as np
 from tests.system.experiment.experiment_lab import AfspmRun, Run
 
 import afspm
-from afspm.record import report
+from afspm.report import night_report as report
 
 SAMPLE = Path(__file__).parents[3] / "experiments" / "sweep" / "experiment.toml"
 FEWER = """

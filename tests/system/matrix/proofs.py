@@ -27,8 +27,8 @@ from afspm import Levelling, levelled
 from afspm.basics.units import convert, si_unit
 from afspm.model import Problem, ScanSet, names
 from afspm.model.arrays import Array
-from afspm.record.run import Run
-from afspm.record.tables import ScanRow
+from afspm.night.run import Run
+from afspm.night.tables import ScanRow
 from afspm.wire.messages import TipVerdict
 
 DONE = "done"

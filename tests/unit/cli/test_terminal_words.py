@@ -21,7 +21,7 @@ from afspm.cli.status_text import RunDescription, StatusText, bar
 from afspm.model import ControlMode, ControlState, ProcessCondition, ScopeState
 from afspm.model.events import LogLines
 from afspm.model.planned_work import PlannedWork
-from afspm.record.overview import Overview
+from afspm.night.overview import Overview
 
 S = 1_000_000_000
 START = 1_700_000_000 * S

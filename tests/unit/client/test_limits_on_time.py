@@ -16,7 +16,7 @@ from afspm.components.spectroscopy_grid import SpectroscopyGrid
 from afspm.components.survey import Survey
 from afspm.components.sweep import Sweep
 from afspm.model import ControlMode, ControlRequest, JournalEntry, Region, names
-from afspm.record import Overview
+from afspm.night import Overview
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit, RoleLimits
 from afspm.testing import Bench
 

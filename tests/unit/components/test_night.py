@@ -19,6 +19,7 @@ from afspm import wire
 from afspm.basics.exit_codes import ExitCode
 from afspm.components.night_picture import NightPicture
 from afspm.components.tip_verdict import BAD, MESSAGE, verdict_message
+from afspm.drawing.palette import LEVELS, NEUTRAL, UNMEASURED
 from afspm.model import (
     ControlEvent,
     ControlMode,
@@ -33,8 +34,7 @@ from afspm.model import (
     ScopeStatus,
 )
 from afspm.model.problems import CONDITIONS
-from afspm.record.drawing.palette import LEVELS, NEUTRAL, UNMEASURED
-from afspm.record.night_record import (
+from afspm.night.night_record import (
     THUMBNAIL_PX,
     NightRecord,
     control_entry,
@@ -44,8 +44,8 @@ from afspm.record.night_record import (
 )
 
 pytest.importorskip("matplotlib")
-from afspm.record import night_figure
-from afspm.record.night_figure import MOST_SHOTS, _chosen, _episodes, draw, flagged_by
+from afspm.report import night_figure
+from afspm.report.night_figure import MOST_SHOTS, _chosen, _episodes, draw, flagged_by
 
 MINUTE_NS = 60_000_000_000
 TIP = int(Problem.TIP_SHAPE_CHANGED)

@@ -31,9 +31,10 @@ from afspm.model import (
     names,
 )
 from afspm.model.problems import HIGHEST_PROBLEM
-from afspm.record.report import agents, write
-from afspm.record.run import open_run
+from afspm.night.run import open_run
 from afspm.record.store import RecordSettings, RecordStore
+from afspm.report import agents
+from afspm.report.night_report import write
 
 S = 1_000_000_000
 START = 1_700_000_000 * S

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+from afspm.drawing.timeline import DrawnBand
 from afspm.model import ProblemNames
-from afspm.record.allowed_bands import MOST_POINTS, ReadingCurve, allowed_bands, instrument_curves
-from afspm.record.drawing.timeline import DrawnBand
-from afspm.record.overview import Overview
+from afspm.night.overview import Overview
+from afspm.night.reading_curves import MOST_POINTS, ReadingCurve, instrument_curves
+from afspm.record.allowed_bands import allowed_bands
 from afspm.record.run_json import EXPERIMENT_FILE
 
 

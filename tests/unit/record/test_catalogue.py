@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 
 from afspm.basics.errors import FileError, InvalidValue
 from afspm.cli.app import app
-from afspm.record import catalogue
-from afspm.record.catalogue import INDEX_FILE, find_runs
+from afspm.night import catalogue
+from afspm.night.catalogue import INDEX_FILE, find_runs
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.run_json import RUN_FILE
 from afspm.record.store import RecordStore

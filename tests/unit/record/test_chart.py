@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from afspm.record.drawing.chart import Axis, Band, Curve, chart
+from afspm.drawing.chart import Axis, Band, Curve, chart
 
 BIAS = np.linspace(-1.0, 1.0, 21)
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from afspm.record.drawing.curves import round_ticks, thinned
+from afspm.drawing.curves import round_ticks, thinned
 
 
 def test_peaks_survive_thinning() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from afspm.model import Progress
 from afspm.model.planned_work import PlannedWork
-from afspm.record.expected_end import expected_end_ns, plans_of
+from afspm.night.expected_end import expected_end_ns, plans_of
 
 S = 1_000_000_000
 BEGAN = 1_700_000_000 * S

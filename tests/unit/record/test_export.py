@@ -20,12 +20,12 @@ from record_lab import REGION, Night
 
 import afspm
 from afspm.basics.errors import FileError, InvalidValue, NoSuchItem
+from afspm.drawing.plotting import save_figure
 from afspm.model import Region, Scan, ScopeState, Spectrum
 from afspm.model.line_levelling import flattened
-from afspm.record.export import chosen, eln, export, png
-from afspm.record.plotting import save_figure
-from afspm.record.run import Run
+from afspm.night.run import Run
 from afspm.record.store import RecordStore
+from afspm.report.export import chosen, eln, export, png
 
 ORCID = "https://orcid.org/0000-0002-1825-0097"
 

@@ -19,10 +19,10 @@ import afspm
 from afspm import wire
 from afspm.basics.errors import FileError, InvalidValue
 from afspm.model import Frame, Region, Scan, ScopeState
-from afspm.record.export import export
-from afspm.record.film import FORMATS, Film, places, recorded_drift
-from afspm.record.run import Run
+from afspm.night.run import Run
 from afspm.record.store import RecordStore
+from afspm.report.export import export
+from afspm.report.film import FORMATS, Film, places, recorded_drift
 
 SIDE_M = 1e-6
 PIXELS = 64

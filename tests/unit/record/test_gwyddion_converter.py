@@ -18,9 +18,8 @@ import afspm
 from afspm.basics.errors import FileError
 from afspm.model import Region, Scan
 from afspm.model.arrays import Array
-from afspm.record import gwyddion_converter
-from afspm.record.export import gwyddion
-from afspm.storage.formats import FileContent
+from afspm.report.export import gwyddion
+from afspm.storage.formats import FileContent, gwyddion_converter
 
 CONVERTED = """
 import shutil

@@ -25,9 +25,9 @@ from afspm.model import (
 )
 from afspm.model.events import MeasurementSettings
 from afspm.model.panel import ChangedValue
-from afspm.record.export import export
+from afspm.night.tables import SweptSetting
 from afspm.record.store import RecordStore
-from afspm.record.tables import SweptSetting
+from afspm.report.export import export
 
 
 def start(night: Night, key: str, action: str = names.START_SCAN, response: int = ControlResponse.SUCCESS) -> Given:
@@ -188,7 +188,7 @@ def test_a_record_without_a_sweep_has_no_column_of_it(night: Night, store: Recor
 
 def test_a_contact_sheet_shows_the_sweep(night: Night, store: RecordStore, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    from afspm.record import sweep_sheet
+    from afspm.report import sweep_sheet
 
     store.take([night.control(), *night.whole_scan(1)])
     with afspm.open_run(tmp_path) as run:
@@ -209,7 +209,7 @@ def test_a_contact_sheet_shows_the_sweep(night: Night, store: RecordStore, tmp_p
 
 def test_row_without_contrast_has_a_scale_of_its_own() -> None:
     pytest.importorskip("matplotlib")
-    from afspm.record import sweep_sheet
+    from afspm.report import sweep_sheet
 
     noise = np.random.default_rng(1).normal(size=(2, 2, 16, 16))
     noise[1, 0, 3] = np.nan

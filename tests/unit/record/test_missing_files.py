@@ -14,17 +14,17 @@ import afspm
 from afspm.basics import entry_points
 from afspm.basics.errors import FileError
 from afspm.model import ScopeState, Spectrum
+from afspm.night.catalogue import find_runs
+from afspm.night.run import Run
 from afspm.plugins.bluesky import documents
 from afspm.plugins.drift.frame import remount
 from afspm.plugins.replay.replay import ReplayOptions, replay
 from afspm.plugins.web.archive import Archive
 from afspm.plugins.web.dashboard.night import Night as NightOfPage
-from afspm.record import report
-from afspm.record.catalogue import find_runs
-from afspm.record.catalogue_page import write_page
-from afspm.record.export import export
-from afspm.record.run import Run
 from afspm.record.store import RecordStore
+from afspm.report import night_report as report
+from afspm.report.catalogue_page import write_page
+from afspm.report.export import export
 
 SCANS, SPECTRA = 5, 9
 MISSING, DAMAGED = 1, 2  # indices among scans and spectra
@@ -138,7 +138,9 @@ def test_export_writes_all_others_and_names_them(
     assert list(export(lab.run, to, tmp_path / "out", few, told.append))
     named = [*told, *caplog.messages]
     of_scans, of_spectra = lab.lost[:2], lab.lost[2:]
-    wanted = {"csv": of_spectra, "eln": lab.lost[::2]} | dict.fromkeys(("gif", "mp4", "png", "pdf"), of_scans)
+    wanted = {"csv": of_spectra, "excel": of_spectra, "eln": lab.lost[::2]} | dict.fromkeys(
+        ("gif", "mp4", "png", "pdf"), of_scans
+    )
     assert replace(lab, lost=wanted.get(to, lab.lost)).is_named(named)
 
 

@@ -12,8 +12,8 @@ from record_lab import Night
 
 import afspm
 from afspm.model import Region, Scan, ScanSet, Spectrum
-from afspm.record.run import Run
-from afspm.record.spectrum_stack import stacked
+from afspm.night.run import Run
+from afspm.night.spectrum_stack import stacked
 from afspm.record.store import RecordStore
 
 xarray = pytest.importorskip("xarray")
@@ -61,7 +61,7 @@ def test_table_is_written_and_read_with_exact_times(
 
 
 def test_large_whole_numbers_are_written(tmp_path: Path) -> None:
-    from afspm.record.netcdf_encoding import fit_classic_netcdf
+    from afspm.night.netcdf_encoding import fit_classic_netcdf
 
     numbers = np.array([1, 2**40 + 1, -(2**50)])
     assert (written(fit_classic_netcdf(xarray.Dataset({"n": ("row", numbers)})), tmp_path).n == numbers).all()

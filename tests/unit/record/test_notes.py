@@ -12,12 +12,12 @@ from record_lab import Night
 import afspm
 from afspm.basics.errors import FileError, InvalidValue
 from afspm.model import JournalEntry, Note
-from afspm.record.export import export
-from afspm.record.notes import append_note
-from afspm.record.report import write
+from afspm.night.notes import append_note
 from afspm.record.run_json import STATE_DIR
 from afspm.record.run_lock import lock_run
 from afspm.record.store import RecordStore
+from afspm.report.export import export
+from afspm.report.night_report import write
 
 HOSTILE = '<script>alert("x")</script> & "tip", changed\nhere'
 

@@ -18,8 +18,8 @@ from afspm import wire
 from afspm.components.metadata import Metadata
 from afspm.components.night_picture import NightPicture
 from afspm.model import ControlMode, ControlState, Packet, ProblemNames, Scan, ScopeState, ScopeStatus
+from afspm.night.overview import Overview
 from afspm.plugins.drift.frame.scan_timing import ScanStartTracker
-from afspm.record.overview import Overview
 from afspm.record.store import RecordStore
 
 OF_SCANS = {

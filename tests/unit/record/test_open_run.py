@@ -20,11 +20,11 @@ from afspm import wire
 from afspm.basics.errors import FileError
 from afspm.components.tip_verdict import BAD, GOOD, verdict_message
 from afspm.model import Problem, Region, RegistrationOutcome, RescanKind, Scan, ScopeState, Spectrum
+from afspm.night.bad_scans import VERDICT_MESSAGE
+from afspm.night.overview import Overview
+from afspm.night.run import Run
 from afspm.record import journal
-from afspm.record.bad_scans import VERDICT_MESSAGE
 from afspm.record.journal import JOURNAL_FILE, open_to_write, read_only
-from afspm.record.overview import Overview
-from afspm.record.run import Run
 from afspm.record.store import RecordStore
 
 

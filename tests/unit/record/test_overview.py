@@ -21,8 +21,8 @@ from afspm.model import (
 )
 from afspm.model.events import NO_LONGER_TRUE, LogLines
 from afspm.model.planned_work import PlannedWork
-from afspm.record.allowed_bands import MOST_POINTS
-from afspm.record.overview import MOST_LINES, Overview
+from afspm.night.overview import MOST_LINES, Overview
+from afspm.night.reading_curves import MOST_POINTS
 
 S = 1_000_000_000
 REGION = model.Region((0.0, 0.0), (1e-6, 1e-6))

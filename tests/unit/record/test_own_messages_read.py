@@ -17,14 +17,14 @@ from google.protobuf.timestamp_pb2 import DESCRIPTOR as TIMESTAMP_FILE
 from record_lab import START_NS, Night
 
 from afspm import wire
+from afspm.night.notes import append_note
+from afspm.night.run import open_run
 from afspm.plugins.web.dashboard.content import messages_html
 from afspm.plugins.web.dashboard.night import Night as RecordedNight
 from afspm.plugins.web.dashboard.night import NightWatch
-from afspm.record.export import export
-from afspm.record.notes import append_note
-from afspm.record.report import write
-from afspm.record.run import open_run
 from afspm.record.store import RecordSettings, RecordStore
+from afspm.report.export import export
+from afspm.report.night_report import write
 from afspm.supervisor.own_runs import register_own_messages
 from afspm.wire import described_types
 

@@ -18,9 +18,10 @@ from afspm.model import (
     ScanParameters,
     names,
 )
-from afspm.record.report import parameters, write
-from afspm.record.run import open_run
+from afspm.night.run import open_run
 from afspm.record.store import RecordSettings, RecordStore
+from afspm.report import parameters
+from afspm.report.night_report import write
 
 S = 1_000_000_000
 START = 1_700_000_000 * S

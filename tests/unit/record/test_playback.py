@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import islice
 
-from afspm.record.packets import RecordPlayback
+from afspm.night.packets import RecordPlayback
 
 
 @dataclass

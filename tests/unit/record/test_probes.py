@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from afspm.cli.app import app
 from afspm.model import ControlRequest, ControlResponse, JournalEntries, JournalEntry, ScopeState
-from afspm.record.catalogue import UNNAMED, find_runs, probe_histories
+from afspm.night.catalogue import UNNAMED, find_runs, probe_histories
 from afspm.record.run_json import RUN_FILE
 from afspm.record.store import RecordStore
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from afspm.record.drawing.curves import profile
+from afspm.drawing.curves import profile
 
 
 def test_profile_has_lengths_in_metres_and_the_values_on_the_line() -> None:

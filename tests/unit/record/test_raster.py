@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from afspm.drawing.image_html import data_url, round_length_m, scale_bar, shown
+from afspm.drawing.palette import LEVELS, UNMEASURED, colour_map
+from afspm.drawing.raster import Contrast, ValueRange, indices, png, reduced, shared_range, value_range
 from afspm.model.line_levelling import Levelling, flattened, levelled
-from afspm.record.drawing.image_html import data_url, round_length_m, scale_bar, shown
-from afspm.record.drawing.palette import LEVELS, UNMEASURED, colour_map
-from afspm.record.drawing.raster import Contrast, ValueRange, indices, png, reduced, shared_range, value_range
 
 BUMP = np.exp(-((np.arange(40) - 20.0) ** 2) / 8)[:, None] * np.exp(-((np.arange(60) - 30.0) ** 2) / 8)
 

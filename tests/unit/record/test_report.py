@@ -22,14 +22,15 @@ from afspm.components.tip_verdict import OF_LINES, LineVerdict, line_verdict_mes
 from afspm.model import ControlMode, ControlState, ProcessCondition, RegistrationOutcome, ScopeState, names
 from afspm.model.events import LogLines
 from afspm.model.problems import CONDITIONS
-from afspm.record.bad_scans import BAD, VERDICT_MESSAGE
-from afspm.record.report import REPORT_FILE, page, pictures, sample, story, write
-from afspm.record.report.markup import PageTimes
-from afspm.record.run import open_run
+from afspm.night.bad_scans import BAD, VERDICT_MESSAGE
+from afspm.night.run import open_run
+from afspm.night.timeline import Span
+from afspm.night.treatment_ledger import TreatmentLedger, TreatmentPlace
 from afspm.record.run_json import EXPERIMENT_FILE, UNFINISHED
 from afspm.record.store import RecordSettings, RecordStore
-from afspm.record.timeline import Span
-from afspm.record.treatment_ledger import TreatmentLedger, TreatmentPlace
+from afspm.report import page, pictures, sample, story
+from afspm.report.markup import PageTimes
+from afspm.report.night_report import REPORT_FILE, write
 from afspm.wire.messages import WatchCounts
 
 S = 1_000_000_000
@@ -285,7 +286,7 @@ def test_without_a_record_there_is_no_report(tmp_path: Path) -> None:
     assert not (tmp_path / REPORT_FILE).exists()
 
 
-@pytest.mark.parametrize("what", ["afspm.record.report.pictures.draw", "pathlib.Path.replace"])
+@pytest.mark.parametrize("what", ["afspm.report.pictures.draw", "pathlib.Path.replace"])
 def test_unwritable_folder_is_named(run: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")

@@ -14,9 +14,9 @@ from record_lab import ABOUT, Night
 
 import afspm
 from afspm.model import ChannelRoles, Frame, Region, Scan, ScanSet, ScopeState, Spectrum
-from afspm.record.export import export, gwyddion, netcdf
-from afspm.record.run import Run
+from afspm.night.run import Run
 from afspm.record.store import RecordStore
+from afspm.report.export import export, gwyddion, netcdf
 from afspm.storage.formats import FileContent
 
 LENGTHS = st.floats(-1e-5, 1e-5)

@@ -15,11 +15,11 @@ from record_lab import ABOUT, REGION, Night
 from afspm.basics.errors import InvalidValue
 from afspm.model import ControlRequest, ControlResponse, JournalEntries, JournalEntry, Region, Scan, ScopeState
 from afspm.model.arrays import Array
-from afspm.record.comparison import RunComparison, compare, differences, flat_settings, roughness, same_region
-from afspm.record.comparison_page import html, roughness_rows, write
-from afspm.record.run import open_run
+from afspm.night.run import open_run
 from afspm.record.run_json import EXPERIMENT_FILE, RUN_FILE
 from afspm.record.store import RecordStore
+from afspm.report.comparison import RunComparison, compare, differences, flat_settings, roughness, same_region
+from afspm.report.comparison_page import html, roughness_rows, write
 
 PX = 24
 ELSEWHERE = Region((8e-6, -2e-6), REGION.size_m)

@@ -16,10 +16,13 @@ from afspm.basics.formatting import duration_text
 from afspm.components.tip_verdict import OF_LINES, LineVerdict, line_verdict_message, verdict_message
 from afspm.model import ActByHand, PanelAct, Region, Scan, ScopeState, names
 from afspm.model.panel import ChangedValue
-from afspm.record.bad_scans import BAD, VERDICT_MESSAGE
-from afspm.record.measurement_history import DriftPoint
-from afspm.record.report.markup import PageTimes
-from afspm.record.report.shadow import (
+from afspm.night.bad_scans import BAD, VERDICT_MESSAGE
+from afspm.night.measurement_history import DriftPoint
+from afspm.night.run import open_run
+from afspm.night.tables import NoteRow, ScanRow
+from afspm.record.store import RecordStore
+from afspm.report.markup import PageTimes
+from afspm.report.shadow import (
     SOON_S,
     Agreement,
     PersonAct,
@@ -35,9 +38,6 @@ from afspm.record.report.shadow import (
     of_drift,
     read,
 )
-from afspm.record.run import open_run
-from afspm.record.store import RecordStore
-from afspm.record.tables import NoteRow, ScanRow
 
 S = 1_000_000_000
 

@@ -7,8 +7,8 @@ import pytest
 
 from afspm.basics.errors import InvalidValue
 from afspm.model import Spectrum
+from afspm.night.spectrum_stack import stacked
 from afspm.record.spectrum_grid import grid
-from afspm.record.spectrum_stack import stacked
 
 BIAS = np.linspace(-1.0, 1.0, 11)
 XY = tuple[float, float]

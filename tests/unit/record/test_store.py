@@ -37,10 +37,10 @@ from afspm.model import (
     ScopeState,
 )
 from afspm.model.events import LogLines
-from afspm.record import report
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.run_json import EXPERIMENT_FILE
 from afspm.record.store import _PROCESS, RecordSettings, RecordStore
+from afspm.report import night_report as report
 from afspm.storage import formats
 from afspm.storage.formats import read
 

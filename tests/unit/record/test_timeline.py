@@ -4,7 +4,7 @@ import itertools
 import re
 from datetime import UTC
 
-from afspm.record.drawing.timeline import (
+from afspm.drawing.timeline import (
     COLUMNS,
     DrawnBand,
     TimelineCurve,
@@ -13,7 +13,7 @@ from afspm.record.drawing.timeline import (
     time_ticks,
     timeline_html,
 )
-from afspm.record.timeline import Span
+from afspm.night.timeline import Span
 
 S = 1_000_000_000
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from afspm.model import ControlRequest, ControlResponse, JournalEntry, Region, names
-from afspm.record.treatment_ledger import TreatmentLedger, TreatmentPlace, treatment_ledger, treatment_times
+from afspm.night.treatment_ledger import TreatmentLedger, TreatmentPlace, treatment_ledger, treatment_times
 
 S = 1_000_000_000
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from afspm.model import Feedback, Region, Scan, ScanSet, Spectrum
 from afspm.plugins.park.emulator import files as park
-from afspm.record.export import gwyddion, netcdf
+from afspm.report.export import gwyddion, netcdf
 from afspm.simulation.activities import ScanActivity, SpectrumActivity
 from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 

@@ -10,8 +10,8 @@ import pytest
 import afspm
 from afspm.basics.errors import FileError
 from afspm.model import Region, Scan
-from afspm.record.export import gwyddion
-from afspm.record.gwyddion_reader import read_gwyddion
+from afspm.report.export import gwyddion
+from afspm.storage.formats.gwyddion_reader import read_gwyddion
 
 REGION = Region((0.0, 0.0), (1e-6, 0.5e-6), 0.0)
 

@@ -22,7 +22,7 @@ from tests.unit.storage.samples import (
 
 import afspm
 from afspm.basics.errors import FileError
-from afspm.record.spectrum_stack import stacked
+from afspm.night.spectrum_stack import stacked
 from afspm.storage.formats import FileContent
 
 SHAPE = (GRID_ROWS, GRID_COLUMNS)

@@ -18,8 +18,8 @@ from afspm.basics.clock import ExperimentClock
 from afspm.components import notifications
 from afspm.components.notifications import OCCASIONS, Targets
 from afspm.experiment import load
-from afspm.record.report import REPORT_FILE
 from afspm.record.store import RecordStore
+from afspm.report.night_report import REPORT_FILE
 from afspm.supervisor import post_run
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.post_run import EndedRun

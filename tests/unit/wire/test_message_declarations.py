@@ -21,11 +21,11 @@ from afspm.client.component import Component
 from afspm.client.dispatch import MessageDispatcher
 from afspm.client.experiment_link import PublishedState
 from afspm.model import Packet, PacketHeader, ProblemNames, Role
+from afspm.night.overview import Overview
+from afspm.night.run import open_run
 from afspm.plugins.web.gateway.events import EventHistory
 from afspm.plugins.web.gateway.models import event_kinds
 from afspm.record.journal import SCHEDULER
-from afspm.record.overview import Overview
-from afspm.record.run import open_run
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.scheduler.publishing.cache import PacketCache
 from afspm.wire import MessageDeclaration, MessageKind

@@ -18,7 +18,7 @@ from afspm import Run
 from afspm.basics import AfspmError, InvalidValue, Plain, PlainMapping
 from afspm.emulation import World
 from afspm.model import ControlMode, ControlRequest, ControlResponse, JournalEntry, Region, Scan, Spectrum
-from afspm.record import ScanRow, SpectrumRow
+from afspm.night import ScanRow, SpectrumRow
 from afspm_bench.agent_folder import read_left
 
 STATUSES: Final = ("done", "cannot", "ask")

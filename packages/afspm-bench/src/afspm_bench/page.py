@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Final
 
 from afspm import replace_file
-from afspm.record import document, section
-from afspm.record import table as html_table
+from afspm.report import document, section
+from afspm.report import table as html_table
 from afspm_bench.agents import HOME
 from afspm_bench.bench import Line
 from afspm_bench.tasks import FAMILIES

@@ -17,13 +17,13 @@ from matplotlib.patheffects import withStroke
 from afspm.basics.formatting import counted, scale, typeset_area, typeset_length
 from afspm.components.surveying.record import Outcome, SurveyRecord, Visit
 from afspm.components.surveying.targets import flattened
+from afspm.drawing.image_html import round_length_m
+from afspm.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM
+from afspm.drawing.plotting import draw_scale_bar, gold
+from afspm.drawing.raster import shared_range
 from afspm.model import Scan, Spectrum
 from afspm.model.arrays import Array
 from afspm.model.geometry import XY
-from afspm.record.drawing.image_html import round_length_m
-from afspm.record.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM
-from afspm.record.drawing.raster import shared_range
-from afspm.record.plotting import draw_scale_bar, gold
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

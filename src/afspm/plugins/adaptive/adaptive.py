@@ -140,8 +140,8 @@ class Adaptive(Component):
         folder = Path(self.run_dir)
         with self._outage.trying():  # on a full disk the error is logged, and the picture is tried
             write_atomic(folder / f"{self.file}.csv", [self._table(found).encode()])
+        from afspm.drawing import save_figure
         from afspm.plugins.adaptive.map_picture import DPI, draw_map  # matplotlib: needed at the end alone
-        from afspm.record import save_figure
 
         drawn = draw_map(found, self._region, title=self.name, simulated=self.simulated)
         path = folder / f"{self.file}.png"

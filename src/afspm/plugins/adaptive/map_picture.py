@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 
 from afspm import Array
 from afspm.basics import counted, scale
+from afspm.drawing import CATEGORICAL, PROBLEM, Contrast, draw_scale_bar, gold, value_range
 from afspm.model import Region
 from afspm.plugins.adaptive.mapping import MapProgress
-from afspm.record import CATEGORICAL, PROBLEM, Contrast, draw_scale_bar, gold, value_range
 
 DPI: Final = 160
 _LONGER: Final = 120  # pixels along the longer side

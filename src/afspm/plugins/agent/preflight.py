@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.basics import AfspmError, Plain
+from afspm.night import ScanSummary
 from afspm.plugins.agent.plan import Plan
 from afspm.plugins.agent.simulated_run import simulate
 from afspm.plugins.agent.twin import LONGEST_S
@@ -13,7 +14,6 @@ from afspm.plugins.agent.workplace import Workplace
 from afspm.plugins.web.gateway import views
 from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest
 from afspm.plugins.web.gateway.services import READER
-from afspm.record import ScanSummary
 
 MOST_AT_ONCE = 1
 

@@ -19,10 +19,10 @@ import numpy as np
 from afspm import Array, robust_spread
 from afspm.basics import AfspmError, Plain
 from afspm.model import Frame, ProblemNames
+from afspm.night import ScanSummary
 from afspm.plugins.agent.plan import Plan
 from afspm.plugins.agent.twin import LONGEST_S
 from afspm.plugins.web.archive import Archive
-from afspm.record import ScanSummary
 
 Values = Callable[[ScanSummary], Array | None]
 """Returns the values of a scan; None if they are no longer known."""

@@ -23,7 +23,9 @@ from numpy.typing import NDArray
 
 from afspm import Levelling, levelled
 from afspm.basics import AfspmError, Plain, escaped, iso_utc, parse_toml
+from afspm.drawing import indices, png, value_range
 from afspm.model import ControlMode, ControlResponse, ControlState, Proposal, names
+from afspm.night import ScanSummary
 from afspm.plugins.agent import arguments
 from afspm.plugins.agent.approval import preflight_of
 from afspm.plugins.agent.plan import Plan, PlannedRequest, plan_of, read_plan, read_step
@@ -35,7 +37,7 @@ from afspm.plugins.web.gateway.guard import PERSON
 from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest, of_error
 from afspm.plugins.web.gateway.services import READER
 from afspm.plugins.web.person_commands import PersonCommands
-from afspm.record import EXPERIMENT_FILE, ScanSummary, indices, png, value_range
+from afspm.record import EXPERIMENT_FILE
 
 INSTRUCTIONS = """A scanning probe microscope. You may look, propose plans, and stop. You measure only what a person
 has approved: one plan (propose, preflight, then wait for the approval, then run), or a grant (measure, within it).

@@ -21,11 +21,12 @@ import numpy as np
 
 from afspm import Levelling, levelled
 from afspm.basics import AfspmError, Plain
+from afspm.drawing import indices, png, value_range
 from afspm.emulation import ScanActivity, SimulatedInstrument
 from afspm.model import Frame, Request, component_of, names
 from afspm.plugins.agent.plan import MoveStep, Plan, ScanStep, SetStep, SpectrumStep, plan_of
 from afspm.processes import load_expanded
-from afspm.record import EXPERIMENT_FILE, indices, png, value_range
+from afspm.record import EXPERIMENT_FILE
 from afspm.scheduler import ExperimentLimits, LimitChecker, PlanRehearsal, not_of_role, number_of
 
 LONGEST_S = 60.0

@@ -15,7 +15,8 @@ from uuid import NAMESPACE_URL, uuid5
 from afspm import Run
 from afspm.basics import NS_PER_S, FileError
 from afspm.driver import hdf5_reading
-from afspm.record import ScanRow, SpectrumRow, field_names, measured_file
+from afspm.night import ScanRow, SpectrumRow
+from afspm.record import field_names, measured_file
 
 Document = tuple[str, dict[str, object]]
 """A document: its name and content."""

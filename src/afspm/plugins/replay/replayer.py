@@ -10,6 +10,7 @@ from itertools import islice
 from afspm import wire
 from afspm.basics import NS_PER_S, ExperimentClock, TransportError, WireError
 from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlResponse, Packet, Response
+from afspm.night import RecordPlayback
 from afspm.processes import (
     Network,
     PeerAsked,
@@ -21,7 +22,6 @@ from afspm.processes import (
     WakeUp,
     milliseconds,
 )
-from afspm.record import RecordPlayback
 
 REASON = "this is a replay of a recorded run: it takes no requests"
 FAREWELL_S = 0.5  # real: for the end to reach all subscribers

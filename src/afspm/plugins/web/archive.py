@@ -10,8 +10,9 @@ from pathlib import Path
 from afspm import open_run, wire
 from afspm.basics import AfspmError, Plain, parse_toml, si
 from afspm.model import PERSON, ProblemNames, Region, Scan, Spectrum
+from afspm.night import Overview
 from afspm.plugins.web.frames import ChannelFrame, FrameKey
-from afspm.record import EXPERIMENT_FILE, JOURNAL_FILE, Overview
+from afspm.record import EXPERIMENT_FILE, JOURNAL_FILE
 
 KEPT = 6
 _AGENT = "Agent"

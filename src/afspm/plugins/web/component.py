@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, ClassVar
 
 from afspm import Component
 from afspm.basics import NS_PER_S, ConfigError
+from afspm.night import plans_of
 from afspm.plugins.web.archive import Archive
 from afspm.plugins.web.server import STALLED_S, WebServer, listening, url_of
 from afspm.plugins.web.watch import Watch
 from afspm.processes import step_back
-from afspm.record import bands_allowed, cut_off_message, plans_of, run_json_or_empty
+from afspm.record import bands_allowed, cut_off_message, run_json_or_empty
 
 if TYPE_CHECKING:
     import socket

@@ -25,9 +25,9 @@ from afspm.model import (
     ScopeState,
     names,
 )
+from afspm.night import Overview
 from afspm.plugins.web.watch import Watch, is_free
 from afspm.processes import ExperimentLink
-from afspm.record import Overview
 
 ANSWER_S = 20.0  # real time for an answer
 FREE_S = 60.0  # real time for the microscope to reach a place

@@ -14,8 +14,9 @@ import numpy as np
 from afspm import Array, tip_verdict
 from afspm.basics import Clock
 from afspm.model import ChannelRoles, ProblemNames, Scan, ScanLines, ScopeState, Spectrum
+from afspm.night import Overview, Plans
 from afspm.plugins.web.frames import FrameStore
-from afspm.record import AllowedBands, Overview, Plans
+from afspm.record import AllowedBands
 
 MOST_SPECTRA, SPECTRA_BYTES = 200, 64 << 20
 

@@ -15,7 +15,8 @@ from afspm import Run, open_run
 from afspm.basics import NS_PER_S, ConfigError, InvalidValue, Plain, PlainMapping, duration_text, from_json, utc_time
 from afspm.plugins.what_if.what_if import changed_experiment
 from afspm.processes import RunOptions, own_homes, run_experiment, toml_text
-from afspm.record import ENDED, EXPERIMENT_FILE, RunStory, read_story, run_json_or_empty
+from afspm.record import ENDED, EXPERIMENT_FILE, run_json_or_empty
+from afspm.report import RunStory, read_story
 
 _TRUTH = "truth.jsonl"
 _LASTED = "lasted"

@@ -12,7 +12,7 @@ from afspm.basics import FileError, counted, day_and_time
 from afspm.plugins.what_if.alignment import Difference
 from afspm.plugins.what_if.side_by_side import changed_fields, message_name, sides, where
 from afspm.plugins.what_if.what_if import Row, WhatIf
-from afspm.record import document, section, table
+from afspm.report import document, section, table
 
 MOST_SHOWN = 100
 """The largest number of differences of a night on the page."""

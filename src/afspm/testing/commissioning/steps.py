@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 
 from afspm.basics.formatting import quantity
+from afspm.drawing import raster
 from afspm.model import ChannelRoles, ControlRequest, Feedback, RegionChange, Scan, ScanParameters, ScopeState, names
-from afspm.record.drawing import raster
 from afspm.testing.commissioning import lines_in_scan
 from afspm.testing.commissioning.guide import Guide
 from afspm.testing.commissioning.progress import CommissioningStep

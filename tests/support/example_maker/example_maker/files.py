@@ -14,7 +14,7 @@ from afspm import Run
 from afspm.basics import FileError
 from afspm.driver import FileContent, OtherFormat, netcdf
 from afspm.model import Region, Scan
-from afspm.record import ScanRow, SpectrumRow
+from afspm.night import ScanRow, SpectrumRow
 
 
 def packed(scans: Iterable[Scan]) -> bytes:

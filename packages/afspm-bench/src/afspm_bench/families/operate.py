@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from afspm.basics import quantity
 from afspm.model import names
-from afspm.record import ScanRow
+from afspm.night import ScanRow
 from afspm_bench.evidence import Evidence
 from afspm_bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, nm, place_text, rounded
 

@@ -20,12 +20,14 @@ import numpy as np
 
 from afspm import Array, Run
 from afspm.basics import FileError, InvalidValue
+from afspm.drawing import reduced
 from afspm.model import XY, Frame, Region, Scan, ScanSet
+from afspm.night import ScanRow
 from afspm.plugins.drift.estimators.correlation import Correlation
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
 from afspm.plugins.drift.pairs.images import Unusable, prepare
 from afspm.plugins.drift.registration import DriftScan, Registration
-from afspm.record import ScanRow, reduced, topography
+from afspm.report import topography
 
 _log = logging.getLogger("afspm.drift")
 COARSE_PX = 64

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from afspm import Array
 from afspm.basics import InvalidValue, typeset_length
+from afspm.drawing import round_length_m
 from afspm.plugins.drift.registration import DriftScan, Matches
 from afspm.plugins.drift.report.style import (
     BLUE,
@@ -37,7 +38,6 @@ from afspm.plugins.drift.report.style import (
     unit_of,
 )
 from afspm.plugins.drift.track.record import DriftRecord
-from afspm.record import round_length_m
 
 
 def draw_offsets(

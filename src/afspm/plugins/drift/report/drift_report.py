@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from afspm import Run, wire
 from afspm.plugins.drift.track.record import DriftRecord
-from afspm.record import OFFSET, drift_at, drift_knowledge, is_ours
+from afspm.record import drift_at, drift_knowledge
+from afspm.report import OFFSET, is_ours
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -39,8 +39,8 @@ def compare(
     from afspm import open_run
     from afspm.plugins.drift.report.scan_pair import onto_first
     from afspm.processes import plain_console, plain_table
-    from afspm.record import compare as compared
-    from afspm.record import rows_that_differ, write_comparison
+    from afspm.report import compare as compared
+    from afspm.report import rows_that_differ, write_comparison
 
     with ExitStack() as stack:
         found = compared([stack.enter_context(open_run(folder)) for folder in runs], onto_first)

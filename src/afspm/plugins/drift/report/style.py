@@ -17,8 +17,8 @@ from matplotlib.ticker import FuncFormatter
 
 from afspm import Array, flattened
 from afspm.basics import Plain, scale
+from afspm.drawing import ValueRange, draw_scale_bar, save_figure, shared_range
 from afspm.plugins.drift.registration import DriftScan
-from afspm.record import ValueRange, draw_scale_bar, save_figure, shared_range
 
 WIDTH_IN = 7.2  # two columns of a journal
 ORANGE, BLUE, GREEN, MAGENTA, GREY = "#EE7733", "#0077BB", "#009988", "#EE3377", "#999999"  # P. Tol's vibrant scheme

@@ -11,8 +11,9 @@ import numpy as np
 
 from afspm import Array
 from afspm.basics import Plain, quantity, time_of_day, typeset_position, zone_offset_s
+from afspm.drawing import Axis, Curve, thinned
 from afspm.model import RegistrationOutcome, Spectrum, registration_summary
-from afspm.record import Axis, Curve, DriftPoint, thinned
+from afspm.night import DriftPoint
 
 Options = Plain
 BEFORE = 6  # spectra that are shown faintly behind the newest

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 
 from afspm.model import names
+from afspm.night import RunningScan
 from afspm.plugins.web.dashboard.actions import Action, ActionResult
 from afspm.plugins.web.watch import Watch
-from afspm.record import RunningScan
 
 LABELS = {names.TIP_BIAS_VOLTAGE: "Bias", names.SCAN_SPEED: "Speed", names.ZCTRL_SETPOINT: "Setpoint"}
 KEPT = 2_000

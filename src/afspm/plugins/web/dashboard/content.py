@@ -10,6 +10,7 @@ from datetime import datetime
 from html import escape
 
 from afspm.basics import NS_PER_S, day_and_time, duration_text, time_of_day, typeset_area
+from afspm.drawing import TimelineRow, timeline_html, tint_class
 from afspm.model import (
     PERSON,
     ControlMode,
@@ -22,22 +23,12 @@ from afspm.model import (
     Region,
     TipStatus,
 )
+from afspm.night import OVER, Overview, ScanSummary, Span, Timeline, instrument_curves
 from afspm.plugins.web.dashboard.charts import Chart, drift_chart
 from afspm.plugins.web.dashboard.flags import Flag, flags
 from afspm.plugins.web.dashboard.sample_map import MapContent, map_html, picture_url
 from afspm.plugins.web.watch import Watch
-from afspm.record import (
-    OVER,
-    AllowedBands,
-    Overview,
-    ScanSummary,
-    Span,
-    Timeline,
-    TimelineRow,
-    instrument_curves,
-    timeline_html,
-    tint_class,
-)
+from afspm.record import AllowedBands
 
 LEAST_AGE_S = 0.4  # age of the content before it is made again, at any rate of messages
 SLOWLY_S = 2.0  # the same for slow content

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from afspm.model import STOPPED_BY_AGENT, ControlMode, ControlState, Problem
-from afspm.record import ROUTINE, Overview
+from afspm.night import ROUTINE, Overview
 
 _ADVICE = {
     Problem.TIP_SHAPE_CHANGED: "condition or change the tip, then clear the problem.",

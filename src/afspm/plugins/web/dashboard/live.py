@@ -14,13 +14,13 @@ import numpy as np
 from fastapi import Depends, FastAPI, Response
 from fastapi.responses import PlainTextResponse
 
+from afspm.drawing import DIVERGING, LEVELS, PALETTES, png, profile
 from afspm.plugins.web.archive import Archive
 from afspm.plugins.web.dashboard.conditions import Conditions
 from afspm.plugins.web.dashboard.pictures import Look, PictureCache, RenderedFrame, Thumbnails
 from afspm.plugins.web.dashboard.scan_facts import Facts, began_ns, scan_facts
 from afspm.plugins.web.frames import ChannelFrame, number_or_none
 from afspm.plugins.web.watch import Bell, Watch
-from afspm.record import DIVERGING, LEVELS, PALETTES, png, profile
 
 POLL_S = 20.0  # then the browser repeats its request: proxies may close a connection that is silent for longer
 GROWING_S = 0.2  # between two pictures of a growing scan

@@ -14,9 +14,10 @@ import numpy as np
 from afspm import Array, Run, open_run
 from afspm.basics import FileError, NeverLate
 from afspm.model import XY, Note, Scan
+from afspm.night import Overview, RecordPlayback
 from afspm.plugins.web.frames import FrameStore
 from afspm.plugins.web.watch import SpectrumStore, Watch
-from afspm.record import Overview, RecordPlayback, bands_allowed
+from afspm.record import bands_allowed
 
 if TYPE_CHECKING:
     from afspm.wire.messages import DriftMapping

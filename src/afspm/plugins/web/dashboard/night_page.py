@@ -20,7 +20,9 @@ from nicegui import events, ui
 
 from afspm import Levelling, append_note, levelled
 from afspm.basics import AfspmError, ExperimentClock, InvalidValue, Plain, time_of_day, typeset_area, zone_offsets_s
+from afspm.drawing import DIVERGING, ValueRange, indices, png, value_range
 from afspm.model import PERSON
+from afspm.night import ScanRow
 from afspm.plugins.drift.report.scan_pair import onto_first
 from afspm.plugins.web.archive import Archive, allowed_region
 from afspm.plugins.web.dashboard import shadow_marks
@@ -31,18 +33,8 @@ from afspm.plugins.web.dashboard.night import Night, NightWatch
 from afspm.plugins.web.dashboard.page import ASSETS, TABS, Page, Services, section
 from afspm.plugins.web.dashboard.pictures import Look, RenderedFrame
 from afspm.plugins.web.frames import ChannelFrame
-from afspm.record import (
-    DIVERGING,
-    REPORT_FILE,
-    ScanRow,
-    ValueRange,
-    bands_allowed,
-    describe_state,
-    indices,
-    png,
-    value_range,
-    write_report,
-)
+from afspm.record import bands_allowed, describe_state
+from afspm.report import REPORT_FILE, write_report
 
 _HEAD = """<link rel="stylesheet" href="assets/night.css"><script type="module" src="assets/night.js"></script>"""
 

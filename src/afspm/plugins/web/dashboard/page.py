@@ -13,6 +13,7 @@ from typing import ClassVar
 from nicegui import ui
 
 from afspm import Levelling
+from afspm.drawing import PALETTES, TIMELINE_CSS
 from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.dashboard.actions import Steering
 from afspm.plugins.web.dashboard.approvals import ApprovalBar
@@ -23,7 +24,6 @@ from afspm.plugins.web.dashboard.sign_in import SIGN_IN
 from afspm.plugins.web.dashboard.steering_panel import ModeButtons, ProblemBar, SteeringPanel
 from afspm.plugins.web.dashboard.steering_session import SteeringSession
 from afspm.plugins.web.watch import Audience, Watch
-from afspm.record import PALETTES, TIMELINE_CSS
 
 ASSETS = Path(__file__).with_name("assets")
 REFRESH_S = 0.5

@@ -11,6 +11,7 @@ from html import escape
 from nicegui import context, events, ui
 
 from afspm.basics import NS_PER_S, duration_text, time_of_day
+from afspm.drawing import tint_class
 from afspm.model import LogLine, ProcessCondition, ProcessState
 from afspm.plugins.web.dashboard.access import Visitor
 from afspm.plugins.web.dashboard.actions import ActionResult, Steering
@@ -20,7 +21,6 @@ from afspm.plugins.web.dashboard.scan_facts import summary_of, tip_facts
 from afspm.plugins.web.dashboard.steering_panel import ask_restart
 from afspm.plugins.web.dashboard.steering_session import SteeringSession, button
 from afspm.plugins.web.watch import Watch
-from afspm.record import tint_class
 
 MOST_LINES = 300
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from afspm import Array, Levelling, flattened, levelled
+from afspm.drawing import PALETTES, Contrast, ValueRange, indices, png, shared_range, shown_image
 from afspm.plugins.web.dashboard.scan_facts import Facts
 from afspm.plugins.web.frames import ChannelFrame
-from afspm.record import PALETTES, Contrast, ValueRange, indices, png, shared_range, shown_image
 
 KEPT, THUMBNAILS_KEPT = 8, 600
 SIDE_PX = 128

@@ -12,8 +12,9 @@ import numpy as np
 
 from afspm import Array
 from afspm.basics import counted, quantity, scale, time_of_day, typeset_area, typeset_position
+from afspm.drawing import Axis
 from afspm.model import XY, Region
-from afspm.record import Axis, FoundPlace, ScanSummary, SpectrumSummary
+from afspm.night import FoundPlace, ScanSummary, SpectrumSummary
 
 MOST_PLACES = 1500
 MOST_PICTURES = 300

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from afspm import SD_PER_MAD
 from afspm.basics import NS_PER_S, duration_text, quantity, scale, time_of_day, typeset, typeset_area
 from afspm.model import RETRACE, XY, ActByHand, ChannelRoles, TipStatus
+from afspm.night import Overview, ScanSummary
 from afspm.plugins.web.frames import ChannelFrame
-from afspm.record import Overview, ScanSummary
 
 _MOST_LINES = 512
 _LAST_LINES, _FEWEST = 32, 8

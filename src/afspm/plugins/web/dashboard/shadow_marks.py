@@ -12,7 +12,7 @@ from afspm import open_run
 from afspm.basics import time_of_day
 from afspm.plugins.web.dashboard.access import Visitor
 from afspm.plugins.web.dashboard.actions import Steering
-from afspm.record import shadow_report
+from afspm.report import shadow_report
 
 
 class ShadowMarks:

@@ -10,6 +10,7 @@ from html import escape
 from nicegui import events, ui
 
 from afspm.basics import PlainMapping, time_of_day, typeset_position
+from afspm.drawing import tint_class
 from afspm.model import ControlMode, Region, TipStatus
 from afspm.plugins.web.dashboard.actions import Actions
 from afspm.plugins.web.dashboard.content import Content
@@ -18,7 +19,6 @@ from afspm.plugins.web.dashboard.grant_dialog import GrantDialog
 from afspm.plugins.web.dashboard.parameter_form import ParameterForm
 from afspm.plugins.web.dashboard.scan_dialog import ScanDialog
 from afspm.plugins.web.dashboard.steering_session import SteeringSession, asked, button
-from afspm.record import tint_class
 
 _MANUAL = "Scan here and Spectrum here, beside the scan, measure where you point."
 _TAKE_OVER = "In MANUAL you can set parameters, scan and take spectra here."

@@ -16,6 +16,7 @@ from afspm import Levelling
 from afspm.basics import iso_utc
 from afspm.model import ControlMode, ControlResponse, ControlState, Spectrum, names
 from afspm.model import Response as ModelResponse
+from afspm.night import ScanSummary, SpectrumSummary
 from afspm.plugins.web.gateway import views
 from afspm.plugins.web.gateway.models import (
     ActionModel,
@@ -34,7 +35,6 @@ from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest, refu
 from afspm.plugins.web.gateway.services import GatewayServices
 from afspm.plugins.web.gateway.stream import MOST_STREAMS, server_sent
 from afspm.plugins.web.person_commands import PersonCommands
-from afspm.record import ScanSummary, SpectrumSummary
 
 NEWEST = "newest"
 FRESH_S = 1.0

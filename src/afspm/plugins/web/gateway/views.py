@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from afspm import Levelling, from_parameter, levelled, wire
 from afspm.basics import iso_utc
+from afspm.drawing import indices, png, value_range
 from afspm.model import Region, Response, names
+from afspm.night import Overview, ScanSummary, SpectrumSummary
 from afspm.plugins.web.frames import number_or_none
 from afspm.plugins.web.gateway.models import (
     ArrayModel,
@@ -23,7 +25,6 @@ from afspm.plugins.web.gateway.models import (
     ScanModel,
     SpectrumModel,
 )
-from afspm.record import Overview, ScanSummary, SpectrumSummary, indices, png, value_range
 
 CHUNK_BYTES = 3 << 16  # a multiple of three, so that pieces of base64 fit together
 

@@ -1,0 +1,45 @@
+"""What people look at: the report of a night, exports, films, figures, comparisons, the shadow's table."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from afspm.basics.lazy import lazily
+
+if TYPE_CHECKING:
+    from afspm.report.markup import document, section, table
+
+if TYPE_CHECKING:  # drift completes the report, and compares nights
+    from afspm.report.comparison import compare
+    from afspm.report.comparison_page import rows_that_differ
+    from afspm.report.comparison_page import write as write_comparison
+    from afspm.report.pictures import OFFSET, is_ours, topography
+
+if TYPE_CHECKING:  # the page writes and shows it
+    from afspm.report import shadow as shadow_report
+    from afspm.report.night_report import REPORT_FILE
+    from afspm.report.night_report import write as write_report
+
+if TYPE_CHECKING:  # a replay is compared by its story
+    from afspm.report.story import RunStory
+    from afspm.report.story import read as read_story
+
+__all__ = [
+    "OFFSET",
+    "REPORT_FILE",
+    "RunStory",
+    "compare",
+    "document",
+    "is_ours",
+    "read_story",
+    "rows_that_differ",
+    "section",
+    "shadow_report",
+    "table",
+    "topography",
+    "write_comparison",
+    "write_report",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazily(__name__)
