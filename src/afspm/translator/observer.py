@@ -217,8 +217,9 @@ class Observer:
         gives_back = self._is_after_spectrum and status.state is ScopeState.FREE
         if is_over or gives_back:
             # after the state: the tip may have been withdrawn between the reading of the values and the end. The values
-            # that the result stands for are read by its verdict, and all others by the next look.
-            if changed := self._changed(*_TIP):
+            # that the result stands for are read by its verdict, values that a spectrum has swept here, before they
+            # could be taken for a person's, and all others by the next look.
+            if changed := self._changed(*_TIP, *self.panel.swept(self.values)):
                 self._take_in_and_publish({**self.values, **changed})
             values = True
         if values:

@@ -137,6 +137,10 @@ class PanelWatch:
         self._before_spectrum, self._by_hand = {}, {}
         self.feedback.lost()
 
+    def swept(self, now: Mapping[str, Value]) -> list[str]:
+        """Return the settings that a reading in a spectrum shows otherwise than before it; empty after its end."""
+        return [name for name, value in self._before_spectrum.items() if now.get(name, value) != value]
+
     def read(
         self, before: Mapping[str, Value], now: Mapping[str, Value], state: ScopeState, now_ns: int, withdrew: str = ""
     ) -> list[ActByHand]:

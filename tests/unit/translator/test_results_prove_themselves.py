@@ -100,6 +100,20 @@ def test_curve_is_complete_if_the_controller_gives_the_feedback_back_late(bench:
     assert acts(bench) == []
 
 
+@pytest.mark.parametrize("held", [False, True])
+def test_value_that_a_spectrum_sweeps_is_no_act_by_hand_in_a_series(bench: Any, held: bool) -> None:
+    for name in ("a", "b", "c"):
+        assert bench.ask(ACTION, names.START_SPEC).code == OK
+        bench.microscope.values |= {"Bias": -700.0, "PX": 0.3, "Loop": not held}
+        bench.look(2.0)  # reads all settings in the spectrum
+        curve(bench, name)
+        bench.microscope.values |= {"Bias": 100.0, "PX": 0.0, "Loop": True}
+        bench.look(0.01)
+        assert bench.heard()[-1] == "FREE"
+    bench.look(2.0)
+    assert acts(bench) == []
+
+
 # results M1
 @pytest.mark.parametrize("name", ["Loop", "Engaged"])
 def test_scan_is_not_complete_if_the_tip_was_changed_while_no_translator_ran(bench: Any, scan: Any, name: str) -> None:
