@@ -91,7 +91,7 @@ class Metadata(Component):
     def _follow_scans(self, thing: object) -> None:
         # kept by number: what a measurement began with is needed at its end, perhaps by a later life of this component
         before, self._history = self._history, self._history.step(thing, self._packet_ns)
-        if self._history.begun == before.begun:
+        if (self._history.begun, self._history.is_running) == (before.begun, before.is_running):
             return
         kept = {one["number"]: one for one in self.memory.get("begun", ())}
         if self._history.count > before.count:
@@ -101,8 +101,10 @@ class Metadata(Component):
             }  # fmt: skip
             self.memory["newest_ns"] = newest.began_ns
         self.memory["begun"] = [
-            kept[one.number] | {"ended_ns": one.ended_ns, "channels": one.channels} for one in self._history.begun
+            kept[one.number] | {"ended_ns": one.ended_ns, "channels": one.channels, "is_presumed": one.is_presumed}
+            for one in self._history.begun
         ]
+        self.memory["is_running"] = self._history.is_running
         self.memory["state_ns"] = self._history.state_ns
         self.memory.save()
 
@@ -110,12 +112,14 @@ class Metadata(Component):
         begun = tuple(
             BegunMeasurement(
                 ScopeState[one["doing"]], one["number"], one["began_ns"],
-                ended_ns=one["ended_ns"], channels=tuple(one["channels"]),
+                ended_ns=one["ended_ns"], channels=tuple(one["channels"]), is_presumed=one["is_presumed"],
             )
             for one in self.memory.get("begun", ())
         )  # fmt: skip
         count = max((one.number for one in begun), default=0)
-        return ScanHistory(begun=begun, count=count, is_observed=bool(begun), state_ns=self.memory.get("state_ns", -1))
+        is_running = bool(begun) and self.memory.get("is_running", False)
+        state_ns = self.memory.get("state_ns", -1)
+        return ScanHistory(begun=begun, is_running=is_running, count=count, is_observed=bool(begun), state_ns=state_ns)
 
     @property
     def _packet_ns(self) -> int:

@@ -136,7 +136,7 @@ class ScanHistory:
             return self
         ended_ns = published_ns if measured_ns is None else measured_ns
         channels = found.channels if channel in found.channels else (*found.channels, channel)
-        with_it = replace(found, ended_ns=ended_ns, channels=channels)
+        with_it = replace(found, ended_ns=ended_ns, channels=channels, is_presumed=False)
         after = replace(self, begun=tuple(with_it if one is found else one for one in self.begun))
         return after._begin(doing, ended_ns, is_presumed=True) if found is self.running else after
 
@@ -160,7 +160,9 @@ class ScanHistory:
         found = self._found(doing, published_ns, measured_ns, channel) or BegunMeasurement(doing)
         for one in reversed(self.conditions):
             if one.time_ns == measured_ns or (filename and one.filename == filename):
-                return replace(found, began_ns=one.began_ns or found.began_ns, asked_by=one.holder)
+                # who is in control where a scan is first seen need not have begun it
+                control = None if one.holder and found.began_ns is None else found.control
+                return replace(found, began_ns=one.began_ns or found.began_ns, asked_by=one.holder, control=control)
         return found
 
     def _found(

@@ -211,9 +211,10 @@ class MeasurementHistory:
             began_ns = self.running.began_ns if began_ns is None else began_ns
             self.running.published = True
             outside |= self.running.outside
+        holder = begun.holder if begun.number or begun.asked_by else holder
         summary = ScanSummary(
             scan.time_ns or time_ns, began_ns, scan.channel, scan.unit, scan.region, scan.shape, scan.filename,
-            begun.holder if begun.number else holder, setpoint=_setpoint(begun), outside=tuple(sorted(outside)),
+            holder, setpoint=_setpoint(begun), outside=tuple(sorted(outside)),
         )  # fmt: skip
         self._add_channel(summary)
 

@@ -446,7 +446,7 @@ class Overview:
 
     def _on_spectrum(self, spectrum: Spectrum, time_ns: int) -> None:
         begun = self._story.of(spectrum, time_ns)
-        self._measured.add_spectrum(spectrum, time_ns, begun.holder if begun.number else self._holder)
+        self._measured.add_spectrum(spectrum, time_ns, begun.holder if begun.number or begun.asked_by else self._holder)
 
     def _on_instrument_readings(self, report: InstrumentReadings, time_ns: int) -> None:
         for one in report.readings:

@@ -89,6 +89,14 @@ SEQUENCES: dict[str, tuple[list[Step], list[tuple[float | None, str | None]]]] =
     "unseen": ([*BEGIN, (9, scan(9)), (9.1, FREE), (30, scan(30))], [(2, "a"), (None, None)]),
     "by its translator": ([*BEGIN, (9, told(9, 1.9, "a")), (9, scan(9)), (9.1, FREE)], [(1.9, "a")]),
     "unseen, by its translator": ([(3, SCANNING), (9, told(9, 1.9, "c")), (9, scan(9))], [(1.9, "c")]),
+    "joined in it, by its translator": (
+        [(2.5, "person"), (3, SCANNING), (9, told(9, 1.9, "series")), (9, scan(9))],
+        [(1.9, "series")],
+    ),
+    "channels without a time, stays scanning": (
+        [*BEGIN, *((at_s + k / 10, scan(None, str(k))) for at_s in (10, 20, 30) for k in (0, 1))],
+        [(2, "a"), (2, "a"), (10, "a"), (10, "a"), (20, "a"), (20, "a")],
+    ),
     "curves": ([(0, FREE), (1, "a"), (2, SPEC), (3, curve(3)), (4, curve(4)), (4.1, FREE)], [(2, "a"), (3, "a")]),
     "a curve after a scan": (
         [*BEGIN, (9, FREE), (10, SPEC), (11, scan(9)), (12, curve(12)), (12.1, FREE)],
