@@ -580,6 +580,20 @@ def test_replaced_plan_shortens_its_scan_alone(agent: AgentLab) -> None:
     assert stopped(agent)
 
 
+# faults 4
+def test_refused_start_of_an_agent_stops_no_scan_of_another(agent: AgentLab) -> None:
+    assert agent.lab.take_control("series") is OK
+    assert agent.do(ACTION, names.START_SCAN, who="series") == ""
+    agent.lab.scope_is(ScopeState.SCANNING)
+    agent.lab.says("series", ControlRequest.RELEASE_CTRL)
+    agent.begin(agent.grant(lasts_s=200.0))
+    assert agent.do(SCAN, ScanParameters(HERE)) == ""
+    assert agent.do(ACTION, names.START_SCAN, answers=ControlResponse.NOT_FREE) == ""
+    agent.lab.says(AGENT, ControlRequest.RELEASE_CTRL)
+    passes(agent, 201.0)
+    assert not stopped(agent)
+
+
 def test_one_packet_revokes_and_takes_control(agent: AgentLab) -> None:
     agent.begin(agent.grant())
     assert agent.do(SCAN, ScanParameters(HERE)) == ""

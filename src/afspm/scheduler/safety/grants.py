@@ -146,11 +146,13 @@ class AgentMeasurement:
         who: the agent; empty: the newest measurement is not of an agent, or has ended.
         until_ns: the experiment time at which that approval runs out.
         plan: the plan that was approved; empty: the approval is a grant.
+        request_id: the id of the request that began it.
     """
 
     who: str = ""
     until_ns: int = 0
     plan: str = ""
+    request_id: str = ""
 
 
 @dataclass(frozen=True)
@@ -432,10 +434,10 @@ class GrantChecker:
         spent = checker._spent(who, request.id)
         if spent is None or not spent.until_ns:
             return checker
-        # this start may be refused: the measurement that runs already keeps its earlier end
-        running = checker.book.measurement
-        is_earlier = is_measuring and running.who and running.until_ns < spent.until_ns
-        return checker if is_earlier else checker._with(measurement=_begun(who, spent))
+        begun, running = _begun(who, spent), checker.book.measurement
+        if is_measuring and running.who:  # this start may be refused: an earlier end holds for both
+            begun = replace(running, until_ns=min(running.until_ns, begun.until_ns))
+        return checker._with(measurement=begun)
 
     def _counting(self, who: str, request: Request, now_ns: int, offset_m: XY | None) -> GrantChecker:
         if not self.rules.is_agent(who) and self._role(who) is None:
@@ -460,6 +462,8 @@ class GrantChecker:
         if not request.id or (spent := self._spent(who, request.id)) is None:
             return self
         book = self.book
+        if (book.measurement.who, book.measurement.request_id) == (who, request.id):
+            book = replace(book, measurement=AgentMeasurement())  # another client's measurement may be running
         plan, grant = book.plans.get(who), book.grants.get(who)
         if spent.plan:
             if plan is not None and plan.unsettled == request.id:
@@ -620,7 +624,7 @@ def _is_start(request: Request) -> bool:
 
 
 def _begun(agent: str, spent: SpentRequest) -> AgentMeasurement:
-    return AgentMeasurement(agent, spent.until_ns, spent.plan)
+    return AgentMeasurement(agent, spent.until_ns, spent.plan, spent.request_id)
 
 
 def _limits_of(grant: Grant) -> ExperimentLimits:
