@@ -457,6 +457,143 @@ def test_end_of_a_scan_survives_the_death_of_the_scheduler(agent: AgentLab) -> N
     assert stopped(agent)
 
 
+# faults 4
+def test_approval_of_a_pulse_stops_no_scan_begun_at_the_panel(agent: AgentLab) -> None:
+    agent.begin(agent.grant(lasts_s=200.0, counts=(GrantedCount(names.PULSE, 1),)))
+    agent.lab.scope_is(ScopeState.FREE)
+    assert agent.do(int(ControlRequest.SET_PROBE_POS), ProbePosition((0.0, 0.0))) == ""
+    assert agent.do(ACTION, names.PULSE) == ""
+    agent.lab.says(AGENT, ControlRequest.RELEASE_CTRL)
+    agent.lab.scope_is(ScopeState.SCANNING)
+    passes(agent, 201.0)
+    assert not stopped(agent)
+
+
+def test_approval_of_a_start_without_effect_stops_no_scan_begun_at_the_panel(agent: AgentLab) -> None:
+    agent.lab.scope_is(ScopeState.FREE)
+    agent.begin(agent.grant(lasts_s=200.0))
+    assert agent.do(SCAN, ScanParameters(HERE)) == ""
+    assert agent.do(ACTION, names.START_SCAN) == ""
+    agent.lab.scope_is(ScopeState.FREE)
+    agent.lab.says(AGENT, ControlRequest.RELEASE_CTRL)
+    agent.lab.later(real_s=agent.settings.control.request_timeout_s + 1.0)
+    agent.lab.scope_is(ScopeState.SCANNING)
+    passes(agent, 201.0)
+    assert not stopped(agent)
+
+
+def test_scan_of_an_added_action_ends_with_its_approval(agent: AgentLab) -> None:
+    agent.begin(agent.grant(lasts_s=200.0, counts=(GrantedCount("x-map", 1),)))
+    agent.lab.scope_is(ScopeState.FREE)
+    assert agent.do(int(ControlRequest.SET_PROBE_POS), ProbePosition((0.0, 0.0))) == ""
+    assert agent.do(ACTION, "x-map", answers=None) == ""
+    agent.lab.scope_is(ScopeState.SPEC)
+    agent.lab.answer(sent(agent.lab)[-1])
+    passes(agent, 201.0)
+    assert sent(agent.lab)[-1].request.subject == names.STOP_SPEC
+
+
+def test_old_state_before_the_scan_of_an_agent_lets_it_end_with_its_approval(agent: AgentLab) -> None:
+    agent.lab.scope_is(ScopeState.FREE)
+    agent.begin(agent.grant(lasts_s=200.0))
+    assert agent.do(SCAN, ScanParameters(HERE)) == ""
+    assert agent.do(ACTION, names.START_SCAN) == ""
+    agent.lab.scope_is(ScopeState.FREE)  # a packet from before the start
+    agent.lab.says(AGENT, ControlRequest.RELEASE_CTRL)
+    assert agent.lab.take_control("series") is OK
+    assert agent.do(ACTION, names.START_SCAN, who="series", answers=None) == ""
+    agent.lab.scope_is(ScopeState.SCANNING)
+    agent.lab.answer(sent(agent.lab)[-1], ControlResponse.NOT_FREE)
+    passes(agent, 201.0)
+    assert stopped(agent)
+
+
+@pytest.mark.parametrize("comes_first", ["answer", "state"])
+@pytest.mark.parametrize("real_s", [0.0, 6.0])
+def test_scan_of_another_after_a_restart_outlasts_the_approval_of_an_agent(
+    agent: AgentLab, comes_first: str, real_s: float
+) -> None:
+    agent.begin(agent.grant(lasts_s=200.0))
+    scanning(agent)
+    agent.lab.says(AGENT, ControlRequest.RELEASE_CTRL)
+    agent.lab = killed(agent.lab, agent.settings)
+    agent.lab.scope_is(ScopeState.FREE)  # the scan has ended while no scheduler ran
+    agent.lab.later(real_s=real_s)
+    assert agent.lab.take_control("series") is OK
+    assert agent.do(ACTION, names.START_SCAN, who="series", answers=None) == ""
+    start = sent(agent.lab)[-1]
+    if comes_first == "answer":
+        agent.lab.answer(start)
+    agent.lab.scope_is(ScopeState.SCANNING)
+    if comes_first == "state":
+        agent.lab.answer(start)
+    passes(agent, 201.0)
+    assert not stopped(agent)
+
+
+def test_scan_at_the_panel_some_time_after_a_restart_outlasts_the_approval_of_an_agent(agent: AgentLab) -> None:
+    agent.begin(agent.grant(lasts_s=200.0))
+    scanning(agent)
+    agent.lab.says(AGENT, ControlRequest.RELEASE_CTRL)
+    agent.lab = killed(agent.lab, agent.settings)
+    agent.lab.scope_is(ScopeState.FREE)
+    agent.lab.later(real_s=agent.settings.control.request_timeout_s + 1.0)
+    agent.lab.scope_is(ScopeState.SCANNING)
+    passes(agent, 201.0)
+    assert not stopped(agent)
+
+
+def test_scan_of_a_repeated_start_ends_with_its_approval(agent: AgentLab) -> None:
+    agent.lab.scope_is(ScopeState.FREE)
+    agent.begin(agent.grant(lasts_s=200.0, counts=(GrantedCount(names.START_SCAN, 1),)))
+    assert agent.do(SCAN, ScanParameters(HERE)) == ""
+    assert agent.do(ACTION, names.START_SCAN, id_=f"{AGENT}/1/again", answers=None) == ""
+    for _ in range(4):  # the translator hangs: no answer, then no more wait for a late one
+        agent.lab.later(real_s=agent.settings.control.request_timeout_s + 1.0)
+        agent.lab.step(Tick())
+    agent.lab.scope_is(ScopeState.FREE)
+    assert agent.do(ACTION, names.START_SCAN, id_=f"{AGENT}/1/again") == ""
+    assert agent.lab.core.state.grants.book.approvals().approvals[0].left == (GrantedCount(names.START_SCAN, 0),)
+    agent.lab.scope_is(ScopeState.SCANNING)
+    agent.lab.says(AGENT, ControlRequest.RELEASE_CTRL)
+    passes(agent, 201.0)
+    assert stopped(agent)
+
+
+def test_next_plan_does_not_shorten_the_last_scan_of_a_completed_plan(agent: AgentLab) -> None:
+    steps = (SCAN, ScanParameters(HERE)), (ACTION, names.START_SCAN)
+    agent.begin(agent.plan(*steps))
+    scanning(agent)
+    assert agent.give(replace(agent.plan(*steps, lasts_s=300.0), plan="next")) is OK
+    passes(agent, 301.0)
+    assert not stopped(agent)
+    passes(agent, 1500.0)
+    assert stopped(agent)
+
+
+def test_replaced_plan_shortens_its_scan_alone(agent: AgentLab) -> None:
+    steps = (SCAN, ScanParameters(HERE)), (ACTION, names.START_SCAN), (ACTION, names.START_SCAN)
+    agent.begin(agent.plan(*steps))
+    scanning(agent)
+    assert agent.give(replace(agent.plan(*steps, lasts_s=300.0), plan="next")) is OK
+    passes(agent, 301.0)
+    assert stopped(agent)
+
+
+# faults 4
+def test_refused_start_of_an_agent_stops_no_scan_of_another(agent: AgentLab) -> None:
+    assert agent.lab.take_control("series") is OK
+    assert agent.do(ACTION, names.START_SCAN, who="series") == ""
+    agent.lab.scope_is(ScopeState.SCANNING)
+    agent.lab.says("series", ControlRequest.RELEASE_CTRL)
+    agent.begin(agent.grant(lasts_s=200.0))
+    assert agent.do(SCAN, ScanParameters(HERE)) == ""
+    assert agent.do(ACTION, names.START_SCAN, answers=ControlResponse.NOT_FREE) == ""
+    agent.lab.says(AGENT, ControlRequest.RELEASE_CTRL)
+    passes(agent, 201.0)
+    assert not stopped(agent)
+
+
 def test_one_packet_revokes_and_takes_control(agent: AgentLab) -> None:
     agent.begin(agent.grant())
     assert agent.do(SCAN, ScanParameters(HERE)) == ""

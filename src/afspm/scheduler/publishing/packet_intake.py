@@ -123,11 +123,11 @@ def _give_to_person(draft: StateDraft, why: str) -> None:
 
 
 def _update_scope_state(draft: StateDraft, state: ScopeState) -> None:
-    was_free = draft.microscope.is_free
-    draft.microscope = draft.microscope.with_state(state, draft.now_s)
+    before = draft.microscope
+    draft.microscope = before.with_state(state, draft.now_s)
     draft.watchdog = draft.watchdog.state_reported(draft.microscope)
-    approvals.state_changed(draft)
-    if draft.microscope.is_free != was_free:
+    approvals.state_changed(draft, before)
+    if draft.microscope.is_free != before.is_free:
         draft.lease = draft.lease.used(draft.now_ns)
     flagged_by = draft.control.problems.get(Problem.DEVICE_MALFUNCTION)
     # only the flag raised for the translator: a flag of a component waits for a person (decision 0016)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from afspm.model import ControlRequest, ControlResponse, ProbePosition, Request, Response
+from afspm.model import ControlRequest, ControlResponse, ProbePosition, Request, Response, ScopeState
 from afspm.model.geometry import XY
-from afspm.model.microscope_status import STARTS, STOPS
+from afspm.model.microscope_status import STARTS, STOPS, MicroscopeStatus
 from afspm.scheduler.control import control_change
 from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlInput
 from afspm.scheduler.coordinate_frame import MappedRequest
@@ -74,10 +74,17 @@ def _may_measure(draft: StateDraft) -> bool:
     return not STOPS.keys().isdisjoint(states) or draft.forwarder.action_in_flight in STARTS
 
 
-def state_changed(draft: StateDraft) -> None:
-    """Forget the newest measurement of an agent once it has ended: the next one may be of another client."""
+def state_changed(draft: StateDraft, before: MicroscopeStatus) -> None:
+    """Forget the newest measurement of an agent once it has ended, or once another client or a person measures."""
+    state, flight = draft.microscope.state, draft.forwarder.flight
     if not _may_measure(draft):
         draft.grants = draft.grants.measured()
+    # not after a loss of the controller: its measurement may have gone on
+    elif before.state is ScopeState.FREE and state in STOPS and state not in before.possible_states(draft.now_s):
+        if flight is not None and flight.request.kind == ControlRequest.ACTION:
+            draft.grants = draft.grants.measuring(flight.client, flight.request)
+        else:  # begun at the panel
+            draft.grants = draft.grants.measured()
 
 
 def publish_changes(draft: StateDraft) -> None:

@@ -41,6 +41,7 @@ from afspm.model import (
     names,
 )
 from afspm.model.geometry import XY
+from afspm.model.microscope_status import STARTS
 from afspm.model.parameter_names import BASE_PARAMETERS
 from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES
 from afspm.model.snapshot import to_plain
@@ -89,6 +90,7 @@ class SpentRequest:
         at_ns: the experiment time of sending.
         plan: the approved plan that the request is part of; empty: no plan.
         action: the action that the request starts; empty: the request is no action.
+        until_ns: the experiment time at which the approval of an agent's action runs out; 0: no such action.
     """
 
     request_id: str
@@ -97,6 +99,7 @@ class SpentRequest:
     at_ns: int
     plan: str = ""
     action: str = ""
+    until_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -142,12 +145,14 @@ class AgentMeasurement:
     Attributes:
         who: the agent; empty: the newest measurement is not of an agent, or has ended.
         until_ns: the experiment time at which that approval runs out.
-        is_planned: whether that approval is a plan.
+        plan: the plan that was approved; empty: the approval is a grant.
+        request_id: the id of the request that began it.
     """
 
     who: str = ""
     until_ns: int = 0
-    is_planned: bool = False
+    plan: str = ""
+    request_id: str = ""
 
 
 @dataclass(frozen=True)
@@ -244,7 +249,9 @@ class GrantChecker:
         if why := self._stale(grant, now_ns, offset_m):
             return self, f"the approval is stale: {why}"
         held = HeldGrant(grant, by, now_ns)
-        if (begun.who, begun.is_planned) == (grant.agent, bool(grant.plan)):  # its approval is replaced
+        replaced = (self.book.plans if grant.plan else self.book.grants).get(grant.agent)
+        # a completed plan is held no more: a new one replaces nothing
+        if replaced is not None and (begun.who, begun.plan) == (grant.agent, replaced.grant.plan):
             begun = replace(begun, until_ns=min(begun.until_ns, held.until_ns))
         if grant.plan:
             return self._with(plans={**self.book.plans, grant.agent: held}, measurement=begun), ""
@@ -401,39 +408,53 @@ class GrantChecker:
         is_known = self.book.measurement != AgentMeasurement()
         return self._with(measurement=AgentMeasurement()) if is_known else self
 
+    def measuring(self, who: str, request: Request) -> GrantChecker:
+        """Register that a measurement has begun while a request was in flight."""
+        if self.book.measurement.who == who:
+            return self  # its end may have become earlier since the request was sent
+        spent = self._spent(who, request.id)
+        return self.measured() if spent is None or not spent.until_ns else self._with(measurement=_begun(who, spent))
+
     def sending(
         self, who: str, request: Request, now_ns: int, offset_m: XY | None, *, is_measuring: bool = False
     ) -> GrantChecker:
         """Count a checked request, about to be sent, against its approval or the limits of its role.
 
+        A repeated request is not counted again.
+
         Args:
             is_measuring: whether a measurement may be running, which the microscope then goes on with.
         """
-        if request.id and self._spent(who, request.id) is not None:
+        is_repeated = bool(request.id) and self._spent(who, request.id) is not None
+        checker = self if is_repeated else self._counting(who, request, now_ns, offset_m)
+        if not _is_start(request):
+            return checker
+        if not self.rules.is_agent(who):
+            return checker if is_measuring else checker.measured()
+        spent = checker._spent(who, request.id)
+        if spent is None or not spent.until_ns:
+            return checker
+        begun, running = _begun(who, spent), checker.book.measurement
+        if is_measuring and running.who:  # this start may be refused: an earlier end holds for both
+            begun = replace(running, until_ns=min(running.until_ns, begun.until_ns))
+        return checker._with(measurement=begun)
+
+    def _counting(self, who: str, request: Request, now_ns: int, offset_m: XY | None) -> GrantChecker:
+        if not self.rules.is_agent(who) and self._role(who) is None:
             return self
-        is_agent = self.rules.is_agent(who)
         action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
-        begins = bool(action) and action not in _STOPS
-        if not is_agent and begins and not is_measuring:
-            return self.measured().sending(who, request, now_ns, offset_m, is_measuring=True)
-        if not is_agent and self._role(who) is None:
-            return self
         book, plan = self.book, self.book.plans.get(who)
         approved, held = "", None
         if plan is not None and not self._refused_by_plan(plan, request, now_ns, offset_m):
             approved, held = plan.grant.plan, plan
             sent = replace(plan, step=plan.step + 1, unsettled=request.id)
             book = replace(book, plans={**book.plans, who: sent})
-        elif begins and (held := book.grants.get(who)) is not None:
+        elif action and action not in _STOPS and (held := book.grants.get(who)) is not None:
             used = {**held.used, action: held.used.get(action, 0) + 1}
             book = replace(book, grants={**book.grants, who: replace(held, used=used)})
-        if begins and held is not None:
-            begun = AgentMeasurement(who, held.until_ns, bool(approved))
-            # this start may be refused: the measurement that runs already keeps its earlier end
-            is_earlier = is_measuring and book.measurement.who and book.measurement.until_ns < begun.until_ns
-            book = book if is_earlier else replace(book, measurement=begun)
+        until_ns = held.until_ns if action and held is not None else 0
         lately = tuple(use for use in book.spent.get(who, ()) if now_ns - use.at_ns < _HOUR_NS)
-        spent = SpentRequest(request.id, request.kind, request.payload, now_ns, approved, action)
+        spent = SpentRequest(request.id, request.kind, request.payload, now_ns, approved, action, until_ns)
         return replace(self, book=replace(book, spent={**book.spent, who: (*lately, spent)}))
 
     def not_done(self, who: str, request: Request) -> GrantChecker:
@@ -441,6 +462,8 @@ class GrantChecker:
         if not request.id or (spent := self._spent(who, request.id)) is None:
             return self
         book = self.book
+        if (book.measurement.who, book.measurement.request_id) == (who, request.id):
+            book = replace(book, measurement=AgentMeasurement())  # another client's measurement may be running
         plan, grant = book.plans.get(who), book.grants.get(who)
         if spent.plan:
             if plan is not None and plan.unsettled == request.id:
@@ -456,6 +479,8 @@ class GrantChecker:
         book = self.book
         if request.kind in (_SET_REGION, _SET_PROBE) and self.rules.is_agent(who):
             book = replace(book, placed=book.placed.after(who, request))
+        if _is_start(request) and not self.rules.is_agent(who):  # an agent's measurement had ended unseen
+            book = replace(book, measurement=AgentMeasurement())
         plan = book.plans.get(who)
         if plan is not None and plan.unsettled and plan.unsettled == request.id:
             is_last = plan.step >= len(plan.grant.steps)
@@ -592,6 +617,14 @@ def _less(held: Mapping[str, HeldGrant], agent: str) -> dict[str, HeldGrant]:
 
 def _is_stop(request: Request) -> bool:
     return request.kind == ControlRequest.ACTION and request.subject in _STOPS
+
+
+def _is_start(request: Request) -> bool:
+    return request.kind == ControlRequest.ACTION and request.subject in STARTS
+
+
+def _begun(agent: str, spent: SpentRequest) -> AgentMeasurement:
+    return AgentMeasurement(agent, spent.until_ns, spent.plan, spent.request_id)
 
 
 def _limits_of(grant: Grant) -> ExperimentLimits:
