@@ -24,7 +24,7 @@ from afspm.experiment.wiring_classes import WIRE_SETTINGS, BoundSocket, wire_of
 from afspm.model import Role, component_of, is_of_instrument, names
 from afspm.model.events import LONGEST_PROCESS_NAME, PERSON, is_process_name
 from afspm.transport.network import is_local
-from afspm.wire.messages import SCAN_LINES
+from afspm.wire.messages import CONDITIONS, SCAN_LINES
 
 OPENS_PLAIN: Final = "opens_plain"
 """Class attribute that marks a component through which programs without keys can send requests."""
@@ -273,7 +273,8 @@ def check_envelopes(resolved: ResolvedExperiment) -> None:
     declared = [
         message for message in wire.declared() if message.always and message.source in (Role.TRANSLATOR, Role.SCHEDULER)
     ]
-    published = {*(message.name for message in declared), *made}
+    # a foreign translator publishes no conditions: who follows measurements finds their starts in states
+    published = {*(message.name for message in declared), CONDITIONS.name, *made}
     published.update(envelope for process in processes for envelope in process.declared.publishes)
     if any(map(_may_publish_lines, resolved.with_role(Role.TRANSLATOR))):
         published.add(SCAN_LINES.name)

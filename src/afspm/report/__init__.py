@@ -1,4 +1,12 @@
-"""What people look at: the report of a night, exports, films, figures, comparisons, the shadow's table."""
+"""The views of a recorded night: report, exports, films, figures, comparisons, the table of a shadow.
+
+**Theory of operation.** Each view reads a night once, and writes its file whole or not at all.
+
+    comes in      a run, as `night` reads it
+    state         none
+    goes out      pages, pictures and files of other programs, for people and for their tools
+    always holds  a simulated night says so; a scan that can't be read is named, and the others are shown
+"""
 
 from __future__ import annotations
 
