@@ -220,6 +220,10 @@ class ExperimentClock:
         """Return the processes for which simulated time waits, or will wait; None if it waits for none."""
         return None if self._waiting is None else self._waiting.read()
 
+    def hold(self) -> TimeHold | None:
+        """Slow the experiment's time down as `late` does, until `drop`; None if the clock waits for no process."""
+        return None if self._waiting is None else self._waiting.hold(self.speed)
+
     def drop(self, hold: TimeHold) -> bool:
         """Let simulated time wait no longer for a process; return False if that must be tried again."""
         return self._waiting is None or self._waiting.drop(hold, self.speed)

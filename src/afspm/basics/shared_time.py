@@ -212,6 +212,10 @@ class SharedSimulationTime:
             self._own.remove(own)
             self._withdraw(own, speed)
 
+    def hold(self, speed: float) -> TimeHold:
+        """Hold the time until `drop`: for a process that must not wait at the end of its hold, as `late` may."""
+        return self._declare(_OwnHold(_AT_ONCE_NS), speed)
+
     @contextmanager
     def passing(self, speed: float) -> Iterator[None]:
         """Withdraw this thread's holds while the block runs."""
@@ -234,7 +238,7 @@ class SharedSimulationTime:
         return any(one.from_ns == _NEVER_NS + what.value for one in self.read().holds)
 
     def drop(self, hold: TimeHold, speed: float) -> bool:
-        """Drop a hold of another process; return False if the file is in use, since its user may hang."""
+        """Drop a hold of any process; return False if the file is in use, since its user may hang."""
         with self._turn, unless_locked(self._file) as is_free:
             if is_free:
                 self._write(lambda shared: shared.without_hold(hold), speed)
@@ -256,7 +260,7 @@ class SharedSimulationTime:
         # also of a change that was not finished, unless it was written in part only
         return SharedTime.from_bytes(self._map[:]) or self._last[1]
 
-    def _declare(self, own: _OwnHold, speed: float) -> None:
+    def _declare(self, own: _OwnHold, speed: float) -> TimeHold:
         def add(shared: SharedTime) -> SharedTime:
             # later than all others, since the clock of Windows stands for milliseconds
             begun_ns = max((shared.real_ns, *(one.begun_ns + 1 for one in shared.holds)))
@@ -264,6 +268,8 @@ class SharedSimulationTime:
             return shared.with_hold(own.hold)
 
         self._change(add, speed)
+        assert own.hold is not None
+        return own.hold
 
     def _withdraw(self, own: _OwnHold, speed: float) -> None:
         hold, own.hold = own.hold, None

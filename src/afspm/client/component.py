@@ -195,6 +195,8 @@ class Component:
 
     def run_process(self, context: ProcessContext) -> int:
         """Run the component; the host calls this, see `afspm.transport.process.context.ExperimentProcess`."""
-        from afspm.client.loop import ComponentLoop
+        with context.activity.step():  # counts as a part of the start, for which simulated time waits
+            from afspm.client.loop import ComponentLoop
 
-        return ComponentLoop(self, Component, context).run()
+            loop = ComponentLoop(self, Component, context)
+        return loop.run()

@@ -12,7 +12,6 @@ import secrets
 import signal
 import threading
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import AfspmError, NoThread
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.formatting import duration_text
+from afspm.basics.shared_time import TimeHold
 from afspm.model import Role
 from afspm.model.events import LOGGED_AS
 from afspm.supervisor.activity_monitor import ActivityMonitor
@@ -111,7 +111,7 @@ class Supervisor:
                 **{process.pid: name for name, process in self._processes.items()},
             },
         )
-        self._starting = ExitStack()
+        self._start_hold: TimeHold | None = None
         self._status = ProcessStatus(policy.liveness)
         self._reported_s = -math.inf
         self._is_unreported = True  # whether an event came since then
@@ -156,7 +156,7 @@ class Supervisor:
         try:
             with signals.caught(self._on_signal, self._wakeup.writer_fileno()):
                 # imports take seconds, which a fast clock would make half an hour without a scan
-                self._starting.enter_context(self._clock.late())
+                self._start_hold = self._clock.hold()
                 self._step(RunBegan())
                 while not self._core.is_over:
                     self._wait()
@@ -164,9 +164,9 @@ class Supervisor:
                     self._step(TimePassed())
                     self._report()
         finally:  # also after an error in this loop: no process may be left behind
-            self._starting.close()
             for process in self._processes.values():
                 process.kill()
+            self._end_start_hold()
             if self._reporter is not None:
                 self._reporter.close()
             self._beats.close()
@@ -229,13 +229,18 @@ class Supervisor:
         self._hold_watch.look()
         now_s = self._clock.monotonic_s()
         if self._status.all_begun(self._core.children.values(), now_s):
-            self._starting.close()
+            self._end_start_hold()
         overdue, lately_s = self._core.overdue(now_s)
         self._monitors = {
             name: self._monitors.get(name) or ActivityMonitor(pid, lately_s) for name, pid in overdue.items()
         }
         for name, monitor in self._monitors.items():
             self._step(ActivitySeen(name, monitor.work(now_s), monitor.processor_s))
+
+    def _end_start_hold(self) -> None:
+        # without a wait: a process may be frozen while it has the lock, and the next look tries again
+        if self._start_hold is not None and self._clock.drop(self._start_hold):
+            self._start_hold = None
 
     def _report(self) -> None:
         now_s = self._clock.monotonic_s()

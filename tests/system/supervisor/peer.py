@@ -26,6 +26,8 @@ def main() -> int:
         beats_sent.release()
         return clock.monotonic_s() - began_s if busy.is_set() else 0.0
 
+    if settings.get("first") == "load":
+        busy.set()  # before the first heartbeat
     assert launch.sockets.heartbeat
     beats = HeartbeatSender(
         launch.sockets.heartbeat,
@@ -50,6 +52,9 @@ def main() -> int:
             threading.Event().wait(float(settings["busy_s"]))
             busy.clear()
             say("no longer busy")
+        case "load":
+            wait_for_a_beat(beats, beats_sent)
+            say("loads for ever")
         case "deaf":
             threading.Event().wait()
         case "grip":  # one call into C that holds Python's lock: no other thread has its turn

@@ -13,6 +13,7 @@ from tests.system.supervisor.supervisor_lab import IMPATIENT, QUICK, RunTasks, p
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.exit_codes import ExitCode
+from afspm.basics.file_lock import locked
 from afspm.experiment import Role
 from afspm.supervisor.process import Task
 from afspm.supervisor.supervision.run_end import EndReason
@@ -257,21 +258,60 @@ def test_program_without_heartbeats_is_not_killed_for_silence(run_tasks: RunTask
 # paper F6
 def test_simulated_time_waits_for_the_first_heartbeats(run_tasks: RunTasks, tmp_path: Path) -> None:
     clock = ExperimentClock.starting_now(speed=600.0).waiting_in(tmp_path / "clock")
-    silent = "import sys; sys.stdin.readline(); print('here', flush=True); sys.stdin.read()"
-    late = replace(peer("late"), command=(sys.executable, "-c", silent))
-    running = run_tasks(peer("begins"), late, clock=clock)
+    running = run_tasks(peer("begins"), _late(), clock=clock)
     running.terminal.wait_for(" late ", "here")
     assert _awaited(clock) == [os.getpid()]
     running.stop()
     assert _awaited(clock) == []
 
 
+def test_simulated_time_waits_for_imports_that_heartbeats_report(run_tasks: RunTasks, tmp_path: Path) -> None:
+    clock = ExperimentClock.starting_now(speed=600.0).waiting_in(tmp_path / "clock")
+    running = run_tasks(peer("loads", first="load", longest_step_s=1e3), clock=clock)
+    running.terminal.wait_for(" loads ", "loads for ever")
+    assert _awaited(clock) == [os.getpid()]
+    kill(running.pid("loads"))
+    running.pid("loads", life=2)
+    kill(running.pid("loads", life=2))
+    running.pid("loads", life=3)  # after a delay, in which the second life counts
+    assert _awaited(clock) == []
+
+
+# a child may be frozen while it holds the lock
+def test_lock_of_the_shared_time_does_not_block_the_supervisor(run_tasks: RunTasks, tmp_path: Path) -> None:
+    clock = ExperimentClock.starting_now(speed=600.0).waiting_in(tmp_path / "clock")
+    running = run_tasks(_late(), clock=clock)
+    running.terminal.wait_for(" late ", "here")
+    with (tmp_path / "clock").open("r+b") as file:
+        with locked(file):
+            kill(running.pid("late"))
+            running.terminal.wait_for(" late ", "here", count=2)
+            assert _awaited(clock) == [os.getpid()]
+        kill(running.pid("late", life=2))
+        running.pid("late", life=3)
+        assert _awaited(clock) == []
+
+
+def test_lock_of_the_shared_time_does_not_block_the_end(run_tasks: RunTasks, tmp_path: Path) -> None:
+    clock = ExperimentClock.starting_now(speed=600.0).waiting_in(tmp_path / "clock")
+    running = run_tasks(_late(), clock=clock)
+    running.terminal.wait_for(" late ", "here")
+    with (tmp_path / "clock").open("r+b") as file, locked(file):
+        assert running.stop().text.startswith("stopped by")
+
+
 def test_simulated_time_does_not_wait_for_a_second_start(run_tasks: RunTasks, tmp_path: Path) -> None:
     clock = ExperimentClock.starting_now(speed=600.0).waiting_in(tmp_path / "clock")
     silent = replace(peer("silent"), command=(sys.executable, "-c", "import sys; sys.stdin.read()"))
     policy = replace(QUICK, liveness=replace(QUICK.liveness, start_s=0.5))
-    run_tasks(peer("begins"), silent, policy=policy, clock=clock).pid("silent", life=2)
+    # the third life comes after a delay, in which the supervisor has looked at the second
+    run_tasks(peer("begins"), silent, policy=policy, clock=clock).pid("silent", life=3)
     assert _awaited(clock) == []
+
+
+def _late() -> Task:
+    silent = "import sys; sys.stdin.readline(); print('here', flush=True); sys.stdin.read()"
+    return replace(peer("late"), command=(sys.executable, "-c", silent))
 
 
 def _awaited(clock: ExperimentClock) -> list[int]:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import pytest
+
+from afspm.basics.exit_codes import ExitCode
 from afspm.model import ProcessCondition, Role
 from afspm.supervisor.supervision.child import ChildPolicy, ChildWatch
 from afspm.supervisor.supervision.liveness import LivenessPolicy
@@ -123,3 +126,34 @@ def test_a_process_at_work_on_a_step_or_late_with_a_beat_is_alive_since_it_came_
     child.start(8)
     child.beats(16.0)
     assert since_s(16.0) == 16
+
+
+# paper F6
+def test_process_has_begun_after_the_end_of_its_first_step() -> None:
+    child, status = Child(), ProcessStatus(POLICY.liveness)
+    assert not status.all_begun([child], 0.0)
+    child.start(7)
+    assert not status.all_begun([child], 1.0)
+    child.beats(2.0, step_age_s=0.5)
+    assert not status.all_begun([child], 2.0), "it imports its libraries"
+    assert not status.all_begun([child], 5.0), "and keeps Python's lock meanwhile"
+    child.beats(6.0)
+    assert status.all_begun([child], 6.0)
+    child.beats(7.0, step_age_s=0.5)
+    assert status.all_begun([child], 7.0)
+
+
+def test_process_restarted_at_once_has_begun() -> None:
+    child, status = Child(), ProcessStatus(POLICY.liveness)
+    child.start(7)
+    child.ends(1, 1.0)
+    child.start(8)
+    assert status.all_begun([child], 1.0)
+
+
+@pytest.mark.parametrize("code", [ExitCode.DONE, ExitCode.CONFIG])
+def test_process_that_ends_at_once_has_begun(code: ExitCode) -> None:
+    child, status = Child(), ProcessStatus(POLICY.liveness)
+    child.start(7)
+    child.ends(code, 1.0)
+    assert status.all_begun([child], 1.0)

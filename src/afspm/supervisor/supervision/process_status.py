@@ -12,6 +12,7 @@ from afspm.supervisor.supervision.supervised_child import ChildLife, SupervisedC
 SILENT_PERIODS = 2.5
 """Beat periods without a heartbeat after which a process is shown as silent; a little later, the process is killed."""
 
+_NOT_BEGUN = (ProcessCondition.STARTING, ProcessCondition.BUSY, ProcessCondition.SILENT)
 _WITHOUT_PROCESS = {
     ChildPhase.IDLE: ProcessCondition.STARTING,
     ChildPhase.STOPPING: ProcessCondition.ENDED,
@@ -27,6 +28,7 @@ class ProcessStatus:
         self._liveness = liveness
         self._since: dict[str, tuple[tuple[object, ...], int]] = {}
         self._alive: dict[str, tuple[int, int]] = {}
+        self._begun: set[str] = set()
 
     def states(
         self, children: Iterable[SupervisedChild], now_s: float, now_ns: int
@@ -54,8 +56,17 @@ class ProcessStatus:
         return tuple(found), changed
 
     def all_begun(self, children: Iterable[SupervisedChild], now_s: float) -> bool:
-        """Return whether no process is being started for the first time any more; `now_s` as in `states`."""
-        return all(condition_of(child, now_s, self._liveness) is not ProcessCondition.STARTING for child in children)
+        """Return whether the first start of each process is over; `now_s` as in `states`.
+
+        A start is over at the first idle heartbeat, and for a process that ends or is killed before.
+        """
+        waits = False
+        for child in children:
+            # heartbeats begin before the imports, which are the first step: a busy process may still be loading
+            if child.starts > 1 or condition_of(child, now_s, self._liveness) not in _NOT_BEGUN:
+                self._begun.add(child.spec.name)
+            waits |= child.spec.name not in self._begun
+        return not waits
 
     def _alive_since_ns(self, name: str, pid: int, now_ns: int) -> int:
         # a process at work on a step, or late with a beat, counts as alive
