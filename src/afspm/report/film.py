@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from PIL import Image, ImageDraw
 
     from afspm.night.overview import DriftPoint
-    from afspm.night.run import Run
 
 _log = logging.getLogger("afspm.record")
 FORMATS: Final = (".gif", ".mp4")
@@ -60,6 +59,8 @@ class RecordedScans(Protocol):
     def frame(self) -> Frame: ...
     @property
     def drift(self) -> Sequence[DriftPoint]: ...
+    @property
+    def scans(self) -> Sequence[ScanRow]: ...
     def scan(self, which: ScanRow) -> Mapping[str, Scan]: ...
 
 
@@ -153,7 +154,7 @@ class Film:
         _write(draw, (width - _MARGIN_PX, low), f"SIMULATED, {shown}" if self.simulated else shown, "rd")
 
 
-def film_of_run(run: Run, rows: Sequence[ScanRow] | None = None, channel: str | None = None) -> Film:
+def film_of_run(run: RecordedScans, rows: Sequence[ScanRow] | None = None, channel: str | None = None) -> Film:
     """Return the film of `run.film`, whose arguments and errors are these."""
     drift = recorded_drift(run)
     if rows is None:
