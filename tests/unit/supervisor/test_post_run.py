@@ -134,9 +134,11 @@ def test_report_is_given_up_only_if_its_process_does_not_work(
 def test_signal_in_the_report_leaves_the_command_that_writes_it(number: int, tmp_path: Path) -> None:
     # spectra, "small list": SIGTERM in the report left no word
     RecordStore(tmp_path).close()
+    # nohup, for example, ignores SIGHUP
     code = f"""
-import logging, sys, threading
+import logging, signal, sys, threading
 from pathlib import Path
+signal.signal({number}, signal.default_int_handler if {number} == signal.SIGINT else signal.SIG_DFL)
 from afspm.supervisor import post_run
 
 class Log:

