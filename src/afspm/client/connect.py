@@ -238,7 +238,6 @@ def _started(run: Path) -> tuple[float, int]:
 
 
 def _name_in(file: Path) -> str | None:
-
     try:
         # editors of Windows write a byte-order mark
         name = parse_toml(file.read_text(encoding="utf-8-sig")).get("name")

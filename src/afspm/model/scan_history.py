@@ -8,11 +8,10 @@ from afspm.basics import replace
 from afspm.model.panel import MeasurementConditions
 from afspm.model.scan import Scan
 from afspm.model.spectrum import Spectrum
-from afspm.model.state import ControlState, Feedback, ScopeState, ScopeStatus
+from afspm.model.state import MEASURING, ControlState, Feedback, ScopeState, ScopeStatus
 
 _KEPT = 4
 """Measurements and conditions that are kept: a result may be published after the next measurement has begun."""
-MEASURING = (ScopeState.SCANNING, ScopeState.SPEC)
 
 
 @dataclass(frozen=True)
@@ -103,9 +102,9 @@ class ScanHistory:
             case ScopeStatus() if time_ns > self.state_ns:
                 return replace(self._after(thing, time_ns), state_ns=time_ns)
             case Scan():
-                return self.with_result(ScopeState.SCANNING, time_ns, thing.time_ns, thing.filename, thing.channel)
+                return self.with_result(ScopeState.SCANNING, time_ns, thing.time_ns, thing.channel)
             case Spectrum():
-                return self.with_result(ScopeState.SPEC, time_ns, thing.time_ns, thing.filename)
+                return self.with_result(ScopeState.SPEC, time_ns, thing.time_ns)
         return self
 
     def _after(self, status: ScopeStatus, time_ns: int) -> ScanHistory:
@@ -118,19 +117,27 @@ class ScanHistory:
         if running is not None and running.doing is status.state and (paused or not running.is_presumed):
             now = replace(running, was_paused=running.was_paused or paused, is_presumed=False)
             return replace(self, begun=(*self.begun[:-1], now), is_observed=True)
-        history = replace(self, begun=earlier)._begin(status.state, time_ns if self.is_observed else None)
-        now = replace(history.begun[-1], was_paused=paused)
-        return replace(history, begun=(*history.begun[:-1], now), is_running=True, is_observed=True)
+        history = replace(self, begun=earlier, is_running=True, is_observed=True)
+        return history._begin(status.state, time_ns if self.is_observed else None, was_paused=paused)
 
-    def _begin(self, doing: ScopeState, began_ns: int | None, *, is_presumed: bool = False) -> ScanHistory:
-        number = self.count + 1
-        now = BegunMeasurement(doing, number, began_ns, self.control, self.feedback, is_presumed=is_presumed)
-        return replace(self, begun=(*self.begun, now)[-_KEPT:], count=number)
+    def _begin(
+        self, doing: ScopeState, began_ns: int | None, *, was_paused: bool = False, is_presumed: bool = False
+    ) -> ScanHistory:
+        now = BegunMeasurement(
+            doing, self.count + 1, began_ns, self.control, self.feedback, was_paused=was_paused, is_presumed=is_presumed
+        )
+        return replace(self, begun=(*self.begun, now)[-_KEPT:], count=now.number)
 
     def with_result(
-        self, doing: ScopeState, published_ns: int, measured_ns: int | None, filename: str = "", channel: str = ""
+        self, doing: ScopeState, published_ns: int, measured_ns: int | None, channel: str = ""
     ) -> ScanHistory:
-        """Return the history after a result: a spectrum, or a channel of a scan. Arguments are those of `of_result`."""
+        """Return the history after a result: a spectrum, or a channel of a scan.
+
+        Args:
+            doing: the state in which it was measured.
+            published_ns, measured_ns: the time of publication, and the end of the measurement if the result has one.
+            channel: of a scan.
+        """
         found = self._found(doing, published_ns, measured_ns, channel)
         if found is None:
             return self
@@ -142,24 +149,10 @@ class ScanHistory:
 
     def of(self, result: Scan | Spectrum, published_ns: int) -> BegunMeasurement:
         """Return the measurement of a result."""
-        if isinstance(result, Scan):
-            named = (result.filename, result.channel)
-            return self.of_result(ScopeState.SCANNING, published_ns, result.time_ns, *named)
-        return self.of_result(ScopeState.SPEC, published_ns, result.time_ns, result.filename)
-
-    def of_result(
-        self, doing: ScopeState, published_ns: int, measured_ns: int | None, filename: str = "", channel: str = ""
-    ) -> BegunMeasurement:
-        """Return the measurement of a result.
-
-        Args:
-            doing: the state in which it was measured.
-            published_ns, measured_ns: the time of publication, and the end of the measurement if the result has one.
-            filename, channel: of the result.
-        """
-        found = self._found(doing, published_ns, measured_ns, channel) or BegunMeasurement(doing)
+        doing, channel = (ScopeState.SCANNING, result.channel) if isinstance(result, Scan) else (ScopeState.SPEC, "")
+        found = self._found(doing, published_ns, result.time_ns, channel) or BegunMeasurement(doing)
         for one in reversed(self.conditions):
-            if one.time_ns == measured_ns or (filename and one.filename == filename):
+            if one.time_ns == result.time_ns or (result.filename and one.filename == result.filename):
                 # who is in control where a scan is first seen need not have begun it
                 control = None if one.holder and found.began_ns is None else found.control
                 return replace(found, began_ns=one.began_ns or found.began_ns, asked_by=one.holder, control=control)

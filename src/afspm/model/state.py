@@ -28,6 +28,9 @@ class ScopeState(_NamedEnum):
     SPEC = 7
 
 
+MEASURING = frozenset({ScopeState.SCANNING, ScopeState.SPEC})
+
+
 class ControlMode(_NamedEnum):
     """The source of commands: components (AUTOMATED), or only the person at the microscope (MANUAL)."""
 

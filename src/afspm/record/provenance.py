@@ -220,12 +220,12 @@ def _history(journal: sqlite3.Connection, until_ns: int) -> ScanHistory:
     for table, column, doing in (("scans", "scan", ScopeState.SCANNING), ("spectra", "spectrum", ScopeState.SPEC)):
         message = "Scan2d" if doing is ScopeState.SCANNING else "Spec1d"
         rows = journal.execute(
-            f"SELECT packets.time_ns, {table}.time_ns, {table}.filename, packets.channel FROM packets"
+            f"SELECT packets.time_ns, {table}.time_ns, packets.channel FROM packets"
             f" JOIN {table} ON packets.{column} = {table}.number WHERE packets.message = ? AND packets.time_ns <= ?"
             f" ORDER BY packets.time_ns DESC LIMIT {_BACK}",
             (message, until_ns),
         )
-        found += [(at_ns, (doing, at_ns, ended_ns, name, channel or "")) for at_ns, ended_ns, name, channel in rows]
+        found += [(at_ns, (doing, at_ns, ended_ns, channel or "")) for at_ns, ended_ns, channel in rows]
     history = ScanHistory()
     for at_ns, thing in sorted(found, key=lambda one: one[0]):
         history = history.with_result(*thing) if isinstance(thing, tuple) else history.step(thing, at_ns)

@@ -17,14 +17,13 @@ from afspm.basics.errors import AfspmError, ConfigError, InvalidValue, Refused
 from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.basics.units import Duration, PollPeriod
 from afspm.model import ChannelRoles, ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model.state import MEASURING
 from afspm.translator.judge import WITNESSES, Stated
 from afspm.translator.parameters import ParameterSpec, ParameterTable, Value
 from afspm.translator.polling import EAGER_S
 from afspm.translator.setting_groups import SettingsGroup, reach_in
 
 T = TypeVar("T")
-
-MEASURING = frozenset({ScopeState.SCANNING, ScopeState.SPEC})
 
 
 class ControllerLost(AfspmError):

@@ -27,11 +27,11 @@ from afspm.model import (
     names,
 )
 from afspm.model.microscope_status import feedback_of
-from afspm.model.state import FeedbackUnits
+from afspm.model.state import MEASURING, FeedbackUnits
 from afspm.storage.disk import is_full
 from afspm.translator import setting_groups
 from afspm.translator.claims import Claims
-from afspm.translator.driver_base import LOST, MEASURING, Action, DriverBase
+from afspm.translator.driver_base import LOST, Action, DriverBase
 from afspm.translator.outbox import Outbox, Outgoing
 from afspm.translator.panel_watch import EXTRA, PanelWatch
 from afspm.translator.parameters import FEEDBACK_ON, Value

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from afspm.model import ScopeState, ScopeStatus
-from afspm.translator.driver_base import MEASURING
+from afspm.model.state import MEASURING
 
 
 @dataclass(frozen=True)

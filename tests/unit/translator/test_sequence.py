@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from afspm.model import ScopeState, ScopeStatus
-from afspm.translator.driver_base import MEASURING
+from afspm.model.state import MEASURING
 from afspm.translator.sequence import DiscardResults, LogError, PublishResults, PublishStatus, StatusSequence
 
 SEEN = [state for state in ScopeState if state is not ScopeState.UNDEFINED]
