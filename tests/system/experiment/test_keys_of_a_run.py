@@ -82,5 +82,6 @@ def test_program_without_keys_joins_if_the_file_allows_it(run: Run, open_to_all:
             assert wire.decode_response(socket.recv_multipart()).ok
             assert one.end() == 0, one.output
         else:
-            one.wait_for(" scheduler ", r"\[security\] insecure = true")
+            # the program sees first that it has no key, and tries only once: it may hang up before the scheduler looks
+            one.wait_for(" scheduler ", r"\[security\] insecure = true|a program without keys gave up")
             assert socket.poll(0) == 0
