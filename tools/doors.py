@@ -43,17 +43,10 @@ WHOLE: Final = {"afspm", "afspm.basics", "afspm.model", "afspm.testing"}
 MOST_NAMES: Final = 80
 PAST_THE_DOORS: Final = {
     "afspm.client.port_log": "what_if",
-    "afspm.experiment.document": "published",
-    "afspm.experiment.findings": "published",
-    "afspm.experiment.parts": "published what_if",
-    "afspm.experiment.resolved_experiment": "published",
-    "afspm.experiment.toml_lines": "published",
-    "afspm.experiment.toml_writer": "published",
-    "afspm.experiment.wiring_classes": "published",
+    "afspm.experiment.parts": "what_if",
     "afspm.model.fencing": "published",
     "afspm.model.sessions": "published web",
     "afspm.scheduler.events": "what_if",
-    "afspm.scheduler.publishing.envelopes": "published",
     "afspm.scheduler.step_log": "what_if",
     "afspm.storage.disk": "what_if",
     "afspm.storage.line_log": "what_if",

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from afspm.supervisor.run import RunOptions
     from afspm.supervisor.run import run as run_experiment
     from afspm.transport.late_joiners import PublishedHistory
-    from afspm.transport.network import Network, is_local
+    from afspm.transport.network import Network
     from afspm.transport.polling import Poller, WakeUp
     from afspm.transport.port import ControlConnected, Incoming, Killed, PacketReceived, ParentGone, ReplyReceived
     from afspm.transport.process.context import ProcessActivity, ProcessContext, new_session
@@ -38,7 +38,7 @@ if TYPE_CHECKING:  # a page offers an ended run for resuming, reads its log, and
 if TYPE_CHECKING:  # a bridge or a replay speaks for one side: its sockets, and the events of the other
     from afspm.transport.control_client import ControlClient
     from afspm.transport.frames import receive_frames, send_frames, send_packet
-    from afspm.transport.network import ACCEPTED, CONNECTED, DISCONNECTED, MAX_PACKET_BYTES, Monitor
+    from afspm.transport.network import ACCEPTED, CONNECTED, DISCONNECTED, MAX_PACKET_BYTES, Monitor, is_local
     from afspm.transport.polling import milliseconds
     from afspm.transport.port import CaughtUp, ControlDisconnected, RequestReceived, Served, SubscriberJoined
     from afspm.transport.process.context import ExperimentProcess

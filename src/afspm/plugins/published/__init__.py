@@ -1,4 +1,4 @@
-"""Bridge to the published implementation: its programs can join an afspm experiment, and afspm reads its files.
+"""Bridge to the published implementation: its programs can join an afspm experiment.
 
 Theory of operation
 -------------------
@@ -24,9 +24,4 @@ The bridge is a process, and no adapter in the core's sockets: with the adapter 
 slow peer delayed all subscribers. The price is about a millisecond for each request. Every peer is a client of its own
 inside (with keys as `<bridge>:<peer>`): between the peers of one common client, control would not be arbitrated. A
 packet that a peer had not yet received when the bridge dies is lost to this peer.
-
-Experiment files of the published form are converted as they are read (`files`), and `afspm check --explain` writes them
-in afspm's form (`short_form`). Code that imports published modules is not run: an imitation of these modules would
-bring back their loops and sockets, and a guess at the effect of a function would move the tip. This module imports
-nothing, so that reading a file does not load the sockets of the bridge.
 """

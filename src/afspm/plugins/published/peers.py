@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar, Final
 
@@ -40,7 +40,6 @@ from afspm.wire.messages import CONTROL_STATE, SCOPE_STATE
 
 if TYPE_CHECKING:
     from afspm.basics import Clock
-    from afspm.experiment.toml_lines import Settings
     from afspm.processes import ProcessContext
 
 SETTLED_S: Final = 0.05
@@ -75,7 +74,7 @@ class PublishedPeers:
         self._as_translator = as_translator
 
     @staticmethod
-    def lends_microscope(settings: Settings) -> bool:
+    def lends_microscope(settings: Mapping[str, object]) -> bool:
         """Return whether these settings make this experiment the microscope of a published scheduler."""
         return settings.get("as_translator") is True
 

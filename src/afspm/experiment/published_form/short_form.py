@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Final
 from afspm.basics import UnitError, is_address, si
 from afspm.experiment.findings import SourceLocation
 from afspm.experiment.parts import ExperimentPart
+from afspm.experiment.published_form.files import INSTEAD, last
 from afspm.experiment.toml_lines import Settings, Table
+from afspm.experiment.toml_writer import dumps as toml_text
 from afspm.experiment.toml_writer import value as toml
 from afspm.experiment.wiring_classes import WIRE_KEYS, WiringClass, wire_of
 from afspm.model import Role
-from afspm.plugins.published.files import INSTEAD, last
-from afspm.processes import is_local, toml_text
+from afspm.transport.network import is_local
 
 if TYPE_CHECKING:
     from afspm.experiment.resolved_experiment import ResolvedExperiment

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from afspm.plugins.published.files import convert
+from afspm.experiment.published_form.files import convert
 
 if TYPE_CHECKING:
     from afspm.experiment.document import Document
@@ -23,13 +23,13 @@ class PublishedForm:
 
     def explained(self, resolved: ResolvedExperiment) -> list[tuple[SourceLocation, str, str]]:
         """Return the location, the setting and afspm's equivalent of each line of the file."""
-        from afspm.plugins.published.short_form import explained  # not needed to run a file
+        from afspm.experiment.published_form.short_form import explained  # not needed to run a file
 
         return explained(resolved)
 
     def short(self, resolved: ResolvedExperiment) -> str:
         """Return the experiment as a file in afspm's short form."""
-        from afspm.plugins.published.short_form import short
+        from afspm.experiment.published_form.short_form import short
 
         return short(resolved)
 

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from afspm.cli.app import app
 from afspm.experiment import Experiment, load
-from afspm.plugins.published.short_form import explained, short
+from afspm.experiment.published_form.short_form import explained, short
 
 from .conftest import Write, errors, line_of
 
