@@ -7,11 +7,11 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 DEV := .venv/.dev
 
-.PHONY: demo demo-drift dev test test-times test-programs test-all test-slow test-power-cut test-apart test-lowest mutants test-samples test-matrix test-nion coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
+.PHONY: demo demo-drift dev test test-times test-programs test-packages test-all test-slow test-power-cut test-apart test-lowest mutants test-samples test-matrix test-nion coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
 .PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift bench-guests soak chaos crowd scanner-nights simulate replay-nights power-cut acts as-reported docs release-check test-plug-ins changelog clean
 .DEFAULT_GOAL := demo
 
-SOURCES := pyproject.toml packages/afspm-bench/pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
+SOURCES := pyproject.toml $(wildcard packages/*/pyproject.toml) uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
 
 # a stamp that is there is only out of date: bringing .venv up to date takes seconds, however large it is
 SETTING_UP = $(if $(wildcard $@),Updating,Setting up)
@@ -65,6 +65,11 @@ test-times: test
 ## of them this computer lacks
 test-programs: $(COLLECTED)
 	@$(PYTEST) -m program tests/unit tests/plugins
+
+## the packages that no other test needs, one line each: bridges to the published implementation
+test-packages: $(TEST)
+	@$(PYTHON) tools/bootstrap.py packages
+	@$(PYTEST) -n 4 --dist worksteal packages/afspm-published/tests
 
 ## the rest: whole experiments, samples, snippets of the docs, faults of controllers, mutants; of the largest sets a part,
 ## another at each commit (tests/support/rotation.py), and all with AFSPM_CASES=all. What is APART, or needs more (root,

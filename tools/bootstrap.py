@@ -1,9 +1,10 @@
 """Make the environment .venv from the lock file, with nothing but Python 3.11 or later.
 
 Run by the Makefile: `python3 tools/bootstrap.py demo` (what a plain install holds), `test` (and what the tests need),
-`all` (and the tools of `make check`), `browser` (what drives one, and as root on Debian chromium itself), `gateway`
-(its judge), `coverage` or `release` (what judges the distributions). Each adds to what is there. The name of a package
-of `packages/` makes an environment of its own in the package's folder, with what its tests need.
+`packages` (and the packages of `make test-packages`), `all` (and the tools of `make check`), `browser` (what drives
+one, and as root on Debian chromium itself), `gateway` (its judge), `coverage` or `release` (what judges the
+distributions). Each adds to what is there. The name of a package of `packages/` makes an environment of its own in the
+package's folder, with what its tests need.
 """
 
 from __future__ import annotations
@@ -39,8 +40,9 @@ def main(wanted: str) -> None:
     if wanted != "demo":
         if wanted == "browser" and not (_has_browser() or (_apt_installs("chromium") and _has_browser())):
             sys.exit("no chromium is found: `apt install chromium`, or AFSPM_CHROMIUM=/path says where one is")
-        groups = ["test", *(["browser"] if _has_browser() else []), *(["check"] if wanted == "all" else [])]
-        groups += [wanted] if wanted in ("coverage", "gateway", "release") else []
+        groups = ["test", *(["browser"] if _has_browser() else [])]
+        groups += ["packages", "check"] if wanted == "all" else []
+        groups += [wanted] if wanted in ("coverage", "gateway", "packages", "release") else []
         _sync(*(f"--group={group}" for group in ["pip", *groups]), *(f"--extra={extra}" for extra in extras()))
 
 
@@ -137,8 +139,9 @@ def _wanted(arguments: list[str]) -> str:
             "browser",
             "gateway",
             "coverage",
+            "packages",
             "release",
-            *(one.name for one in PACKAGES.iterdir()),
+            *(one.parent.name for one in PACKAGES.glob("*/pyproject.toml")),
         ),
     )
     return str(parser.parse_args(arguments).wanted)

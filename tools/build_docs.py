@@ -57,6 +57,7 @@ def main() -> None:
         *(ROOT / "src").rglob("README.md"),
         *(ROOT / "clients").glob("*/README.md"),
         *(ROOT / "packages").glob("*/README.md"),
+        *(ROOT / "packages").glob("*/docs/*.md"),
     ]:
         _write(page.relative_to(ROOT).as_posix(), _for_site(page))
     shutil.copytree(ROOT / "docs" / "pictures", SOURCE / "docs" / "pictures")

@@ -261,7 +261,7 @@ def house() -> str:
         width = 440 / len(rooms)
         for column, room in enumerate(rooms):
             sheet.box((25 + width * (column + 0.5), 78 + number * 50), (width - 10, 34), kind, f"{room}/")
-    guests = ("nanonis", "asylum", "gxsm", "nanosurf", "park", "image", "drift", "web", "bluesky", "published")
+    guests = ("nanonis", "asylum", "gxsm", "nanosurf", "park", "image", "drift", "web", "bluesky", "secop")
     for number, guest in enumerate(guests):
         x, y = 567 + number % 2 * 106, 78 + number // 2 * 50
         sheet.box((x, y), (96, 34), "decision", f"{guest}/")

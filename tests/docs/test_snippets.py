@@ -35,6 +35,8 @@ from afspm_bench import sealing
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "experiments").rglob("*.md"))]
+OF_PACKAGES = sorted((ROOT / "packages").glob("*/README.md")) + sorted((ROOT / "packages").glob("*/docs/*.md"))
+"""Pages whose snippets run in the tests of their package."""
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\((?!https?:|#|mailto:)([^)#]+)")
 PROCESS = re.compile(r"… (\w+) …")
@@ -61,19 +63,24 @@ def test_every_snippet_runs(page: Path, tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(connect, "JOINED_WITHIN_S", DEADLINE_S)  # of a run that a busy computer is still starting
     if page.name == "bench-an-agent.md" and (why := sealing.unavailable()):
         pytest.skip(f"its agent runs sealed, and this computer can't seal a process: {why}")
+    run_page(page, tmp_path)
+
+
+def run_page(page: Path, folder: Path) -> None:
+    """Run the snippets of a page in an empty folder."""
     names: dict[str, Any] = {"__name__": "__main__"}
     for snippet in snippets(page):
         where = f"{page.relative_to(ROOT)}:{snippet.line}"
         file_name = FILE_NAME.match(snippet.text)
         if file_name and snippet.kind in ("python", "toml", "proto"):
-            (tmp_path / file_name[1]).parent.mkdir(parents=True, exist_ok=True)
-            (tmp_path / file_name[1]).write_text(snippet.text, encoding="utf-8")
+            (folder / file_name[1]).parent.mkdir(parents=True, exist_ok=True)
+            (folder / file_name[1]).write_text(snippet.text, encoding="utf-8")
         elif snippet.kind == "python":
             exec(compile("\n" * (snippet.line - 1) + snippet.text, str(page), "exec"), names)
         elif snippet.kind == "toml":
             tomllib.loads(snippet.text)
         elif snippet.kind == "console":
-            run_console(snippet.text, tmp_path, where)
+            run_console(snippet.text, folder, where)
 
 
 def run_console(text: str, folder: Path, where: str) -> None:
@@ -110,7 +117,7 @@ def test_pages_are_found() -> None:
     assert len(PAGES) > 5
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize("page", [*PAGES, *OF_PACKAGES], ids=lambda page: str(page.relative_to(ROOT)))
 def test_link_within_the_project_has_a_target(page: Path) -> None:
     for target in LINK.findall(page.read_text(encoding="utf-8")):
         assert (page.parent / target).exists(), f"{page.relative_to(ROOT)} links to {target}, which does not exist"

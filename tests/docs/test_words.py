@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("packages/afspm-bench/src", "packages/afspm-nion/src")
+PACKAGES = ("packages/afspm-bench/src", "packages/afspm-nion/src", "packages/afspm-published/src")
 WORDS = (
     "anew",
     "whoever",
@@ -55,7 +55,8 @@ def _pages() -> list[Path]:
     decisions = ROOT / "docs" / "explanation" / "decisions"
     pages = [file for file in sorted((ROOT / "docs").rglob("*.md")) if decisions not in file.parents]
     samples = sorted((ROOT / "experiments").rglob("*.md"))
-    return [*pages, *sorted(ROOT.glob("*.md")), *sorted((ROOT / "src").rglob("*.md")), *samples]
+    packages = sorted(ROOT.glob("packages/*/README.md")) + sorted(ROOT.glob("packages/*/docs/*.md"))
+    return [*pages, *sorted(ROOT.glob("*.md")), *sorted((ROOT / "src").rglob("*.md")), *samples, *packages]
 
 
 def _sentences(source: str) -> Iterator[tuple[int, str]]:
@@ -117,7 +118,8 @@ def test_pages_are_free_of_the_words() -> None:
 
 
 def test_names_of_tests_are_free_of_the_words() -> None:
-    found = [line for file in _python("tests") for line in in_test_names(file)]
+    folders = ["tests", *(folder.relative_to(ROOT).as_posix() for folder in sorted(ROOT.glob("packages/*/tests")))]
+    found = [line for folder in folders for file in _python(folder) for line in in_test_names(file)]
     assert not found, "\n".join(found) + REMEDY
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from afspm.basics import entry_points, named_imports
+from afspm.basics import entry_points, named_imports, packages
 from afspm.basics.errors import ConfigError
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.parts import DECLARED_KEYS
@@ -109,7 +109,8 @@ def full_path(name: str) -> str:
     except ConfigError as error:
         raise Unloadable(error.what, error.hint) from error
     if path is None:
-        hint = nearest(name, entry_points.names(*entry_points.CLASSES)) or 'write it as "module.Name"'
+        hint = packages.advice(name) or nearest(name, entry_points.names(*entry_points.CLASSES))
+        hint = hint or 'write it as "module.Name"'
         for one in entry_points.unreadable():
             hint += f"; or it is of the package {one.package}: {one.problem}"
         raise Unloadable(f"there is no ready-made class {name!r}", hint)
@@ -144,6 +145,8 @@ def load(path: str) -> Any:
     except ConfigError as error:
         raise Unloadable(error.what, error.hint) from error
     except ModuleNotFoundError as error:
+        if module_name.startswith("afspm.") and (advice := packages.advice(name)):  # as in files of older runs
+            raise Unloadable(f"there is no module {module_name!r}", f'write class = "{name}"; {advice}') from error
         raise _no_module(module_name, error) from error
     except (Exception, SystemExit) as error:  # the user's module may do anything when imported, even exit
         raise Unloadable(f"importing {module_name} fails: {_error_line(error)}", _door_hint(error)) from error

@@ -39,10 +39,6 @@ ELSEWHERE = {
     "Instrument": "speaks to another instrument, not to the microscope",
     "Notifier": "speaks to a person, not to the microscope",
     "TraceReplay": "stands in for a controller",
-    "PublishedScheduler": "is the mediator of the published implementation",
-    "PublishedPeers": "serves peers of the published implementation",
-    "PublishedTranslator": "stands in for a driver",
-    "SimulatedPublishedTranslator": "stands in for a driver",
 }
 """Components that have no job here, and why."""
 CELLS = [(job, instrument) for job in PROOFS for instrument in SECOND_FILES]

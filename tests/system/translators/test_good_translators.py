@@ -31,12 +31,6 @@ class = "Simulator"
 surface = "particles"
 initial = { tip-bias-voltage = "200 mV", scan-angle = "3 deg" }
 """
-PLAIN = """
-[microscope]
-component = true
-class = "SimulatedPublishedTranslator"
-program = ["python", "{script}"]
-"""
 SAMPLE_COORDINATES = """
 [control]
 solved_by_hand = ["thermal-drift", "device-malfunction"]
@@ -139,25 +133,6 @@ def test_spectrum_too_short_to_be_stopped_is_reported(file: Path) -> None:
     outcomes = {result.name: (result.outcome, result.line) for result in report.results}
     assert outcomes["spectrum/cancel"] == (CheckOutcome.SKIPPED, "a spectrum ends before it can be stopped")
     assert outcomes["spectrum/order"] == (CheckOutcome.PASSED, "")
-
-
-def test_a_translator_of_version_1_made_without_afspm_is_checked_just_the_same(tmp_path: Path) -> None:
-    file = tmp_path / "experiment.toml"
-    file.write_text(PLAIN.format(script=Path(__file__).with_name("plain.py").as_posix()), encoding="utf-8")
-    report = run(CheckOptions([file], runs=tmp_path / "runs"))
-    assert report.passed, report
-    passed = {result.name for result in report.results if result.outcome is CheckOutcome.PASSED}
-    assert {
-        "scan/cancel",
-        "scan/order",
-        "scan/frame",
-        "scan/time",
-        "frame/set",
-        "refused/nan",
-        "busy/refused",
-    } <= passed
-    assert report.support.actions["start-scan"] is None  # it can't be asked what it supports
-    assert report.support.parameters["tip-bias-voltage"] is None
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from afspm.basics.packages import BROUGHT_BY
 from afspm.experiment import class_loader
 
 
@@ -46,3 +47,10 @@ def test_module_that_imports_a_moved_name_is_pointed_to_its_door(
     ):
         class_loader.load("older.Mine")
     assert found.value.hint == hint
+
+
+def test_class_of_a_package_that_is_not_installed_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(BROUGHT_BY, "NotInstalled", "afspm-published")  # whose own classes may be installed here
+    with pytest.raises(class_loader.Unloadable, match="no ready-made class 'NotInstalled'") as found:
+        class_loader.full_path("NotInstalled")
+    assert found.value.hint.endswith("pip install ./packages/afspm-published")

@@ -172,6 +172,11 @@ def test_findings_are_in_the_order_of_the_lines(write: Write) -> None:
         ("time.X", "time has no 'X'", "rename time.py"),
         ("leaving.X", "SystemExit: 3 (leaving.py:2)", ""),
         ("afspm.components.planned_scans.ScanSerie", "has no 'ScanSerie'", "ScanSeries"),
+        (
+            "afspm.plugins.published.peers.PublishedPeers",
+            "no module 'afspm.pl",
+            'class = "PublishedPeers"; the package',
+        ),
     ],
 )
 def test_class_that_can_not_be_loaded_is_an_error(

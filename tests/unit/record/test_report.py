@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from record_lab import Night
 
 from afspm import model, wire
 from afspm.basics.errors import FileError
@@ -26,7 +27,7 @@ from afspm.night.bad_scans import BAD, VERDICT_MESSAGE
 from afspm.night.run import open_run
 from afspm.night.timeline import Span
 from afspm.night.treatment_ledger import TreatmentLedger, TreatmentPlace
-from afspm.record.run_json import EXPERIMENT_FILE, UNFINISHED
+from afspm.record.run_json import EXPERIMENT_FILE, RUN_FILE, UNFINISHED
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.report import page, pictures, sample, story
 from afspm.report.markup import PageTimes
@@ -745,3 +746,16 @@ def test_report_shows_how_many_scans_a_watch_judged(run: Path) -> None:
     text = write(run).read_text(encoding="utf-8")
     assert "watch watched 2 of 3 complete scans; 1 line came after the end of their scan." in text
     assert "1 complete scan;" not in text
+
+
+def test_run_with_a_class_that_is_no_longer_there_opens_and_has_a_report(
+    tmp_path: Path, night: Night, store: RecordStore
+) -> None:
+    store.take(night.whole_scan(1))
+    table = '[peers]\ncomponent = true\nclass = "afspm.plugins.published.peers.PublishedPeers"\n'
+    (tmp_path / EXPERIMENT_FILE).write_text(table, encoding="utf-8")
+    facts = {"name": "lab", "processes": {"peers": {"role": "component", "class": "afspm.plugins.published.peers"}}}
+    (tmp_path / RUN_FILE).write_text(json.dumps(facts), encoding="utf-8")
+    with open_run(tmp_path) as run:
+        assert len(run.scans) == 1
+    assert write(tmp_path).is_file()

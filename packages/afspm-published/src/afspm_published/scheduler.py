@@ -13,7 +13,6 @@ import zmq
 from afspm import wire
 from afspm.basics import ConfigError, ExitCode, WireError
 from afspm.model import ControlRequest, ControlResponse, Request, Response, ResponseDetail, Role, component_of
-from afspm.plugins.published import version_1
 from afspm.processes import (
     CONNECTED,
     DISCONNECTED,
@@ -33,6 +32,7 @@ from afspm.processes import (
     send_frames,
 )
 from afspm.wire.messages import CONTROL_STATE
+from afspm_published import version_1
 
 if TYPE_CHECKING:
     from afspm.processes import ProcessContext
@@ -63,7 +63,7 @@ class PublishedScheduler:
     microscope_elsewhere: ClassVar[str] = (
         "leave it out here; afspm's microscope serves the published scheduler from an experiment of its own, with "
         "Scheduler and PublishedPeers (as_translator = true), since its own ports are encrypted: "
-        "see docs/how-to/under-a-published-mediator.md"
+        "see packages/afspm-published/docs/under-a-published-mediator.md"
     )
     """Advice for an experiment file that has a microscope beside this scheduler."""
 

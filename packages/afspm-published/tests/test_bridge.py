@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import zmq
 from bridged_rig import BridgedRig
-from tests.system.published.version_1 import REQUEST, Client, Subscriber
+from version_1 import REQUEST, Client, Subscriber
 
 from afspm import wire
 from afspm.basics.launch import Sockets

@@ -10,7 +10,7 @@ import pytest
 from afspm.basics import ConfigError
 from afspm.experiment import load
 from afspm.model import Role
-from afspm.plugins.published.scheduler import PublishedScheduler
+from afspm_published.scheduler import PublishedScheduler
 
 PEERS = """
 [microscope]

@@ -9,7 +9,7 @@ import pytest
 
 from afspm import wire
 from afspm.model import Spectrum
-from afspm.plugins.published.translator import by_point
+from afspm_published.translator import by_point
 
 
 @pytest.mark.parametrize("shape", [(5, 2), (2, 5), (1, 3), (4, 1), (0, 2)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from afspm.model import Packet, ScopeState
-from afspm.plugins.published.version_1 import MOST_WAITING, PAUSE_S, Pacing
+from afspm_published.version_1 import MOST_WAITING, PAUSE_S, Pacing
 
 
 def put(pacing: Pacing, *messages: str | ScopeState) -> None:

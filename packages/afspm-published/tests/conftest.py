@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import zmq
 from bridged_rig import Bridge, BridgedRig
-from tests.system.published.version_1 import Router
+from version_1 import Router
 
 from afspm.basics.launch import Sockets
 from afspm.supervisor.ports import FreePorts

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.system.experiment.experiment_lab import Run
-from tests.system.published.version_1 import Mediator
+from version_1 import Mediator
 
 import afspm
 from afspm.supervisor.ports import FreePorts

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import zmq
 from deadlines import DEADLINE_S
-from tests.system.published.version_1 import END, PARAM, RELEASE, REQUEST, Client, Router, Server, Subscriber
+from version_1 import END, PARAM, RELEASE, REQUEST, Client, Router, Server, Subscriber
 
 from afspm import wire
 from afspm.basics.clock import ExperimentClock

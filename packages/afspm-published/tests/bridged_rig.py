@@ -13,7 +13,7 @@ from scheduler_rig import Component, Rig
 from afspm.basics.launch import Launch, Sockets
 from afspm.supervisor.ports import FreePorts
 
-PACKAGE = "afspm.plugins.published"
+PACKAGE = "afspm_published"
 
 
 class Bridge:

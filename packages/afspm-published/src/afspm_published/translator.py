@@ -30,7 +30,6 @@ from afspm.model import (
 )
 from afspm.model.fencing import Epoch, SchedulerFence
 from afspm.model.sessions import run_of
-from afspm.plugins.published import version_1
 from afspm.processes import (
     CONNECTED,
     DISCONNECTED,
@@ -51,6 +50,7 @@ from afspm.processes import (
 from afspm.supervisor.process import GUARD
 from afspm.translator.requests import RequestOutcomes
 from afspm.wire.messages import SCOPE_STATE, SPECTRUM
+from afspm_published import version_1
 
 if TYPE_CHECKING:
     from afspm.processes import ProcessContext

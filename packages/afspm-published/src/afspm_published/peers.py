@@ -14,8 +14,6 @@ import zmq
 from afspm import wire
 from afspm.basics import ConfigError, ExitCode, Launch, WireError
 from afspm.model import PERSON, ControlRequest, ControlResponse, Packet, Response, ScopeState
-from afspm.plugins.published import version_1
-from afspm.plugins.published.version_1 import Pacing
 from afspm.processes import (
     ACCEPTED,
     DISCONNECTED,
@@ -37,6 +35,8 @@ from afspm.processes import (
     send_packet,
 )
 from afspm.wire.messages import CONTROL_STATE, SCOPE_STATE
+from afspm_published import version_1
+from afspm_published.version_1 import Pacing
 
 if TYPE_CHECKING:
     from afspm.basics import Clock
