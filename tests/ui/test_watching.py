@@ -271,8 +271,39 @@ def test_a_phone_shows_one_part_at_a_time_below_a_bar_that_stays(
     bar, tabs = page.evaluate(places)
     assert 0 <= bar["y"] < 150
     assert page.locator("h1").is_visible(), "the name of the experiment"
+    assert page.locator("button[aria-label='Light or dark']").is_visible()
+    assert page.locator("[data-part=progress]").is_visible(), "5 of 49"
     assert tabs["y"] + tabs["height"] == pytest.approx(844, abs=1)
     keep(page, f"phone-{name}")
+
+
+# users 11
+def test_nothing_moves_below_the_bar_when_a_scan_begins(night: Night, opened: Opened, scan: Scan) -> None:
+    page = opened(night.url, width=1280, height=800)
+    drawn(page)
+    longer = """() => {
+      const chips = document.querySelector('.bar .chips'), top = () => document.querySelector('.screen').offsetTop;
+      const before = top();
+      chips.innerHTML += '<span class=chip>microscope scanning 100 % <small>ends 23:07:23</small></span>';
+      return [before, top(), chips.textContent];
+    }"""
+    before, after, text = page.evaluate(longer)
+    assert before == after
+    assert " for " in text, "a reader hears two words, not one"
+
+
+# users 11
+def test_a_wide_scan_fills_the_width_of_its_panel(night: Night, opened: Opened, scan: Scan, keep: Any) -> None:
+    with afspm.connect(night.folder, "wide") as scope, scope.control():
+        taken = scope.scan(Region((0, 0), (2e-6, 0.5e-6)), shape=(16, 64), timeout_s=60.0).first
+    page = opened(night.url, width=1280, height=800)
+    canvas = shown(page, taken)
+    room = page.locator(".stage").bounding_box()
+    box, facts = canvas.bounding_box(), page.locator(".stage .facts").bounding_box()
+    assert box["width"] == pytest.approx(room["width"], abs=2)
+    assert box["y"] + box["height"] <= facts["y"] < facts["y"] + 80 <= room["y"] + room["height"]
+    canvas.focus()
+    keep(page, "wide-scan")
 
 
 def test_scans_of_different_sizes_at_one_place_are_pictures_on_the_map(

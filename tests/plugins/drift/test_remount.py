@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from record_lab import ABOUT, Night
-from tests.unit.record.test_measured_tables import start
+from tests.unit.report.test_measured_tables import start
 from typer.testing import CliRunner
 
 from afspm import open_run

@@ -301,30 +301,30 @@ def status_html(watch: Watch, overview: Overview) -> str:
     if control is None:
         return '<span class="chip">waiting for the scheduler</span>'
     since_ns, now_ns = overview.control_since_ns, _now_ns(watch, overview)
-    since = "" if since_ns is None else f" for {duration_text((now_ns - since_ns) / NS_PER_S)}"
+    since = "" if since_ns is None else f"for {duration_text((now_ns - since_ns) / NS_PER_S)}"
     mode = control.mode.name
     holder = overview.in_control
     who = f'<b class="{tint_class(holder)}">{escape(holder)}</b>' if holder else "nobody"
     parts = [
         _chip(mode, "mode", f"mode-{mode.lower()}"),
-        _chip(f"{who} is in control<small>{since}</small>", "holder"),
+        _chip(f"{who} is in control <small>{since}</small>", "holder"),
         *_microscope(overview, now_ns),
     ]
     end_ns = watch.expected_end_ns(overview, now_ns)
     for entry in overview.waits_at(now_ns):
         until = _end_text(entry.again_ns or now_ns, now_ns)
         parts.append(
-            _chip(f"<b>{escape(entry.who)}</b> waits until {until}<small>{escape(entry.reason)}</small>", "wait")
+            _chip(f"<b>{escape(entry.who)}</b> waits until {until} <small>{escape(entry.reason)}</small>", "wait")
         )
     for name, report in overview.progress_at(now_ns).items():
         left_ns = report.remaining_ns(now_ns) if report.done < report.of else None
         # the component that decides the end needs no end of its own
         has_end = left_ns and (end_ns is None or abs(now_ns + left_ns - end_ns) > _MINUTE_NS)
-        end = f"<small>ends {_end_text(now_ns + left_ns, now_ns)}</small>" if left_ns and has_end else ""
+        end = f" <small>ends {_end_text(now_ns + left_ns, now_ns)}</small>" if left_ns and has_end else ""
         parts.append(_chip(f"<b>{escape(name)}</b> {report.done} of {report.of}{end}", "progress"))
     if end_ns is not None and end_ns > now_ns:
         left = duration_text((end_ns - now_ns) / NS_PER_S)
-        parts.append(_chip(f"ends about {_end_text(end_ns, now_ns)}<small>{left} left</small>", "end"))
+        parts.append(_chip(f"ends about {_end_text(end_ns, now_ns)} <small>{left} left</small>", "end"))
     zone = datetime.fromtimestamp(now_ns / NS_PER_S).astimezone().tzname()
     parts.append(_chip(f"{time_of_day(now_ns, seconds=False)} {zone}", "clock", "time"))
     return "".join(parts)
@@ -345,7 +345,7 @@ def _microscope(overview: Overview, now_ns: int) -> Iterator[str]:
     state = status.state.name.lower().replace("_", " ") if status else NO_REPORT
     paused = " (paused)" if status and status.paused else ""
     done = overview.scan_progress(now_ns)
-    far = "" if done is None else f" {100 * done[0]:.0f} %<small>ends {time_of_day(now_ns + done[1])}</small>"
+    far = "" if done is None else f" {100 * done[0]:.0f} % <small>ends {time_of_day(now_ns + done[1])}</small>"
     yield _chip(f"microscope {state}{paused}{far}", "state", f"state-{state.replace(' ', '-')}")
     if overview.readings.feedback is not None and overview.readings.feedback.on is False:
         yield _chip("FEEDBACK OFF", "feedback", "problem")

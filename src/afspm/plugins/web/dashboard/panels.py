@@ -25,7 +25,7 @@ from afspm.plugins.web.watch import Watch
 MOST_LINES = 300
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
 MOMENT, SCAN = "this moment", "the scan shown"
-_SHOWN = "return [window.afspm?.image?.head?.time_ns ?? '', Boolean(window.afspm?.image?.pinned)]"
+_SHOWN = "return window.afspm.scansToNote()"
 _EVERYTHING = "all"
 _BAD = {ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.GIVEN_UP}
 
@@ -259,15 +259,9 @@ class NotesPanel:
         self._steering = steering
         self._visitor = visitor
         self._client = context.client
-        self._seen: str | None = None  # the scan shown when the note was begun: a later scan may replace it meanwhile
         if visitor.person:
             with ui.element("div").classes("acts"):
-                self._text = (
-                    ui.input("note", on_change=self._begin)
-                    .props("dense outlined")
-                    .classes("text")
-                    .on("keydown.enter", self._write)
-                )
+                self._text = ui.input("note").props("dense outlined").classes("text").on("keydown.enter", self._write)
                 self._on = ui.select([SCAN, MOMENT], value=SCAN, label="on").props("dense outlined")
                 ui.button("Note", on_click=self._write, color=None).props("no-caps outline")
         else:
@@ -277,18 +271,11 @@ class NotesPanel:
     def show(self, notes: str) -> None:
         self._list.set_content(notes)
 
-    async def _begin(self) -> None:
-        if not self._text.value:
-            self._seen = None
-        elif self._seen is None and self._watch.moment_ns is None:
-            self._seen = ""
-            self._seen, _ = await ui.run_javascript(_SHOWN)
-
     async def _write(self) -> None:
         text, time_ns, scan_ns = str(self._text.value or "").strip(), self._watch.moment_ns, None
         if self._on.value == SCAN:
-            shown, is_pinned = await ui.run_javascript(_SHOWN)
-            shown = shown if is_pinned else self._seen or shown
+            shown, begun = await ui.run_javascript(_SHOWN)
+            shown = shown if time_ns is not None else begun
             if not shown:
                 self._say(ActionResult("The scan shown is not finished: write the note on this moment.", ok=False))
                 return

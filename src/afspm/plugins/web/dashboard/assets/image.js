@@ -6,7 +6,8 @@ import { Geometry } from "./geometry.js";
 import { drawProfile } from "./profile.js";
 
 const MARGIN = { left: 58, right: 78, top: 22, bottom: 40 };
-const BESIDE = 166; // pixels of the width, for the facts
+const BESIDE = 166; // pixels of the width, for the facts beside the picture
+const BELOW = 150; // pixels of the height, for the facts below a wide one
 const MOST_ZOOM = 64;
 
 export class ImageView {
@@ -187,15 +188,19 @@ export class ImageView {
     else if (!this.pinned && select.value !== before) this.fetch();
   }
 
-  /** Fit the canvas beside the facts; on a phone, where the page scrolls, only to the width. */
+  /** Fit the canvas beside or above the facts, where it is larger; on a phone, where the page scrolls, to the width. */
   #fit() {
     const stage = this.find("stage"), { canvas } = this;
     const [along, across] = this.head?.size ?? [1, 1];
     const across_px = MARGIN.left + MARGIN.right, up_px = MARGIN.top + MARGIN.bottom;
-    const scrolls = getComputedStyle(stage).flexDirection === "column";
-    const room = stage.clientWidth - (scrolls ? 0 : BESIDE);
-    const most = scrolls ? Infinity : stage.clientHeight;
-    const perMetre = Math.max(0, Math.min((room - across_px) / along, (most - up_px) / across));
+    const [wide, high] = [stage.clientWidth, stage.clientHeight];
+    const within = (room, most) => Math.max(0, Math.min((room - across_px) / along, (most - up_px) / across));
+    const scrolls = matchMedia("(max-width: 760px)").matches;
+    const [beside, above] = [within(wide - BESIDE, high), within(wide, high - BELOW)];
+    const isAbove = !scrolls && above > beside;
+    stage.classList.toggle("above", isAbove);
+    const room = wide - (scrolls || isAbove ? 0 : BESIDE);
+    const perMetre = scrolls ? within(wide, Infinity) : Math.max(above, beside);
     const size = [across_px + along * perMetre, up_px + across * perMetre];
     const [width, height] = [Math.min(room, Math.max(size[0], 180)), Math.max(size[1], 160)].map((n) => `${Math.round(n)}px`);
     if (canvas.style.height !== height) canvas.style.height = height;

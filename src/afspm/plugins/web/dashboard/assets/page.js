@@ -7,6 +7,7 @@ let image = null;
 let updated = Date.now();
 let ended = false;
 let watched = null;
+let noteBegunOn = "";
 
 /** Update the page. The dashboard calls this twice a second; the returned theme also shows that the browser keeps up. */
 function update(state) {
@@ -72,6 +73,11 @@ document.addEventListener("click", (event) => {
   if (event.target.dataset?.part === "live") emitEvent("scan_picked", {});
 });
 
+// A note is on the scan that its author saw: a later scan may be shown before the server hears of the first letter.
+document.addEventListener("beforeinput", (event) => {
+  if (event.target.matches?.(".noted .text input") && !event.target.value) noteBegunOn = image?.head?.time_ns ?? "";
+});
+
 /** Choose the part of the page that a phone shows. */
 function chooseTab(name) {
   document.body.dataset.tab = name;
@@ -97,6 +103,11 @@ window.afspm = {
   update,
   keepTheme: (name) => localStorage.setItem("afspm-theme", name),
   pin: (scan) => image?.pin(scan),
+  /** The times of the scan shown and of the one that a note is on: the pinned one, or the one shown when it was begun. */
+  scansToNote: () => {
+    const shown = image?.head?.time_ns ?? "";
+    return [shown, image?.pinned ? shown : noteBegunOn || shown];
+  },
   get image() {
     return image;
   },
