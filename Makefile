@@ -7,7 +7,7 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 DEV := .venv/.dev
 
-.PHONY: demo demo-drift dev test test-times test-programs test-packages test-all test-slow test-power-cut test-apart test-lowest mutants test-samples test-matrix test-nion coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
+.PHONY: demo demo-drift dev test test-times test-programs test-packages test-all test-slow test-power-cut test-apart test-lowest mutants test-samples test-matrix test-nion coverage test-ui test-gateway test-translators test-clients test-octave test-windows test-hosts
 .PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift bench-guests soak chaos crowd scanner-nights simulate replay-nights power-cut acts as-reported docs release-check test-plug-ins changelog clean
 .DEFAULT_GOAL := demo
 
@@ -79,7 +79,7 @@ SLOW_AT_A_TIME ?= 5
 test-all: test-slow test-power-cut
 
 test-slow: $(COLLECTED)
-	@$(PYTEST) -n $(SLOW_AT_A_TIME) --dist worksteal -m slow --in-turn $(addprefix --ignore ,$(APART) tests/system/hosts $(POWER_CUT))
+	@$(PYTEST) -n $(SLOW_AT_A_TIME) --dist worksteal -m slow --in-turn $(addprefix --ignore ,$(APART) tests/system/hosts tests/system/octave $(POWER_CUT))
 
 # A power cut is tried alone: the scheduler publishes what a disk has not taken within 0.2 s, which may be lost
 test-power-cut: $(COLLECTED)
@@ -156,6 +156,10 @@ test-translators: $(TEST)
 CLIENTS ?=
 test-clients: $(TEST)
 	@$(BIN)/python tools/test_clients.py $(CLIENTS)
+
+## the client in Java as MATLAB uses it, in GNU Octave: a component, and a script that joins. Says what this computer lacks
+test-octave: $(TEST)
+	@$(BIN)/pytest --must-run tests/system/octave
 
 ## tests with a Windows Python under Wine, on Debian, two folders at a time (an hour and more): make test-windows TESTS="tests/unit/wire"
 # (those of whole experiments take longest: they come first; tip_repair is in components, the Nanonis sample in microscopes)

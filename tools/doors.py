@@ -136,6 +136,9 @@ def _wrong_doors() -> Iterator[str]:
             yield f"{door} has {len(names)} names, more than {MOST_NAMES}: move what one plug-in alone needs"
         if unlisted := {name for _, name, _ in _homes(door)} ^ set(names):
             yield f"{door}: __all__ and its imports differ in {', '.join(sorted(unlisted))}"
+        if differing := {(module, name) for module, name, _ in _homes(door)} ^ set(_loaded(door)):
+            names_of = ", ".join(sorted(f"{module}.{name}" for module, name in differing))
+            yield f"{door}: its imports and the names that it gives to lazily() differ in {names_of}"
         yield from (f"{door}.{name} has no docstring" for name in names if not _about(door, name))
         if door in WHOLE:
             continue
@@ -177,6 +180,18 @@ def _homes(door: str) -> Iterator[tuple[str, str, bool]]:
                 assert isinstance(node, ast.ImportFrom)
                 for alias in node.names:
                     yield node.module or "", alias.asname or alias.name, "#" in lines[block.lineno - 1]
+
+
+def _loaded(door: str) -> Iterator[tuple[str, str]]:
+    """Yield (module, name) for each name that a door loads on first use."""
+    file = _file(door)
+    assert file is not None
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "lazily":
+            homes = ast.literal_eval(node.args[1])
+            yield from ((module, name) for module, several in homes.items() for name in several.split())
+            for home in node.keywords:
+                yield ast.literal_eval(home.value).rpartition(".")[0], home.arg or ""
 
 
 @cache

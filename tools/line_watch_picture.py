@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from afspm.model import Region
-from afspm.plugins.line_watch.line_judge import LOOK, AlarmLevel, Kind, LineJudge
+from afspm.plugins.line_watch.line_judge import FITTED, AlarmLevel, Kind, LineJudge
 from afspm.plugins.line_watch.registration import levelled
 from afspm.simulation import World
 
@@ -64,9 +64,9 @@ def main() -> None:
     axes[2].text(CHANGED_ROW + 6, 0.8, "scan with the change", color="tab:red")
     axes[2].text(ROWS, 0.4, "good scan", ha="right", color="tab:blue")
     axes[2].axhline(1.0, color="k", linewidth=0.8)
-    axes[2].axhline(LOOK, color="k", linewidth=0.8, linestyle=":")
+    axes[2].axhline(FITTED.look, color="k", linewidth=0.8, linestyle=":")
     axes[2].text(ROWS, 1.02, "stop", ha="right", va="bottom")
-    axes[2].text(ROWS, LOOK + 0.02, "look", ha="right", va="bottom")
+    axes[2].text(ROWS, FITTED.look + 0.02, "look", ha="right", va="bottom")
     axes[2].axvline(CHANGED_ROW, color="0.6", linewidth=0.8)
     axes[2].text(CHANGED_ROW + 3, 1.2, "true change", color="0.4")
     axes[2].set(xlabel="row", ylabel="evidence / threshold", xlim=(0, ROWS), ylim=(0, 1.3), title="evidence by row")

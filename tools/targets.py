@@ -48,6 +48,7 @@ IN_TURN: Final = {
     "test-lowest": "",
     "test-matrix": "",
     "test-nion": "",
+    "test-octave": "",
     "test-plug-ins": "",
     "test-tiled": "",
 }

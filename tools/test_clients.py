@@ -89,7 +89,7 @@ def afspm(*arguments: str, folder: Path = ROOT) -> bool:
 
 
 def resolved(command: list[str]) -> list[str]:
-    """Return a command with the whole path of its program, which Windows needs for npm.cmd."""
+    """Return a command with the whole path of its program, which Windows needs for mvn.cmd."""
     return [shutil.which(command[0]) or command[0], *command[1:]]
 
 

@@ -108,7 +108,35 @@ __all__ += [
     "xy_of",
 ]
 
-_own = lazily(__name__)
+_own = lazily(
+    __name__,
+    {
+        "afspm.basics.shared_time": "Publication",
+        "afspm.client.component": "Component",
+        "afspm.client.connect": "connect GUEST find_run guest_of",
+        "afspm.client.cycle": "Cycle CycleOutcome",
+        "afspm.client.events": "Events PublishedEvent",
+        "afspm.client.measurement": "BEGUN_WITHIN_S",
+        "afspm.client.parameter_text": "Value from_parameter to_parameter value_in",
+        "afspm.client.scope": "Scope",
+        "afspm.client.targets": "FITS ScanTarget SpectrumTarget Target is_set target_from xy_of",
+        "afspm.components": "tip_verdict",
+        "afspm.components.channel_pairs": "ChannelPairing HeightPair MissingChannels",
+        "afspm.components.line_file": "LineFile csv_line",
+        "afspm.components.tip_judge": "Opinion TipJudge",
+        "afspm.model": "ControlMode Problem Region Scan ScanSet ScopeState Spectrum",
+        "afspm.model.arrays": "SD_PER_MAD Array robust_spread",
+        "afspm.model.line_levelling": "Levelling flattened levelled",
+        "afspm.model.planned_work": "PlannedWork",
+        "afspm.model.snapshot": "from_plain restored snapshot to_plain",
+        "afspm.night.catalogue": "find_runs",
+        "afspm.night.notes": "append_note",
+        "afspm.night.run": "Run open_run",
+        "afspm.storage.atomic": "OutageLog replace_file write_atomic",
+        "afspm.storage.formats": "read suffixes",
+        "afspm.storage.memory": "Memory",
+    },
+)
 
 
 def __getattr__(name: str) -> Any:

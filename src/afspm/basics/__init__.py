@@ -161,4 +161,35 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:
-    __getattr__ = lazily(__name__)
+    __getattr__ = lazily(
+        __name__,
+        {
+            "afspm.basics.addresses": "Listens is_address",
+            "afspm.basics.clock": "NS_PER_S Clock ExperimentClock NeverLate iso_utc utc_time",
+            "afspm.basics.errors": (
+                "AfspmError ConfigError ControlLost ExperimentEnded FileError InvalidValue MeasurementFailed "
+                "NoResponse NoSuchItem Refused RequestError TransportError UnitError WireError"
+            ),
+            "afspm.basics.exit_codes": "ExitCode",
+            "afspm.basics.formatting": (
+                "area_text counted day_and_time duration_text escaped lengths_text position_text quantity scale "
+                "shortest_single typeset_position time_of_day typeset typeset_area typeset_length zone_offset_s "
+                "zone_offsets_s"
+            ),
+            "afspm.basics.frozen": "replace",
+            "afspm.basics.interpreter": "python_command python_environment",
+            "afspm.basics.launch": "Launch Sockets",
+            "afspm.basics.named_imports": "import_named require_trusted trusting_only",
+            "afspm.basics.plain_data": "Count Plain PlainList PlainMapping from_json",
+            "afspm.basics.progress_line": "ProgressLine",
+            "afspm.basics.requirements": "require imports_of_extra",
+            "afspm.basics.shared_time": "Publication",
+            "afspm.basics.toml": "parse_toml",
+            "afspm.basics.units": (
+                "Angle Current Duration Length PollPeriod PositiveLength Speed Voltage convert parse_quantity "
+                "same_kind si si_or_text"
+            ),
+        },
+        load_plugin="afspm.basics.entry_points.load",
+        plugin_names="afspm.basics.entry_points.names",
+    )

@@ -2,34 +2,26 @@
 
 from __future__ import annotations
 
-import re
 import sys
-from collections.abc import Callable
-from functools import cache
+from collections.abc import Callable, Mapping
 from importlib import import_module
-from pathlib import Path
-
-_IMPORT = re.compile(r"^    from (\S+) import (?:\(([^)]*)\)|(.*))$", re.MULTILINE)
 
 
-def lazily(package: str) -> Callable[[str], object]:
-    """Return `__getattr__` for a package that imports its names under TYPE_CHECKING, and has no other import there."""
+def lazily(package: str, names: Mapping[str, str], /, **renamed: str) -> Callable[[str], object]:
+    """Return `__getattr__` for a package.
 
-    @cache
-    def homes() -> dict[str, tuple[str, str]]:
-        found = {}
-        for module, several, line in _IMPORT.findall(Path(str(sys.modules[package].__file__)).read_text("utf-8")):
-            for name in re.findall(r"\w+(?: as \w+)?", several or line.partition("#")[0]):
-                own, _, renamed = name.partition(" as ")
-                found[renamed or own] = (module, own)
-        return found
+    Args:
+        names: by module, the names that come from it, with spaces between; one may be a module in it.
+        renamed: names that the package has under another: `write_report="afspm.report.night_report.write"`.
+    """
+    homes = {name: f"{module}.{name}" for module, several in names.items() for name in several.split()} | renamed
 
     def load(name: str) -> object:
-        if (home := homes().get(name)) is None:
+        if (home := homes.get(name)) is None:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module, own = home
+        module, _, own = home.rpartition(".")
         inside = import_module(module)
-        thing = getattr(inside, own) if hasattr(inside, own) else import_module(f"{module}.{own}")
+        thing = getattr(inside, own) if hasattr(inside, own) else import_module(home)
         setattr(sys.modules[package], name, thing)
         return thing
 

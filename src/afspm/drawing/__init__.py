@@ -59,4 +59,17 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:
-    __getattr__ = lazily(__name__)
+    __getattr__ = lazily(
+        __name__,
+        {
+            "afspm.drawing.chart": "Axis Curve",
+            "afspm.drawing.curves": "profile thinned",
+            "afspm.drawing.image_html": "round_length_m",
+            "afspm.drawing.palette": "CATEGORICAL PROBLEM DIVERGING LEVELS PALETTES",
+            "afspm.drawing.plotting": "draw_scale_bar save_figure gold",
+            "afspm.drawing.raster": "Contrast ValueRange indices png shared_range value_range reduced",
+            "afspm.drawing.timeline": "TimelineRow timeline_html tint_class",
+        },
+        TIMELINE_CSS="afspm.drawing.timeline.CSS",
+        shown_image="afspm.drawing.image_html.shown",
+    )

@@ -123,4 +123,30 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:
-    __getattr__ = lazily(__name__)
+    __getattr__ = lazily(
+        __name__,
+        {
+            "afspm.storage.formats": "hdf5_reading igor netcdf",
+            "afspm.storage.formats.content": "FileContent OtherFormat local_ns name_and_unit text_of clock_ns",
+            "afspm.translator.activity": "Activity TipWay",
+            "afspm.translator.driver": "Driver",
+            "afspm.translator.driver_base": "ControllerLost action connected LOST ControllerSilent Introduction",
+            "afspm.translator.folder_files": "FolderFiles",
+            "afspm.translator.judge": "Stated",
+            "afspm.translator.long_call": "ANSWERS_S LongCall",
+            "afspm.translator.own_files": "FileFacts encode_scan encode_spectrum",
+            "afspm.translator.parameters": "FEEDBACK_ON Value ParameterSpec ParameterTable refuse_value",
+            "afspm.translator.result_files": (
+                "SCAN Content Entry FilePrecision ResultFiles lines_missing modified_ns read_result missing_text newest"
+            ),
+            "afspm.translator.scripted_driver": "ScriptedDriver",
+            "afspm.translator.setting_groups": (
+                "FRAME POSITION KeptSettings SettingsGroup as_list as_region check_speed frame frame_values CENTER"
+            ),
+            "afspm.translator.shadow": "ShadowDriver refusal require_question",
+            "afspm.translator.state": "Kept",
+            "afspm.translator.tcp": "Receiver TcpConnection host_and_port",
+            "afspm.translator.trace": "TCP TRACE",
+            "afspm.translator.zmq_connection": "ZmqConnection",
+        },
+    )

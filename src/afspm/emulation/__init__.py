@@ -68,4 +68,23 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:
-    __getattr__ = lazily(__name__)
+    __getattr__ = lazily(
+        __name__,
+        {
+            "afspm.simulation.activities": "RETRACE ScanActivity SpectrumActivity Channels",
+            "afspm.simulation.emulation.controller_clock": "ControllerClock",
+            "afspm.simulation.emulation.emulator": "LOOPBACK Crashed Emulator",
+            "afspm.simulation.emulation.pending_writes": "PendingWrites",
+            "afspm.simulation.emulation.program": "MakerProgram NamedFile",
+            "afspm.simulation.emulation.scripted": (
+                "Client OnRequest ScriptedEmulator ScriptFailed ScriptWire Unfinished"
+            ),
+            "afspm.simulation.emulation.tcp_server": "ClientConnection TcpServer",
+            "afspm.simulation.faults": "Faults EVERY_TIME",
+            "afspm.simulation.instrument": "InstrumentBusy SimulatedInstrument",
+            "afspm.simulation.ledger": "LEDGER_EVENT",
+            "afspm.simulation.scanning": "MOST_PIXELS",
+            "afspm.simulation.simulator": "Simulator",
+            "afspm.simulation.world": "World",
+        },
+    )

@@ -45,4 +45,16 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:
-    __getattr__ = lazily(__name__)
+    __getattr__ = lazily(
+        __name__,
+        {
+            "afspm.night.expected_end": "Plans plans_of",
+            "afspm.night.overview": (
+                "ScanSummary OVER ROUTINE DriftPoint FoundPlace Overview RunningScan SpectrumSummary"
+            ),
+            "afspm.night.packets": "RecordPlayback",
+            "afspm.night.reading_curves": "instrument_curves",
+            "afspm.night.tables": "ScanRow SpectrumRow",
+            "afspm.night.timeline": "Span Timeline",
+        },
+    )

@@ -147,4 +147,43 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:
-    __getattr__ = lazily(__name__)
+    __getattr__ = lazily(
+        __name__,
+        {
+            "afspm.cli.arguments": "AFTERWARDS MEANWHILE RUNS HelpWhenBare NoProgress Where names_in opt RecordedRun",
+            "afspm.cli.joining": "looking plain_console plain_table acting",
+            "afspm.client.experiment_link": "ExperimentLink",
+            "afspm.experiment.class_loader": "importing_from",
+            "afspm.experiment.experiment": "Experiment load_expanded",
+            "afspm.experiment.process_starts": "DASHBOARD",
+            "afspm.storage.packet_log": "log_folder logged_packets",
+            "afspm.supervisor.own_runs": "own_homes register_own_messages",
+            "afspm.supervisor.ports": "FreePorts",
+            "afspm.supervisor.resume": "ResumableRun",
+            "afspm.supervisor.run": "RunOptions dry_run",
+            "afspm.transport.control_client": "ControlClient",
+            "afspm.transport.frames": "receive_frames send_frames send_packet",
+            "afspm.transport.late_joiners": "PublishedHistory",
+            "afspm.transport.network": "Network is_local ACCEPTED CONNECTED DISCONNECTED MAX_PACKET_BYTES Monitor",
+            "afspm.transport.polling": "Poller WakeUp milliseconds",
+            "afspm.transport.port": (
+                "ControlConnected Incoming Killed PacketReceived ParentGone ReplyReceived CaughtUp "
+                "ControlDisconnected RequestReceived Served SubscriberJoined Port"
+            ),
+            "afspm.transport.process.context": "ProcessActivity ProcessContext new_session ExperimentProcess step_back",
+            "afspm.transport.process.loading": "find_class find_object",
+            "afspm.transport.process.parent": "StopRequested leave_interrupts_to_parent",
+            "afspm.transport.publisher": "Publisher",
+            "afspm.transport.rate_limited_log": "RateLimitedLog",
+            "afspm.transport.router": "PeerAsked Router PeerConnected PeerDisconnected RouterEvent",
+            "afspm.transport.subscriber": "Subscriber",
+            "afspm.transport.zmq_port": "open_port BasePort ZmqPort",
+            "afspm.transport.zmq_server": "ZmqServerPort",
+        },
+        load_class="afspm.transport.process.loading.load",
+        load_experiment="afspm.experiment.experiment.load",
+        register_messages="afspm.wire.message_types.register_all",
+        run_experiment="afspm.supervisor.run.run",
+        run_time="afspm.supervisor.run.now",
+        toml_text="afspm.experiment.toml_writer.dumps",
+    )

@@ -62,4 +62,19 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:
-    __getattr__ = lazily(__name__)
+    __getattr__ = lazily(
+        __name__,
+        {
+            "afspm.record.allowed_bands": "AllowedBands",
+            "afspm.record.drift_mapping": "drift_at drift_knowledge",
+            "afspm.record.journal": "JOURNAL_FILE measured_file",
+            "afspm.record.nexus_writer": "field_names",
+            "afspm.record.run_json": (
+                "ENDED EXPERIMENT_FILE STATE_DIR experiment_name run_json_or_empty REPLAY_OF RUN_FILE latest_run "
+                "read_run_json"
+            ),
+            "afspm.record.run_lock": "lock_run cut_off_message describe_state goes_on",
+        },
+        MEASURED_SUFFIX="afspm.record.measured_files.SUFFIX",
+        bands_allowed="afspm.record.allowed_bands.allowed_bands",
+    )

@@ -50,4 +50,18 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:
-    __getattr__ = lazily(__name__)
+    __getattr__ = lazily(
+        __name__,
+        {
+            "afspm.report.comparison": "compare",
+            "afspm.report.comparison_page": "rows_that_differ",
+            "afspm.report.markup": "document section table",
+            "afspm.report.night_report": "REPORT_FILE",
+            "afspm.report.pictures": "OFFSET is_ours topography",
+            "afspm.report.story": "RunStory",
+        },
+        read_story="afspm.report.story.read",
+        shadow_report="afspm.report.shadow",
+        write_comparison="afspm.report.comparison_page.write",
+        write_report="afspm.report.night_report.write",
+    )

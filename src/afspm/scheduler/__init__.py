@@ -142,4 +142,34 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:
-    __getattr__ = lazily(__name__)
+    __getattr__ = lazily(
+        __name__,
+        {
+            "afspm.model.drift_removal": "undistorted",
+            "afspm.model.grants": "with_proposal",
+            "afspm.model.microscope_status": "feedback_of",
+            "afspm.model.positions": "PROBE_CHANGES REGION_CHANGES scan_values",
+            "afspm.model.problems": "STOPPER",
+            "afspm.scheduler.control.arbitration": "ArbitrationState",
+            "afspm.scheduler.control.descriptions": "request_text",
+            "afspm.scheduler.coordinate_frame": (
+                "TIP_FRAME AskMicroscope CoordinateFrame FrameOutput HoldControl MappedRequest Reconsider SaveNow"
+            ),
+            "afspm.scheduler.events": (
+                "Announced Codec ControlChanged Delegate FrameAnswered FrameReported Input Log PacketIn ProblemSeen "
+                "RequestIn Started Tick TranslatorCaughtUp TranslatorUp"
+            ),
+            "afspm.scheduler.safety.forbidden_states": "PlanRehearsal",
+            "afspm.scheduler.safety.grants": "not_of_role",
+            "afspm.scheduler.safety.limit_checker": "LimitChecker",
+            "afspm.scheduler.safety.limits": "ExperimentLimits",
+            "afspm.scheduler.safety.parameter_values": "number_of",
+            "afspm.scheduler.saved_state": "SavedState",
+            "afspm.scheduler.scheduler": "Coordinates Scheduler",
+            "afspm.scheduler.scheduler_core": "SchedulerCore",
+            "afspm.scheduler.step_log": "Restored StateSums Step facts_of read_cached read_event",
+            "afspm.scheduler.wire_codec": "WireCodec",
+        },
+        STATE_KIND="afspm.scheduler.saved_state.KIND",
+        STATE_VERSION="afspm.scheduler.saved_state.VERSION",
+    )

@@ -7,15 +7,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from afspm.basics.lazy import lazily
+
 if TYPE_CHECKING:
     from afspm.testing.components.component_bench import Bench
 
 __all__ = ["Bench"]
 
-
-def __getattr__(name: str) -> object:
-    if name != "Bench":
-        raise AttributeError(f"module 'afspm.testing' has no attribute {name!r}")
-    from afspm.testing.components.component_bench import Bench
-
-    return Bench
+if not TYPE_CHECKING:
+    __getattr__ = lazily(__name__, {"afspm.testing.components.component_bench": "Bench"})

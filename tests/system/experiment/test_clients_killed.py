@@ -16,11 +16,10 @@ from afspm.model import ScopeState
 ROOT = Path(__file__).parents[3]
 SAMPLES = ROOT / "experiments" / "other_language"
 BUILT = {
-    "typescript": "clients/typescript/dist/src/index.js",
     "java": "clients/java/target/afspm-client.jar",
     "rust": "clients/target/release/examples/flattest",
 }
-PROGRAMS = {"typescript": "node", "java": "java", "rust": ""}
+PROGRAMS = {"java": "java", "rust": ""}
 """What runs a client; empty: it is a program itself."""
 SLOWER = '[clock]\nspeed = 60.0\n[microscope]\ninitial = { scan-speed = "0.5 um/s" }\n'
 

@@ -26,6 +26,7 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,43 +45,6 @@ from afspm.plugins.line_watch.registration import (
     residual_spread,
 )
 
-ACQUIRE = 6  # lines that only find the shift, before the first is judged
-REACH = (3, 5)  # rows and columns about the predicted shift
-JUMP_REACH = (12, 16)  # the same for a sample that has jumped
-NEAR = (1, 2)  # the same about a shift that a search has found
-MOST_JUMPS = 3  # in one scan
-REMEMBERED = 24  # lines for the search after a jump
-EXPLAINED = 1.5
-"""Standard deviations beyond the usual, by the median of these lines, up to which a jump explains them. With 1, a jump
-of the sample was taken for a changed tip in row 11 of an unseen night."""
-NEWEST = 4  # lines since a change that a jump must explain, at least
-PER_PIXEL = 0.03  # standard deviations that a pixel of a jump costs: short jumps are likelier than long ones
-DRIFT = 1.0  # standard deviations above the usual difference beyond which a line lets the sum grow
-LEAST_PER_SLOPE = 0.06  # pixels: two scans without drift between them show too small a misfit of steep flanks
-SPIKE = 6.0  # standard deviations beyond which a single pixel of a good scan is removed as a spike
-SCAR = 4.0  # standard deviations beyond which a row of a good scan is no measure of later ones
-MOST = 6.0  # standard deviations that one line adds at most
-FLOOR, FACTOR = 15.0, 2.0
-"""Least threshold, and ratio of a threshold to the highest sum of good scans. A floor of 20, in place of the least
-alike of few pairs (`ENOUGH_PAIRS`), stopped 8 of 512 good scans instead of 6."""
-FEWEST_SUSPECT = 6  # rows since a change before an alarm: three fit wrong places of a flat step, as after a jump
-FEWEST_STOP = 10
-"""Rows since a change before a scan is stopped, after a second search for a jump with more lines. With six, an unseen
-night was stopped 68 rows before its tip changed; with ten, 7 rows after."""
-LOOK = 0.6  # share of the threshold above which a person should look
-PARTS = ((1, 1 / 4), (2, 1 / 8))  # number and width, relative to the line, of parts that a changed sample may fill
-ELSEWHERE = 0.4  # share of the threshold that the rest of the lines must reach before a scan is stopped
-LASTING = 3 / 8
-"""Share of the rows for which a sum grows before the change counts as the tip's, and not as a single adsorbate's.
-Without this rule a double tip among few particles in 64 rows never stopped a scan."""
-HUM_PEAK = 6.0
-"""Power of a hum relative to the frequencies beside it. Of 80 scans with hum, 20 raised an alarm, 19 of these with
-such a peak; so did 7 of 45 changed tips, and were stopped in the same rows without it."""
-BESIDE_HUM = (2.5, 5.5)  # periods per line from the peak: a Hann window widens it by two
-FINER = 8  # steps of frequency in a period per line: two steps off leave a twentieth of a hum's power
-MOST_HUMS = 3  # frequencies in one scan
-LEAST_SPREAD = 0.05  # of the image's part
-NEWER = 0.15  # weight of the newest line in the spectrum of the noise
 GOOD_DECAY = 5.0  # decay, with the evidence, of the share of good scans that reach it: assumed, not fitted
 FEWEST_PAIRS = 2  # least number of pairs of good scans before scans of their kind are judged
 ENOUGH_PAIRS = 4  # least number of pairs for medians
@@ -88,6 +52,56 @@ KEPT_PAIRS, KEPT_SPEEDS = 16, 3
 MOST_KINDS, MOST_PLACES = 4, 8
 SAME_SIZE = 0.02  # relative difference of sizes, and of angles in rad, within which they count as equal
 LEAST_COMMON = 0.5  # share of width and height that an earlier scan must cover
+
+
+@dataclass(frozen=True)
+class JudgeSettings:
+    """Numbers of the judgement, tuned together on the half "fitted" of the nights of `benchmarks/line_watch`."""
+
+    acquire: int = 6  # lines that only find the shift, before the first is judged
+    reach: tuple[int, int] = (3, 5)  # rows and columns about the predicted shift
+    jump_reach: tuple[int, int] = (12, 16)  # the same for a sample that has jumped
+    near: tuple[int, int] = (1, 2)  # the same about a shift that a search has found
+    most_jumps: int = 3  # in one scan
+    remembered: int = 24  # lines for the search after a jump
+    explained: float = 1.5
+    """Standard deviations beyond the usual, by the median of these lines, up to which a jump explains them. With 1, a
+    jump of the sample was taken for a changed tip in row 11 of an unseen night."""
+    newest: int = 4  # lines since a change that a jump must explain, at least
+    per_pixel: float = 0.03  # standard deviations that a pixel of a jump costs: short jumps are likelier than long ones
+    drift: float = 1.0  # standard deviations above the usual difference beyond which a line lets the sum grow
+    least_per_slope: float = 0.06
+    """In pixels: two scans without drift between them show too small a misfit of steep flanks."""
+    spike: float = 6.0  # standard deviations beyond which a single pixel of a good scan is removed as a spike
+    scar: float = 4.0  # standard deviations beyond which a row of a good scan is no measure of later ones
+    most: float = 6.0  # standard deviations that one line adds at most
+    floor: float = 15.0
+    """Least threshold. A floor of 20, in place of the least alike of few pairs (`ENOUGH_PAIRS`), stopped 8 of 512 good
+    scans instead of 6."""
+    factor: float = 2.0  # of a threshold to the highest sum of good scans
+    fewest_suspect: int = 6
+    """Rows since a change before an alarm: three fit wrong places of a flat step, as after a jump."""
+    fewest_stop: int = 10
+    """Rows since a change before a scan is stopped, after a second search for a jump with more lines. With six, an
+    unseen night was stopped 68 rows before its tip changed; with ten, 7 rows after."""
+    look: float = 0.6  # share of the threshold above which a person should look
+    parts: tuple[tuple[int, float], ...] = ((1, 1 / 4), (2, 1 / 8))
+    """Number and width, relative to the line, of parts that a changed sample may fill."""
+    elsewhere: float = 0.4  # share of the threshold that the rest of the lines must reach before a scan is stopped
+    lasting: float = 3 / 8
+    """Share of the rows for which a sum grows before the change counts as the tip's, and not as a single adsorbate's.
+    Without this rule a double tip among few particles in 64 rows never stopped a scan."""
+    hum_peak: float = 6.0
+    """Power of a hum relative to the frequencies beside it. Of 80 scans with hum, 20 raised an alarm, 19 of these with
+    such a peak; so did 7 of 45 changed tips, and were stopped in the same rows without it."""
+    beside_hum: tuple[float, float] = (2.5, 5.5)  # periods per line from the peak: a Hann window widens it by two
+    finer: int = 8  # steps of frequency in a period per line: two steps off leave a twentieth of a hum's power
+    most_hums: int = 3  # frequencies in one scan
+    least_spread: float = 0.05  # of the image's part
+    newer: float = 0.15  # weight of the newest line in the spectrum of the noise
+
+
+FITTED: Final = JudgeSettings()
 
 
 class AlarmLevel(Enum):
@@ -259,7 +273,7 @@ class Cusum:
     since: int | None = None
 
     def add(self, row: int, sigmas: float) -> None:
-        self.value = max(0.0, self.value + min(sigmas, MOST) - DRIFT)
+        self.value = max(0.0, self.value + min(sigmas, FITTED.most) - FITTED.drift)
         if self.value == 0.0:
             self.since = None
         elif self.since is None:
@@ -289,7 +303,7 @@ class LineStatistic:
         self.pairs = len(pairs)
         highest = sorted(pair.highest for pair in pairs)
         # the highest of many may be of a scan whose tip had changed without an alarm
-        self.threshold = max(FLOOR, FACTOR * highest[-2 if len(highest) >= FEWEST_PAIRS + 2 else -1])
+        self.threshold = max(FITTED.floor, FITTED.factor * highest[-2 if len(highest) >= FEWEST_PAIRS + 2 else -1])
 
     def sigma_m(self, steepness: Array) -> Array:
         return np.asarray(np.hypot(self.flat_m, self.per_slope * steepness))
@@ -331,7 +345,7 @@ class NoiseFilter:
         power = np.convolve(np.pad(power, 1, mode="edge"), np.full(3, 1 / 3), mode="valid")
         before = np.ones_like(power) if self._power is None else self._power
         self._count += 1
-        self._power = before + max(NEWER, 1.0 / self._count) * (power - before)
+        self._power = before + max(FITTED.newer, 1.0 / self._count) * (power - before)
         self.square = float(self._power.mean())
         return self.products(fits)
 
@@ -412,7 +426,7 @@ class ScanJudge:
     @property
     def noise(self) -> float:
         """Standard deviation of the newest lines' noise, relative to good scans; 1 before there are enough lines."""
-        enough = self._followed >= ACQUIRE + REMEMBERED
+        enough = self._followed >= FITTED.acquire + FITTED.remembered
         # a changed tip may have a narrow peak, too, but raises an alarm without it
         hum = self._hum if self.alarm is None else 0.0
         return math.sqrt((self._filter.square + hum) / self._statistic.noise) if enough else 1.0
@@ -428,13 +442,13 @@ class ScanJudge:
         if not all(np.isfinite(values).all() for values in level):
             return None  # a missing line is no evidence about the tip
         self._comparer.follow(row, level)
-        self._recent = [*self._recent, (row, level)][-REMEMBERED:]
+        self._recent = [*self._recent, (row, level)][-FITTED.remembered :]
         self._followed += 1
         fits = self._comparer.fits(row, level)
         if not fits:
             return None
         products = self._filter.add(fits)
-        if self._followed <= ACQUIRE:
+        if self._followed <= FITTED.acquire:
             return None  # the scanner still creeps from its last move: the first lines only find the shift, and noise
         self.fitted[row] = fits
         self._sum_up(row, self._statistic.sigmas(products))
@@ -461,19 +475,19 @@ class ScanJudge:
 
     def _level(self) -> AlarmLevel | None:
         suspects = sum(self._is_suspect(row) for row, _ in self._recent)
-        if self.evidence >= 1.0 and suspects >= FEWEST_STOP and (self._is_everywhere() or self._lasts()):
+        if self.evidence >= 1.0 and suspects >= FITTED.fewest_stop and (self._is_everywhere() or self._lasts()):
             return AlarmLevel.STOP
-        return AlarmLevel.LOOK if self.evidence >= LOOK and suspects >= FEWEST_SUSPECT else None
+        return AlarmLevel.LOOK if self.evidence >= FITTED.look and suspects >= FITTED.fewest_suspect else None
 
     def _is_everywhere(self) -> bool:
         # whether the lines differ also outside of the few parts in which they differ most
         suspects = [(row, line) for row, line in self._recent if self._is_suspect(row)]
         products = [self._filter.products(fits) for row, _ in suspects if (fits := self.fitted.get(row))]
         total = np.sum([np.nan_to_num(one) for one in products], axis=0)
-        return all(self._differ(suspects, _elsewhere(total, *parts)) for parts in PARTS)
+        return all(self._differ(suspects, _elsewhere(total, *parts)) for parts in FITTED.parts)
 
     def _lasts(self) -> bool:
-        rows = round(LASTING * len(self._comparer.place.templates[0].heights))
+        rows = round(FITTED.lasting * len(self._comparer.place.templates[0].heights))
         return len(self._sums) >= rows and self._sums[-1] > self._sums[-1 - rows // 4]
 
     def _differ(self, lines: Sequence[tuple[int, Sequence[Array]]], where: NDArray[np.bool_]) -> bool:
@@ -485,7 +499,7 @@ class ScanJudge:
             if fits := again.fits(row, [np.where(where, values, np.nan) for values in line]):
                 cusum.add(row, self._sigmas(fits))
                 highest = max(highest, cusum.value)
-        return highest >= ELSEWHERE * self.threshold
+        return highest >= FITTED.elsewhere * self.threshold
 
     def _sigmas(self, fits: Sequence[RowFit]) -> float:
         return self._statistic.sigmas(self._filter.products(fits))
@@ -493,13 +507,13 @@ class ScanJudge:
     def _hums(self) -> bool:
         # whether a hum was found and removed, and the sum taken again
         comparer = self._comparer
-        if len(comparer.place.templates) > 1 or len(comparer.hums) == MOST_HUMS:
+        if len(comparer.place.templates) > 1 or len(comparer.hums) == FITTED.most_hums:
             return False
         suspects = [row for row, _ in self._recent if self._is_suspect(row) and self.fitted.get(row)]
         if not suspects:
             return False
         peak, frequency = _narrowest(np.array([self._filter.relative(self.fitted[row])[0] for row in suspects]))
-        if peak < HUM_PEAK:
+        if peak < FITTED.hum_peak:
             return False
         waves = [_waves(self.fitted[row][0].residual, [frequency]) for row in suspects]
         self._hum += float(np.mean(np.square(waves))) / self._statistic.flat_m**2
@@ -516,36 +530,36 @@ class ScanJudge:
         return True
 
     def _has_jumped(self) -> bool:
-        if self._comparer.jumps >= MOST_JUMPS:
+        if self._comparer.jumps >= FITTED.most_jumps:
             return False
         # since the change, for a sample that has jumped; all lines, for a lattice that was matched one period away
         suspects = [(row, line) for row, line in self._recent if self._is_suspect(row)]
         # the older half may lie before the jump
-        newest = suspects[-max(NEWEST, (len(suspects) + 1) // 2) :]
+        newest = suspects[-max(FITTED.newest, (len(suspects) + 1) // 2) :]
         template, statistic = self._comparer.place.templates[0], self._statistic
         # a contaminated tip spoils some lines at any shift, and leaves the others as they were
-        odd = {row for row, _ in newest if (fits := self.fitted.get(row)) and self._sigmas(fits) > EXPLAINED}
+        odd = {row for row, _ in newest if (fits := self.fitted.get(row)) and self._sigmas(fits) > FITTED.explained}
         found: list[tuple[float, RowRegistration]] = []
         for lines in (newest, self._recent):
             traces = [(row, line[0]) for row, line in lines]
             about = self._comparer.registration.shift
-            likely = likely_shifts(template, traces, about, JUMP_REACH, statistic.flat_m)
+            likely = likely_shifts(template, traces, about, FITTED.jump_reach, statistic.flat_m)
             # an earlier jump may have been none, and an earlier scan may itself have jumped back on its way
             for shift in (*likely, self._home):
-                registration = RowRegistration(template, shift, NEAR, steady=1.0)
+                registration = RowRegistration(template, shift, FITTED.near, steady=1.0)
                 again = replace(self._comparer, registration=registration, before=None)
                 for row, line in lines:
                     again.follow(row, line)
                 sigmas = {row: self._sigmas(fits) for row, line in newest if (fits := again.fits(row, line))}
                 off = max(_median(sigmas.values()), _median([of for row, of in sigmas.items() if row in odd]))
-                if 2 * len(sigmas) > len(newest) and off < EXPLAINED:
+                if 2 * len(sigmas) > len(newest) and off < FITTED.explained:
                     far = math.dist(again.registration.shift, self._home)
-                    found.append((max(0.0, off) + PER_PIXEL * far, again.registration))
+                    found.append((max(0.0, off) + FITTED.per_pixel * far, again.registration))
         if not found:
             return False
         self._comparer.jumps += 1
         shift = min(found, key=lambda one: one[0])[1].shift
-        self._comparer.registration = RowRegistration(template, shift, REACH)
+        self._comparer.registration = RowRegistration(template, shift, FITTED.reach)
         for row, line in newest:
             self._comparer.follow(row, line)
             self.fitted[row] = self._comparer.fits(row, line)
@@ -571,13 +585,13 @@ def _elsewhere(total: Array, parts: int, width: float) -> NDArray[np.bool_]:
 def _narrowest(lines: Array) -> tuple[float, float]:
     # the highest peak in the spectrum, relative to the higher of both sides, and its frequency per pixel
     count = lines.shape[1]
-    power = np.mean(np.abs(np.fft.rfft(np.nan_to_num(lines) * np.hanning(count), n=FINER * count)) ** 2, axis=0)
-    near, far = (round(FINER * periods) for periods in BESIDE_HUM)
+    power = np.mean(np.abs(np.fft.rfft(np.nan_to_num(lines) * np.hanning(count), n=FITTED.finer * count)) ** 2, axis=0)
+    near, far = (round(FITTED.finer * periods) for periods in FITTED.beside_hum)
     sums = np.append(0.0, np.cumsum(np.pad(power, far, mode="reflect")))
     means = (sums[far - near + 1 :] - sums[: -(far - near + 1)]) / (far - near + 1)
     beside = np.maximum(means[: power.size], means[far + near :][: power.size])
     at = int(np.argmax(power / beside))
-    return float(power[at] / beside[at]), at / (FINER * count)
+    return float(power[at] / beside[at]), at / (FITTED.finer * count)
 
 
 def _waves(residual: Array, hums: Sequence[float]) -> Array:
@@ -598,12 +612,12 @@ class _OddRows:
     spikes: list[tuple[int, int, Array]] = field(default_factory=list)
 
     def note(self, row: int, fits: Sequence[RowFit], statistic: LineStatistic, sigmas: float) -> None:
-        if sigmas > SCAR:
+        if sigmas > FITTED.scar:
             self.doubtful.add(row)
         for channel, fit in enumerate(fits):
             off = np.nan_to_num(np.abs(fit.residual) / statistic.sigma_m(fit.steepness))
             beside = np.maximum(np.append(off[1:], 0.0), np.append(0.0, off[:-1]))
-            alone = (off > SPIKE) & (beside < 0.5 * off)
+            alone = (off > FITTED.spike) & (beside < 0.5 * off)
             if alone.any():
                 self.spikes.append((channel, row, np.where(alone, fit.residual, 0.0)))
 
@@ -637,7 +651,7 @@ class LineJudge:
             return None
         place = known.place(region)
         if place is not None and len(place.templates) == channels and len(known.pairs) >= FEWEST_PAIRS:
-            registration = RowRegistration(place.templates[0], known.shift(place, region, at_s), REACH)
+            registration = RowRegistration(place.templates[0], known.shift(place, region, at_s), FITTED.reach)
             what = "lines differ from the earlier scan of this place"
             return ScanJudge(_Comparer(place, registration), LineStatistic(known.pairs), what)
         return None
@@ -702,10 +716,12 @@ class LineJudge:
         lines = [(row, line) for row, line in lines if all(np.isfinite(values).all() for values in line)]
         if downwards:
             lines.reverse()
-        if len(lines) <= ACQUIRE:
+        if len(lines) <= FITTED.acquire:
             return odd
         if place is not None and len(place.templates) == len(picture):
-            comparer = _Comparer(place, RowRegistration(place.templates[0], known.shift(place, region, at_s), REACH))
+            comparer = _Comparer(
+                place, RowRegistration(place.templates[0], known.shift(place, region, at_s), FITTED.reach)
+            )
             _append(known.pairs, _statistics(comparer, lines, known.pairs, odd))
             if comparer.jumps:
                 known.note_jump(place, region, at_s, comparer.registration.shift)
@@ -722,7 +738,7 @@ class LineJudge:
         alone = replace(known, places=[place])
         if not earlier.kind.fits(later.kind) or alone.place(later.region) is None:
             return False
-        registration = RowRegistration(place.templates[0], alone.shift(place, later.region, later.at_s), REACH)
+        registration = RowRegistration(place.templates[0], alone.shift(place, later.region, later.at_s), FITTED.reach)
         running = ScanJudge(_Comparer(place, registration), LineStatistic(known.pairs), "")
         rows = range(len(later.picture[0]))
         return all(
@@ -776,7 +792,7 @@ def _statistics(
         fitted = []
         for number, (row, line) in enumerate(lines):
             comparer.follow(row, line)
-            if number >= ACQUIRE and (fits := comparer.fits(row, line)):
+            if number >= FITTED.acquire and (fits := comparer.fits(row, line)):
                 fitted.append((row, fits))
     if len(fitted) < len(lines) // 2:
         return None
@@ -787,7 +803,7 @@ def _statistics(
         own.append(float(np.nanmean(filtering.add(fits))))
         noise.append(filtering.square)
     usual = float(np.median(own))
-    spread = max(float(np.quantile(own, 0.84)) - usual, LEAST_SPREAD)
+    spread = max(float(np.quantile(own, 0.84)) - usual, FITTED.least_spread)
     pair = PairStatistics(flat_m, per_slope, usual, spread, 0.0, float(np.median(noise)))
     # judged by the other pairs, as a running scan is
     statistic, cusum, highest = LineStatistic(before or [pair]), Cusum(), 0.0
@@ -809,4 +825,4 @@ def _expected(fits: Sequence[RowFit]) -> tuple[float, float]:
     steep = steepness >= np.quantile(steepness, 0.9)
     flat_m = residual_spread(residual[flat])
     beyond = max(0.0, residual_spread(residual[steep]) ** 2 - flat_m**2)
-    return flat_m, max(LEAST_PER_SLOPE, math.sqrt(beyond) / max(float(np.median(steepness[steep])), 1e-15))
+    return flat_m, max(FITTED.least_per_slope, math.sqrt(beyond) / max(float(np.median(steepness[steep])), 1e-15))

@@ -118,7 +118,8 @@ class _TlsListener(socket.socket):
 
 
 def _impatient(stalled_s: float, head_s: float, listener: _TlsListener | None) -> type[asyncio.Protocol]:
-    # uvicorn keeps a stalled client's connection for ever; this protocol disconnects it
+    # uvicorn keeps a stalled client's connection for ever, and has no setting for it; this protocol disconnects it. It
+    # reads `conn` and `transport` of uvicorn's, so pyproject.toml takes only versions that this was tried with
     import h11
 
     # h11, not httptools: only h11 bounds the head of a request

@@ -63,6 +63,28 @@ public final class Component {
         Runtime.getRuntime().halt(code); // nothing is left to do, and a thread of the user may still run
     }
 
+    /**
+     * Take part as a component that is no Java program, such as a script of MATLAB or Octave, which can't implement an
+     * interface. The process ends by itself when the experiment or standard input does: no call of the script throws
+     * {@link ExperimentEndedException} or {@link StopRequestedException}.
+     */
+    public static Experiment begin() {
+        logToStandardError();
+        BufferedReader input = new BufferedReader(new InputStreamReader(System.in, StandardCharsets.UTF_8));
+        Experiment experiment;
+        try {
+            String line = input.readLine();
+            experiment = new Experiment(Launch.parse(line == null ? "" : line), Experiment.LONGEST_STEP_S);
+        } catch (IOException error) {
+            throw new ConfigException("standard input has no launch line: " + error);
+        }
+        // before a call of the script throws: its interpreter would end with the exit code of a crash
+        experiment.link().onFail(reason -> Runtime.getRuntime().halt(exitCodeOf(reason)));
+        experiment.start();
+        thread("standard input", () -> read(input, line -> { }, experiment));
+        return experiment;
+    }
+
     private static CompletableFuture<Integer> begin(Consumer<Experiment> main, Experiment experiment) {
         CompletableFuture<Integer> done = new CompletableFuture<>();
         CompletableFuture<Void> begun = new CompletableFuture<>();

@@ -17,6 +17,7 @@ import java.util.concurrent.ConcurrentLinkedQueue;
 import java.util.concurrent.CopyOnWriteArrayList;
 import java.util.function.BiConsumer;
 import java.util.function.BooleanSupplier;
+import java.util.function.Consumer;
 import java.util.logging.Level;
 import java.util.logging.Logger;
 import org.zeromq.ZContext;
@@ -48,6 +49,7 @@ final class Link implements AutoCloseable {
     private int waiting;
     private long busySince = System.nanoTime();
     private volatile boolean isClosed;
+    private volatile Consumer<RuntimeException> beforeFailure = reason -> { };
 
     Link(Launch launch) {
         this.launch = launch;
@@ -136,8 +138,14 @@ final class Link implements AutoCloseable {
         notifyAll();
     }
 
+    /** Call {@code action} with the reason before a waiting call throws it. */
+    void onFail(Consumer<RuntimeException> action) {
+        beforeFailure = action;
+    }
+
     /** End all waiting, with a reason. */
     void fail(RuntimeException reason) {
+        beforeFailure.accept(reason);
         change(() -> over = over == null ? reason : over);
     }
 
