@@ -26,7 +26,7 @@ from afspm.client.connect import find_run, guest_of
 from afspm.experiment import Experiment, Role
 from afspm.model import CLOCK_REQUEST, ProcessCondition, ProcessStates, Request
 from afspm.model.events import SUPERVISOR
-from afspm.record.run_lock import goes_on
+from afspm.record import goes_on
 from afspm.supervisor.reporter import computer_name
 from afspm.translator.trace import FILE as TRACE_FILE
 from afspm.translator.trace import load_of, newest_lines

@@ -12,8 +12,8 @@ from afspm.basics.launch import Launch
 from afspm.client.connect import guest_of
 from afspm.client.experiment_link import ExperimentLink
 from afspm.model import Packet, ProblemNames
-from afspm.night.overview import Overview
-from afspm.record.run_lock import cut_off_message
+from afspm.night import Overview
+from afspm.record import cut_off_message
 from afspm.supervisor.own_runs import register_own_messages
 from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import open_port

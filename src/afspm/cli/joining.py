@@ -72,8 +72,8 @@ def acting(where: Path) -> Iterator[Scope]:
 def describe(follower: Follower, *, fancy: bool = True) -> RunDescription:
     """Return facts about the run that are not in its packets."""
     from afspm.cli.status_text import RunDescription
-    from afspm.night.expected_end import plans_of
-    from afspm.record.run_json import REPLAY_OF, read_run_json
+    from afspm.night import plans_of
+    from afspm.record import REPLAY_OF, read_run_json
 
     clock, facts = follower.launch.clock, read_run_json(follower.folder)
     return RunDescription(
@@ -120,8 +120,8 @@ def _end_without_run(why: str, *, as_json: bool, running: bool | None) -> NoRetu
 def _running(where: Path, *, as_json: bool, acts: bool) -> Path:
     from afspm.basics.errors import FileError
     from afspm.client.connect import find_run, others_running, require_no_others, several_run
-    from afspm.record.run_json import ENDED, RUN_FILE, read_run_json
-    from afspm.record.run_lock import goes_on
+    from afspm.record import RUN_FILE, goes_on, read_run_json
+    from afspm.record.run_json import ENDED
 
     try:
         folder = find_run(where)
@@ -145,8 +145,9 @@ def _running(where: Path, *, as_json: bool, acts: bool) -> Path:
 @contextmanager
 def _only_if_running(folder: Path, *, as_json: bool) -> Iterator[None]:
     from afspm.basics.errors import ExperimentEnded, NoResponse
+    from afspm.record import cut_off_message
     from afspm.record.run_json import run_json_or_empty
-    from afspm.record.run_lock import cut_off_message, other_computer
+    from afspm.record.run_lock import other_computer
 
     try:
         yield

@@ -104,7 +104,7 @@ def report(where: Where = RUNS, quiet: Quiet = False) -> None:
     """
     from afspm.basics.progress_line import ProgressLine
     from afspm.client.connect import find_run
-    from afspm.report.night_report import write
+    from afspm.report import write_report as write
 
     with ProgressLine("writing the report", quiet=quiet) as line:
         written = write(find_run(where), line.step)

@@ -53,7 +53,7 @@ def watch(
     from afspm.cli.run import with_overlay
     from afspm.experiment.shadow import shadow_file, shadow_overlay
     from afspm.night.run import open_run
-    from afspm.report import shadow as watched
+    from afspm.report import shadow_report as watched
     from afspm.supervisor import run as running
 
     with tempfile.TemporaryDirectory() as folder:

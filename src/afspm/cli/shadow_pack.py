@@ -25,7 +25,7 @@ import numpy as np
 from afspm.basics.errors import AfspmError, FileError, InvalidValue
 from afspm.night.run import Run
 from afspm.record.run_json import COMPUTER
-from afspm.report import shadow
+from afspm.report import shadow_report as shadow
 from afspm.report.export.netcdf import scan_file
 from afspm.report.markup import PageTimes, document, section
 from afspm.storage import formats

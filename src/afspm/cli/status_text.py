@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from afspm import wire
-from afspm.basics.clock import NS_PER_S, utc_time
-from afspm.basics.formatting import area_text, day_and_time, duration_text, time_of_day
+from afspm.basics import time_of_day, utc_time
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.formatting import area_text, day_and_time, duration_text
 from afspm.model import LogLine, ProcessCondition, ProcessState, Progress, Region, ScopeState
-from afspm.night.expected_end import Plans
-from afspm.night.overview import OLD_S, OVER, ROUTINE, Overview
-from afspm.night.timeline import Span
+from afspm.night import OVER, ROUTINE, Overview, Plans, Span
+from afspm.night.overview import OLD_S
 
 if TYPE_CHECKING:
     from rich.console import Group

@@ -130,9 +130,10 @@ def note(
     from afspm.client.connect import find_one_run
     from afspm.night.notes import append_note
     from afspm.night.run import open_run
-    from afspm.record.run_lock import goes_on
-    from afspm.report import shadow
-    from afspm.report.night_report import REPORT_FILE, write
+    from afspm.record import goes_on
+    from afspm.report import REPORT_FILE
+    from afspm.report import shadow_report as shadow
+    from afspm.report import write_report as write
 
     *where, text = words
     if len(where) > 1:

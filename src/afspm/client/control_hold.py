@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 
-from afspm.basics.errors import ControlLost, ExperimentEnded, NoResponse, Refused
+from afspm.basics import ControlLost
+from afspm.basics.errors import ExperimentEnded, NoResponse, Refused
 from afspm.client.experiment_link import ExperimentLink
 from afspm.model import (
     LEASE_AT_ONCE_S,

@@ -9,8 +9,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from afspm import wire
+from afspm.basics import RequestError
 from afspm.basics.clock import NS_PER_S, Clock
-from afspm.basics.errors import ConfigError, ExperimentEnded, MeasurementFailed, RequestError
+from afspm.basics.errors import ConfigError, ExperimentEnded, MeasurementFailed
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.own_fault import OwnFault
 from afspm.client.backlog import PacketBacklog

@@ -8,17 +8,9 @@ from datetime import UTC
 from typing import Any
 
 from afspm import wire
-from afspm.basics.errors import (
-    ControlLost,
-    ExperimentEnded,
-    MeasurementFailed,
-    NoResponse,
-    Refused,
-    RequestError,
-    WireError,
-)
+from afspm.basics import ControlLost, Publication, RequestError
+from afspm.basics.errors import ExperimentEnded, MeasurementFailed, NoResponse, Refused, WireError
 from afspm.basics.formatting import day_and_time
-from afspm.basics.shared_time import Publication
 from afspm.client.command_retry import NOT_IN_CONTROL, CommandRetry
 from afspm.client.control_hold import ControlHold
 from afspm.client.cycle import Cycle, CycleOutcome

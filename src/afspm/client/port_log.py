@@ -26,9 +26,9 @@ from pathlib import Path
 from typing import TypedDict
 
 from afspm import wire
+from afspm.basics import PlainList, Publication
 from afspm.basics.clock import Clock
-from afspm.basics.plain_data import Plain, PlainList
-from afspm.basics.shared_time import Publication
+from afspm.basics.plain_data import Plain
 from afspm.client.keyed_results import kept_in
 from afspm.model import Packet
 from afspm.storage.line_log import REQUESTS_FOLDER, LineLog

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 from afspm import wire
-from afspm.basics.errors import ExperimentEnded, InvalidValue, Refused, RequestError
+from afspm.basics import RequestError
+from afspm.basics.errors import ExperimentEnded, InvalidValue, Refused
 from afspm.basics.plain_data import Plain
 from afspm.client.command_retry import CommandRetry, refused
 from afspm.client.control_hold import ControlHold

@@ -6,8 +6,9 @@ from typing import Annotated
 
 import numpy as np
 
-from afspm.basics.errors import ConfigError, InvalidValue, Refused, RequestError, UnitError
-from afspm.basics.units import Length, convert, same_kind
+from afspm.basics import RequestError, same_kind
+from afspm.basics.errors import ConfigError, InvalidValue, Refused, UnitError
+from afspm.basics.units import Length, convert
 from afspm.client.component import Component
 from afspm.client.scope import Scope
 from afspm.components.feedback_metrics import FeedbackError, FeedbackLimits, feedback_error, relative_error

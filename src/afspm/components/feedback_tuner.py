@@ -5,7 +5,8 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import Any, ClassVar
 
-from afspm.basics.errors import ConfigError, ControlLost, InvalidValue, Refused, RequestError
+from afspm.basics import ControlLost, RequestError
+from afspm.basics.errors import ConfigError, InvalidValue, Refused
 from afspm.components.feedback_metrics import FeedbackError, FeedbackQuality, gain_search
 from afspm.components.feedback_signal import FeedbackObserver
 from afspm.model import Parameter, Problem, names

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from afspm.basics.clock import utc_time
+from afspm.basics import utc_time
 from afspm.basics.errors import AfspmError, ConfigError
 
 END: Final = "end"

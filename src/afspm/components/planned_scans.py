@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 from datetime import UTC
 from typing import Any, Literal
 
+from afspm.basics import Angle, ControlLost, RequestError
 from afspm.basics.clock import NS_PER_S
-from afspm.basics.errors import ConfigError, ControlLost, InvalidValue, Refused, RequestError, UnitError
+from afspm.basics.errors import ConfigError, InvalidValue, Refused, UnitError
 from afspm.basics.formatting import counted, day_and_time
-from afspm.basics.units import Angle, Length, Period, convert, si
+from afspm.basics.units import Length, Period, convert, si
 from afspm.client.component import Component
 from afspm.client.events import PublishedEvent
 from afspm.client.parameter_text import to_parameter

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from typing import ClassVar, Literal
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
-from afspm.basics.errors import ConfigError, ControlLost, NoResponse, Refused
+from afspm.basics import ControlLost
+from afspm.basics.errors import ConfigError, NoResponse, Refused
 from afspm.client.component import Component
 from afspm.model import (
     ControlEvent,

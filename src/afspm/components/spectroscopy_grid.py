@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 from contextlib import suppress
 
-from afspm.basics.errors import ConfigError, Refused, RequestError
+from afspm.basics import Angle, RequestError
+from afspm.basics.errors import ConfigError, Refused
 from afspm.basics.formatting import position_text
-from afspm.basics.units import Angle, Length
+from afspm.basics.units import Length
 from afspm.client.component import Component
 from afspm.components.pace import Pace
 from afspm.components.planned_scans import pair

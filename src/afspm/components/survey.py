@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
+from afspm.basics import Angle
 from afspm.basics.errors import ConfigError, Refused
 from afspm.basics.formatting import area_text, counted, lengths_text, position_text
-from afspm.basics.units import Angle, Length
+from afspm.basics.units import Length
 from afspm.client.component import Component
 from afspm.client.events import Events
 from afspm.client.keyed_results import check_key
@@ -34,7 +35,7 @@ from afspm.model import (
 )
 from afspm.model.geometry import XY
 from afspm.model.planned_work import PlannedWork, planned_rounds
-from afspm.record.drift_mapping import drift_knowledge
+from afspm.record import drift_knowledge
 from afspm.storage.atomic import OutageLog
 from afspm.transport.process.loading import find_object
 

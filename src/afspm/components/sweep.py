@@ -8,10 +8,11 @@ from functools import reduce
 from operator import add
 from typing import Literal
 
+from afspm.basics import Angle
 from afspm.basics.errors import ConfigError, InvalidValue, UnitError
 from afspm.basics.formatting import quantity
 from afspm.basics.plain_data import Plain
-from afspm.basics.units import Angle, Length
+from afspm.basics.units import Length
 from afspm.client.component import Component
 from afspm.components.pace import Pace
 from afspm.components.planned_scans import FRAME, Pixels, pair, shape_of

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-from afspm.basics.errors import AfspmError, ConfigError, ControlLost, FileError, NoResponse, Refused
+from afspm.basics import ControlLost, Speed, Voltage
+from afspm.basics.errors import AfspmError, ConfigError, FileError, NoResponse, Refused
 from afspm.basics.formatting import position_text
-from afspm.basics.units import Duration, Length, Period, Speed, Voltage
+from afspm.basics.units import Duration, Length, Period
 from afspm.client.component import Component
 from afspm.client.events import Events
 from afspm.components import tip_verdict

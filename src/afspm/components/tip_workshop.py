@@ -7,7 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from afspm import wire
-from afspm.basics.errors import ControlLost, FileError, NoResponse, Refused
+from afspm.basics import ControlLost
+from afspm.basics.errors import FileError, NoResponse, Refused
 from afspm.basics.formatting import position_text
 from afspm.client.component import Component
 from afspm.components.tip_treatments import XY, Pulse, Treatment, TreatmentPlaces, clearance_m

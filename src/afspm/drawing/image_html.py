@@ -9,7 +9,8 @@ from html import escape
 
 import numpy as np
 
-from afspm.basics.formatting import quantity, scale, typeset_length
+from afspm.basics import typeset_length
+from afspm.basics.formatting import quantity, scale
 from afspm.drawing.palette import PALETTES, colour_map
 from afspm.drawing.raster import ValueRange, indices, png, reduced, value_range, webp
 from afspm.model.arrays import Array

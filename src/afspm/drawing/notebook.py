@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from afspm.basics.formatting import day_and_time, typeset_area, typeset_position
+from afspm.basics import typeset_area
+from afspm.basics.formatting import day_and_time, typeset_position
 from afspm.drawing import image_html
 from afspm.drawing.chart import Axis, Curve, chart
 

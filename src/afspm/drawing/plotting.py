@@ -8,8 +8,9 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from afspm.basics import typeset_length
 from afspm.basics.errors import InvalidValue
-from afspm.basics.formatting import scale, typeset_length
+from afspm.basics.formatting import scale
 from afspm.drawing.image_html import round_length_m
 from afspm.drawing.palette import PALETTES, colour_map
 from afspm.drawing.raster import ValueRange, value_range

@@ -9,8 +9,9 @@ from datetime import tzinfo
 from html import escape
 from typing import Protocol
 
+from afspm.basics import time_of_day
 from afspm.basics.clock import NS_PER_S
-from afspm.basics.formatting import duration_text, quantity, time_of_day
+from afspm.basics.formatting import duration_text, quantity
 
 COLUMNS = 720  # resolution of a row: intervals within one column are merged
 MOST_PICTURES = 14

@@ -15,7 +15,8 @@ from afspm.experiment.document import Document
 from afspm.experiment.findings import nearest
 from afspm.experiment.limits_section import LimitsReader
 from afspm.experiment.toml_lines import Table
-from afspm.scheduler.safety.limits import ExperimentLimits, Limit, bounds, limit_key
+from afspm.scheduler import ExperimentLimits
+from afspm.scheduler.safety.limits import Limit, bounds, limit_key
 
 
 @dataclass(frozen=True)

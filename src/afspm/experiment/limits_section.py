@@ -36,9 +36,10 @@ from typing import Any, Final
 
 import pydantic
 
+from afspm.basics import Angle, Count
 from afspm.basics.errors import AfspmError
-from afspm.basics.plain_data import Count, WholeNumber
-from afspm.basics.units import Angle, Length, parse_quantity, require_unit, si, si_unit
+from afspm.basics.plain_data import WholeNumber
+from afspm.basics.units import Length, parse_quantity, require_unit, si, si_unit
 from afspm.experiment.document import Document
 from afspm.experiment.findings import nearest
 from afspm.experiment.sections import Section, parse
@@ -46,9 +47,10 @@ from afspm.experiment.toml_lines import Table
 from afspm.experiment.validation_messages import name_of, report
 from afspm.model import Parameter, Region, component_of, names
 from afspm.model.instruments import instrument_of
+from afspm.scheduler import ExperimentLimits
 from afspm.scheduler.safety import rule_language
 from afspm.scheduler.safety.forbidden_states import NEVER_REFUSED, STATES
-from afspm.scheduler.safety.limits import ExperimentLimits, ForbiddenState, Limit, RoleLimits, bounds, limit_key
+from afspm.scheduler.safety.limits import ForbiddenState, Limit, RoleLimits, bounds, limit_key
 from afspm.scheduler.safety.rule_language import RuleComparison, RuleError, RuleTree
 
 Quantity = str | float

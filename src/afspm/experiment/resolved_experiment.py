@@ -19,9 +19,9 @@ from afspm.experiment.sections import ExperimentSections
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.wiring_classes import BoundSocket, Wiring, WiringKeys
 from afspm.model import Frame, ProblemNames, Role
+from afspm.scheduler import ExperimentLimits
 from afspm.scheduler.instruments.conditions import InstrumentSettings
 from afspm.scheduler.publishing.envelopes import CacheSettings
-from afspm.scheduler.safety.limits import ExperimentLimits
 
 if TYPE_CHECKING:
     from afspm.translator.driver import Driver

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import TYPE_CHECKING, Final
 
-from afspm.basics.clock import utc_time
+from afspm.basics import NoSuchItem, imports_of_extra, utc_time
 from afspm.basics.entry_points import DISPLAYS, required
-from afspm.basics.errors import InvalidValue, NoSuchItem
-from afspm.basics.requirements import imports_of_extra
+from afspm.basics.errors import InvalidValue
 from afspm.model.geometry import XY, Region, RegionChange
 
 if TYPE_CHECKING:

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import TYPE_CHECKING
 
-from afspm.basics.clock import utc_time
+from afspm.basics import NoSuchItem, imports_of_extra, utc_time
 from afspm.basics.entry_points import DISPLAYS, required
-from afspm.basics.errors import InvalidValue, NoSuchItem
+from afspm.basics.errors import InvalidValue
 from afspm.basics.plain_data import Plain
-from afspm.basics.requirements import imports_of_extra
 from afspm.model.geometry import XY, Frame
 
 if TYPE_CHECKING:

@@ -11,7 +11,8 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from afspm import wire
-from afspm.basics.errors import FileError, NoSuchItem, UnitError, WireError
+from afspm.basics import NoSuchItem
+from afspm.basics.errors import FileError, UnitError, WireError
 from afspm.basics.plain_data import from_json
 from afspm.basics.units import convert, si_unit
 from afspm.model import Frame, Parameter, Region, RegistrationOutcome, Spectrum, component_of, names
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
     from afspm.model import Scan
     from afspm.night.spectrum_stack import Quantity, SpectrumStack
-    from afspm.record.allowed_bands import AllowedBands
+    from afspm.record import AllowedBands
     from afspm.record.instrument_values import RecordedReadings
 
 _log = logging.getLogger("afspm.record")
@@ -202,7 +203,7 @@ def _positions(query: Query) -> dict[int, tuple[RegistrationOutcome, float | Non
     if not mappings:
         return {}
     knowledge, after_ns = {}, -1
-    from afspm.record.drift_mapping import drift_knowledge  # imports numpy, which the supervisor avoids
+    from afspm.record import drift_knowledge
 
     for number, published_ns in sorted(query(_PUBLISHED["scans"]), key=itemgetter(1)):
         payload = None

@@ -9,12 +9,13 @@ from dataclasses import dataclass, replace
 from statistics import median
 from typing import TYPE_CHECKING, TypeVar
 
-from afspm.basics.units import convert, same_kind
+from afspm.basics import same_kind
+from afspm.basics.units import convert
 from afspm.model import Frame, MeasurementConditions, Region, RegistrationOutcome, Scan, ScanParameters, Spectrum
 from afspm.model.geometry import XY
 from afspm.model.scan_history import BegunMeasurement
 from afspm.night.running_scan import DoneScan, RunningScan
-from afspm.record.drift_mapping import drift_at, drift_knowledge
+from afspm.record import drift_at, drift_knowledge
 
 if TYPE_CHECKING:
     from afspm.wire.messages import DriftMapping, SpatialPointWithScoreList

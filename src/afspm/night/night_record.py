@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.basics.plain_data import Plain, from_json
-from afspm.drawing.palette import LEVELS, UNMEASURED
-from afspm.drawing.raster import ValueRange, indices, reduced, value_range
+from afspm.drawing import LEVELS, reduced
+from afspm.drawing.palette import UNMEASURED
+from afspm.drawing.raster import ValueRange, indices, value_range
 from afspm.model import ControlMode, ControlState, Problem, Scan
 from afspm.model.line_levelling import flattened
 from afspm.night.bad_scans import bad_scans

@@ -15,9 +15,9 @@ from afspm import wire
 from afspm.basics.errors import FileError
 from afspm.model import Note, Packet
 from afspm.night.run import open_run
+from afspm.record import lock_run
 from afspm.record.journal import SCHEDULER
 from afspm.record.run_json import STATE_DIR
-from afspm.record.run_lock import lock_run
 from afspm.record.store import RecordStore
 from afspm.wire.messages import NOTE
 

@@ -63,7 +63,7 @@ from afspm.night.measurement_history import (
 from afspm.night.reading_curves import ReadingCurve
 from afspm.night.running_scan import RunningScan
 from afspm.night.timeline import Span, Timeline, Timelines
-from afspm.record.allowed_bands import AllowedBands
+from afspm.record import AllowedBands
 
 if TYPE_CHECKING:
     from afspm.wire.messages import DriftMapping, DriftRescan, SpatialPointWithScoreList

@@ -14,7 +14,8 @@ from afspm import wire
 from afspm.basics.errors import FileError, WireError
 from afspm.model import Frame, Packet, Scan, Spectrum
 from afspm.night.measured_tables import Row
-from afspm.record.journal import SCHEDULER, measured_file
+from afspm.record import measured_file
+from afspm.record.journal import SCHEDULER
 from afspm.wire.messages import parse
 from afspm.wire.values import with_nan, with_values
 

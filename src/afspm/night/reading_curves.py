@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from afspm.drawing.timeline import DrawnBand, TimelineCurve
-from afspm.record.allowed_bands import AllowedBands, WrittenBand, number_in
+from afspm.record import AllowedBands
+from afspm.record.allowed_bands import WrittenBand, number_in
 
 MOST_POINTS = 4000
 

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from afspm import wire
+from afspm.basics import NoSuchItem
 from afspm.basics.argument_checks import PATH, checked
 from afspm.basics.entry_points import DISPLAYS, required
-from afspm.basics.errors import FileError, InvalidValue, NoSuchItem, WireError
+from afspm.basics.errors import FileError, InvalidValue, WireError
 from afspm.basics.formatting import counted
 from afspm.basics.plain_data import from_json
 from afspm.basics.toml import parse_toml
@@ -46,10 +47,10 @@ from afspm.night.measured_tables import (
 from afspm.night.packets import PacketLookup, packets, without_reading_files
 from afspm.night.tables import ControlRow, NoteRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
 from afspm.night.treatment_ledger import KEEP_AWAY_M, TreatmentLedger, treatment_ledger, treatment_times
-from afspm.record import journal
+from afspm.record import REPLAY_OF, journal, latest_run
 from afspm.record.instrument_values import RecordedReadings
 from afspm.record.journal import SCHEDULER
-from afspm.record.run_json import EXPERIMENT_FILE, METADATA, REPLAY_OF, latest_run, run_json_or_empty
+from afspm.record.run_json import EXPERIMENT_FILE, METADATA, run_json_or_empty
 from afspm.wire import described_types
 from afspm.wire.message_types import register_all
 from afspm.wire.messages import SpatialROIWithScoreList, TipVerdict, WatchCounts
@@ -58,7 +59,7 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message
 
     from afspm.night.overview import DriftPoint, Overview
-    from afspm.record.allowed_bands import AllowedBands
+    from afspm.record import AllowedBands
     from afspm.report.film import Film
     from afspm.storage.formats.content import FileContent
 
@@ -481,7 +482,7 @@ class Run:
 
     @cached_property
     def _bands(self) -> AllowedBands:
-        from afspm.record.allowed_bands import allowed_bands  # imports numpy, which the supervisor avoids
+        from afspm.record import bands_allowed as allowed_bands
 
         return allowed_bands(self.folder)
 

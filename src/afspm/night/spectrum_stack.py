@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.basics import imports_of_extra
 from afspm.basics.errors import InvalidValue
-from afspm.basics.requirements import imports_of_extra
 from afspm.model.arrays import Array
 from afspm.model.geometry import Frame, Region
 from afspm.model.scan import Scan

@@ -11,8 +11,8 @@ from enum import Enum
 from html import escape
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar, overload
 
+from afspm.basics import imports_of_extra
 from afspm.basics.formatting import day_and_time, quantity, scale
-from afspm.basics.requirements import imports_of_extra
 from afspm.model import ControlState, Frame, ProcessCondition, Region, RegistrationOutcome
 from afspm.model.geometry import XY
 

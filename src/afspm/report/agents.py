@@ -7,7 +7,8 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 
-from afspm.basics.formatting import quantity, typeset_area, typeset_position
+from afspm.basics import typeset_area
+from afspm.basics.formatting import quantity, typeset_position
 from afspm.model import (
     STOPPED_BY_AGENT,
     Approval,
@@ -19,9 +20,9 @@ from afspm.model import (
     component_of,
 )
 from afspm.model.parameter_names import BASE_PARAMETERS
-from afspm.model.problems import STOPPER
 from afspm.night.run import Run
 from afspm.report.markup import PageTimes, table
+from afspm.scheduler import STOPPER
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,12 @@ from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 
+from afspm.basics import typeset_area
 from afspm.basics.errors import FileError
-from afspm.basics.formatting import quantity, typeset_area
+from afspm.basics.formatting import quantity
+from afspm.drawing import DIVERGING, PALETTES, reduced
 from afspm.drawing.image_html import Shown, image_html
-from afspm.drawing.palette import DIVERGING, PALETTES
-from afspm.drawing.raster import ValueRange, indices, png, reduced, shared_range, value_range
+from afspm.drawing.raster import ValueRange, indices, png, shared_range, value_range
 from afspm.model.arrays import Array
 from afspm.report.comparison import ComparedRegion, RegionScan, RunComparison, ScanDifference
 from afspm.report.markup import document, section, table

@@ -10,7 +10,8 @@ import numpy as np
 
 from afspm.basics.errors import AfspmError, InvalidValue
 from afspm.basics.formatting import typeset_position
-from afspm.drawing.chart import BACKWARD, Axis, Band, Curve, chart
+from afspm.drawing import Axis, Curve
+from afspm.drawing.chart import BACKWARD, Band, chart
 from afspm.model import Spectrum
 from afspm.model.arrays import Array
 from afspm.model.geometry import XY

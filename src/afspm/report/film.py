@@ -18,11 +18,12 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
+from afspm.basics import typeset_length
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import FileError, InvalidValue
-from afspm.basics.formatting import day_and_time, duration_text, quantity, typeset_length
-from afspm.drawing.image_html import round_length_m
-from afspm.drawing.palette import PALETTES, colour_map
+from afspm.basics.formatting import day_and_time, duration_text, quantity
+from afspm.drawing import PALETTES, round_length_m
+from afspm.drawing.palette import colour_map
 from afspm.drawing.raster import ValueRange, indices, shared_range
 from afspm.model import Frame, Region, Scan
 from afspm.model.arrays import Array
@@ -33,7 +34,7 @@ from afspm.night.tables import ScanRow
 if TYPE_CHECKING:
     from PIL import Image, ImageDraw
 
-    from afspm.night.overview import DriftPoint
+    from afspm.night import DriftPoint
 
 _log = logging.getLogger("afspm.record")
 FORMATS: Final = (".gif", ".mp4")

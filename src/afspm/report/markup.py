@@ -6,8 +6,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC
 from html import escape
 
-from afspm.basics.clock import NS_PER_S, utc_time
-from afspm.basics.formatting import day, day_and_time, period_text, time_of_day, zone_offset_s
+from afspm.basics import time_of_day, utc_time, zone_offset_s
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.formatting import day, day_and_time, period_text
 from afspm.report.style import CSS
 
 _DAY_NS = 86_400 * NS_PER_S

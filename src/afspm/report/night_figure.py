@@ -13,16 +13,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.basics import time_of_day, typeset_length
 from afspm.basics.clock import NS_PER_S
-from afspm.basics.formatting import counted, period_text, scale, time_of_day, typeset_length
-from afspm.drawing.image_html import round_length_m
-from afspm.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM, UNMEASURED, colour_map
+from afspm.basics.formatting import counted, period_text, scale
+from afspm.drawing import CATEGORICAL, PROBLEM, round_length_m
+from afspm.drawing.palette import NEUTRAL, UNMEASURED, colour_map
 from afspm.drawing.raster import ValueRange, indices, pooled_range
 from afspm.drawing.timeline import time_ticks
 from afspm.model import names
+from afspm.night import Span
 from afspm.night.bad_scans import BAD
 from afspm.night.night_record import NightMark, NightRecord, Shot, Thumbnail
-from afspm.night.timeline import Span
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

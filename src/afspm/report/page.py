@@ -12,10 +12,8 @@ from afspm.drawing import timeline
 from afspm.drawing.image_html import data_url
 from afspm.model import ScopeState, component_of
 from afspm.model.events import SUPERVISOR
-from afspm.night.overview import ROUTINE
-from afspm.night.reading_curves import instrument_curves
+from afspm.night import ROUTINE, Timeline, instrument_curves
 from afspm.night.tables import ScanRow
-from afspm.night.timeline import Timeline
 from afspm.report import agents, curves, estimate, markup, parameters, proofs, sample, shadow
 from afspm.report.curves import SpectrumGroup
 from afspm.report.markup import PageTimes, document, section, table

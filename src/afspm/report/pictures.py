@@ -13,8 +13,10 @@ import numpy as np
 
 from afspm.basics import entry_points
 from afspm.basics.errors import AfspmError
-from afspm.drawing.image_html import Shown, shown
-from afspm.drawing.raster import pooled_range, reduced
+from afspm.drawing import reduced
+from afspm.drawing import shown_image as shown
+from afspm.drawing.image_html import Shown
+from afspm.drawing.raster import pooled_range
 from afspm.model import TOPOGRAPHY, ControlMode, ControlState, ScanSet, names
 from afspm.model.arrays import Array
 from afspm.model.line_levelling import flattened

@@ -10,9 +10,10 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from afspm.basics import typeset_area
 from afspm.basics.clock import NS_PER_S
-from afspm.basics.formatting import counted, duration_text, quantity, scale, typeset_area, typeset_position
-from afspm.drawing.chart import Axis
+from afspm.basics.formatting import counted, duration_text, quantity, scale, typeset_position
+from afspm.drawing import Axis
 from afspm.drawing.image_html import data_url, scale_bar
 from afspm.model import Frame, RegistrationOutcome
 from afspm.model.geometry import XY

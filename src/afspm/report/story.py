@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from afspm.basics.formatting import counted
-from afspm.drawing.timeline import TimelineRow
+from afspm.drawing import TimelineRow
 from afspm.model import (
     ControlEvent,
     ControlRequest,
@@ -19,15 +19,14 @@ from afspm.model import (
     ScopeState,
     names,
 )
-from afspm.night.expected_end import plans_of
-from afspm.night.overview import Overview, ProcessRestart
+from afspm.night import Overview, Span, Timeline, plans_of
+from afspm.night.overview import ProcessRestart
 from afspm.night.run import Run
 from afspm.night.tables import NoteRow, ScanRow, SpectrumRow
-from afspm.night.timeline import Span, Timeline
 from afspm.night.treatment_ledger import TreatmentLedger, treatments_once
-from afspm.record.allowed_bands import AllowedBands, allowed_bands
+from afspm.record import AllowedBands, describe_state
+from afspm.record import bands_allowed as allowed_bands
 from afspm.record.run_json import REAL_S, UNFINISHED
-from afspm.record.run_lock import describe_state
 from afspm.report import agents, parameters, proofs, shadow
 from afspm.report.proofs import ResultProofs
 from afspm.report.work_comparison import WorkComparison, compare

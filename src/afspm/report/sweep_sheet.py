@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from afspm.basics import typeset
 from afspm.basics.errors import FileError
-from afspm.basics.formatting import scale, typeset
-from afspm.drawing.raster import ValueRange, reduced, shared_range
+from afspm.basics.formatting import scale
+from afspm.drawing import reduced
+from afspm.drawing.raster import ValueRange, shared_range
 from afspm.model import Scan
 from afspm.model.arrays import Array
 from afspm.model.line_levelling import flattened
@@ -72,7 +74,8 @@ def sheet(scans: Sequence[tuple[Setting, Scan]], title: str) -> Figure:
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
-    from afspm.drawing.plotting import draw_scale_bar, gold
+    from afspm.drawing import gold
+    from afspm.drawing.plotting import draw_scale_bar
 
     across, down = _sorted(settings[-1:] for settings, _ in scans), _sorted(settings[:-1] for settings, _ in scans)
     last, others = scans[0][0][-1], scans[0][0][:-1]

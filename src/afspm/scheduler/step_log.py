@@ -26,9 +26,9 @@ from enum import Enum
 from pathlib import Path
 
 from afspm import wire
+from afspm.basics import PlainList
 from afspm.basics.errors import WireError
 from afspm.basics.launch import Launch
-from afspm.basics.plain_data import PlainList
 from afspm.model import (
     CLOCK_REQUEST,
     ControlResponse,

@@ -7,10 +7,10 @@ import math
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 
+from afspm.basics import Publication
 from afspm.basics.clock import Clock
 from afspm.basics.errors import InvalidValue
 from afspm.basics.plain_data import Plain
-from afspm.basics.shared_time import Publication
 from afspm.simulation.activities import NoValues, ScanActivity, ScanValues, ValuesInAir
 from afspm.simulation.feedback import Loop
 from afspm.simulation.world import World

@@ -9,8 +9,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from afspm.basics import PlainList
 from afspm.basics.errors import FileError
-from afspm.basics.plain_data import PlainList, from_json
+from afspm.basics.plain_data import from_json
 from afspm.storage.disk import DEADLINE_S, DiskBacklogFull, DiskThread, DiskTimeout
 
 REQUESTS_FOLDER = "requests"

@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TextIO
 
+from afspm.basics import time_of_day
 from afspm.basics.clock import NS_PER_S, Clock, ExperimentClock
-from afspm.basics.formatting import day_and_time, time_of_day
+from afspm.basics.formatting import day_and_time
 from afspm.model.events import LOGGED_AS
 from afspm.storage.atomic import SLOW_S
 from afspm.storage.disk import SYNCER

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from afspm.basics import python_environment
 from afspm.basics.clock import Clock
 from afspm.basics.errors import ConfigError, FileError
 from afspm.basics.formatting import duration_text
-from afspm.basics.interpreter import python_command, python_environment
+from afspm.basics.interpreter import python_command
 from afspm.basics.progress_line import ProgressLine
 from afspm.components import notifications
 from afspm.components.notifications import END, GIVEN_UP, NotDelivered, Notification, Targets, Way
@@ -174,7 +175,7 @@ def report(folder: Path, log: RunLog) -> None:
         lines = output.decode(errors="replace").strip().splitlines()
         log.write(LOGGED_AS, logging.WARNING, f"no report: {lines[-1] if lines else f'exit code {exit_code}'}")
     else:
-        from afspm.report.night_report import REPORT_FILE
+        from afspm.report import REPORT_FILE
 
         log.write(LOGGED_AS, logging.INFO, f"the report is {folder / REPORT_FILE}")
 

@@ -14,8 +14,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
+from afspm.basics import python_environment
 from afspm.basics.errors import AfspmError, NoThread
-from afspm.basics.interpreter import python_command, python_environment
+from afspm.basics.interpreter import python_command
 from afspm.basics.launch import Launch
 from afspm.experiment import ProcessStart
 from afspm.model import Role

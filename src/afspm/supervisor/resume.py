@@ -19,9 +19,10 @@ from afspm.basics.errors import ConfigError, FileError
 from afspm.basics.plain_data import Plain
 from afspm.client.connect import find_run
 from afspm.experiment import Experiment, load, load_expanded
+from afspm.record import REPLAY_OF, lock_run, read_run_json
 from afspm.record.journal import open_to_read
-from afspm.record.run_json import EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, read_run_json
-from afspm.record.run_lock import lock_run, quoted, resume_command
+from afspm.record.run_json import EXPERIMENT_FILE, STATE_DIR
+from afspm.record.run_lock import quoted, resume_command
 from afspm.storage.atomic import load_checkpoint
 from afspm.storage.packet_log import log_folder, logged_packets
 from afspm.supervisor import run as running

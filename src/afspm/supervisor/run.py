@@ -20,6 +20,7 @@ from afspm.basics.launch import Launch, Sockets
 from afspm.client.connect import GUEST, guest_facts
 from afspm.experiment import Experiment, ProcessStart, Role
 from afspm.model.events import LOGGED_AS
+from afspm.record import lock_run
 from afspm.record.run_json import (
     COMPUTER,
     ENDED,
@@ -35,7 +36,7 @@ from afspm.record.run_json import (
     WAITS_GIVEN_UP,
     run_json_or_empty,
 )
-from afspm.record.run_lock import lock_run, writing_to
+from afspm.record.run_lock import writing_to
 from afspm.storage.disk import run_bounded
 from afspm.storage.packet_log import discard_if_recorded, expect_recorder, log_folder
 from afspm.supervisor import key_handout, own_runs, post_run, run_folder, run_identity

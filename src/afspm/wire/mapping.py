@@ -13,9 +13,9 @@ from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from afspm import model
+from afspm.basics import shortest_single
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import InvalidValue
-from afspm.basics.formatting import shortest_single
 from afspm.model.events import LogLines, MeasurementSettings
 from afspm.model.instruments import InstrumentOrders
 from afspm.model.panel import ChangedValue

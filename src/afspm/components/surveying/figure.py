@@ -14,12 +14,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 
-from afspm.basics.formatting import counted, scale, typeset_area, typeset_length
+from afspm.basics import typeset_area, typeset_length
+from afspm.basics.formatting import counted, scale
 from afspm.components.surveying.record import Outcome, SurveyRecord, Visit
 from afspm.components.surveying.targets import flattened
-from afspm.drawing.image_html import round_length_m
-from afspm.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM
-from afspm.drawing.plotting import draw_scale_bar, gold
+from afspm.drawing import CATEGORICAL, PROBLEM, gold, round_length_m
+from afspm.drawing.palette import NEUTRAL
+from afspm.drawing.plotting import draw_scale_bar
 from afspm.drawing.raster import shared_range
 from afspm.model import Scan, Spectrum
 from afspm.model.arrays import Array

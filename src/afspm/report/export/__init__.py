@@ -25,7 +25,7 @@ from afspm.model import Spectrum
 from afspm.night.run import Run
 from afspm.night.spectrum_stack import SpectrumStack, stacked
 from afspm.night.tables import ScanRow, SpectrumRow
-from afspm.record.journal import measured_file
+from afspm.record import measured_file
 from afspm.record.measured_files import write_synced
 
 __all__ = ["chosen", "export"]

@@ -15,7 +15,7 @@ from afspm.model import ScanSet, Spectrum
 from afspm.model.channels import ROLES_APART
 from afspm.night.run import Run
 from afspm.night.tables import ScanRow, SpectrumRow
-from afspm.record.nexus_writer import field_names
+from afspm.record import field_names
 from afspm.storage.formats.netcdf import Attributes, Variable, encoded
 from afspm.storage.formats.netcdf_reader import FACTS, PLACES
 

@@ -13,9 +13,8 @@ from afspm.basics.clock import iso_utc
 from afspm.night.run import Run
 from afspm.night.spectrum_stack import SpectrumStack, mean_over_repeats
 from afspm.night.tables import ScanRow, SpectrumRow
-from afspm.record.journal import measured_file
+from afspm.record import field_names, measured_file
 from afspm.record.nexus_reader import ABOUT, GRID
-from afspm.record.nexus_writer import field_names
 from afspm.record.nxspm import group, mark, put, values
 
 

@@ -8,7 +8,8 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from afspm import wire
-from afspm.basics.clock import iso_utc, utc_time
+from afspm.basics import utc_time
+from afspm.basics.clock import iso_utc
 from afspm.night.run import Run
 from afspm.night.tables import ScanRow, SpectrumRow, Table
 

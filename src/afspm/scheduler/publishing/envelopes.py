@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from afspm import wire
+from afspm.basics import Count
 from afspm.basics.errors import ConfigError, InvalidValue, WireError
-from afspm.basics.plain_data import SECTION, Count
+from afspm.basics.plain_data import SECTION
 from afspm.basics.units import Length
 from afspm.model import PacketHeader
 from afspm.wire.messages import SCAN, SPECTRUM

@@ -14,11 +14,11 @@ from typing import Any, ClassVar
 import zmq
 
 from afspm.basics import entry_points
+from afspm.driver import Introduction
 from afspm.simulation.emulation.emulator import LOOPBACK, Emulator
 from afspm.simulation.emulation.playback import Deviation, Playback
 from afspm.storage.atomic import write_atomic
 from afspm.translator.driver import Driver
-from afspm.translator.driver_base import Introduction
 from afspm.translator.trace import ZEROMQ, TraceHeader, read_trace
 from afspm.transport.polling import milliseconds
 

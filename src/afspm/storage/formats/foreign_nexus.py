@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from afspm.basics import same_kind
 from afspm.basics.errors import FileError, UnitError
-from afspm.basics.units import convert, same_kind
+from afspm.basics.units import convert
 from afspm.model import Region, Scan, Spectrum
 from afspm.model.arrays import Array
 from afspm.model.geometry import XY

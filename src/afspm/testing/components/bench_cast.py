@@ -10,12 +10,12 @@ from afspm.basics.errors import ConfigError
 from afspm.basics.launch import Launch
 from afspm.basics.plain_data import PlainMapping
 from afspm.client.component import Component
+from afspm.emulation import Simulator
 from afspm.experiment import load as load_experiment
 from afspm.experiment.class_loader import importing_from
 from afspm.experiment.process_starts import ProcessStart
 from afspm.model import Role
 from afspm.scheduler.scheduler import Scheduler
-from afspm.simulation.simulator import Simulator
 from afspm.transport.process.loading import find_class, load
 from afspm.wire.message_types import register_all
 

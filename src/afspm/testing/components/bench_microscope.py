@@ -25,8 +25,8 @@ from typing import Literal, get_args
 
 from afspm.basics.errors import ConfigError
 from afspm.basics.plain_data import Plain, PlainMapping
+from afspm.emulation import Simulator
 from afspm.model import ControlRequest, ControlResponse, Request, Response
-from afspm.simulation.simulator import Simulator
 from afspm.testing.components.hosted_processes import TranslatorProcess
 from afspm.testing.components.memory_network import ControlLine
 from afspm.testing.components.simulated_time import SimulatedTime

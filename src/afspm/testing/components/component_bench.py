@@ -21,6 +21,7 @@ from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.basics.units import si
 from afspm.client.component import Component
 from afspm.client.loop import ComponentLoop
+from afspm.emulation import Simulator
 from afspm.experiment.class_loader import ComponentDeclaration
 from afspm.model import (
     ControlMode,
@@ -34,13 +35,11 @@ from afspm.model import (
     ScanSet,
 )
 from afspm.model.snapshot import to_plain
-from afspm.scheduler.events import Effect, Input, Publish
-from afspm.scheduler.safety.limits import ExperimentLimits
+from afspm.scheduler import ExperimentLimits, Input, SchedulerCore
+from afspm.scheduler.events import Effect, Publish
 from afspm.scheduler.scheduler import Scheduler
-from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.scheduler.step_log import RecordedCore, StepLog
 from afspm.scheduler.wire_codec import WireCodec
-from afspm.simulation.simulator import Simulator
 from afspm.testing.components.bench_cast import BenchCast, cast_of
 from afspm.testing.components.bench_microscope import BenchMicroscope, BenchTranslator, Polls, polls_from
 from afspm.testing.components.hosted_processes import BlockingProcess, ComponentProcess, TranslatorProcess

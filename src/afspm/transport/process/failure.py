@@ -11,7 +11,8 @@ from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
-from afspm.basics.errors import AfspmError, FileError, Refused, RequestError, TransportError
+from afspm.basics import RequestError
+from afspm.basics.errors import AfspmError, FileError, Refused, TransportError
 from afspm.basics.own_fault import OwnFault
 from afspm.model import ControlResponse
 from afspm.storage.atomic import write_atomic
