@@ -37,7 +37,7 @@ from afspm.transport.port import CaughtUp, ControlConnected, PacketReceived, Rep
 from afspm.transport.zmq_port import open_port
 from afspm.wire.message_types import register_all
 
-_PROBE_BYTES = 16 << 20
+_PROBE_BYTES = 16 << 20  # written once to measure the disk
 # keys that are usually on any computer of an experiment; else any key found there is used
 _ASKED_AS = (SUPERVISOR, "terminal")
 _ILL = (ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.GIVEN_UP)

@@ -19,7 +19,7 @@ from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import open_port
 from afspm.wire.messages import SCAN_LINES
 
-HEARD_WITHIN_S = 5.0
+HEARD_WITHIN_S = 5.0  # real time; with some of the cached packets missing, what came is shown
 
 
 class Follower:

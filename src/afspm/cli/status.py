@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from afspm.cli.follower import Follower
     from afspm.cli.status_text import StatusText
 
-REFRESH_S = 0.25
+REFRESH_S = 0.25  # real time between two pictures of the terminal
 LOOK_S = 2.0
 """Interval of checks whether the run still goes on, while no packets arrive."""
 

@@ -9,7 +9,7 @@ from afspm.basics.errors import FileError
 from afspm.model import LoggedPacket, Packet
 from afspm.storage.segment import head_of, read_packet
 
-MEMORY_LIMIT_BYTES = 256 << 20
+MEMORY_LIMIT_BYTES = 256 << 20  # of packets that a slow component has not handled; more wait in a file
 
 
 class PacketBacklog:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 GUEST = "guest"
 GUEST_KEYS = "guest.keys"
 """The file with the keys of guests, in the state folder of the run; see `supervisor.key_handout`."""
-JOINED_WITHIN_S = 5.0
+JOINED_WITHIN_S = 5.0  # real time, where no run holds its lock on this computer
 STARTED_WITHIN_S = 60.0
 """Limit for a run that holds its lock on this computer: a busy one takes long to start its scheduler."""
 HEARD_WITHIN_S = 30.0  # the cache may hold many large scans

@@ -25,7 +25,7 @@ from afspm.wire.messages import CONDITIONS
 
 _log = logging.getLogger("afspm.memory")
 _HEAD = "result"
-LONGEST_KEY = 100
+LONGEST_KEY = 100  # characters
 
 
 @dataclass(frozen=True)

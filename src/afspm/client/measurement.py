@@ -109,9 +109,10 @@ class _Watch:
 
     def _is_ours(self, found: Scan | Spectrum) -> bool:
         # a person may scan the same frame; a translator that does not say who asked is believed
-        told = self._conditions
-        is_told = told is not None and told.began_ns is not None and told.time_ns == found.time_ns
-        return told is None or not is_told or told.holder == self._link.name
+        stated = self._conditions
+        if stated is None or stated.began_ns is None or stated.time_ns != found.time_ns:
+            return True
+        return stated.holder == self._link.name
 
 
 @dataclass

@@ -14,7 +14,7 @@ from afspm.client.scope import Scope
 from afspm.components.feedback_metrics import FeedbackError, FeedbackLimits, feedback_error, relative_error
 from afspm.model import HEIGHT, ChannelName, Scan, names
 
-ASKED_WITHIN_S = 5.0
+ASKED_WITHIN_S = 5.0  # for an answer of the microscope; without one the unit is not known yet
 
 _THRESHOLD = 0.1
 _CURRENT_THRESHOLD = 0.5  # of the logarithm: 25 pm

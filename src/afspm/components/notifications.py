@@ -26,7 +26,7 @@ USUAL: Final = (END, UNSOLVED, GIVEN_UP, CRITICAL, BY_HAND)
 OCCASIONS: Final = (*USUAL, SOLVED)
 
 TIMEOUT_S = 10.0  # of one attempt
-FIRST_DELAY_S, LONGEST_DELAY_S = 2.0, 300.0
+FIRST_DELAY_S, LONGEST_DELAY_S = 2.0, 300.0  # between tries; each is twice the one before
 MOST_TRIES = 12  # about 25 minutes, with the delays between them
 # a webhook that is down all night must not fill the memory
 MOST_WAITING = 50

@@ -27,8 +27,8 @@ from afspm.model.problems import QUIET_HOURS
 
 WORKS, WAITS, PAUSES, PAUSED, RETURNS, LEFT = "works", "waits", "pauses", "paused", "returns", "left to a person"
 _ASKS_FOR_S = 2.0  # real time; then other packets are handled before it asks again
-_PUBLISHED_WITHIN_S = 10.0
-_ACCEPTED_WITHIN_S = 30.0
+_PUBLISHED_WITHIN_S = 10.0  # for the state that follows from what it asked
+_ACCEPTED_WITHIN_S = 30.0  # for an action of the microscope to begin
 _MOVED_WITHIN_S = 600.0  # real time: an approach may take minutes
 _SETTLED_TICKS = 3
 SCHEDULER = "scheduler"

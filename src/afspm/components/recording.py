@@ -24,19 +24,19 @@ MOST_BYTES = 256 << 20
 FAR_BEHIND_BYTES = 64 << 20
 # limit the memory for one batch, and the length of one step: 10,000 log lines take 0.3 s of a processor
 AT_ONCE_BYTES = 32 << 20
-MOST_AT_ONCE = 10_000
+MOST_AT_ONCE = 10_000  # packets in one read of the log
 LOOK_S = 0.1
 """Interval of reads of the log: delivery to other processes comes before recording."""
 LONGEST_LOOK_S = 0.25
 """The interval of reads that find nothing: it doubles up to here, so that an idle run costs little."""
-AGAIN_S = 2.0
+AGAIN_S = 2.0  # between attempts while the disk has no room
 # after a silence incomplete scans are written, too: their last channel may never come
 QUIET_S = 1.0
 # each commit syncs the disk, so not after every packet
 COMMIT_S = 1.0
 # a run that stops may be resumed, and then the log is read on from the last commit: no need to wait long
 LAST_WORDS_S = 30.0
-STOPPING_S = 1.0
+STOPPING_S = 1.0  # for the last packets of a run that may be resumed: its log keeps the others
 
 _MOST_NAMED = 3
 _UNRECORDED = "nothing can be recorded"

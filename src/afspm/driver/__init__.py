@@ -53,7 +53,7 @@ if TYPE_CHECKING:  # one maker's controller has it today, and another's may
     from afspm.storage.formats.content import clock_ns
     from afspm.translator.driver_base import LOST, ControllerSilent, Introduction
     from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
-    from afspm.translator.parameters import ParameterSpec, ParameterTable, refuse_value
+    from afspm.translator.parameters import ParameterSpec, refuse_value
     from afspm.translator.result_files import missing_text, newest
     from afspm.translator.setting_groups import CENTER
     from afspm.translator.trace import TCP, TRACE
@@ -84,7 +84,6 @@ __all__ = [
     "LongCall",
     "OtherFormat",
     "ParameterSpec",
-    "ParameterTable",
     "Receiver",
     "ResultFiles",
     "ScriptedDriver",
@@ -135,7 +134,7 @@ if not TYPE_CHECKING:
             "afspm.translator.judge": "Stated",
             "afspm.translator.long_call": "ANSWERS_S LongCall",
             "afspm.translator.own_files": "FileFacts encode_scan encode_spectrum",
-            "afspm.translator.parameters": "FEEDBACK_ON Value ParameterSpec ParameterTable refuse_value",
+            "afspm.translator.parameters": "FEEDBACK_ON Value ParameterSpec refuse_value",
             "afspm.translator.result_files": (
                 "SCAN Content Entry FilePrecision ResultFiles lines_missing modified_ns read_result missing_text newest"
             ),

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from afspm.basics.errors import InvalidValue
 from afspm.model.geometry import XY, Region
 
-MOST_STEPS = 1000
-MOST_COUNT = 10_000
-LONGEST_GRANT_S = 7 * 86_400.0
+MOST_STEPS = 1000  # requests in a plan
+MOST_COUNT = 10_000  # times that one action is granted
+LONGEST_GRANT_S = 7 * 86_400.0  # a week
 LONGEST_PROPOSAL = 60_000
 """Largest length of a plan or a preflight, in characters."""
 

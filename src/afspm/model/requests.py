@@ -43,7 +43,7 @@ LEASE_REQUEST = 104
 
 The subject is the time in real seconds without another command or lease request.
 """
-LONGEST_LEASE_S = 86_400.0
+LONGEST_LEASE_S = 86_400.0  # a day
 LEASE_AT_ONCE_S = 1e-3
 """A lease that ends at once. Unlike a release it is no decision: the scheduler retracts a tip in danger."""
 GRANT_REQUEST = 105

@@ -24,11 +24,11 @@ from afspm.night.bad_scans import bad_scans
 from afspm.night.night_record import NightMark, NightRecord, Shot, Thumbnail, thumbnail
 from afspm.night.run import Run
 from afspm.night.tables import ScanRow
+from afspm.night.treatment_ledger import treatments_once
 from afspm.report.story import RunStory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-from afspm.night.treatment_ledger import treatments_once
 
 MOST = 98
 LARGEST_PX = 192

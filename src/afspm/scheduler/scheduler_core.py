@@ -434,13 +434,13 @@ def _open_barrier(draft: StateDraft) -> bool:
 
 
 def _flag_malfunction(draft: StateDraft) -> bool:
-    at_s, told_by = _malfunction_due(draft)
+    at_s, flagged_by = _malfunction_due(draft)
     if not _is_due(at_s, draft.now_s):
         return False
-    if told_by == SCHEDULER:
+    if flagged_by == SCHEDULER:
         draft.watchdog = draft.watchdog.people_called()
         draft.log("WARNING", "the tip was in danger: bring it back to the surface, then clear device-malfunction")
-    control_change.decide(draft, ControlInput(ArbitrationEvent.FLAG, told_by, _MALFUNCTION))
+    control_change.decide(draft, ControlInput(ArbitrationEvent.FLAG, flagged_by, _MALFUNCTION))
     return True
 
 
@@ -466,11 +466,11 @@ def _entries_due_s(state: SchedulerState | StateDraft) -> float | None:
 
 def _holder_dead_at_s(state: SchedulerState | StateDraft) -> float | None:
     # not before the startup barrier opens: the state of before the restart is published first
-    holder, told_at_s = state.control.holder, state.barrier.until_s
+    holder, opens_at_s = state.control.holder, state.barrier.until_s
     if holder is None:
         return None
     dead_at_s = state.peers.dead_at_s(holder)
-    return dead_at_s if dead_at_s is None or told_at_s is None else max(dead_at_s, told_at_s)
+    return dead_at_s if dead_at_s is None or opens_at_s is None else max(dead_at_s, opens_at_s)
 
 
 def _is_restarted_too_often(state: SchedulerState | StateDraft) -> bool:
@@ -483,8 +483,8 @@ def _is_restarted_too_often(state: SchedulerState | StateDraft) -> bool:
 
 def _lease_ends_at_s(state: SchedulerState | StateDraft) -> float | None:
     # not before the startup barrier opens: the state of before the restart is published first
-    until_s, told_at_s = state.lease.asked_until_s(), state.barrier.until_s
-    return until_s if until_s is None or told_at_s is None else max(until_s, told_at_s)
+    until_s, opens_at_s = state.lease.asked_until_s(), state.barrier.until_s
+    return until_s if until_s is None or opens_at_s is None else max(until_s, opens_at_s)
 
 
 def _malfunction_due(state: SchedulerState | StateDraft) -> tuple[float | None, str]:

@@ -22,11 +22,11 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-DEADLINE_S = 0.2
-SYNC_PERIOD_S = 0.1
+DEADLINE_S = 0.2  # for which one write may hold up its process
+SYNC_PERIOD_S = 0.1  # what a power cut may take
 MOST_BYTES = 256 << 20
 """Limit in bytes on data that wait for a hanging disk; further data are not written."""
-MOST_TASKS = 10_000
+MOST_TASKS = 10_000  # the same limit by number
 FULL_BYTES = 1 << 20
 """Free bytes below which a disk counts as full: too little for a usual scan."""
 _log = logging.getLogger("afspm.disk")

@@ -28,13 +28,13 @@ LOG_FOLDER = "packets"
 """Folder of the log, in the state folder of a run."""
 COMMITTED_FILE = "recorded"
 """File in the log's folder with the committed position, if there is a recorder."""
-SEGMENT_BYTES = 16 << 20
+SEGMENT_BYTES = 16 << 20  # of one file, after which the next begins
 CAPACITY_BYTES = 64 << 20
 """Size up to which no segment is freed; twice the size of the cached packets, if that is larger."""
-MOST_UNRECORDED_BYTES = 1 << 30
+MOST_UNRECORDED_BYTES = 1 << 30  # beyond the usual size; above it unrecorded packets are dropped
 SPARE_BYTES = 256 << 20
 """Largest size of all spare files together, enough for a flood of packets until it is recorded."""
-SYNCED_WITHIN_S = 5.0
+SYNCED_WITHIN_S = 5.0  # for a disk that hangs: then the log goes on without it
 _SPARE_SUFFIX = ".spare"
 
 

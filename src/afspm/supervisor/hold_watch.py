@@ -13,7 +13,7 @@ from afspm.basics.clock import NS_PER_S, ExperimentClock
 from afspm.basics.formatting import counted, duration_text
 from afspm.basics.shared_time import LONGEST_HOLD_S, SharedTime, TimeHold
 
-LOOK_EVERY_S = 1.0
+LOOK_EVERY_S = 1.0  # real time
 LONG_S = 60.0
 """Real time after which a wait is logged. On a quiet computer a wait takes a second."""
 

@@ -27,7 +27,7 @@ CLOCK = ExperimentClock.real()
 # lines that wait for a blocked terminal or disk; beyond it the oldest are dropped
 MOST_UNSHOWN = 10_000
 _HANGS = "the disk has not answered for {:.0f} s: log.txt is written once it does, and the run goes on"
-SHOWN_WITHIN_S = 2.0
+SHOWN_WITHIN_S = 2.0  # at the end, for the lines that wait for a blocked terminal
 COLOURS = ("cyan", "green", "magenta", "blue", "bright_cyan", "bright_green", "bright_magenta", "bright_blue")
 LEVEL_STYLES = {logging.WARNING: "yellow", logging.ERROR: "bold red", logging.CRITICAL: "bold red"}
 _LEVELS = {name: getattr(logging, name) for name in ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")}

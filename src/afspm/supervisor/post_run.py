@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
 # each of these bounds the wait for a hanging disk, network or program: the terminal returns in any case
 REPORT_STALLED_S = 120.0
-TOLD_WITHIN_S = 30.0
-COUNTED_WITHIN_S = 20.0
+TOLD_WITHIN_S = 30.0  # for all notifications together
+COUNTED_WITHIN_S = 20.0  # for reading the record
 TABLE = "metadata.csv"  # written by the component Metadata
 
 

@@ -16,8 +16,8 @@ from afspm.model import CLOCK_REQUEST, ControlResponse, Request, Response
 from afspm.transport.port import ControlConnected, ReplyReceived
 from afspm.transport.zmq_port import open_port
 
-AGAIN_S = 1.0
-REFUSED_S = 10.0
+_ASK_EVERY_S = 1.0  # real time: an answer may be lost, and a refusal may end
+_GIVE_UP_AFTER_S = 10.0
 """Real time for which a refusal may be temporary: the scheduler may still hold the connection of a dead computer."""
 _SAME_S = 1e-3  # clocks of two processes of one computer differ by less
 
@@ -40,11 +40,11 @@ def new_identity() -> str:
     return os.urandom(8).hex()
 
 
-def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
+def ask_scheduler(launch: Launch, report: Callable[[str], None]) -> RunIdentity:
     """Wait for the scheduler, and return the identity of its run. A scheduler without a clock uses real time.
 
     Raises:
-        ConfigError: the scheduler still refuses the request after `REFUSED_S`.
+        ConfigError: the scheduler still refuses the request after ten seconds.
         WireError: the answer can't be read.
     """
     wall = ExperimentClock.real()
@@ -55,27 +55,27 @@ def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
     try:
         while True:
             if connected and wall.monotonic_s() >= again_s:
-                sent, asked_s, again_s = sent + 1, wall.now_s(), wall.monotonic_s() + AGAIN_S
+                sent, asked_s, again_s = sent + 1, wall.now_s(), wall.monotonic_s() + _ASK_EVERY_S
                 asked = f"{launch.name}/{session}/{sent}"
                 port.send(wire.encode_request(Request(CLOCK_REQUEST, id=asked)))
-            for incoming in port.poll(AGAIN_S):
+            for incoming in port.poll(_ASK_EVERY_S):
                 connected = connected or isinstance(incoming, ControlConnected)
                 if not isinstance(incoming, ReplyReceived) or incoming.response.id != asked:
                     continue
                 response, now_s = incoming.response, wall.monotonic_s()
                 if response.code == ControlResponse.CMD_NOT_SUPPORTED:
-                    tell(f"{response.reason}: the experiment goes by real time")
+                    report(f"{response.reason}: the experiment goes by real time")
                     return RunIdentity(wall, "", simulated=False)
-                if response.ok or now_s >= refused_s + REFUSED_S:
+                if response.ok or now_s >= refused_s + _GIVE_UP_AFTER_S:
                     return _identity_in(response, asked_s, wall.now_s(), str(launch.sockets.control))
                 if refused_s == math.inf:
                     refused_s = now_s
-                    tell(f"the scheduler refuses: {response.reason}; asking again for {REFUSED_S:.0f} s")
+                    report(f"the scheduler refuses: {response.reason}; asking again for {_GIVE_UP_AFTER_S:.0f} s")
             # a time, not an empty poll: a refused key causes events without end
-            if not connected and not waiting and wall.monotonic_s() >= began_s + AGAIN_S:
+            if not connected and not waiting and wall.monotonic_s() >= began_s + _ASK_EVERY_S:
                 waiting = True
                 where = f"the scheduler at {launch.sockets.control}, whose run and clock this part joins"
-                tell(
+                report(
                     f"waiting for {where}; if it runs already, `afspm doctor` with the experiment file finds the cause"
                 )
     finally:

@@ -298,7 +298,7 @@ class Supervisor:
         return self._may_begin if task.role is Role.COMPONENT else None
 
 
-TOLERANCE_S = 5.0
+TOLERANCE_S = 5.0  # real time between the clocks of the computer and the run before the warning
 
 
 class ClockCheck:

@@ -11,14 +11,14 @@ from afspm.translator.driver_base import LOST, ControllerLost, ControllerSilent,
 from afspm.translator.emulated_controller import EmulatedController
 from afspm.transport.process.failure import place_of
 
-RETRY_S = 1.0  # real; decision 0016
-_OFTEN_SILENT = 3
+RETRY_S = 1.0  # real: a controller that was started again is found within a second (decision 0016)
+_OFTEN_SILENT = 3  # attempts in turn that a port accepts and does not answer, before the error asks for a restart
 _MOST_DOUBLED = 4
 """A port that stays silent is tried each `RETRY_S` · 2 ** 4 = 16 s at last."""
 _STARTUP_S = 2.0
 """Real time in which a controller that starts together with its translator (an emulated one) may be missing: until then
 connecting is retried every `_STARTUP_RETRY_S`, and nothing is logged."""
-_STARTUP_RETRY_S = 0.1
+_STARTUP_RETRY_S = 0.1  # real time
 
 
 class Connection:

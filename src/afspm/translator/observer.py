@@ -89,7 +89,7 @@ class Observer:
         self._is_after_spectrum = False
         self._published_last: dict[type, object] = {}
         self._acts: list[ActByHand] = []
-        self._others_told = False
+        self._others_reported = False
         self._polled_for = ScopeState.UNDEFINED
         self._all_at_s = self._all_read_s = 0.0
         self._result_since_s: float | None = None
@@ -117,7 +117,7 @@ class Observer:
         self._told = self._as_told()
         acts = self.panel.read({}, self.values, ScopeState.UNDEFINED, self._clock.now_ns(), self._driver.withdrew_tip())
         self.publish_all()
-        self._tell(acts)
+        self._report(acts)
 
     def look(self) -> None:
         """Read the controller, and publish the changes since the last reading."""
@@ -228,7 +228,7 @@ class Observer:
             acts = self.panel.read(before, self.values, state, self._clock.now_ns(), withdrew)
             if self._result_since_s is not None and any(map(self._spoils, acts)):
                 self._publish_earlier_scan()
-            self._tell(acts)
+            self._report(acts)
             self._judge_feedback()
         if gives_back and self.panel.feedback.level is FeedbackLevel.HELD:
             return  # what follows would move a tip without feedback: the microscope is free once it is given back
@@ -241,7 +241,7 @@ class Observer:
             is_followed = bool(steps)
             of_another = not self._outbox.is_of(was.state)
             steps += sequence.observe(status, results and not steps, self._clock.now_s(), of_another=of_another)
-            self._tell(self._acts_shown_by(steps, was, is_requested=is_requested))
+            self._report(self._acts_shown_by(steps, was, is_requested=is_requested))
             self.play(self._without_spoiled(steps, is_at_end=not is_followed))
             if is_over and sequence.published.state not in MEASURING:
                 self._clock.published(Publication.RESULTS)
@@ -284,7 +284,7 @@ class Observer:
         feedback = feedback_of(request)
         switches = action.switches_feedback if action else feedback is not None and feedback.on is not None
         self.panel.feedback.asked(name, self._clock.now_s(), switches=switches)
-        self._others_told = False
+        self._others_reported = False
 
     def look_before_start(self, request: Request) -> None:
         """Publish all changes, and what a person has just done to the tip, before a measurement is begun."""
@@ -294,7 +294,7 @@ class Observer:
         if not is_changed:  # the same reading again is a second one
             state = self._of_controller(self._state.sequence.published.state)
             acts = self.panel.read(before, self.values, state, self._clock.now_ns())
-            self._tell(acts)
+            self._report(acts)
         self.claims.asks(request, self.values)
 
     def is_set(self, values: Mapping[str, Value]) -> None:
@@ -327,16 +327,16 @@ class Observer:
         if not (states and self.panel.is_certain):
             return []
         now_ns, acts = self._clock.now_ns(), []
-        is_told = bool(self._state.kept.get("spoiled"))  # a tip withdrawn by hand may end the scan as well
-        if is_requested and not is_told and any(one.state is ScopeState.INTERRUPTED for one in states):
+        is_explained = bool(self._state.kept.get("spoiled"))  # a tip withdrawn by hand may end the scan as well
+        if is_requested and not is_explained and any(one.state is ScopeState.INTERRUPTED for one in states):
             evidence = self._driver.stopped_by_hand()
             acts += [ActByHand(now_ns, PanelAct.STOP, evidence)] if evidence else []
         if is_requested and states[0].paused and not was.paused:
             acts.append(ActByHand(now_ns, PanelAct.PAUSE))
         others = MEASURING - {was.state} if was.state in (ScopeState.FREE, *MEASURING) else ()
         begun = next((one.state for one in states if one.state in others), None)
-        if begun is not None and not self._others_told:
-            self._others_told = True  # a panel that repeats scans would tell each
+        if begun is not None and not self._others_reported:
+            self._others_reported = True  # a panel that repeats scans would report each
             acts.append(ActByHand(now_ns, PanelAct.SCAN if begun is ScopeState.SCANNING else PanelAct.SPECTRUM))
         return acts
 
@@ -358,10 +358,10 @@ class Observer:
             DiscardResults(),
         ]
         if self.claims.repeated:
-            self._tell([ActByHand(self._clock.now_ns(), PanelAct.CONTRADICTION, self.claims.repeated)])
+            self._report([ActByHand(self._clock.now_ns(), PanelAct.CONTRADICTION, self.claims.repeated)])
         return [one for step in steps for one in (instead if isinstance(step, PublishResults) else [step])]
 
-    def _tell(self, acts: Sequence[ActByHand]) -> None:
+    def _report(self, acts: Sequence[ActByHand]) -> None:
         for act in acts:
             self._log.warning("by hand: %s", act)
             if self._state.sequence.published.state in MEASURING:

@@ -188,8 +188,8 @@ class PanelWatch:
         level = self.feedback.read(_known(engaged), _known(on), state, now_ns / NS_PER_S)
         if level is FeedbackLevel.OFF and self.feedback.wished is None:
             self._kept["tip_by_hand"] = SINCE_BEFORE
-        is_told = bool(self._kept.get("tip_by_hand"))
-        if level is not FeedbackLevel.BY_HAND or withdrew or is_told:
+        is_reported = bool(self._kept.get("tip_by_hand"))
+        if level is not FeedbackLevel.BY_HAND or withdrew or is_reported:
             return []
         return [self._tip_act(PanelAct.FEEDBACK_OFF, now_ns, self.feedback.hint)]
 

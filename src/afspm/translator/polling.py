@@ -23,8 +23,8 @@ _GUESSED, _BY_OTHERS, _SAME = (
     0.03,
     0.005,
 )  # uncertainty of the end, as a part of the duration: by settings, by other scans, by the same scan
-_LEAST_DOUBT_S = 0.05
-_REMEMBERED = 64
+_LEAST_DOUBT_S = 0.05  # about the end of even the shortest measurement
+_REMEMBERED = 64  # durations, of the kinds measured last
 
 
 @dataclass(frozen=True)

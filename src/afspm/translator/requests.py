@@ -38,7 +38,7 @@ from afspm.translator.trace import TRACE
 from afspm.transport.port import RequestReceived
 
 Reply = Callable[[Response, int], None]
-_CAPACITY = 300
+_CAPACITY = 300  # answers kept for requests that are repeated
 
 
 class RequestHandler:

@@ -14,7 +14,7 @@ from afspm.translator.driver_base import LOST
 from afspm.translator.state import TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
 
-_LOOK_S = 0.1
+_LOOK_S = 0.1  # real time between looks whether the tip moves
 _TIP_S = 8.0
 """Real time for attempts to retract the tip when the run is stopped: the controller may be lost just then, or refuse. A
 little less than `transport.process.parent` allows."""
@@ -75,19 +75,19 @@ class SafeExit:
             self._connection.guarded(self._temporary.end)
         # the feedback is not switched on instead: where the tip would land by then is not known (decision 0007)
         until_s = self._clock.monotonic_s() + _TIP_S
-        is_told = False
-        while is_told or self.is_owed():
-            is_off = is_told or self._state.feedback.is_off
+        has_asked = False
+        while has_asked or self.is_owed():
+            is_off = has_asked or self._state.feedback.is_off
             why_not = self._retract_failure() if is_off else f"the controller is lost: {self._connection.why_lost}"
             if not why_not:
-                is_told = True
+                has_asked = True
                 why_not = self._motion_failure(wait, until_s)
             if not why_not:
                 self._log.warning("the run is stopping with the feedback off: the tip was retracted")
                 return
             if self._clock.monotonic_s() >= until_s:
                 off = "off" if is_off else "perhaps off"
-                so = "it is not certain that the tip was retracted" if is_told else "the tip can't be retracted"
+                so = "it is not certain that the tip was retracted" if has_asked else "the tip can't be retracted"
                 self._log.critical("the run is stopping with the feedback %s, and %s: %s", off, so, why_not)
                 return
             wait(RETRY_S)

@@ -22,7 +22,7 @@ LONGEST_S: Final = 5.0
 """Longest wait for the current, experiment time from the end that the controller shows."""
 NEAR: Final = 2.0
 """Largest ratio of current and setpoint, and of setpoint and current, at which the feedback holds the current."""
-_LOOK_S: Final = 0.25
+_LOOK_S: Final = 0.25  # experiment time between readings, until the current is near its setpoint
 _KEY, _UNPROVED = "treatment", "unproved_treatment"
 
 

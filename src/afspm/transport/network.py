@@ -30,7 +30,7 @@ HAS_PRIVATE_SOCKETS = sys.platform != "win32" and zmq.has("ipc")
 QUEUE_LENGTH = 4000
 """Limit of waiting messages for one peer; a publisher drops further messages."""
 
-_LINGER_MS = 200
+_LINGER_MS = 200  # for the last messages of a socket that is closed
 # ZMTP heartbeats: a peer that is frozen or cut off is noticed within seconds, not after hours as by TCP.
 _ALIVE_CHECK_MS = 2_000
 _ALIVE_TIMEOUT_MS = _ANSWERED_WITHIN_MS = round(CUT_OFF_SHOWS_WITHIN_S * 1e3) - _ALIVE_CHECK_MS
@@ -51,8 +51,8 @@ _KEEPALIVE_S, _KEEPALIVE_TRIES = 2, 3
 # reconnection it requests them. (Linux and Windows.)
 _STALLED_MS = 5_000
 _WINDOWS_MAXRT = 5  # from ws2ipdef.h; Python's socket module lacks it
-_RECONNECT_MS, _RECONNECT_MAX_MS = 20, 200
-_HANDSHAKE_MS = 5_000
+_RECONNECT_MS, _RECONNECT_MAX_MS = 20, 200  # the first wait before a new attempt, and the longest
+_HANDSHAKE_MS = 5_000  # for greeting and keys of a new connection, which is closed then
 # Systems repeat an attempt to connect after 1, 3, 7, 15, 31 s …: an attempt begun while the link was down would notice
 # its return only after half a minute. So attempts are ended after this time, and begun again.
 _CONNECT_MS = 2_000

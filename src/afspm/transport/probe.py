@@ -13,7 +13,7 @@ from afspm.basics.clock import ExperimentClock
 from afspm.transport.diagnosis import Handshake, Reach, Versions
 from afspm.transport.network import CONNECTED, KEY_REFUSED, REFUSED, Monitor, Network
 
-WITHIN_S = 5.0
+WITHIN_S = 5.0  # real time for each step of a test of a connection
 _ZMTP = b"\xff"  # the first byte of ZeroMQ's greeting (ZMTP)
 _NO_ROUTE = (errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN)
 

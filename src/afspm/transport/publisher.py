@@ -29,7 +29,7 @@ _BATCH, _MOST_REPLAYS = 100, 5
 """Limit of received messages and sent replays in one turn, so that other sockets get a turn."""
 _BEACON_S = 1.0
 _SETTLED_S = 0.05  # a SUB socket sends its prefixes one by one
-_TOGETHER_S = 1.0
+_TOGETHER_S = 1.0  # from one shared replay to the next: subscribers that join in between share it
 _PAUSE_S = 0.05  # libzmq needs less to send half a queue on this computer
 _STUCK_S = 10.0  # twice the time after which a peer that reads nothing is disconnected
 

@@ -6,8 +6,8 @@ import logging
 
 from afspm.basics.clock import Clock
 
-_BURST = 5
-_PERIOD_S = 10.0
+_BURST = 5  # warnings in one period
+_PERIOD_S = 10.0  # real time
 
 
 class RateLimitedLog:

@@ -18,7 +18,7 @@ from afspm.transport.port import CaughtUp, Incoming, Killed, PacketReceived
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.wire import Buffer, decode_packet
 
-_MOST_ENVELOPES = 10_000
+_MOST_ENVELOPES = 10_000  # names come from peers, and memory must stay bounded
 # small: a packet that waits in libzmq's queue costs nothing, but a received one keeps its large buffer from reuse
 _BATCH = 16
 _MOST_NAMED = 3

@@ -152,7 +152,7 @@ def _values(kind: str) -> NDArray[np.float64]:
     [
         ("not measured", "only 0 of 96 rows"),
         ("one third measured", "only 32 of 96 rows"),
-        ("constant", "only 0 of 96 rows|all values are equal"),
+        ("constant", "only 0 of 96 rows|all values of the scan are equal"),
         ("tilted rows alone", "an offset and a tilt"),
         ("noise alone", "noise or streaks"),
         ("saturated", "saturated"),

@@ -143,8 +143,8 @@ def test_refused_withdrawal_is_no_success(bench: Make, monkeypatch: pytest.Monke
     [
         ("no-reply", "no reply to"),
         ("late-reply", "no reply to"),
-        ("half-reply", "a reply that is not JSON"),
-        ("garbage", "a reply that is not JSON"),
+        ("half-reply", "SmartScan's reply is not JSON"),
+        ("garbage", "SmartScan's reply is not JSON"),
         ("nan", "SmartScan replied"),
         ("dialog", "a dialog may wait on its screen"),
     ],

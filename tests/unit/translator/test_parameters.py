@@ -11,12 +11,13 @@ from hypothesis import strategies as st
 
 from afspm.basics import entry_points
 from afspm.basics.errors import ConfigError, Refused
-from afspm.driver import Driver, ParameterSpec, ParameterTable, Value
+from afspm.driver import Driver, ParameterSpec, Value
 from afspm.model import names
 from afspm.plugins.asylum import Asylum
 from afspm.plugins.gxsm import Gxsm
 from afspm.plugins.nanonis import Nanonis
 from afspm.simulation.simulator import FAULT_KINDS, Simulator
+from afspm.translator.parameters import ParameterTable
 
 TABLE = ParameterTable({}).extended(
     {

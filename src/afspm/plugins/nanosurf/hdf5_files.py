@@ -78,7 +78,7 @@ def _scans(group: h5py.Group) -> Iterator[Scan]:
             if dataset.size != rows * columns:
                 continue
             if min(rows, columns) < 2:
-                raise FileError(f"holds an image of {columns} x {rows} pixels")
+                raise FileError(f"an image must have at least 2 x 2 pixels, not {columns} x {rows}")
             values = _values(dataset).reshape(rows, columns)
             # A stopped image: the remaining lines were not scanned.
             if acquired < rows:

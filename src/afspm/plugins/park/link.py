@@ -139,12 +139,12 @@ def _fields(raw: bytes) -> Plain:
     try:
         reply = from_json(raw)
     except ValueError as error:
-        raise ControllerLost(f"a reply that is not JSON: {raw[:_SHOWN]!r}") from error
+        raise ControllerLost(f"SmartScan's reply is not JSON: {raw[:_SHOWN]!r}") from error
     if not isinstance(reply, dict):
-        raise ControllerLost(f"a reply that is not JSON-RPC: {raw[:_SHOWN]!r}")
+        raise ControllerLost(f"SmartScan's reply is not JSON-RPC: {raw[:_SHOWN]!r}")
     if reply.get("error"):
         failure = reply["error"]
         raise SmartScanError(str(failure.get("message", failure) if isinstance(failure, dict) else failure))
     if "result" not in reply:
-        raise ControllerLost(f"a reply without a result: {raw[:_SHOWN]!r}")
+        raise ControllerLost(f"SmartScan's reply has no result: {raw[:_SHOWN]!r}")
     return reply

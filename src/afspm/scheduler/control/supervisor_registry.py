@@ -35,7 +35,7 @@ SILENT_S = 10.0
 """A supervisor without a report for this time, real, gets no more orders: the orders would be lost."""
 CLOCKS_DIFFER_S = 5.0
 """Difference between a supervisor's clock and the scheduler's, real, above which a warning is logged."""
-_STEADY_S = 1.0
+_STEADY_S = 1.0  # a larger change of the difference between two reports is the delay of one
 _MOST = 64  # supervisors: names come from peers, and memory must stay bounded
 OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
 """Conditions of a process that has ended for good."""

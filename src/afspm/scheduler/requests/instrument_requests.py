@@ -45,7 +45,7 @@ from afspm.scheduler.safety.present_state import present_state
 from afspm.scheduler.state import SchedulerState, StateDraft
 from afspm.wire.messages import INSTRUMENT_READINGS
 
-_LONGEST_HOLD_S = 1.0
+_LONGEST_HOLD_S = 1.0  # of a report without an order, which is answered then
 MaySend = Callable[[StateDraft, ForwardedRequest], Response | None]
 """A function that returns the refusal of a request whose client may no longer send it, else None."""
 

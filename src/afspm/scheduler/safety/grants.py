@@ -53,7 +53,7 @@ from afspm.wire.messages import LOG, PROCESSES
 
 AGENT_LEASE_S = 60.0
 """Lease of an agent without a lease request, in s of real time."""
-LONGEST_AGENT_LEASE_S = 600.0
+LONGEST_AGENT_LEASE_S = 600.0  # real time
 STALE_S = 3600.0
 """Experiment time after which a preflight is too old to be approved."""
 _HOUR_NS = 3600 * 10**9

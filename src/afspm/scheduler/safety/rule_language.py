@@ -30,7 +30,7 @@ Known = Mapping[str, Value | None]
 
 BORDER: Final = 1e-6
 """Relative distance within which a value lies on its bound: controllers round, some to single precision."""
-_LONGEST, _DEEPEST = 1000, 20
+_LONGEST, _DEEPEST = 1000, 20  # characters, and nested brackets: the parser calls itself for each
 _OPPOSITE: Final = {"<": ">=", "<=": ">", ">": "<=", ">=": "<"}
 _WORDS = frozenset({"and", "or", "not", "abs"})
 _TOKEN = re.compile(

@@ -16,7 +16,7 @@ from afspm.model.microscope_status import FEEDBACK_OFF, STARTS, STOPS, Microscop
 from afspm.scheduler.control.arbitration import Cause
 
 _DEFAULT_STOPS = frozenset(set(Cause) - {Cause.RELEASED, Cause.SOLVED, Cause.ENDED, Cause.BY_HAND})
-_SOON_S = 1.0
+_SOON_S = 1.0  # for the first packets of a new translator, and between attempts at the end
 
 
 class TipDuty(Enum):

@@ -87,7 +87,7 @@ class Baton:
                 self.code = self._body()
         except LifeEnded:
             self.code = None
-        except BaseException as error:
+        except BaseException as error:  # the simulation raises it in its own thread, where a test sees it
             self.error = error
         self.over = True
         self._to_simulation.release()

@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 
-END_WITHIN_S = 1.5
+END_WITHIN_S = 1.5  # then the process is ended from outside of its handlers
 TIP_WITHIN_S = 14.0  # time to withdraw the tip: the controller may answer slowly, or need a new connection
 _STDIN = 0
 _CHUNK = 1 << 16

@@ -55,7 +55,7 @@ def prepare(values: Array) -> Image:
     measured = values[known]
     lowest, highest = measured.min(), measured.max()
     if highest - lowest <= 1e-12 * max(abs(lowest), abs(highest)):
-        raise Unusable("all values are equal")
+        raise Unusable("all values of the scan are equal")
     if max(np.mean(measured == lowest), np.mean(measured == highest)) > MOST_SATURATED:
         raise Unusable("most pixels have the same value (saturated): check whether the tip crashed")
     scaled = (_filled(values, known) - lowest) / (highest - lowest)
