@@ -7,11 +7,11 @@ DEMO := .venv/.demo
 TEST := .venv/.test
 DEV := .venv/.dev
 
-.PHONY: demo demo-drift dev test test-times test-programs test-all test-slow test-power-cut test-apart test-lowest mutants test-samples test-matrix test-nion coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
+.PHONY: demo demo-drift dev test test-times test-packages test-programs test-all test-slow test-power-cut test-apart test-lowest mutants test-samples test-matrix test-nion coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
 .PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift bench-guests soak chaos crowd scanner-nights simulate replay-nights power-cut acts as-reported docs release-check test-plug-ins changelog clean
 .DEFAULT_GOAL := demo
 
-SOURCES := pyproject.toml packages/afspm-bench/pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
+SOURCES := pyproject.toml $(wildcard packages/*/pyproject.toml) uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
 
 # a stamp that is there is only out of date: bringing .venv up to date takes seconds, however large it is
 SETTING_UP = $(if $(wildcard $@),Updating,Setting up)
@@ -61,6 +61,10 @@ test: $(COLLECTED)
 test-times: TABLE := --processor-times
 test-times: test
 
+## the tests of the distributions in packages/ that no night needs: of the largest sets a part, another at each commit
+test-packages: $(COLLECTED)
+	@$(PYTEST) -n $(TESTS_AT_A_TIME) --dist worksteal --in-turn packages/afspm-lab/tests
+
 ## what is compared with a program or library that `make test` does not install: Gwyddion, GXSM, QCoDeS, sidpy; says which
 ## of them this computer lacks
 test-programs: $(COLLECTED)
@@ -94,7 +98,7 @@ $(COLLECTED): $(TEST) $(shell find tests -name '*.py')
 
 ## decisions broken on purpose, each of which the simulated nights have to find; prints how many they found
 mutants: $(TEST)
-	@AFSPM_CASES=all $(PYTEST) -n 2 $(addprefix tests/simulation/,test_mutants.py test_what_if.py test_agent_mutants.py)
+	@AFSPM_CASES=all $(PYTEST) -n 2 $(addprefix tests/simulation/,test_mutants.py test_agent_mutants.py) packages/afspm-lab/tests/test_what_if.py
 
 ## the tests of units and plug-ins with the lowest versions of all dependencies, in build/lowest-env: needs Python 3.11
 LOWEST ?= tests/unit tests/plugins
@@ -267,7 +271,7 @@ simulate: $(TEST)
 
 ## nights with kills, replayed by what-if without a change: NIGHTS=200 SEED=0
 replay-nights: $(TEST)
-	@PYTHONPATH=tests/support $(BIN)/python -m tests.simulation.replayed_nights --nights $(NIGHTS) --seed $(SEED)
+	@PYTHONPATH=tests/support:packages/afspm-lab/tests $(BIN)/python -m replayed_nights --nights $(NIGHTS) --seed $(SEED)
 replay-nights: NIGHTS = 200
 
 ## a recorded run that loses its power, with all that was not synced, and is resumed, again and again: CUTS=100 SEED=1

@@ -15,12 +15,12 @@ from afspm.basics import entry_points
 
 ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "src" / "afspm"
-BENCH = ROOT / "packages" / "afspm-bench" / "src"
+PACKAGES = tuple(ROOT / "packages" / name / "src" for name in ("afspm-bench", "afspm-lab"))
 WORD = re.compile(r"[A-Za-z_]\w*")
 QUOTED = re.compile(r"(?<!`)`([A-Za-z_][\w.]*)(?:\([^`]*\))?`(?!`)")
 PARTS = {
     file: file.relative_to(root).with_suffix("").parts
-    for root in (SOURCE, BENCH)
+    for root in (SOURCE, *PACKAGES)
     for file in sorted(root.rglob("*.py"))
     if "generated" not in file.parts
 }

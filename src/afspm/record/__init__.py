@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # drift writes its mapping beside the files
     from afspm.record.measured_files import SUFFIX as MEASURED_SUFFIX
 
 if TYPE_CHECKING:  # a recorded run is found and published again
-    from afspm.record.run_json import REPLAY_OF, RUN_FILE, latest_run
+    from afspm.record.run_json import REPLAY_OF, latest_run
     from afspm.record.run_lock import lock_run
 
 if TYPE_CHECKING:  # the page says how a run stands
@@ -43,7 +43,6 @@ __all__ = [
     "JOURNAL_FILE",
     "MEASURED_SUFFIX",
     "REPLAY_OF",
-    "RUN_FILE",
     "STATE_DIR",
     "AllowedBands",
     "bands_allowed",

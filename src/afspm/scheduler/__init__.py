@@ -81,18 +81,12 @@ if TYPE_CHECKING:  # an agent's plan is checked against the limits before a pers
     from afspm.scheduler.safety.limits import ExperimentLimits
 
 if TYPE_CHECKING:  # a replay gives a scheduler its recorded steps
-    from afspm.scheduler.control.descriptions import request_text
-    from afspm.scheduler.saved_state import KIND as STATE_KIND
-    from afspm.scheduler.saved_state import VERSION as STATE_VERSION
     from afspm.scheduler.saved_state import SavedState
     from afspm.scheduler.scheduler_core import SchedulerCore
-    from afspm.scheduler.step_log import Restored, StateSums, Step, facts_of, read_cached, read_event
 
 __all__ = [
     "PROBE_CHANGES",
     "REGION_CHANGES",
-    "STATE_KIND",
-    "STATE_VERSION",
     "STOPPER",
     "TIP_FRAME",
     "Announced",
@@ -117,25 +111,18 @@ __all__ = [
     "ProblemSeen",
     "Reconsider",
     "RequestIn",
-    "Restored",
     "SaveNow",
     "SavedState",
     "Scheduler",
     "SchedulerCore",
     "Started",
-    "StateSums",
-    "Step",
     "Tick",
     "TranslatorCaughtUp",
     "TranslatorUp",
     "WireCodec",
-    "facts_of",
     "feedback_of",
     "not_of_role",
     "number_of",
-    "read_cached",
-    "read_event",
-    "request_text",
     "scan_values",
     "undistorted",
     "with_proposal",
