@@ -63,7 +63,7 @@ test-times: test
 
 ## the tests of the distributions in packages/ that no night needs: of the largest sets a part, another at each commit
 test-packages: $(COLLECTED)
-	@$(PYTEST) -n $(TESTS_AT_A_TIME) --dist worksteal --in-turn packages/afspm-lab/tests
+	@$(PYTEST) -n $(TESTS_AT_A_TIME) --dist worksteal --in-turn packages/afspm-agents/tests packages/afspm-lab/tests
 
 ## what is compared with a program or library that `make test` does not install: Gwyddion, GXSM, QCoDeS, sidpy; says which
 ## of them this computer lacks
@@ -98,7 +98,7 @@ $(COLLECTED): $(TEST) $(shell find tests -name '*.py')
 
 ## decisions broken on purpose, each of which the simulated nights have to find; prints how many they found
 mutants: $(TEST)
-	@AFSPM_CASES=all $(PYTEST) -n 2 $(addprefix tests/simulation/,test_mutants.py test_agent_mutants.py) packages/afspm-lab/tests/test_what_if.py
+	@AFSPM_CASES=all $(PYTEST) -n 2 $(addprefix tests/simulation/,test_mutants.py test_grant_mutants.py) packages/afspm-lab/tests/test_what_if.py
 
 ## the tests of units and plug-ins with the lowest versions of all dependencies, in build/lowest-env: needs Python 3.11
 LOWEST ?= tests/unit tests/plugins

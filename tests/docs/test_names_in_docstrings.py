@@ -15,7 +15,7 @@ from afspm.basics import entry_points
 
 ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "src" / "afspm"
-PACKAGES = tuple(ROOT / "packages" / name / "src" for name in ("afspm-bench", "afspm-lab"))
+PACKAGES = tuple(ROOT / "packages" / name / "src" for name in ("afspm-agents", "afspm-bench", "afspm-lab"))
 WORD = re.compile(r"[A-Za-z_]\w*")
 QUOTED = re.compile(r"(?<!`)`([A-Za-z_][\w.]*)(?:\([^`]*\))?`(?!`)")
 PARTS = {

@@ -14,7 +14,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("packages/afspm-bench/src", "packages/afspm-lab/src", "packages/afspm-nion/src")
+PACKAGES = (
+    "packages/afspm-agents/src",
+    "packages/afspm-bench/src",
+    "packages/afspm-lab/src",
+    "packages/afspm-nion/src",
+)
 WORDS = (
     "anew",
     "whoever",

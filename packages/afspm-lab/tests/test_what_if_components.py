@@ -500,6 +500,18 @@ def test_command_exits_with_one_if_a_component_can_not_be_replayed(night: Path, 
     assert "judge was not replayed: " in result.output
 
 
+def test_run_that_names_classes_of_moved_modules_is_read(night: Path, tmp_path: Path) -> None:
+    shutil.copytree(night, tmp_path, dirs_exist_ok=True)
+    moved = "afspm.plugins.agent.agent.Agent"
+    log = tmp_path / "requests" / "judge.jsonl"
+    log.write_text(log.read_text().replace("what_if_lab.Judge", moved))
+    (tmp_path / "run.json").write_text(json.dumps({"classes": {"judge": moved}, "homes": ["afspm.plugins.what_if"]}))
+    assert len(open_run(tmp_path).scans) == len(open_run(night).scans) > 0
+    result = afspm.what_if(tmp_path)
+    assert moved.rpartition(".")[0] in result.unread["judge"]
+    assert any(row.name == "series" and row.same for row in result.table())
+
+
 def test_command_prints_json_for_programs(night: Path) -> None:
     result = CliRunner().invoke(app, [str(night), "--set", "judge.factor=0.0", "--component", "judge", "--json"])
     assert result.exit_code == DIFFERS

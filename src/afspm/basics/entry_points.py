@@ -41,6 +41,7 @@ FUNCTIONS = "afspm.functions"  # of `afspm` itself, for scripts and notebooks: a
 FORMS = "afspm.forms"  # of experiment files: experiment.forms.FileForm
 COMMANDS = "afspm.commands"  # afspm NAME: a function, or a typer.Typer
 DRIFT_COMMANDS = "afspm.drift_commands"  # afspm drift NAME: as COMMANDS
+PAGE_PARTS = "afspm.page_parts"  # of the page: see afspm.plugins.web.dashboard.page_parts
 PAGES = "afspm.pages"  # `afspm run --dashboard`: a module with the functions of afspm.cli.run.RunPage
 
 CLASSES = (COMPONENTS, SCHEDULERS, DRIVERS, EMULATORS)
@@ -50,7 +51,7 @@ _OWN = "afspm"
 _IN_FILES = (*CLASSES, ESTIMATORS, TRACKERS)
 """Groups whose names stand in experiment files: another package's object would change what the file means."""
 _FOR_FILES = (READERS, EXPORTERS, FORMS)
-_FOR_PROGRAMS = (FIGURES, DISPLAYS, FUNCTIONS, COMMANDS, DRIFT_COMMANDS, PAGES)
+_FOR_PROGRAMS = (FIGURES, DISPLAYS, FUNCTIONS, COMMANDS, DRIFT_COMMANDS, PAGES, PAGE_PARTS)
 GROUPS = (*CLASSES, ESTIMATORS, TRACKERS, *_FOR_FILES, *_FOR_PROGRAMS)
 
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 from typing import Final
 
 BROUGHT_BY: Final = {
+    "Agent": "afspm-agents",
+    "agent": "afspm-agents",
+    "approve": "afspm-agents",
     "drift study": "afspm-lab",
     "what-if": "afspm-lab",
     "what_if": "afspm-lab",

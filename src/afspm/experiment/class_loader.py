@@ -19,7 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from afspm.basics import entry_points, named_imports
+from afspm.basics import entry_points, named_imports, packages
 from afspm.basics.errors import ConfigError
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.parts import DECLARED_KEYS
@@ -109,7 +109,8 @@ def full_path(name: str) -> str:
     except ConfigError as error:
         raise Unloadable(error.what, error.hint) from error
     if path is None:
-        hint = nearest(name, entry_points.names(*entry_points.CLASSES)) or 'write it as "module.Name"'
+        near = nearest(name, entry_points.names(*entry_points.CLASSES))
+        hint = packages.remedy(name) or near or 'write it as "module.Name"'
         for one in entry_points.unreadable():
             hint += f"; or it is of the package {one.package}: {one.problem}"
         raise Unloadable(f"there is no ready-made class {name!r}", hint)

@@ -50,7 +50,6 @@ if TYPE_CHECKING:  # a bridge or a replay speaks for one side: its sockets, and 
 if TYPE_CHECKING:  # one command, page or bridge has it, and another may
     from afspm.cli.arguments import HelpWhenBare, RecordedRun
     from afspm.cli.declared_commands import DeclaredCommands
-    from afspm.cli.joining import acting
     from afspm.experiment.experiment import load as load_experiment
     from afspm.supervisor.own_runs import register_own_messages
     from afspm.supervisor.run import dry_run
@@ -110,7 +109,6 @@ __all__ = [
     "Where",
     "ZmqPort",
     "ZmqServerPort",
-    "acting",
     "dry_run",
     "find_object",
     "importing_from",

@@ -72,12 +72,6 @@ if TYPE_CHECKING:  # a coordinate frame is asked about every event, and answers 
     from afspm.scheduler.wire_codec import WireCodec
 
 if TYPE_CHECKING:  # an agent's plan is checked against the limits before a person sees it
-    from afspm.model.grants import with_proposal
-    from afspm.model.microscope_status import feedback_of
-    from afspm.model.problems import STOPPER
-    from afspm.scheduler.safety.forbidden_states import PlanRehearsal
-    from afspm.scheduler.safety.grants import not_of_role
-    from afspm.scheduler.safety.limit_checker import LimitChecker
     from afspm.scheduler.safety.limits import ExperimentLimits
 
 if TYPE_CHECKING:  # a replay gives a scheduler its recorded steps
@@ -87,7 +81,6 @@ if TYPE_CHECKING:  # a replay gives a scheduler its recorded steps
 __all__ = [
     "PROBE_CHANGES",
     "REGION_CHANGES",
-    "STOPPER",
     "TIP_FRAME",
     "Announced",
     "ArbitrationState",
@@ -103,11 +96,9 @@ __all__ = [
     "FrameReported",
     "HoldControl",
     "Input",
-    "LimitChecker",
     "Log",
     "MappedRequest",
     "PacketIn",
-    "PlanRehearsal",
     "ProblemSeen",
     "Reconsider",
     "RequestIn",
@@ -120,12 +111,9 @@ __all__ = [
     "TranslatorCaughtUp",
     "TranslatorUp",
     "WireCodec",
-    "feedback_of",
-    "not_of_role",
     "number_of",
     "scan_values",
     "undistorted",
-    "with_proposal",
 ]
 
 if not TYPE_CHECKING:

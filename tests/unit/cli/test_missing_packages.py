@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 import afspm
 from afspm.basics import ConfigError, entry_points, packages
 from afspm.cli.app import app
+from afspm.experiment import load
 
 PACKAGES = Path(__file__).parents[3] / "packages"
 
@@ -28,14 +29,29 @@ def plain_install(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.parametrize(
-    "line", ["what-if runs/latest --set tip_classifier.sigmas=60", "drift study tracker=bank,paper -n 2"]
+    ("line", "package"),
+    [
+        ("agent runs/latest", "afspm-agents"),
+        ("approve --grant grant.toml", "afspm-agents"),
+        ("drift study tracker=bank,paper -n 2", "afspm-lab"),
+        ("what-if runs/latest --set tip_classifier.sigmas=60", "afspm-lab"),
+    ],
 )
-def test_missing_command_names_its_package(line: str) -> None:
+def test_missing_command_names_its_package(line: str, package: str) -> None:
     done = CliRunner().invoke(app, line.split())
     assert isinstance(done.exception, ConfigError)
-    assert line.startswith(str(done.exception).partition("the command afspm ")[2].partition(" is not installed")[0])
-    assert "pip install ./packages/afspm-lab" in str(done.exception)
-    assert "what-if" not in CliRunner().invoke(app, ["--help"]).output
+    named = str(done.exception).partition("the command afspm ")[2].partition(" is not installed")[0]
+    assert named
+    assert line.startswith(named)
+    assert f"pip install ./packages/{package}" in str(done.exception)
+
+
+def test_missing_class_names_its_package(tmp_path: Path) -> None:
+    file = tmp_path / "night.toml"
+    file.write_text('[agent]\ncomponent = true\nclass = "Agent"\n')
+    (finding,) = [one for one in load(file).check() if "Agent" in one.what]
+    assert finding.is_error
+    assert "pip install ./packages/afspm-agents" in finding.hint
 
 
 def test_missing_function_names_its_package() -> None:
