@@ -66,10 +66,11 @@ test-times: test
 test-programs: $(COLLECTED)
 	@$(PYTEST) -m program tests/unit tests/plugins
 
-## the packages that no other test needs, one line each: bridges to the published implementation
-test-packages: $(TEST)
+## the packages of packages/ with tests of their own: agents, replays and studies of nights, and bridges to the published
+## implementation
+test-packages: $(COLLECTED)
 	@$(PYTHON) tools/bootstrap.py packages
-	@$(PYTEST) -n 4 --dist worksteal packages/afspm-published/tests
+	@$(PYTEST) -n $(TESTS_AT_A_TIME) --dist worksteal --in-turn $(addprefix packages/afspm-,$(addsuffix /tests,agents lab published))
 
 ## the rest: whole experiments, samples, snippets of the docs, faults of controllers, mutants; of the largest sets a part,
 ## another at each commit (tests/support/rotation.py), and all with AFSPM_CASES=all. What is APART, or needs more (root,
@@ -99,7 +100,7 @@ $(COLLECTED): $(TEST) $(shell find tests -name '*.py')
 
 ## decisions broken on purpose, each of which the simulated nights have to find; prints how many they found
 mutants: $(TEST)
-	@AFSPM_CASES=all $(PYTEST) -n 2 $(addprefix tests/simulation/,test_mutants.py test_what_if.py test_agent_mutants.py)
+	@AFSPM_CASES=all $(PYTEST) -n 2 $(addprefix tests/simulation/,test_mutants.py test_grant_mutants.py) packages/afspm-lab/tests/test_what_if.py
 
 ## the tests of units and plug-ins with the lowest versions of all dependencies, in build/lowest-env: needs Python 3.11
 LOWEST ?= tests/unit tests/plugins
@@ -276,7 +277,7 @@ simulate: $(TEST)
 
 ## nights with kills, replayed by what-if without a change: NIGHTS=200 SEED=0
 replay-nights: $(TEST)
-	@PYTHONPATH=tests/support $(BIN)/python -m tests.simulation.replayed_nights --nights $(NIGHTS) --seed $(SEED)
+	@PYTHONPATH=tests/support:packages/afspm-lab/tests $(BIN)/python -m replayed_nights --nights $(NIGHTS) --seed $(SEED)
 replay-nights: NIGHTS = 200
 
 ## a recorded run that loses its power, with all that was not synced, and is resumed, again and again: CUTS=100 SEED=1

@@ -1,8 +1,7 @@
-"""For the tests of packages: fixtures and plug-ins of afspm's tests."""
+"""For the tests of packages: fixtures of afspm's own tests."""
 
-from tests.conftest import plain
+from __future__ import annotations
+
 from tests.system.experiment.conftest import afspm_run
 
-__all__ = ["afspm_run", "plain"]
-
-pytest_plugins = ["must_run", "rotation", "time_per_test"]
+__all__ = ["afspm_run"]

@@ -162,7 +162,7 @@ def drift_stages() -> str:
         sheet.note((12, 285 + number * 15), text, anchor="start", fill=CONTROL, size=11)
     sheet.note(
         (20, 590),
-        "report/ draws and tabulates what track/ and frame/ know; study/ runs the stages in simulated nights.",
+        "report/ draws and tabulates what track/ and frame/ know; afspm-lab runs the stages in simulated nights.",
         anchor="start",
     )
     return sheet.document(790, 605, "The stages of drift correction")

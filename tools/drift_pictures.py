@@ -33,8 +33,8 @@ from afspm.plugins.drift.report.style import (
     styled,
     time_axis,
 )  # fmt: skip
-from afspm.plugins.drift.study import NightSettings, night
 from afspm.simulation import World
+from afspm_lab.study import NightSettings, night
 
 PICTURES = Path(__file__).resolve().parents[1] / "docs" / "pictures"
 NM = 1e9

@@ -10,7 +10,7 @@ from mcp.client.streamable_http import streamable_http_client
 
 from afspm import Component
 from afspm.model import Frame
-from afspm.plugins.agent.approval import of_plan, of_table
+from afspm_agents.approval import of_plan, of_table
 
 NAME = "script"
 WITHIN_S = 120.0  # real

@@ -145,10 +145,12 @@ def __getattr__(name: str) -> Any:
     # a function that a package adds, so that notebooks need no path of a guest; never under a name of Python's own, nor
     # of a module here: `from afspm import wire` asks for the name first, and must not read all packages' metadata
     if not name.startswith("_") and PathFinder.find_spec(f"{__name__}.{name}", __path__) is None:
-        from afspm.basics import entry_points
+        from afspm.basics import entry_points, packages
 
         if (found := entry_points.load(entry_points.FUNCTIONS, name)) is not None:
             return found
+        if remedy := packages.advice(name):
+            raise AttributeError(f"module 'afspm' has no attribute {name!r}: {remedy}")
     raise AttributeError(f"module 'afspm' has no attribute {name!r}")
 
 

@@ -15,7 +15,7 @@ from afspm.basics import entry_points
 
 ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "src" / "afspm"
-PACKAGES = (ROOT / "packages" / "afspm-bench" / "src", ROOT / "packages" / "afspm-published" / "src")
+PACKAGES = tuple(ROOT / "packages" / f"afspm-{name}" / "src" for name in ("agents", "bench", "lab", "published"))
 WORD = re.compile(r"[A-Za-z_]\w*")
 QUOTED = re.compile(r"(?<!`)`([A-Za-z_][\w.]*)(?:\([^`]*\))?`(?!`)")
 PARTS = {

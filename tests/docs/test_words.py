@@ -14,7 +14,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("packages/afspm-bench/src", "packages/afspm-nion/src", "packages/afspm-published/src")
+PACKAGES = (
+    "packages/afspm-agents/src",
+    "packages/afspm-bench/src",
+    "packages/afspm-lab/src",
+    "packages/afspm-nion/src",
+    "packages/afspm-published/src",
+)
 WORDS = (
     "anew",
     "whoever",

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
+from bridged_fixtures import rig  # noqa: F401
 from bridged_rig import BridgedRig
 from version_1 import REQUEST, Client, Subscriber
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import zmq
+from bridged_fixtures import rig  # noqa: F401
 
 from afspm import wire
 from afspm.model import ControlRequest, ControlResponse, Region, ResponseDetail, Scan

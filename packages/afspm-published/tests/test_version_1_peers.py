@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
+from bridged_fixtures import rig, router  # noqa: F401
 from deadlines import DEADLINE_S
 from version_1 import END, PARAM, RELEASE, REQUEST, Client, Router, Server, Subscriber
 

@@ -40,6 +40,8 @@ DISPLAYS = "afspm.displays"  # of scans and spectra: what their `plot`, `to_sidp
 FUNCTIONS = "afspm.functions"  # of `afspm` itself, for scripts and notebooks: afspm.NAME
 FORMS = "afspm.forms"  # of experiment files: experiment.forms.FileForm
 COMMANDS = "afspm.commands"  # afspm NAME: a function, or a typer.Typer
+DRIFT_COMMANDS = "afspm.drift_commands"  # afspm drift NAME: as COMMANDS
+PAGE_PARTS = "afspm.page_parts"  # of the page: see afspm.plugins.web.dashboard.page_parts
 PAGES = "afspm.pages"  # `afspm run --dashboard`: a module with the functions of afspm.cli.run.RunPage
 
 CLASSES = (COMPONENTS, SCHEDULERS, DRIVERS, EMULATORS)
@@ -48,7 +50,9 @@ _FILE = "entry_points.txt"
 _OWN = "afspm"
 _IN_FILES = (*CLASSES, ESTIMATORS, TRACKERS)
 """Groups whose names stand in experiment files: another package's object would change what the file means."""
-GROUPS = (*CLASSES, READERS, EXPORTERS, ESTIMATORS, TRACKERS, FIGURES, DISPLAYS, FUNCTIONS, FORMS, COMMANDS, PAGES)
+_FOR_FILES = (READERS, EXPORTERS, FORMS)
+_FOR_PROGRAMS = (FIGURES, DISPLAYS, FUNCTIONS, COMMANDS, DRIFT_COMMANDS, PAGES, PAGE_PARTS)
+GROUPS = (*CLASSES, ESTIMATORS, TRACKERS, *_FOR_FILES, *_FOR_PROGRAMS)
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,18 @@
-"""Packages of this repository that a plain installation does not have, by the names that they bring."""
+"""Packages of the folder `packages/`, which `pip install .` leaves out, by the names that they bring."""
 
 from __future__ import annotations
 
 from typing import Final
 
-BROUGHT_BY: Final[dict[str, str]] = dict.fromkeys(
-    ("PublishedPeers", "PublishedScheduler", "PublishedTranslator", "SimulatedPublishedTranslator"), "afspm-published"
-)
-"""Package in the folder `packages/`, by the name of an entry point: a class of an experiment file, or a command."""
+BROUGHT_BY: Final[dict[str, str]] = {
+    **dict.fromkeys(("Agent", "agent", "approve"), "afspm-agents"),
+    **dict.fromkeys(("drift study", "what-if", "what_if"), "afspm-lab"),
+    **dict.fromkeys(
+        ("PublishedPeers", "PublishedScheduler", "PublishedTranslator", "SimulatedPublishedTranslator"),
+        "afspm-published",
+    ),
+}
+"""The package of each class of an experiment file, command and function that may be missing."""
 
 
 def advice(name: str) -> str:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-from typer.core import TyperCommand, TyperGroup
 
-from afspm.basics import entry_points
-from afspm.basics.errors import ConfigError
 from afspm.cli import (
     commission,
     developing,
@@ -20,25 +16,8 @@ from afspm.cli import (
     status,
     steer,
 )
-from afspm.cli.arguments import AFTERWARDS, BEFORE, MEANWHILE, MICROSCOPES, PLUGINS, HelpWhenBare
-
-if TYPE_CHECKING:
-    from typer._click.core import Command
-
-# options that typer adds to each app; only those of `afspm` itself install something
-_COMPLETION = ("install_completion", "show_completion")
-
-
-class DeclaredCommands(HelpWhenBare):
-    """Commands of afspm and of other packages; a package's command is loaded for the help, and when called."""
-
-    def list_commands(self, ctx: object) -> list[str]:
-        declared = entry_points.names(entry_points.COMMANDS)
-        return [*self.commands, *(name for name in declared if name not in self.commands)]
-
-    def get_command(self, ctx: object, cmd_name: str) -> Command | None:
-        return self.commands.get(cmd_name) or _declared(cmd_name)
-
+from afspm.cli.arguments import AFTERWARDS, BEFORE, MEANWHILE, MICROSCOPES
+from afspm.cli.declared_commands import DeclaredCommands
 
 app = typer.Typer(
     name="afspm",
@@ -93,37 +72,3 @@ app.command("commission", rich_help_panel=MICROSCOPES)(commission.commission)
 app.add_typer(shadow.app, name="shadow", rich_help_panel=MICROSCOPES)
 app.command("trace", rich_help_panel=MICROSCOPES)(run.trace)
 app.command("emulate", rich_help_panel=MICROSCOPES)(developing.emulate)
-
-
-def _declared(name: str) -> Command | None:
-    try:
-        found = entry_points.load(entry_points.COMMANDS, name)
-        if found is None:
-            return None
-        command = _command(name, found)
-    except ConfigError as error:  # raised when the command is called: the help must list all others
-        command = _command(name, _unloadable(error))
-    except Exception as error:  # typer raises many kinds where a package's function can't be a command
-        what = f"the command {name} of a package can't be used: {type(error).__name__}: {error}"
-        command = _command(name, _unloadable(ConfigError(what, where=entry_points.COMMANDS)))
-    return command
-
-
-def _command(name: str, found: typer.Typer | Callable[..., object]) -> Command:
-    if not isinstance(found, typer.Typer):
-        function, found = found, typer.Typer(rich_markup_mode=None)
-        found.command()(function)
-    command = typer.main.get_command(found)
-    command.name = name
-    command.params = [one for one in command.params if one.name not in _COMPLETION]
-    if isinstance(command, TyperCommand | TyperGroup):  # typer sets the panel only in add_typer
-        command.rich_help_panel = found.rich_help_panel if isinstance(found.rich_help_panel, str) else PLUGINS
-    return command
-
-
-def _unloadable(error: ConfigError) -> Callable[[], None]:
-    def command() -> None:
-        """Not available: its package can't be loaded."""
-        raise error
-
-    return command

@@ -120,8 +120,8 @@ def _end_without_run(why: str, *, as_json: bool, running: bool | None) -> NoRetu
 def _running(where: Path, *, as_json: bool, acts: bool) -> Path:
     from afspm.basics.errors import FileError
     from afspm.client.connect import find_run, others_running, require_no_others, several_run
-    from afspm.record import RUN_FILE, goes_on, read_run_json
-    from afspm.record.run_json import ENDED
+    from afspm.record import goes_on, read_run_json
+    from afspm.record.run_json import ENDED, RUN_FILE
 
     try:
         folder = find_run(where)

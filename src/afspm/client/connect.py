@@ -19,8 +19,8 @@ from afspm.basics.toml import parse_toml
 from afspm.client.experiment_link import ExperimentLink
 from afspm.model import Frame, ProblemNames
 from afspm.model.events import is_process_name
-from afspm.record import RUN_FILE, cut_off_message, goes_on, latest_run, read_run_json
-from afspm.record.run_json import STATE_DIR, run_json_or_empty
+from afspm.record import cut_off_message, goes_on, latest_run, read_run_json
+from afspm.record.run_json import RUN_FILE, STATE_DIR, run_json_or_empty
 from afspm.record.run_lock import is_locked
 from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import open_port

@@ -11,7 +11,7 @@ from afspm.experiment.toml_lines import Table
 from afspm.model import ChannelRoles, Parameter, Region, names
 
 if TYPE_CHECKING:
-    from afspm.driver import ParameterTable
+    from afspm.translator.parameters import ParameterTable
 
 
 @dataclass(frozen=True)

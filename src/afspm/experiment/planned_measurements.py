@@ -27,7 +27,9 @@ from afspm.model import (
 from afspm.model.geometry import XY
 from afspm.model.planned_work import PlannedWork, path_length_m
 from afspm.model.sweep_plan import SweepPlan
-from afspm.scheduler import ExperimentLimits, LimitChecker, PlanRehearsal
+from afspm.scheduler import ExperimentLimits
+from afspm.scheduler.safety.forbidden_states import PlanRehearsal
+from afspm.scheduler.safety.limit_checker import LimitChecker
 from afspm.scheduler.safety.limits import Limit, RoleLimits
 
 

@@ -27,8 +27,9 @@ from afspm.model.planned_work import path_length_m
 from afspm.night.bad_scans import BAD
 from afspm.night.run import Run, open_run
 from afspm.night.tables import ScanRow
-from afspm.record import RUN_FILE, describe_state
+from afspm.record import describe_state
 from afspm.record.journal import not_a_table
+from afspm.record.run_json import RUN_FILE
 from afspm.wire.messages import CONTROL_STATE, DRIFT_RESCAN, JOURNAL
 
 INDEX_FILE: Final = "runs.sqlite"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from afspm.basics.lazy import lazily
 
 if TYPE_CHECKING:
-    from afspm.cli.arguments import AFTERWARDS, MEANWHILE, RUNS, HelpWhenBare, NoProgress, Where, names_in, opt
+    from afspm.cli.arguments import AFTERWARDS, MEANWHILE, RUNS, NoProgress, Where, names_in, opt
     from afspm.cli.joining import looking, plain_console, plain_table
     from afspm.client.experiment_link import ExperimentLink
     from afspm.experiment.class_loader import importing_from
@@ -40,8 +40,7 @@ if TYPE_CHECKING:  # a bridge or a replay speaks for one side: its sockets, and 
     from afspm.transport.frames import receive_frames, send_frames, send_packet
     from afspm.transport.network import ACCEPTED, CONNECTED, DISCONNECTED, MAX_PACKET_BYTES, Monitor, is_local
     from afspm.transport.polling import milliseconds
-    from afspm.transport.port import CaughtUp, ControlDisconnected, RequestReceived, Served, SubscriberJoined
-    from afspm.transport.process.context import ExperimentProcess
+    from afspm.transport.port import RequestReceived, Served, SubscriberJoined
     from afspm.transport.publisher import Publisher
     from afspm.transport.router import PeerConnected, PeerDisconnected, RouterEvent
     from afspm.transport.subscriber import Subscriber
@@ -49,19 +48,17 @@ if TYPE_CHECKING:  # a bridge or a replay speaks for one side: its sockets, and 
     from afspm.transport.zmq_server import ZmqServerPort
 
 if TYPE_CHECKING:  # one command, page or bridge has it, and another may
-    from afspm.cli.arguments import RecordedRun
-    from afspm.cli.joining import acting
+    from afspm.cli.arguments import HelpWhenBare, RecordedRun
+    from afspm.cli.declared_commands import DeclaredCommands
     from afspm.experiment.experiment import load as load_experiment
-    from afspm.supervisor.own_runs import own_homes, register_own_messages
+    from afspm.supervisor.own_runs import register_own_messages
     from afspm.supervisor.run import dry_run
     from afspm.supervisor.run import now as run_time
     from afspm.transport.port import Port
     from afspm.transport.process.context import step_back
-    from afspm.transport.process.loading import find_class, find_object
-    from afspm.transport.process.loading import load as load_class
+    from afspm.transport.process.loading import find_object
     from afspm.transport.process.parent import leave_interrupts_to_parent
     from afspm.transport.zmq_port import ZmqPort
-    from afspm.wire.message_types import register_all as register_messages
 
 __all__ = [
     "ACCEPTED",
@@ -73,13 +70,11 @@ __all__ = [
     "MEANWHILE",
     "RUNS",
     "BasePort",
-    "CaughtUp",
     "ControlClient",
     "ControlConnected",
-    "ControlDisconnected",
+    "DeclaredCommands",
     "Experiment",
     "ExperimentLink",
-    "ExperimentProcess",
     "FreePorts",
     "HelpWhenBare",
     "Incoming",
@@ -114,14 +109,11 @@ __all__ = [
     "Where",
     "ZmqPort",
     "ZmqServerPort",
-    "acting",
     "dry_run",
-    "find_class",
     "find_object",
     "importing_from",
     "is_local",
     "leave_interrupts_to_parent",
-    "load_class",
     "load_expanded",
     "load_experiment",
     "log_folder",
@@ -132,11 +124,9 @@ __all__ = [
     "new_session",
     "open_port",
     "opt",
-    "own_homes",
     "plain_console",
     "plain_table",
     "receive_frames",
-    "register_messages",
     "register_own_messages",
     "run_experiment",
     "run_time",
@@ -150,28 +140,29 @@ if not TYPE_CHECKING:
     __getattr__ = lazily(
         __name__,
         {
-            "afspm.cli.arguments": "AFTERWARDS MEANWHILE RUNS HelpWhenBare NoProgress Where names_in opt RecordedRun",
-            "afspm.cli.joining": "looking plain_console plain_table acting",
+            "afspm.cli.arguments": "AFTERWARDS MEANWHILE RUNS NoProgress Where names_in opt HelpWhenBare RecordedRun",
+            "afspm.cli.declared_commands": "DeclaredCommands",
+            "afspm.cli.joining": "looking plain_console plain_table",
             "afspm.client.experiment_link": "ExperimentLink",
             "afspm.experiment.class_loader": "importing_from",
             "afspm.experiment.experiment": "Experiment load_expanded",
             "afspm.experiment.process_starts": "DASHBOARD",
             "afspm.storage.packet_log": "log_folder logged_packets",
-            "afspm.supervisor.own_runs": "own_homes register_own_messages",
+            "afspm.supervisor.own_runs": "register_own_messages",
             "afspm.supervisor.ports": "FreePorts",
             "afspm.supervisor.resume": "ResumableRun",
             "afspm.supervisor.run": "RunOptions dry_run",
             "afspm.transport.control_client": "ControlClient",
             "afspm.transport.frames": "receive_frames send_frames send_packet",
             "afspm.transport.late_joiners": "PublishedHistory",
-            "afspm.transport.network": "Network is_local ACCEPTED CONNECTED DISCONNECTED MAX_PACKET_BYTES Monitor",
+            "afspm.transport.network": "Network ACCEPTED CONNECTED DISCONNECTED MAX_PACKET_BYTES Monitor is_local",
             "afspm.transport.polling": "Poller WakeUp milliseconds",
             "afspm.transport.port": (
-                "ControlConnected Incoming Killed PacketReceived ParentGone ReplyReceived CaughtUp "
-                "ControlDisconnected RequestReceived Served SubscriberJoined Port"
+                "ControlConnected Incoming Killed PacketReceived ParentGone ReplyReceived RequestReceived "
+                "Served SubscriberJoined Port"
             ),
-            "afspm.transport.process.context": "ProcessActivity ProcessContext new_session ExperimentProcess step_back",
-            "afspm.transport.process.loading": "find_class find_object",
+            "afspm.transport.process.context": "ProcessActivity ProcessContext new_session step_back",
+            "afspm.transport.process.loading": "find_object",
             "afspm.transport.process.parent": "StopRequested leave_interrupts_to_parent",
             "afspm.transport.publisher": "Publisher",
             "afspm.transport.rate_limited_log": "RateLimitedLog",
@@ -180,9 +171,7 @@ if not TYPE_CHECKING:
             "afspm.transport.zmq_port": "open_port BasePort ZmqPort",
             "afspm.transport.zmq_server": "ZmqServerPort",
         },
-        load_class="afspm.transport.process.loading.load",
         load_experiment="afspm.experiment.experiment.load",
-        register_messages="afspm.wire.message_types.register_all",
         run_experiment="afspm.supervisor.run.run",
         run_time="afspm.supervisor.run.now",
         toml_text="afspm.experiment.toml_writer.dumps",

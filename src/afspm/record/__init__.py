@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # drift writes its mapping beside the files
     from afspm.record.measured_files import SUFFIX as MEASURED_SUFFIX
 
 if TYPE_CHECKING:  # a recorded run is found and published again
-    from afspm.record.run_json import REPLAY_OF, RUN_FILE, latest_run
+    from afspm.record.run_json import REPLAY_OF, latest_run
     from afspm.record.run_lock import lock_run
 
 if TYPE_CHECKING:  # the page says how a run stands
@@ -43,7 +43,6 @@ __all__ = [
     "JOURNAL_FILE",
     "MEASURED_SUFFIX",
     "REPLAY_OF",
-    "RUN_FILE",
     "STATE_DIR",
     "AllowedBands",
     "bands_allowed",
@@ -70,8 +69,7 @@ if not TYPE_CHECKING:
             "afspm.record.journal": "JOURNAL_FILE measured_file",
             "afspm.record.nexus_writer": "field_names",
             "afspm.record.run_json": (
-                "ENDED EXPERIMENT_FILE STATE_DIR experiment_name run_json_or_empty REPLAY_OF RUN_FILE latest_run "
-                "read_run_json"
+                "ENDED EXPERIMENT_FILE STATE_DIR experiment_name run_json_or_empty REPLAY_OF latest_run read_run_json"
             ),
             "afspm.record.run_lock": "lock_run cut_off_message describe_state goes_on",
         },

@@ -28,18 +28,12 @@ if TYPE_CHECKING:  # the page writes and shows it
     from afspm.report.night_report import REPORT_FILE
     from afspm.report.night_report import write as write_report
 
-if TYPE_CHECKING:  # a replay is compared by its story
-    from afspm.report.story import RunStory
-    from afspm.report.story import read as read_story
-
 __all__ = [
     "OFFSET",
     "REPORT_FILE",
-    "RunStory",
     "compare",
     "document",
     "is_ours",
-    "read_story",
     "rows_that_differ",
     "section",
     "shadow_report",
@@ -58,9 +52,7 @@ if not TYPE_CHECKING:
             "afspm.report.markup": "document section table",
             "afspm.report.night_report": "REPORT_FILE",
             "afspm.report.pictures": "OFFSET is_ours topography",
-            "afspm.report.story": "RunStory",
         },
-        read_story="afspm.report.story.read",
         shadow_report="afspm.report.shadow",
         write_comparison="afspm.report.comparison_page.write",
         write_report="afspm.report.night_report.write",

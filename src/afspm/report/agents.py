@@ -20,9 +20,9 @@ from afspm.model import (
     component_of,
 )
 from afspm.model.parameter_names import BASE_PARAMETERS
+from afspm.model.problems import STOPPER
 from afspm.night.run import Run
 from afspm.report.markup import PageTimes, table
-from afspm.scheduler import STOPPER
 
 
 @dataclass(frozen=True)

@@ -72,28 +72,15 @@ if TYPE_CHECKING:  # a coordinate frame is asked about every event, and answers 
     from afspm.scheduler.wire_codec import WireCodec
 
 if TYPE_CHECKING:  # an agent's plan is checked against the limits before a person sees it
-    from afspm.model.grants import with_proposal
-    from afspm.model.microscope_status import feedback_of
-    from afspm.model.problems import STOPPER
-    from afspm.scheduler.safety.forbidden_states import PlanRehearsal
-    from afspm.scheduler.safety.grants import not_of_role
-    from afspm.scheduler.safety.limit_checker import LimitChecker
     from afspm.scheduler.safety.limits import ExperimentLimits
 
 if TYPE_CHECKING:  # a replay gives a scheduler its recorded steps
-    from afspm.scheduler.control.descriptions import request_text
-    from afspm.scheduler.saved_state import KIND as STATE_KIND
-    from afspm.scheduler.saved_state import VERSION as STATE_VERSION
     from afspm.scheduler.saved_state import SavedState
     from afspm.scheduler.scheduler_core import SchedulerCore
-    from afspm.scheduler.step_log import Restored, StateSums, Step, facts_of, read_cached, read_event
 
 __all__ = [
     "PROBE_CHANGES",
     "REGION_CHANGES",
-    "STATE_KIND",
-    "STATE_VERSION",
-    "STOPPER",
     "TIP_FRAME",
     "Announced",
     "ArbitrationState",
@@ -109,36 +96,24 @@ __all__ = [
     "FrameReported",
     "HoldControl",
     "Input",
-    "LimitChecker",
     "Log",
     "MappedRequest",
     "PacketIn",
-    "PlanRehearsal",
     "ProblemSeen",
     "Reconsider",
     "RequestIn",
-    "Restored",
     "SaveNow",
     "SavedState",
     "Scheduler",
     "SchedulerCore",
     "Started",
-    "StateSums",
-    "Step",
     "Tick",
     "TranslatorCaughtUp",
     "TranslatorUp",
     "WireCodec",
-    "facts_of",
-    "feedback_of",
-    "not_of_role",
     "number_of",
-    "read_cached",
-    "read_event",
-    "request_text",
     "scan_values",
     "undistorted",
-    "with_proposal",
 ]
 
 if not TYPE_CHECKING:
@@ -146,30 +121,20 @@ if not TYPE_CHECKING:
         __name__,
         {
             "afspm.model.drift_removal": "undistorted",
-            "afspm.model.grants": "with_proposal",
-            "afspm.model.microscope_status": "feedback_of",
             "afspm.model.positions": "PROBE_CHANGES REGION_CHANGES scan_values",
-            "afspm.model.problems": "STOPPER",
             "afspm.scheduler.control.arbitration": "ArbitrationState",
-            "afspm.scheduler.control.descriptions": "request_text",
             "afspm.scheduler.coordinate_frame": (
                 "TIP_FRAME AskMicroscope CoordinateFrame FrameOutput HoldControl MappedRequest Reconsider SaveNow"
             ),
             "afspm.scheduler.events": (
-                "Announced Codec ControlChanged Delegate FrameAnswered FrameReported Input Log PacketIn ProblemSeen "
-                "RequestIn Started Tick TranslatorCaughtUp TranslatorUp"
+                "Announced Codec ControlChanged Delegate FrameAnswered FrameReported Input Log PacketIn "
+                "ProblemSeen RequestIn Started Tick TranslatorCaughtUp TranslatorUp"
             ),
-            "afspm.scheduler.safety.forbidden_states": "PlanRehearsal",
-            "afspm.scheduler.safety.grants": "not_of_role",
-            "afspm.scheduler.safety.limit_checker": "LimitChecker",
             "afspm.scheduler.safety.limits": "ExperimentLimits",
             "afspm.scheduler.safety.parameter_values": "number_of",
             "afspm.scheduler.saved_state": "SavedState",
             "afspm.scheduler.scheduler": "Coordinates Scheduler",
             "afspm.scheduler.scheduler_core": "SchedulerCore",
-            "afspm.scheduler.step_log": "Restored StateSums Step facts_of read_cached read_event",
             "afspm.scheduler.wire_codec": "WireCodec",
         },
-        STATE_KIND="afspm.scheduler.saved_state.KIND",
-        STATE_VERSION="afspm.scheduler.saved_state.VERSION",
     )

@@ -10,8 +10,7 @@ from datetime import datetime
 from pathlib import Path
 
 from afspm.basics.errors import FileError
-from afspm.record import RUN_FILE
-from afspm.record.run_json import EXPERIMENT_FILE, LATEST_FILE, LATEST_LINK, STATE_DIR
+from afspm.record.run_json import EXPERIMENT_FILE, LATEST_FILE, LATEST_LINK, RUN_FILE, STATE_DIR
 from afspm.storage.atomic import replace_file
 from afspm.storage.disk import sync_folder
 

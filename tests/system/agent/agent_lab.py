@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import httpx2
+import pytest
 from afspm_process import AfspmProcess
 from deadlines import DEADLINE_S
 from mcp import Client
@@ -128,3 +129,20 @@ class AgentRun(AfspmProcess):
         file = self.home / "grant.toml"
         file.write_text(text, encoding="utf-8")
         self.person("approve", "--grant", str(file), "--yes", "", str(self.folder))
+
+
+Started = Callable[..., AgentRun]
+
+
+@pytest.fixture
+def started(tmp_path: Path) -> Iterator[Started]:
+    """Starts an experiment with an agent server; killed after the test."""
+    runs: list[AgentRun] = []
+
+    def start(more: str = "", **options: Any) -> AgentRun:
+        runs.append(AgentRun(tmp_path, more, **options))
+        return runs[-1]
+
+    yield start
+    for one in runs:
+        one.close()

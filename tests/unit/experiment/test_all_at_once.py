@@ -21,9 +21,12 @@ region = { x = ["-2 um", "2 um"], y = ["-2 um", "2 um"] }
 max = "10 um/s"
 """
 GRANT = """
+[control]
+agents = ["agent"]
+
 [agent]
 component = true
-class = "Agent"
+class = "Gateway"
 
 [limits.roles.agent]
 actions = ["start-scna", "fly"]

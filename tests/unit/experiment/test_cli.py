@@ -89,10 +89,10 @@ def test_keys_makes_a_pair_for_each_process_and_person_and_leaves_old_ones(
 @pytest.mark.parametrize(
     ("words", "some"),
     [
-        (("afspm", ""), {"run", "export", "drift", "what-if", "bench"}),
-        (("afspm", "drift", ""), {"files", "study"}),
+        (("afspm", ""), {"run", "export", "drift", "bench"}),
+        (("afspm", "drift", ""), {"files"}),
         (("afspm", "new", "d"), {"driver"}),
-        (("afspm", "what-if", "--"), {"--component", "--closed"}),
+        (("afspm", "replay", "--"), {"--speed"}),
     ],
 )
 def test_shell_completes_commands_of_all_packages_and_their_options(

@@ -534,7 +534,7 @@ def test_experiment_in_which_nothing_measures_is_a_warning(write: Write, text: s
     [
         SERIES.format(on="true"),
         '[dashboard]\ncomponent = true\nclass = "Dashboard"\n',
-        '[agent]\ncomponent = true\nclass = "Agent"\n',
+        '[gateway]\ncomponent = true\nclass = "Gateway"\n',
         '[own]\ncomponent = true\nclass = "parts.Peaks"\n',
         '[own]\ncomponent = true\ncommand = ["python3", "own.py"]\n',
     ],

@@ -107,7 +107,8 @@ def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable
         FileError: the output folder can't be written, its key is malformed, or a file of `read` is missing.
     """
     if (options.record or options.replay) and find_spec("mcp") is None:
-        raise ConfigError("a cassette holds calls over MCP, which is not installed", hint='pip install "afspm[agent]"')
+        hint = "pip install ./packages/afspm-agents in the folder of the clone"
+        raise ConfigError("a cassette holds calls over MCP, which is not installed", hint=hint)
     seal = options.seal and any(not agent.sees_truth for agent in agents)
     if seal and (why := sealing.unavailable()):
         raise ConfigError(

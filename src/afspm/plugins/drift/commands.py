@@ -1,4 +1,4 @@
-"""`afspm drift`: follow drift in recorded scans, and study settings in simulated nights."""
+"""`afspm drift`: follow drift in recorded scans; packages add further commands."""
 
 from __future__ import annotations
 
@@ -8,16 +8,19 @@ from typing import Annotated, Any
 
 import typer
 
-from afspm.processes import AFTERWARDS, HelpWhenBare, NoProgress
+from afspm.processes import AFTERWARDS, DeclaredCommands, NoProgress
 
 _FILES = "files"
 
 
-class FilesUnlessNamed(HelpWhenBare):
+class FilesUnlessNamed(DeclaredCommands):
     """Command group that runs `afspm drift a.sxm` as `afspm drift files a.sxm`."""
 
+    group = "afspm.drift_commands"
+    prefix = "drift "
+
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
+        if args and not self.is_name(ctx, args[0]) and args[0] not in ctx.help_option_names:
             args = [_FILES, *args]
         return super().parse_args(ctx, args)
 
@@ -27,8 +30,15 @@ app = typer.Typer(
     rich_markup_mode=None,
     rich_help_panel=AFTERWARDS,
     help="Follow drift in recorded scans (afspm drift FILE…; its options: afspm drift files --help), or study settings "
-    "in simulated nights (afspm drift study).",
+    "in simulated nights (afspm drift study, of the package afspm-lab).",
 )
+
+
+@app.callback()
+def _drift() -> None:  # without it typer makes a group with one command that command
+    pass
+
+
 Jobs = Annotated[
     int | None,
     typer.Option(
@@ -62,7 +72,7 @@ def files(
     (drift_stack.nc). Unreadable files are named and left out. Your own estimator or tracker, module.Class, may be in
     the current folder.
     """
-    _one_thread_a_process()
+    one_thread_a_process()
     from afspm.plugins.drift.report import file_commands as drift_files
     from afspm.processes import importing_from
 
@@ -72,35 +82,8 @@ def files(
         drift_files.run(paths, channel, estimator, tracker, output, jobs, quiet=quiet)
 
 
-@app.command("study")
-def study(
-    settings: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="NAME=VALUE,…",
-            help="Values to try: tracker=bank,paper paper.queue=3,5,10; or a TOML file of such names.",
-            show_default=False,
-        ),
-    ] = None,
-    nights: Annotated[int, typer.Option("--nights", "-n", min=1, help="Nights for each combination of settings.")] = 10,
-    seed: Annotated[int, typer.Option(help="Of the first night; every combination gets the same nights.")] = 1,
-    cluster: Annotated[
-        str, typer.Option(metavar="ADDRESS", help="The scheduler of a Dask cluster to work on.", show_default=False)
-    ] = "",
-    jobs: Jobs = None,
-    quiet: NoProgress = False,
-) -> None:
-    """Simulate many nights over a grid of settings, rank the settings, and check whether the defaults hold."""
-    _one_thread_a_process()
-    from afspm.plugins.drift.study import study_commands as drift_study
-    from afspm.processes import importing_from
-
-    with importing_from([Path.cwd()]):
-        drift_study.run(settings or [], nights, seed, cluster, jobs, quiet=quiet)
-
-
-def _one_thread_a_process() -> None:
-    # Registration works on small arrays with one process per core: threads of the linear algebra would only compete.
-    # The variables count before numpy is loaded, and child processes inherit them.
+def one_thread_a_process() -> None:
+    """Let the linear algebra of this process and its children use one thread; call it before numpy is imported."""
+    # registration works on small arrays with one process per core: threads would only compete
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")

@@ -22,9 +22,9 @@ from afspm.basics.clock import iso_utc
 from afspm.basics.formatting import counted
 from afspm.night.run import Run
 from afspm.night.tables import ScanRow, SpectrumRow
-from afspm.record import RUN_FILE, journal
+from afspm.record import journal
 from afspm.record.nexus_writer import afspm_version
-from afspm.record.run_json import EXPERIMENT_FILE
+from afspm.record.run_json import EXPERIMENT_FILE, RUN_FILE
 from afspm.report.export import unreadable
 from afspm.report.night_report import REPORT_FILE
 

@@ -17,14 +17,14 @@ from typing import Final
 import numpy as np
 
 from afspm.basics.errors import AfspmError, FileError, InvalidValue, Refused
-from afspm.driver import ParameterTable, encode_spectrum
+from afspm.driver import encode_spectrum
 from afspm.model import ControlResponse, ScanLines, ScopeState, Spectrum, names
 from afspm.simulation.activities import Channels, ScanActivity, SpectrumActivity
 from afspm.simulation.faults import Faults
 from afspm.simulation.instrument import InstrumentBusy, SimulatedInstrument
 from afspm.storage.atomic import write_atomic
 from afspm.translator.own_files import FileFacts, encode_scan
-from afspm.translator.parameters import Value
+from afspm.translator.parameters import ParameterTable, Value
 from afspm.translator.setting_groups import feedback, frame
 from afspm.translator.state import Kept
 

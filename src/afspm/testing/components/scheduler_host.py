@@ -15,10 +15,9 @@ from afspm.basics.exit_codes import ExitCode
 from afspm.model import LoggedPacket, Packet, Request, Response
 from afspm.model.events import component_of
 from afspm.model.snapshot import restored, snapshot
-from afspm.scheduler import STATE_KIND as KIND
-from afspm.scheduler import STATE_VERSION as VERSION
 from afspm.scheduler import Codec, Input, SavedState, SchedulerCore
 from afspm.scheduler.events import Effect
+from afspm.scheduler.saved_state import KIND, VERSION
 from afspm.scheduler.settings import SchedulerSettings
 from afspm.scheduler.shell import FrameWorker, Messages, SchedulerShell
 from afspm.testing.components.memory_network import (

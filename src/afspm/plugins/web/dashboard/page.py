@@ -16,9 +16,9 @@ from afspm import Levelling
 from afspm.drawing import PALETTES, TIMELINE_CSS
 from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.dashboard.actions import Steering
-from afspm.plugins.web.dashboard.approvals import ApprovalBar
 from afspm.plugins.web.dashboard.conditions import Conditions
 from afspm.plugins.web.dashboard.content import Content, Contents
+from afspm.plugins.web.dashboard.page_parts import page_part
 from afspm.plugins.web.dashboard.panels import AlarmBar, ChartPanel, HealthPanel, LogPanel, NotesPanel, SpectraPanel
 from afspm.plugins.web.dashboard.sign_in import SIGN_IN
 from afspm.plugins.web.dashboard.steering_panel import ModeButtons, ProblemBar, SteeringPanel
@@ -103,7 +103,8 @@ class Page:
                 self._sign_in_or_out()
         self._problems = ProblemBar(self._session)
         self._alarms = AlarmBar()
-        self._approvals = ApprovalBar(self._session)
+        approvals = page_part("approvals")
+        self._approvals = approvals and approvals(self._session)
         ui.html('<div id="trouble" role="alert" hidden></div>', sanitize=False)
 
     def _sign_in_or_out(self) -> None:
@@ -129,7 +130,8 @@ class Page:
         self._mode.show()
         self._problems.show()
         self._alarms.show(content.alarms)
-        self._approvals.show()
+        if self._approvals:
+            self._approvals.show()
         self._sections.show(content)
         state = self._state(content)
         try:
@@ -150,7 +152,7 @@ class Page:
             "trouble": content.trouble,
             "ended": content.ended,
             "may_measure": self._session.may_measure,
-            "may_grant": self._session.may_steer and bool(content.agents),
+            "may_grant": self._session.may_steer and bool(content.agents) and page_part("grant") is not None,
         }
 
     def _stop(self) -> None:

@@ -15,7 +15,7 @@ from afspm.model import ControlMode, Region, TipStatus
 from afspm.plugins.web.dashboard.actions import Actions
 from afspm.plugins.web.dashboard.content import Content
 from afspm.plugins.web.dashboard.flags import Flag
-from afspm.plugins.web.dashboard.grant_dialog import GrantDialog
+from afspm.plugins.web.dashboard.page_parts import page_part
 from afspm.plugins.web.dashboard.parameter_form import ParameterForm
 from afspm.plugins.web.dashboard.scan_dialog import ScanDialog
 from afspm.plugins.web.dashboard.steering_session import SteeringSession, asked, button
@@ -132,6 +132,7 @@ class SteeringPanel:
         with ui.element("div").classes("acts") as self._agents:
             button("Give an agent a grant …", self._give_grant)
         self._agents.set_visibility(False)
+        self._grant_dialog = page_part("grant")
         with ui.element("div").classes("acts"):
             button("End the experiment …", self._ask_end, "negative").props("outline")
         ui.on("scan_here", self._ask_scan)
@@ -143,7 +144,7 @@ class SteeringPanel:
         for one in self._by_hand:
             one.set_visibility(content.is_manual)
         self._hint.set_text(_MANUAL if content.is_manual else _ADJUST if content.adjustable else _TAKE_OVER)
-        self._agents.set_visibility(bool(content.agents) and self._session.may_steer)
+        self._agents.set_visibility(bool(content.agents and self._session.may_steer and self._grant_dialog))
         self._parameters.show()
 
     async def _ask_end(self) -> None:
@@ -171,10 +172,10 @@ class SteeringPanel:
             self._session.do(lambda a: a.scan(*wanted))
 
     async def _give_grant(self) -> None:
-        await GrantDialog(self._session, self._session.content.agents, None).show()
+        await self._grant_dialog(self._session, self._session.content.agents, None).show()
 
     async def _ask_grant(self, event: events.GenericEventArguments) -> None:
-        await GrantDialog(self._session, self._session.content.agents, drawn_box(event.args)).show()
+        await self._grant_dialog(self._session, self._session.content.agents, drawn_box(event.args)).show()
 
     async def _ask_spectrum(self, event: events.GenericEventArguments) -> None:
         at_m = (float(event.args["x"]), float(event.args["y"]))

@@ -1,0 +1,1 @@
+"""Parts of the page with which a person approves the plans of agents."""
