@@ -160,10 +160,11 @@ def _done(do: arbitration.ControlChange) -> str:
 
 
 def component_pages() -> str:
-    """Each ready-made component: what it does, and its settings."""
-    found = {
-        name: entry_points.load(entry_points.COMPONENTS, name) for name in entry_points.names(entry_points.COMPONENTS)
-    }
+    """Each component of the one distribution: what it does, and its settings."""
+    # packages have pages of their own, and need not be installed
+    every = entry_points.names(entry_points.COMPONENTS)
+    own = [name for name in every if str(entry_points.class_path(name)).startswith("afspm.")]
+    found = {name: entry_points.load(entry_points.COMPONENTS, name) for name in own}
     return "\n".join(_class_page(name, class_) for name, class_ in found.items() if issubclass(class_, Component))
 
 
